@@ -1,0 +1,35 @@
+# Two stages: the first fetches what requirements.lock pins (every file checked against its hash) and builds the wheel,
+# the second installs from those files alone, so that neither the build tools nor the checks end up in the image.
+#
+#   docker build -t coec .
+#   docker run --network host -v ./deploy/coec.yaml:/etc/coec/coec.yaml:ro -v coec-state:/var/lib/coec coec
+
+FROM python:3.11-slim-bookworm AS build
+WORKDIR /build
+COPY requirements.lock ./
+RUN pip download --quiet --require-hashes --requirement requirements.lock --dest packages
+RUN python -m venv tools && tools/bin/pip install --quiet --no-index --find-links packages hatchling
+COPY pyproject.toml README.md LICENSE ./
+COPY service service
+RUN tools/bin/hatchling build --target wheel --directory dist \
+    && python -m venv /opt/coec \
+    && /opt/coec/bin/pip install --quiet --no-index --find-links packages dist/coec-*.whl \
+    && /opt/coec/bin/python -m compileall -q /opt/coec/lib
+
+FROM python:3.11-slim-bookworm
+RUN useradd --system --uid 10001 --home-dir /var/lib/coec --shell /usr/sbin/nologin coec \
+    && install --directory --owner coec --group coec /var/lib/coec /var/cache/coec
+COPY --from=build /opt/coec /opt/coec
+# Compiled kernels are cached below XDG_CACHE_HOME/coec: keep that folder on a volume for quick restarts.
+ENV PATH=/opt/coec/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    XDG_CACHE_HOME=/var/cache
+USER coec
+# Relative paths in the configuration are relative to its file: set `state: {directory: /var/lib/coec}`.
+VOLUME ["/var/lib/coec", "/var/cache/coec"]
+STOPSIGNAL SIGTERM
+# The first start compiles the kernels.
+HEALTHCHECK --interval=30s --timeout=10s --start-period=120s --retries=3 \
+    CMD ["coec", "query", "status", "--config", "/etc/coec/coec.yaml"]
+ENTRYPOINT ["coec"]
+CMD ["run", "--config", "/etc/coec/coec.yaml"]
