@@ -1,0 +1,92 @@
+"""Every error that coec raises on purpose: a sentence for people, an exit code and a reply code for programs."""
+
+from __future__ import annotations
+
+
+class CoecError(Exception):
+    """Base of all deliberate errors. The message says what was wrong, where, and what to do.
+
+    Attributes:
+        exit_code: process exit status of a command that ends with this error (CONTRACT, "Command line").
+        reply_code: machine-readable code of a Zenoh `reply_err` that carries this error.
+    """
+
+    exit_code = 1
+    reply_code = "internal"
+
+
+class UsageError(CoecError):
+    """A command, selector or payload that does not fit its own grammar."""
+
+    exit_code = 2
+    reply_code = "bad_request"
+
+
+class ConfigError(CoecError):
+    """A configuration that cannot be used: unknown key, wrong type, value out of range, missing file."""
+
+    exit_code = 78  # EX_CONFIG of sysexits.h, so that systemd does not restart on it
+    reply_code = "bad_configuration"
+
+
+class SourceError(CoecError):
+    """A recording that is absent, incomplete or not in the layout its name promises."""
+
+    reply_code = "bad_source"
+
+
+class WindowError(CoecError):
+    """A window file that cannot be read, or that holds too little to calibrate from."""
+
+    reply_code = "bad_window"
+
+
+class ModelError(CoecError):
+    """A depth network that is missing, corrupt, or does not match its model card."""
+
+    reply_code = "bad_model"
+
+
+class CalibrationError(CoecError):
+    """A window from which no calibration can be computed (for example: no LiDAR point in view)."""
+
+    reply_code = "calibration_failed"
+
+
+class StateError(CoecError):
+    """A state file that is damaged or of another schema version."""
+
+    reply_code = "bad_state"
+
+
+class RecordingError(CoecError):
+    """A window that could not be written (disk full, folder not writable)."""
+
+    reply_code = "recording_failed"
+
+
+class WorkerError(CoecError):
+    """The worker process crashed, hung or outgrew its memory while it had a job."""
+
+    reply_code = "worker_failed"
+
+
+class NotFoundError(CoecError):
+    """A window, pair or key that does not exist."""
+
+    reply_code = "not_found"
+
+
+class DecodeError(CoecError):
+    """A message or image that was refused before it could do harm.
+
+    Attributes:
+        reason: short code under which the loss is counted, for example `image_truncated`. It is one of a fixed
+            set and never holds text of the sender's.
+    """
+
+    reply_code = "bad_input"
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason

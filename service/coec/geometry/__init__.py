@@ -1,0 +1,73 @@
+"""Arrays in, arrays out: rigid transforms, camera models and compiled kernels. NumPy and numba only.
+
+Importing this package points numba's on-disk cache at a user-writable directory before any kernel is defined.
+The directory is keyed by a hash of the sources in this package: numba itself only looks at the file that holds
+the outermost kernel, so after an edit to a camera formula a kernel in another file would be served stale.
+"""
+
+import hashlib
+import os
+import stat
+import tempfile
+from pathlib import Path
+
+import numba
+
+# Twelve hexadecimal digits are 48 bits: enough to tell the edits of one code base apart.
+_HASH_DIGITS = 12
+
+
+def _sources_hash(package: Path) -> str:
+    """Hex digest over the paths and contents of all Python sources below `package`."""
+    digest = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        digest.update(source.relative_to(package).as_posix().encode() + b"\0")
+        digest.update(source.read_bytes() + b"\0")
+    return digest.hexdigest()[:_HASH_DIGITS]
+
+
+def _user_cache_root() -> Path:
+    """$XDG_CACHE_HOME, or ~/.cache. Raises RuntimeError where the user has no home."""
+    configured = os.environ.get("XDG_CACHE_HOME", "")
+    return Path(configured) if Path(configured).is_absolute() else Path.home() / ".cache"
+
+
+def _private_directory(directory: Path) -> bool:
+    """Create `directory` if need be; true if we may write to it and nobody else may.
+
+    numba's cache holds pickled objects and machine code, so whoever can write to it can run code in our name.
+    """
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = directory.lstat()
+    except OSError:
+        return False
+    return (
+        stat.S_ISDIR(status.st_mode)
+        and status.st_uid == os.geteuid()
+        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        and os.access(directory, os.W_OK | os.X_OK)
+    )
+
+
+def kernel_cache_directory(package: Path) -> Path:
+    """A private, writable directory for the compiled kernels of the sources below `package`.
+
+    `<user cache>/coec/kernels-<hash>`, else `<temporary folder>/coec-kernels-<user>-<hash>`, else a fresh temporary
+    directory (then every process compiles anew).
+    """
+    name = f"kernels-{_sources_hash(package)}"
+    temporary = Path(tempfile.gettempdir()) / f"coec-{os.geteuid()}-{name}"
+    try:
+        candidates = [_user_cache_root() / "coec" / name, temporary]
+    except RuntimeError:
+        candidates = [temporary]
+    for candidate in candidates:
+        if _private_directory(candidate):
+            return candidate
+    return Path(tempfile.mkdtemp(prefix=f"coec-{name}-"))
+
+
+if not os.environ.get("NUMBA_CACHE_DIR"):  # a directory chosen by the user wins
+    # numba's configuration is a module that fills itself at run time.
+    numba.config.CACHE_DIR = str(kernel_cache_directory(Path(__file__).parent))  # type: ignore[attr-defined]

@@ -1,0 +1,32 @@
+"""Camera models: one module each, with named intrinsics, the formula, its domain and its source.
+
+A camera is an immutable named tuple, so that compiled code takes it as it is and knows its model at compile time.
+Points of the camera frame: x right, y down, z forward, metres. Pixel centres lie at integer coordinates (OpenCV).
+"""
+
+from coec.geometry.cameras.dispatch import project_point, unproject_point
+from coec.geometry.cameras.double_sphere import DoubleSphere
+from coec.geometry.cameras.eucm import Eucm
+from coec.geometry.cameras.kannala_brandt import KannalaBrandt
+from coec.geometry.cameras.mei import Mei
+from coec.geometry.cameras.pinhole import Pinhole
+from coec.geometry.cameras.radtan import RadTan
+from coec.geometry.cameras.registry import MODELS, Camera, Model, build, intrinsics_of, name_of, scaled
+
+__all__ = [
+    "MODELS",
+    "Camera",
+    "DoubleSphere",
+    "Eucm",
+    "KannalaBrandt",
+    "Mei",
+    "Model",
+    "Pinhole",
+    "RadTan",
+    "build",
+    "intrinsics_of",
+    "name_of",
+    "project_point",
+    "scaled",
+    "unproject_point",
+]

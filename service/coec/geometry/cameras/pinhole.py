@@ -1,0 +1,36 @@
+"""Pinhole: u = fx x/z + cx, v = fy y/z + cy for z > 0."""
+
+from typing import NamedTuple
+
+from coec.geometry.cameras.intrinsics import sensor
+from coec.geometry.cameras.kernel import MAX_RANGE_M, guarded_pixel, guarded_ray
+
+
+class Pinhole(NamedTuple):
+    """Size in pixels, focal lengths and principal point in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+def build(*, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Pinhole:
+    """A checked camera. Raises ValueError that names the field."""
+    return Pinhole(*sensor(width, height, fx, fy, cx, cy))
+
+
+def project_point(camera: Pinhole, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """Pixel of a point in the camera frame, and whether it has one: z > 0."""
+    in_domain = (z > 0.0) & (z < MAX_RANGE_M)
+    inverse_z = 1.0 / (z if in_domain else 1.0)
+    return guarded_pixel(
+        camera, camera.fx * (x * inverse_z) + camera.cx, camera.fy * (y * inverse_z) + camera.cy, in_domain
+    )
+
+
+def unproject_point(camera: Pinhole, u: float, v: float) -> tuple[float, float, float, bool]:
+    """Unit ray in the camera frame of a pixel; every finite pixel has one."""
+    return guarded_ray((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0, True)

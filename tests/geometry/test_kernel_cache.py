@@ -1,0 +1,87 @@
+"""Where compiled kernels are kept: private, writable, and another place after every edit of a source."""
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import coec
+from coec.geometry import kernel_cache_directory
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A package of two sources, one of them in a sub-package."""
+    folder = tmp_path / "package"
+    (folder / "inner").mkdir(parents=True)
+    (folder / "outer.py").write_text("a = 1\n")
+    (folder / "inner" / "formula.py").write_text("b = 2\n")
+    return folder
+
+
+def test_it_lies_in_the_users_cache_and_is_private(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    directory = kernel_cache_directory(package)
+    assert directory.parent == tmp_path / "cache" / "coec"
+    assert stat.S_IMODE(directory.stat().st_mode) == 0o700
+    assert kernel_cache_directory(package) == directory
+
+
+def test_an_edit_in_any_source_moves_it(package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    before = kernel_cache_directory(package)
+    (package / "inner" / "formula.py").write_text("b = 3\n")
+    after = kernel_cache_directory(package)
+    (package / "inner" / "formula.py").rename(package / "inner" / "other.py")
+    assert len({before, after, kernel_cache_directory(package)}) == 3
+
+
+def test_without_a_usable_cache_it_lies_in_the_temporary_folder(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "occupied").write_text("a file, not a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "occupied"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    directory = kernel_cache_directory(package)
+    assert directory.parent == tmp_path
+    assert kernel_cache_directory(package) == directory
+
+
+def test_a_directory_that_others_may_write_to_is_not_used(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    open_to_all = kernel_cache_directory(package)
+    open_to_all.chmod(0o777)
+    second = kernel_cache_directory(package)
+    second.chmod(0o777)
+    third = kernel_cache_directory(package)
+    assert len({open_to_all, second, third}) == 3
+    assert stat.S_IMODE(third.stat().st_mode) == 0o700
+
+
+def _numba_cache_directory(environment: dict[str, str]) -> str:
+    code = "import coec.geometry, numba; print(numba.config.CACHE_DIR)"
+    source_root = str(Path(coec.__file__).parents[1])
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": source_root} | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return result.stdout.strip()
+
+
+def test_the_import_sets_it_unless_the_user_has(tmp_path: Path) -> None:
+    cache_home = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    ours = Path(_numba_cache_directory(cache_home | {"NUMBA_CACHE_DIR": ""}))
+    assert ours.parent == tmp_path / "cache" / "coec"
+    theirs = _numba_cache_directory(cache_home | {"NUMBA_CACHE_DIR": str(tmp_path / "mine")})
+    assert theirs == str(tmp_path / "mine")
