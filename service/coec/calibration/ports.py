@@ -1,0 +1,51 @@
+"""What the calibration flow asks of the outside world. Adapters implement these; tests fake them."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from coec.calibration.values import CameraFrame, DepthMap, ImageQuality
+
+
+class DepthModel(Protocol):
+    """A virtual depth sensor: one camera frame in, one depth map out (METHOD, section 1)."""
+
+    @property
+    def identity(self) -> str:
+        """sha256 of the network file in hexadecimal, or `precomputed`: part of every decision's hash."""
+        ...
+
+    def infer(self, frame: CameraFrame) -> DepthMap:
+        """Depth of the frame, at the resolution of the network.
+
+        Raises:
+            DecodeError: the image or the precomputed map cannot be decoded, or there is no map.
+        """
+        ...
+
+
+class ImageInspector(Protocol):
+    """Judges an exposure without keeping its pixels."""
+
+    def inspect(self, frame: CameraFrame) -> ImageQuality:
+        """Sharpness and exposure of the frame.
+
+        Raises:
+            DecodeError: the image cannot be decoded within the limits.
+        """
+        ...
+
+
+class Progress(Protocol):
+    """Hears how far a calibration has come; it has no say in the result."""
+
+    def step(self, stage: str, done: int, total: int) -> None:
+        """`done` of `total` parts of the stage are complete."""
+        ...
+
+
+class Silence:
+    """A `Progress` for callers who do not listen."""
+
+    def step(self, stage: str, done: int, total: int) -> None:
+        """Nothing."""

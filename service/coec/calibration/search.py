@@ -1,0 +1,113 @@
+"""Maximising an objective over a box of perturbations with BOBYQA (Powell 2009, NLopt): bounded, derivative-free.
+
+Two stages on one objective: the first finds the basin with a trust region of degrees, the second starts again in it
+with a fresh quadratic model of its size. Deterministic: same objective, same evaluations, same optimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import radians
+
+import nlopt
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.objective import Objective, SearchBox
+from coec.calibration.values import Matrix4, StopReason
+from coec.config import SearchConfig
+from coec.geometry import se3
+
+REFINE_BOX_RAD, REFINE_STEP_RAD = radians(1.5), radians(0.6)
+"""Second stage, rotation. The box holds the widest ripple of pixels and scan lines around the end of the first stage;
+the step spans several of those ripples (cells of a depth map, rings of a sweep: 0.1 to 0.4 degrees), so that the first
+quadratic model sees the hill and not the ripple."""
+
+REFINE_BOX_M, REFINE_STEP_M = 0.10, 0.04
+"""Second stage, translation: the shifts that move a point 4 m away as far as the rotations above."""
+
+AT_BOUND = 0.995
+"""Share of the half-width of the box beyond which an optimum counts as lying on the bound."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchResult:
+    """Where the search ended: pose (4, 4), objective there and at the start, and its effort."""
+
+    T_camera_lidar: Matrix4
+    score: float
+    score_at_start: float
+    evaluations: int
+    stop_reason: StopReason
+
+
+def box_of(config: SearchConfig) -> SearchBox:
+    """The reach of the search, from the configuration."""
+    return SearchBox(radians(config.rotation_deg), config.translation_m if config.dof == 6 else 0.0)
+
+
+def maximise(objective: Objective, start: Matrix4, config: SearchConfig, heard: Callable[[int], None]) -> SearchResult:
+    """The pose of the highest score in the box about `start` (4, 4); `heard` is told the number of evaluations so far.
+
+    Coordinates are the perturbation ξ = [rx ry rz tx ty tz] on the left of the start, about the camera axes; with three
+    degrees of freedom the translation is not searched.
+    """
+    evaluations = 0
+
+    def score(coordinates: NDArray[np.float64]) -> float:
+        nonlocal evaluations
+        evaluations += 1
+        heard(evaluations)
+        return objective.evaluate(_pose(start, coordinates)).score
+
+    half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
+    score_at_start = score(np.zeros(config.dof))
+    found, exhausted = _bobyqa(
+        score, np.zeros(config.dof), half_width, half_width,
+        _per_axis(config.dof, radians(config.step_deg), config.step_m), config,
+    )  # fmt: skip
+    near = _per_axis(config.dof, REFINE_BOX_RAD, REFINE_BOX_M)
+    found, exhausted_again = _bobyqa(
+        score, found, near, half_width, _per_axis(config.dof, REFINE_STEP_RAD, REFINE_STEP_M), config
+    )
+    stop_reason = StopReason.TOLERANCE
+    if exhausted or exhausted_again:
+        stop_reason = StopReason.EVALUATIONS
+    elif (np.abs(found) >= AT_BOUND * half_width).any():
+        stop_reason = StopReason.AT_BOUND
+    return SearchResult(_pose(start, found), score(found), score_at_start, evaluations, stop_reason)
+
+
+def _bobyqa(
+    score: Callable[[NDArray[np.float64]], float],
+    centre: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    half_width: NDArray[np.float64],
+    step: NDArray[np.float64],
+    config: SearchConfig,
+) -> tuple[NDArray[np.float64], bool]:
+    """The best coordinates within `reach` of `centre` and inside the box, and whether the evaluations ran out."""
+    optimiser = nlopt.opt(nlopt.LN_BOBYQA, config.dof)
+    lower, upper = np.maximum(centre - reach, -half_width), np.minimum(centre + reach, half_width)
+    # The first quadratic model needs two steps of room between the bounds.
+    step = np.minimum(step, (upper - lower) / 2.0)
+    optimiser.set_lower_bounds(lower)
+    optimiser.set_upper_bounds(upper)
+    optimiser.set_initial_step(step)
+    # NLopt scales the axes by their steps; this is the radius of the last trust region on each of them.
+    optimiser.set_xtol_abs(step * radians(config.tolerance_deg) / step[0])
+    optimiser.set_maxeval(config.max_evaluations)
+    optimiser.set_max_objective(lambda x, _gradient: score(x))
+    found = np.asarray(optimiser.optimize(centre))
+    return found, optimiser.last_optimize_result() == nlopt.MAXEVAL_REACHED
+
+
+def _per_axis(dof: int, rotation: float, translation: float) -> NDArray[np.float64]:
+    return np.array([rotation] * 3 + [translation] * 3)[:dof]
+
+
+def _pose(start: Matrix4, coordinates: NDArray[np.float64]) -> Matrix4:
+    perturbation = np.zeros(6)
+    perturbation[: len(coordinates)] = coordinates
+    return se3.perturb(start, perturbation)

@@ -1,0 +1,303 @@
+"""One immutable value per hop of the pipeline.
+
+bytes -> `CameraFrame | LidarFrame | EgoMotion` -> `FramePair` -> `Window` -> `DepthMap` -> `Optimum` -> `Verdict`
+-> `Estimate`. The same values carry a live stream, an MCAP replay and a folder on disk.
+
+Frames: `T_camera_lidar` maps LiDAR coordinates (x forward, y left, z up) to camera coordinates (x right, y down,
+z forward). Stamps are sensor time in integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.geometry.cameras import Camera
+
+Matrix4 = NDArray[np.float64]
+
+
+class ImageFormat(StrEnum):
+    """How the bytes of an image are laid out. `mono16` is used for depth maps only."""
+
+    JPEG = "jpeg"
+    PNG = "png"
+    MONO8 = "mono8"
+    RGB8 = "rgb8"
+    BGR8 = "bgr8"
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedImage:
+    """An image as it came: compressed, or rows of raw pixels without padding.
+
+    `width` and `height` are in pixels, read from the header when compressed, checked against limits before any decode.
+    """
+
+    format: ImageFormat
+    width: int
+    height: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """One exposure.
+
+    `depth` is an optional precomputed depth map of the same view (16-bit grey PNG, any monotonic code of depth or
+    inverse depth, 0 = no value), used instead of a network. `sequence` counts frames at the sender; gaps are loss.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    image: EncodedImage
+    sequence: int | None = None
+    depth: EncodedImage | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ImageQuality:
+    """What one look at an exposure tells, on a version reduced to about 1/8 of the pixels.
+
+    Attributes:
+        sharpness: mean squared gradient over twice the grey-value variance: 0 to about 1, falls with blur.
+        mean_level: mean grey value, 0 to 255.
+        clipped: share of pixels at 0-2 or 253-255.
+        digest: 64-bit digest of the reduced image: equal digests in a row are a frozen camera.
+    """
+
+    sharpness: float
+    mean_level: float
+    clipped: float
+    digest: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarFrame:
+    """One sweep, in the LiDAR frame, not motion-compensated. Every array has the same length N, every point is finite.
+
+    Attributes:
+        xyz_m: (N, 3) float32.
+        intensity: (N,) float32 or None.
+        ring: (N,) uint16 or None.
+        time_offset_s: (N,) float32 or None: when each point was measured, relative to `stamp_ns`.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    xyz_m: NDArray[np.float32]
+    intensity: NDArray[np.float32] | None = None
+    ring: NDArray[np.uint16] | None = None
+    time_offset_s: NDArray[np.float32] | None = None
+    sequence: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EgoMotion:
+    """Velocity of the vehicle at `stamp_ns`, expressed in the ego frame `frame_id` (x forward, y left, z up)."""
+
+    stamp_ns: int
+    frame_id: str
+    linear_mps: tuple[float, float, float]
+    angular_radps: tuple[float, float, float]
+    sequence: int | None = None
+
+    @property
+    def speed_mps(self) -> float:
+        """Magnitude of the linear velocity in metres per second."""
+        x, y, z = self.linear_mps
+        return float(np.sqrt(x * x + y * y + z * z))
+
+
+class Compensation(StrEnum):
+    """What motion compensation did to a pair, and if nothing, why."""
+
+    DONE = "done"
+    NO_EGO_MOTION = "no_ego_motion"
+    NO_POINT_TIME = "no_point_time"
+    DISABLED = "disabled"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePair:
+    """A camera frame and the LiDAR sweep nearest to it in sensor time; `motion` is the ego-motion at the camera stamp,
+    or None when none is known there."""
+
+    camera: CameraFrame
+    lidar: LidarFrame
+    motion: EgoMotion | None = None
+
+    @property
+    def stamp_ns(self) -> int:
+        """The pair is dated by its camera frame."""
+        return self.camera.stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class SweepTiming:
+    """How the time of a point follows from its azimuth, for spinning LiDARs without per-point time.
+
+    A point at azimuth a = atan2(y, x) was measured `sign · wrap(a - stamp_azimuth_rad) / 2π` revolutions after the
+    stamp of the sweep. KITTI's HDL-64 (clockwise, stamped when it looks forward): sign = -1, stamp_azimuth_rad = 0
+    (METHOD, section 3).
+    """
+
+    period_s: float
+    sign: int
+    stamp_azimuth_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """What is known of one camera-LiDAR pair before the first frame.
+
+    Attributes:
+        pair: name of the pair, for example `front`.
+        camera: intrinsics.
+        T_camera_lidar_nominal: (4, 4) workshop calibration: corrections and drift are counted from it.
+        T_lidar_ego: (4, 4) maps ego-frame coordinates to LiDAR coordinates; carries ego-motion to the sensor.
+        mask: (height, width) bool or None; False = ignore this pixel (vehicle body, outside the lens).
+        sweep: azimuth timing, or None when unknown or when the clouds carry per-point time.
+    """
+
+    pair: str
+    camera: Camera
+    camera_frame: str
+    lidar_frame: str
+    T_camera_lidar_nominal: Matrix4
+    T_lidar_ego: Matrix4
+    mask: NDArray[np.bool_] | None = None
+    sweep: SweepTiming | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """The pairs of one slice of sensor time, in order of their stamps, and the extrinsic that was current then.
+
+    `T_camera_lidar_start` (4, 4) is where the search starts: it is part of the window, so that a replay starts there
+    too.
+    """
+
+    window_id: str
+    rig: Rig
+    T_camera_lidar_start: Matrix4
+    pairs: tuple[FramePair, ...]
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the last contributing pair."""
+        return self.pairs[-1].stamp_ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """Output of a depth network as it comes: any monotonic code of depth or inverse depth over the whole image.
+
+    Attributes:
+        values: (h, w) float32 at network resolution; NaN = no value. Covers the same field of view as the image.
+    """
+
+    values: NDArray[np.float32]
+
+
+class StopReason(StrEnum):
+    """Why a search ended."""
+
+    TOLERANCE = "tolerance_reached"
+    AT_BOUND = "optimum_at_bound"
+    EVALUATIONS = "evaluations_exhausted"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimum:
+    """Where a search ended, with its evidence.
+
+    Attributes:
+        T_camera_lidar: (4, 4).
+        score, score_at_start: objective values (nats) at the end and at the start.
+        mi: mutual information (nats), equation (1), without the overlap guard.
+        overlap: share of the guarded points that lie in view, 0 to 1.
+        points_in_view: number of points that entered the histograms, over all frames.
+        evaluations: number of objective evaluations.
+        first_derivative: (6,) dS/dξ per axis, nats per radian or metre; NaN for axes that were not searched.
+        second_derivative: (6,) -d²S/dξ² per axis, nats per radian² or metre²; positive at a maximum; NaN likewise.
+    """
+
+    T_camera_lidar: Matrix4
+    score: float
+    score_at_start: float
+    mi: float
+    overlap: float
+    points_in_view: int
+    evaluations: int
+    stop_reason: StopReason
+    first_derivative: NDArray[np.float64]
+    second_derivative: NDArray[np.float64]
+
+
+class Decision(StrEnum):
+    """The verdict on an optimum."""
+
+    ACCEPTED = "accepted"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """A machine-readable code and one sentence for people."""
+
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A figure of self-diagnosis with the limit it was judged by. `at_least` tells which side of the limit is good."""
+
+    name: str
+    value: float
+    limit: float
+    at_least: bool
+
+    @property
+    def passed(self) -> bool:
+        """NaN never passes: a figure that could not be computed is not a good one."""
+        return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Equation (2): every metric beside its limit, and the reasons when it failed (empty when accepted)."""
+
+    decision: Decision
+    metrics: tuple[Metric, ...]
+    reasons: tuple[Reason, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The immutable result of calibrating one window.
+
+    Attributes:
+        correction: (6,) rotation vector (rad) and translation (m) from the nominal calibration, about the camera axes.
+        sigma: (6,) standard deviation per axis (rad, m); NaN where it was not estimated.
+        solved: (6,) bool, the axes that were searched.
+        compensation: how many pairs ended with which `Compensation`, by name.
+        depth_identity: sha256 of the network, or `precomputed`.
+        config_hash: of everything that decides the result.
+    """
+
+    window_id: str
+    data_stamp_ns: int
+    pairs: int
+    optimum: Optimum
+    verdict: Verdict
+    correction: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    solved: NDArray[np.bool_]
+    compensation: dict[str, int]
+    depth_identity: str
+    config_hash: str

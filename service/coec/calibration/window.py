@@ -1,0 +1,144 @@
+"""Choosing the pairs of a window while the stream passes: evenly over the slice, each sharp, in view, taken in motion.
+
+The slice is divided into as many bins as pairs are wanted; the first good pair of a bin is taken, and the rest of the
+bin is not even decoded. Bins and slices are cut by sensor time, so a replay at any rate chooses the same pairs.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from coec.calibration.ports import ImageInspector
+from coec.calibration.values import FramePair, ImageQuality, Matrix4, Rig
+from coec.config import WindowConfig
+from coec.errors import DecodeError
+from coec.geometry.projection import in_image, project
+
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairSelected:
+    """A pair that belongs to the window; `first` opens it."""
+
+    window_id: str
+    pair: FramePair
+    first: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SliceEnded:
+    """The end of a slice that had at least one pair; `complete` when there are enough of them for a window."""
+
+    window_id: str
+    pairs: int
+    complete: bool
+
+
+@dataclass(slots=True)
+class _Slice:
+    window_id: str
+    start_ns: int
+    filled: set[int]
+    last_selected_ns: int | None = None
+
+
+class WindowCutter:
+    """Cuts the stream of one camera-LiDAR pair into slices and picks the pairs of each.
+
+    Attributes:
+        rejections: pairs that were looked at and refused, by reason.
+        last_quality: what the last look at an image told.
+    """
+
+    def __init__(self, config: WindowConfig, rig: Rig, inspector: ImageInspector) -> None:
+        self._config = config
+        self._rig = rig
+        self._inspector = inspector
+        self._slice_ns = round(config.slice_s * NS_PER_S)
+        self._open: _Slice | None = None
+        self.rejections: Counter[str] = Counter()
+        self.last_quality: ImageQuality | None = None
+
+    @property
+    def selected(self) -> int:
+        """Pairs chosen so far in the open slice."""
+        return len(self._open.filled) if self._open else 0
+
+    @property
+    def slice_end_ns(self) -> int | None:
+        """Sensor time at which the open slice ends; None when none is open."""
+        return self._open.start_ns + self._slice_ns if self._open else None
+
+    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[PairSelected | SliceEnded]:
+        """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, by which it must be in view."""
+        events: list[PairSelected | SliceEnded] = [*self._end_before(pair.stamp_ns)]
+        if self._open is None:
+            window_id = f"{self._rig.pair}-{pair.stamp_ns}"
+            self._open = _Slice(window_id, pair.stamp_ns, set())
+        if self._select(self._open, pair, T_camera_lidar):
+            events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
+        return events
+
+    def advance(self, stamp_ns: int) -> list[SliceEnded]:
+        """Sensor time has passed `stamp_ns` though no pair came."""
+        return self._end_before(stamp_ns) if self.slice_end_ns and stamp_ns >= self.slice_end_ns else []
+
+    def finish(self) -> list[SliceEnded]:
+        """Ends the open slice here and now."""
+        ended, self._open = self._open, None
+        if ended is None or not ended.filled:
+            return []
+        return [SliceEnded(ended.window_id, len(ended.filled), len(ended.filled) >= self._config.min_pairs)]
+
+    def _end_before(self, stamp_ns: int) -> list[SliceEnded]:
+        """Ends the open slice if the stamp lies outside it; sensor time that stepped back is outside, too."""
+        if self._open is None or 0 <= stamp_ns - self._open.start_ns < self._slice_ns:
+            return []
+        return self.finish()
+
+    def _select(self, current: _Slice, pair: FramePair, T_camera_lidar: Matrix4) -> bool:
+        bin_ns = self._slice_ns // self._config.pairs
+        index = min((pair.stamp_ns - current.start_ns) // bin_ns, self._config.pairs - 1)
+        too_close = current.last_selected_ns is not None and 2 * (pair.stamp_ns - current.last_selected_ns) < bin_ns
+        if index in current.filled or too_close:
+            return False
+        reason = self._objection(pair, T_camera_lidar)
+        if reason is not None:
+            self.rejections[reason] += 1
+            return False
+        current.filled.add(index)
+        current.last_selected_ns = pair.stamp_ns
+        return True
+
+    def _objection(self, pair: FramePair, T_camera_lidar: Matrix4) -> str | None:
+        """Why the pair is not fit for a window, cheapest question first; None when it is fit."""
+        config = self._config
+        stands = pair.motion is not None and pair.motion.speed_mps < config.min_speed_mps
+        if config.require_motion and stands:
+            return "standing"
+        if self._points_in_view(pair, T_camera_lidar) < config.min_points_in_view:
+            return "out_of_view"
+        previous = self.last_quality
+        try:
+            quality = self._inspector.inspect(pair.camera)
+        except DecodeError as error:
+            return error.reason
+        self.last_quality = quality
+        if quality.mean_level < config.min_mean_level:
+            return "too_dark"
+        if quality.clipped > config.max_clipped:
+            return "clipped"
+        if quality.sharpness < config.min_sharpness:
+            return "blurred"
+        if previous is not None and previous.digest == quality.digest and not stands:
+            return "frozen"
+        return None
+
+    def _points_in_view(self, pair: FramePair, T_camera_lidar: Matrix4) -> int:
+        p_camera = pair.lidar.xyz_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+        uv_px, valid = project(self._rig.camera, p_camera)
+        return int(np.count_nonzero(valid & in_image(self._rig.camera, uv_px)))

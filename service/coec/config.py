@@ -1,0 +1,358 @@
+"""Everything a user may set, with its default, unit and reason: one frozen model per stage, unknown keys refused.
+
+`load_config` reads the one YAML file of a daemon. The same stage models (`WindowConfig`, `CalibrationConfig`, ...)
+serve the command line, so a default exists once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from coec.errors import ConfigError
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
+"""A name that becomes one chunk of a Zenoh key and part of a file name."""
+
+KeyExpression = Annotated[str, Field(pattern=r"^[^\s/*$?#][^\s*$?#]*$", max_length=256)]
+"""A Zenoh key without wildcards."""
+
+Matrix4x4 = tuple[
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+]
+
+IDENTITY: Matrix4x4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+class Stage(BaseModel):
+    """Base of every configuration model: frozen, no unknown keys, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+# --- the rig --------------------------------------------------------------------------------------------------------
+
+
+class CameraIntrinsics(Stage):
+    """Intrinsics as in `dataset.yaml`; which of the optional parameters are needed depends on `model`."""
+
+    model: Literal["pinhole", "radtan", "kannala_brandt", "mei", "eucm", "double_sphere"]
+    width: int = Field(gt=0, le=16384, description="image width, px")
+    height: int = Field(gt=0, le=16384, description="image height, px")
+    fx: float = Field(gt=0, description="focal length, px")
+    fy: float = Field(gt=0, description="focal length, px")
+    cx: float = Field(description="principal point, px; pixel centres at integers")
+    cy: float = Field(description="principal point, px; pixel centres at integers")
+    xi: float | None = None
+    alpha: float | None = None
+    beta: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+
+    def parameters(self) -> dict[str, float]:
+        """Every intrinsic that was given, by name, without `model`."""
+        return self.model_dump(exclude={"model"}, exclude_none=True)
+
+
+class SweepConfig(Stage):
+    """Azimuth timing of a spinning LiDAR without per-point time: a point at azimuth a was measured
+    `sign · wrap(a - stamp_azimuth_deg) / 360°` revolutions after the stamp."""
+
+    period_s: float = Field(default=0.1, gt=0, le=10, description="one revolution, s")
+    sign: Literal[-1, 1] = Field(default=-1, description="-1 clockwise seen from above, 1 counter-clockwise")
+    stamp_azimuth_deg: float = Field(default=0.0, ge=-360, le=360, description="azimuth that is measured at the stamp")
+
+
+Encoding = Literal["msgpack", "cdr"]
+
+
+class CameraConfig(Stage):
+    """Camera stream of a pair."""
+
+    key: KeyExpression
+    frame_id: str = Field(default="camera", max_length=128, description="frames of another id are refused")
+    encoding: Encoding = Field(default="msgpack", description="assumed when a sample names no encoding")
+    type: Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"] = "sensor_msgs/msg/CompressedImage"
+    intrinsics: CameraIntrinsics
+    mask: Path | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
+
+
+class LidarConfig(Stage):
+    """LiDAR stream of a pair."""
+
+    key: KeyExpression
+    frame_id: str = Field(default="lidar", max_length=128, description="frames of another id are refused")
+    encoding: Encoding = "msgpack"
+    sweep: SweepConfig | None = Field(default=None, description="needed for clouds without per-point time")
+
+
+class EgoConfig(Stage):
+    """Ego-motion stream of a pair."""
+
+    key: KeyExpression
+    encoding: Encoding = "msgpack"
+    type: Literal["nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped"] = "nav_msgs/msg/Odometry"
+    T_lidar_ego: Matrix4x4 = Field(default=IDENTITY, description="maps ego-frame to LiDAR coordinates")
+
+
+# --- stages of the calibration
+# -----------------------------------------------------------------------------------------
+
+
+class PairingConfig(Stage):
+    """Which camera frame belongs to which sweep."""
+
+    tolerance_s: float = Field(default=0.05, gt=0, le=1, description="largest stamp difference; half a 10 Hz period")
+    motion_tolerance_s: float = Field(
+        default=0.2, gt=0, le=5, description="largest distance of a pair from the nearest ego-motion sample"
+    )
+    queue_frames: int = Field(
+        default=16, ge=2, le=256, description="frames kept per stream while they wait for partners"
+    )
+    max_stamp_jump_s: float = Field(
+        default=300.0, gt=0, description="a stamp further from its predecessor is refused, until five agree"
+    )
+
+
+class WindowConfig(Stage):
+    """How a window is chosen from the stream (the paper: 25 pairs over three minutes)."""
+
+    pairs: int = Field(default=25, ge=1, le=400)
+    min_pairs: int = Field(default=10, ge=1, le=400, description="a slice that ends with fewer makes no window")
+    slice_s: float = Field(default=180.0, gt=0, le=3600)
+    require_motion: bool = Field(default=True, description="skip pairs taken while the vehicle is known to stand")
+    min_speed_mps: float = Field(default=0.5, ge=0, description="slower counts as standing")
+    min_sharpness: float = Field(
+        default=0.02, ge=0, description="gradient energy over contrast, 0 to 1; a strong blur is below 0.01"
+    )
+    min_mean_level: float = Field(default=8.0, ge=0, le=255, description="mean grey value; darker tells nothing")
+    max_clipped: float = Field(
+        default=0.6, gt=0, le=1, description="share of black or white pixels; a covered or blinded lens"
+    )
+    min_points_in_view: int = Field(default=500, ge=1, description="LiDAR points in the image at the current extrinsic")
+
+    @model_validator(mode="after")
+    def _counts_agree(self) -> WindowConfig:
+        if self.min_pairs > self.pairs:
+            raise ValueError("min_pairs must not exceed pairs")
+        return self
+
+
+class DepthConfig(Stage):
+    """The depth network."""
+
+    model: str = Field(
+        default="stereo", description="an ONNX file, a built-in name, or `stereo` (maps that come with the frames)"
+    )
+    providers: tuple[Literal["cpu", "cuda", "tensorrt"], ...] = Field(
+        default=("cpu",), min_length=1, description="tried in this order; cpu is always the last resort"
+    )
+    threads: int = Field(default=2, ge=1, le=64)
+
+
+class ObjectiveConfig(Stage):
+    """Equation (1) and the guard against looking away."""
+
+    kind: Literal["mi"] = "mi"
+    depth_bins: int = Field(default=32, ge=2, le=4096)
+    range_bins: int = Field(default=32, ge=2, le=4096)
+    min_range_m: float = Field(default=2.0, ge=0, description="nearer points are the vehicle itself")
+    max_range_m: float = Field(default=80.0, gt=0, description="further points are too sparse to carry information")
+
+    @model_validator(mode="after")
+    def _range_is_not_empty(self) -> ObjectiveConfig:
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError("min_range_m must be below max_range_m")
+        return self
+
+
+class SearchConfig(Stage):
+    """The box and the steps of BOBYQA."""
+
+    dof: Literal[3, 6] = 3
+    rotation_deg: float = Field(
+        default=10.0, gt=0, le=45, description="half-width of the box about the start, per axis"
+    )
+    translation_m: float = Field(default=0.3, gt=0, le=2, description="half-width of the box about the start, per axis")
+    step_deg: float = Field(default=2.0, gt=0, description="first trust region, rotation")
+    step_m: float = Field(default=0.05, gt=0, description="first trust region, translation")
+    tolerance_deg: float = Field(default=0.002, gt=0, description="last trust region, rotation")
+    max_evaluations: int = Field(default=600, ge=20, le=100_000)
+
+
+class VerdictConfig(Stage):
+    """Limits of equation (2) for a rig that is not commissioned yet. All are ratios of the window to itself, so that
+    they do not depend on the scene, the bins or the network."""
+
+    min_mi_over_unrelated: float = Field(default=1.2, gt=0, description="MI over the MI with other frames' depth maps")
+    max_newton_step_deg: float = Field(default=0.25, gt=0, description="|f'|/f'': distance to the zero of f', degrees")
+    min_peakedness_per_deg2: float = Field(default=0.01, description="f''/score, per degree²; least of the rotations")
+    min_overlap: float = Field(
+        default=0.5, ge=0, le=1, description="points in view over the most any pose of the box sees"
+    )
+
+
+class CalibrationConfig(Stage):
+    """Everything that decides a result, given a window: its hash is the `config_hash` of the result."""
+
+    depth: DepthConfig = DepthConfig()
+    objective: ObjectiveConfig = ObjectiveConfig()
+    search: SearchConfig = SearchConfig()
+    verdict: VerdictConfig = VerdictConfig()
+    motion_compensation: bool = True
+
+
+# --- the daemon -----------------------------------------------------------------------------------------------------
+
+
+class PairConfig(Stage):
+    """One camera-LiDAR pair."""
+
+    name: Name
+    camera: CameraConfig
+    lidar: LidarConfig
+    ego: EgoConfig | None = None
+    T_camera_lidar: Matrix4x4 = Field(description="workshop calibration: LiDAR to camera")
+    pairing: PairingConfig = PairingConfig()
+    window: WindowConfig = WindowConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
+
+
+class LimitsConfig(Stage):
+    """Hard limits on what a message may hold: larger is refused before it is decoded."""
+
+    max_message_bytes: int = Field(default=32 * 2**20, ge=2**16, le=2**30, description="as Zenoh's max_message_size")
+    max_image_pixels: int = Field(default=33_000_000, ge=2**12, description="8K UHD")
+    max_points: int = Field(default=1_000_000, ge=2**10)
+
+
+class StateConfig(Stage):
+    """The state directory; deleting it returns the vehicle to nominal."""
+
+    directory: Path = Path("coec-state")
+    max_bytes: int = Field(default=4 * 2**30, ge=2**20, description="windows kept, bytes; the oldest go first")
+    max_age_days: float = Field(default=90.0, gt=0)
+    min_free_bytes: int = Field(
+        default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
+    )
+    history: int = Field(default=500, ge=1, le=10_000, description="results kept per pair")
+
+
+class WorkerConfig(Stage):
+    """The process that infers and solves."""
+
+    timeout_s: float = Field(default=120.0, gt=0, description="one job; a worker that needs longer is replaced")
+    max_memory_bytes: int = Field(default=3 * 2**30, ge=2**28, description="resident; a worker above is replaced")
+    attempts: int = Field(
+        default=2, ge=1, le=10, description="workers that may die on one window before it is given up"
+    )
+    threads: int = Field(default=2, ge=1, le=64)
+    niceness: int = Field(default=10, ge=0, le=19, description="so that queries are answered first")
+
+
+class ZenohConfig(Stage):
+    """The session. `file` is a Zenoh configuration (JSON5) for TLS, access control and the like."""
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    embedded_router: bool = Field(default=False, description="be the router and listen on `listen`")
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    file: Path | None = None
+
+
+class Config(Stage):
+    """The one configuration file of a daemon."""
+
+    vehicle: Name = "vehicle"
+    prefix: KeyExpression = "coec"
+    zenoh: ZenohConfig = ZenohConfig()
+    state: StateConfig = StateConfig()
+    worker: WorkerConfig = WorkerConfig()
+    limits: LimitsConfig = LimitsConfig()
+    stale_after_s: float = Field(
+        default=86_400.0, gt=0, description="age at which a result is no longer called healthy"
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    pairs: tuple[PairConfig, ...] = Field(min_length=1, max_length=32)
+
+    @model_validator(mode="after")
+    def _names_unique(self) -> Config:
+        names = [pair.name for pair in self.pairs]
+        if len(set(names)) != len(names):
+            raise ValueError("pair names must be unique")
+        return self
+
+
+def config_hash(*parts: BaseModel | str) -> str:
+    """First 16 hexadecimal digits of the sha256 over the canonical JSON of the parts."""
+    canonical = [part if isinstance(part, str) else part.model_dump(mode="json") for part in parts]
+    text = json.dumps(canonical, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def load_yaml(path: Path) -> Any:
+    """The document of a YAML 1.2 file.
+
+    Raises:
+        ConfigError: the file cannot be read or is not YAML.
+    """
+    try:
+        return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid YAML: {error}") from error
+
+
+def load_config(path: Path) -> Config:
+    """The validated configuration of a daemon; relative paths in it are relative to the file.
+
+    Raises:
+        ConfigError: unreadable, not YAML, unknown key, wrong type or value out of range; names each place.
+    """
+    document = load_yaml(path)
+    if not isinstance(document, dict):
+        raise ConfigError(f"{path}: expected a mapping at the top, found {type(document).__name__}")
+    try:
+        config = Config.model_validate(document)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {describe(error)}") from error
+    return _resolve_paths(config, path.parent)
+
+
+def describe(error: ValidationError) -> str:
+    """Each complaint of pydantic on a line: where, what."""
+    lines = [f"{'.'.join(str(part) for part in item['loc']) or '(top)'}: {item['msg']}" for item in error.errors()]
+    return "; ".join(lines)
+
+
+def _resolve_paths(config: Config, folder: Path) -> Config:
+    """Relative paths are relative to the configuration file, not to wherever the daemon was started."""
+    zenoh = config.zenoh
+    if zenoh.file is not None:
+        zenoh = zenoh.model_copy(update={"file": folder / zenoh.file})
+    state = config.state.model_copy(update={"directory": folder / config.state.directory})
+    pairs = tuple(_resolve_pair_paths(pair, folder) for pair in config.pairs)
+    return config.model_copy(update={"pairs": pairs, "state": state, "zenoh": zenoh})
+
+
+def _resolve_pair_paths(pair: PairConfig, folder: Path) -> PairConfig:
+    camera, depth = pair.camera, pair.calibration.depth
+    if camera.mask is not None:
+        camera = camera.model_copy(update={"mask": folder / camera.mask})
+    if depth.model.endswith(".onnx"):
+        depth = depth.model_copy(update={"model": str(folder / depth.model)})
+    calibration = pair.calibration.model_copy(update={"depth": depth})
+    return pair.model_copy(update={"camera": camera, "calibration": calibration})

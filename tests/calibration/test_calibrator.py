@@ -1,0 +1,197 @@
+"""The solver on a street with a known truth, and what must follow when its input is changed in a known way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.calibration.calibrator import calibrate
+from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.values import CameraFrame, Decision, DepthMap, Estimate, StopReason, Window
+from coec.config import CalibrationConfig, ObjectiveConfig, SearchConfig
+from coec.errors import CalibrationError, DecodeError
+from coec.geometry import se3
+
+CONFIG = CalibrationConfig()
+SIX = CalibrationConfig(search=SearchConfig(dof=6))
+
+
+def solve(window: Window, depth: DepthModel, config: CalibrationConfig = CONFIG) -> Estimate:
+    return calibrate(window, depth, config, Silence())
+
+
+def from_start(window: Window, *deg_and_m: float) -> Window:
+    xi = np.zeros(6)
+    xi[: len(deg_and_m)] = deg_and_m
+    xi[:3] = np.radians(xi[:3])
+    return replace(window, T_camera_lidar_start=se3.perturb(window.rig.T_camera_lidar_nominal, xi))
+
+
+def error_deg(estimate: Estimate) -> NDArray[np.float64]:
+    """Per axis; the nominal calibration of the street is the truth."""
+    return np.degrees(estimate.correction[:3])
+
+
+@pytest.mark.parametrize("start", [(5, 0, 0), (0, 5, 0), (0, 0, 5), (3, -3, 3), (-4, 4, 2)])
+def test_starts_around_the_truth_come_back_to_it(street: Window, stereo: DepthModel, start: tuple[float, ...]) -> None:
+    estimate = solve(from_start(street, *start), stereo)
+    assert np.abs(error_deg(estimate)).max() < 0.3
+    assert estimate.verdict.decision is Decision.ACCEPTED
+    assert estimate.optimum.score > estimate.optimum.score_at_start
+
+
+def test_six_degrees_of_freedom(street: Window, stereo: DepthModel) -> None:
+    estimate = solve(from_start(street, 1, -1, 1, 0.1, -0.1, 0.1), stereo, SIX)
+    assert np.abs(error_deg(estimate)).max() < 0.5
+    # A street of walls along the way says little about the position along it.
+    assert np.abs(estimate.correction[3:]).max() < 0.2
+    assert estimate.solved.all()
+
+
+def test_same_input_same_bits(street: Window, stereo: DepthModel) -> None:
+    first, second = (solve(from_start(street, 3, -3, 3), stereo) for _ in range(2))
+    assert first.optimum.T_camera_lidar.tobytes() == second.optimum.T_camera_lidar.tobytes()
+    assert first.sigma.tobytes() == second.sigma.tobytes()
+    assert first.verdict == second.verdict
+    assert first.config_hash == second.config_hash
+
+
+def test_turning_the_lidar_turns_the_optimum_back(street: Window, stereo: DepthModel) -> None:
+    """Metamorphic: clouds turned by S about the LiDAR have their optimum at T·S⁻¹."""
+    turn = se3.perturbation(np.array([0.0, 0.0, np.radians(30.0), 0.0, 0.0, 0.0]))
+    off = CalibrationConfig(motion_compensation=False)
+    start = from_start(street, 2, 1, -1)
+    turned = replace(
+        start,
+        T_camera_lidar_start=start.T_camera_lidar_start @ se3.inverse(turn),
+        pairs=tuple(
+            replace(
+                pair,
+                lidar=replace(pair.lidar, xyz_m=(pair.lidar.xyz_m @ turn[:3, :3].T).astype(np.float32)),
+            )
+            for pair in start.pairs
+        ),
+    )
+    plain, moved = solve(start, stereo, off), solve(turned, stereo, off)
+    back = moved.optimum.T_camera_lidar @ turn
+    assert np.degrees(se3.rotation_angle_rad(back @ se3.inverse(plain.optimum.T_camera_lidar))) < 0.05
+    assert moved.optimum.score == pytest.approx(plain.optimum.score, abs=2e-3)
+
+
+def test_the_order_of_the_frames_does_not_matter(street: Window, stereo: DepthModel) -> None:
+    start = from_start(street, 2, 1, -1)
+    backwards = replace(start, pairs=start.pairs[::-1])
+    difference = solve(start, stereo).correction - solve(backwards, stereo).correction
+    assert np.degrees(np.abs(difference[:3])).max() < 1e-6
+
+
+class Recoded:
+    """The same maps in another monotonic code."""
+
+    identity = "recoded"
+
+    def __init__(self, maps: DepthModel) -> None:
+        self._maps = maps
+
+    def infer(self, frame: CameraFrame) -> DepthMap:
+        values = self._maps.infer(frame).values
+        return DepthMap((np.exp(values / np.nanmax(values) * 3.0) - 7.0).astype(np.float32))
+
+
+def test_any_monotonic_code_of_depth_gives_the_same_answer(street: Window, stereo: DepthModel) -> None:
+    start = from_start(street, 2, 1, -1)
+    difference = solve(start, stereo).correction - solve(start, Recoded(stereo)).correction
+    assert np.degrees(np.abs(difference[:3])).max() < 0.05
+
+
+class Shuffled:
+    """Depth that belongs to other frames: what a frozen camera or a wrong pairing looks like."""
+
+    identity = "shuffled"
+
+    def __init__(self, maps: DepthModel, window: Window) -> None:
+        frames = [pair.camera for pair in window.pairs]
+        half = len(frames) // 2
+        self._maps = maps
+        self._other = {f.stamp_ns: frames[(i + half) % len(frames)] for i, f in enumerate(frames)}
+
+    def infer(self, frame: CameraFrame) -> DepthMap:
+        return self._maps.infer(self._other[frame.stamp_ns])
+
+
+def test_depth_of_other_frames_is_not_believed(street: Window, stereo: DepthModel) -> None:
+    verdict = solve(street, Shuffled(stereo, street)).verdict
+    assert verdict.decision is Decision.FAILED
+    assert "mi_over_unrelated" in {reason.code for reason in verdict.reasons}
+
+
+def test_a_truth_outside_the_box_is_not_believed(street: Window, stereo: DepthModel) -> None:
+    config = CalibrationConfig(search=SearchConfig(rotation_deg=2.0))
+    estimate = solve(from_start(street, 0, 6, 0), stereo, config)
+    assert estimate.optimum.stop_reason is StopReason.AT_BOUND
+    assert estimate.verdict.decision is Decision.FAILED
+
+
+class Flat:
+    """A network that sees nothing."""
+
+    identity = "flat"
+
+    def infer(self, frame: CameraFrame) -> DepthMap:
+        assert frame.image.data
+        return DepthMap(np.ones((32, 32), np.float32))
+
+
+def test_a_flat_depth_map_fails_with_its_reason(street: Window) -> None:
+    verdict = solve(street, Flat()).verdict
+    assert verdict.decision is Decision.FAILED
+    assert "mi_over_unrelated" in {reason.code for reason in verdict.reasons}
+
+
+def test_sigma_covers_the_error(street: Window, stereo: DepthModel) -> None:
+    estimate = solve(from_start(street, 2, -2, 2), stereo)
+    assert (np.abs(estimate.correction[:3]) < 5.0 * estimate.sigma[:3]).all()
+    assert (np.degrees(estimate.sigma[:3]) < 0.5).all()
+    assert np.isnan(estimate.sigma[3:]).all()
+
+
+def test_a_window_without_pairs_is_an_error(street: Window, stereo: DepthModel) -> None:
+    with pytest.raises(CalibrationError, match="holds no pairs"):
+        solve(replace(street, pairs=()), stereo)
+
+
+def test_a_window_without_a_point_in_the_range_limits_is_an_error(street: Window, stereo: DepthModel) -> None:
+    config = CalibrationConfig(objective=ObjectiveConfig(min_range_m=150.0, max_range_m=151.0))
+    with pytest.raises(CalibrationError, match="no LiDAR point"):
+        solve(street, stereo, config)
+
+
+def test_a_frame_without_depth_is_an_error_that_names_it(street: Window, stereo: DepthModel) -> None:
+    pairs = (replace(street.pairs[0], camera=replace(street.pairs[0].camera, depth=None)), *street.pairs[1:])
+    with pytest.raises(CalibrationError, match=str(street.pairs[0].stamp_ns)) as raised:
+        solve(replace(street, pairs=pairs), stereo)
+    assert isinstance(raised.value.__cause__, DecodeError)
+
+
+def test_masked_pixels_do_not_count(street: Window, stereo: DepthModel) -> None:
+    camera = street.rig.camera
+    mask = np.ones((camera.height, camera.width), np.bool_)
+    mask[camera.height // 2 :] = False
+    masked = replace(street, rig=replace(street.rig, mask=mask))
+    assert 0 < solve(masked, stereo).optimum.points_in_view < 0.7 * solve(street, stereo).optimum.points_in_view
+
+
+def test_progress_is_told(street: Window, stereo: DepthModel) -> None:
+    class Listener:
+        def __init__(self) -> None:
+            self.heard: dict[str, int] = {}
+
+        def step(self, stage: str, done: int, total: int) -> None:
+            assert 0 < done <= total
+            self.heard[stage] = done
+
+    listener = Listener()
+    estimate = calibrate(street, stereo, CONFIG, listener)
+    assert listener.heard["depth"] == len(street.pairs)
+    assert listener.heard["search"] == estimate.optimum.evaluations
