@@ -1,0 +1,100 @@
+"""What all wire models share: frozen, unknown fields ignored, no NaN; and their two encodings."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, TypeVar
+
+import msgpack
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coec.errors import DecodeError
+
+SCHEMA_VERSION = 1
+"""Version of the models in this package. It is raised when a field is added; a field that changes its meaning
+or goes away needs a new `@v2` in the keys instead."""
+
+
+class Part(BaseModel):
+    """A value inside a message. Readers ignore fields that they do not know, so that a newer sender is
+    understood."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="ignore",
+        allow_inf_nan=False,
+        # A writer writes every field, also those that a reader could do without.
+        json_schema_serialization_defaults_required=True,
+    )
+
+
+class Message(Part):
+    """A value that travels by itself, and therefore says which version of the schema it was written with."""
+
+    schema_version: int = Field(default=SCHEMA_VERSION, ge=1, description="version of this schema at the writer")
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def to_json(model: BaseModel) -> bytes:
+    """Canonical JSON: keys sorted, no spaces, UTF-8, floats in the shortest form that reads back to the same
+    double.
+
+    Equal models give equal bytes.
+    """
+    return json.dumps(
+        model.model_dump(mode="json"),
+        sort_keys=True,
+        separators=(",", ":"),
+        ensure_ascii=False,
+        allow_nan=False,
+    ).encode()
+
+
+def to_msgpack(model: BaseModel) -> bytes:
+    """Canonical msgpack: keys sorted, doubles, `bytes` as bin. Equal models give equal bytes."""
+    packed: bytes = msgpack.packb(_sorted(model.model_dump(mode="python")), use_bin_type=True)
+    return packed
+
+
+def from_json(model: type[M], payload: bytes) -> M:
+    """The model that `to_json` wrote, or a newer writer's.
+
+    Raises:
+        DecodeError: not JSON, or not this model.
+    """
+    try:
+        return model.model_validate(json.loads(payload))
+    except (ValueError, RecursionError) as error:
+        raise DecodeError("message_malformed", f"not a {model.__name__} in JSON: {_places(error)}") from error
+
+
+def from_msgpack(model: type[M], payload: bytes) -> M:
+    """The model that `to_msgpack` wrote, or a newer writer's. For replies, that is for senders one has asked;
+    frames come from anywhere and pass through `coec.adapters.msgpack_frames`, which is stricter.
+
+    Raises:
+        DecodeError: not msgpack, or not this model.
+    """
+    try:
+        return model.model_validate(msgpack.unpackb(payload))
+    except (ValueError, RecursionError, msgpack.UnpackException) as error:
+        raise DecodeError("message_malformed", f"not a {model.__name__} in msgpack: {_places(error)}") from error
+
+
+def _sorted(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _sorted(value[key]) for key in sorted(value)}
+    if isinstance(value, list | tuple):
+        return [_sorted(item) for item in value]
+    return value
+
+
+def _places(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        # At most three places, and never the values: they are the sender's text.
+        return "; ".join(
+            f"{'.'.join(str(part) for part in item['loc'])}: {item['type']}" for item in error.errors()[:3]
+        )
+    return type(error).__name__

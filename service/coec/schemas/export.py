@@ -1,0 +1,60 @@
+"""JSON Schemas of the wire models: `python -m coec.schemas.export DIR` writes them (committed under
+`schemas/v1`)."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from coec.schemas import frames, replies
+from coec.schemas.base import Message
+
+FRAMES: tuple[type[Message], ...] = (frames.CameraFrame, frames.LidarFrame, frames.EgoMotion)
+
+MESSAGES: tuple[type[Message], ...] = (
+    *FRAMES,
+    replies.ExtrinsicReply,
+    replies.HealthReply,
+    replies.HistoryReply,
+    replies.WindowsReply,
+    replies.StatusReply,
+    replies.Acknowledgement,
+    replies.ErrorReply,
+    replies.CalibrationResult,
+    replies.CalibrationReport,
+)
+
+
+def schemas() -> dict[str, dict[str, Any]]:
+    """JSON Schema (2020-12) of every message, by file name."""
+    return {
+        f"{message.__name__}.json": {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            # What a sender may leave out of a frame, and what a reply always holds.
+            **message.model_json_schema(mode="validation" if message in FRAMES else "serialization"),
+        }
+        for message in MESSAGES
+    }
+
+
+def text(schema: dict[str, Any]) -> str:
+    """The schema as it is committed."""
+    return json.dumps(schema, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
+
+
+def main(arguments: list[str]) -> int:
+    """Writes every schema into the folder that is the only argument."""
+    if len(arguments) != 1:
+        sys.stderr.write("usage: python -m coec.schemas.export DIR\n")
+        return 2
+    folder = Path(arguments[0])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, schema in schemas().items():
+        (folder / name).write_text(text(schema), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

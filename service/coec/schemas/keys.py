@@ -1,0 +1,207 @@
+"""The keys and selectors of CONTRACT: `<prefix>/@v1/<vehicle>/<pair>/...`, built and parsed in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from coec.errors import UsageError
+
+VERSION_CHUNK: Final = "@v1"
+"""A chunk that starts with `@` is not matched by `**`: the version never leaks into wildcards."""
+
+MAX_LIMIT: Final = 10_000
+"""Most results in one reply of `history`, as many as the state keeps at most (config.StateConfig.history)."""
+
+MAX_LENGTH: Final = 16 * 2**20
+"""Most bytes in one reply of `windows/<id>`: half of Zenoh's configured message size."""
+
+Format = Literal["msgpack", "json"]
+_FORMATS: Final[dict[str, Format]] = {"msgpack": "msgpack", "json": "json"}
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """What a key names: `resource` of `pair`, or of the vehicle where `pair` is None; `argument` is the
+    window's id or the command's name."""
+
+    pair: str | None
+    resource: str
+    argument: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """Keys of one vehicle."""
+
+    prefix: str
+    vehicle: str
+
+    @property
+    def root(self) -> str:
+        """The part that all keys of the vehicle share."""
+        return f"{self.prefix}/{VERSION_CHUNK}/{self.vehicle}"
+
+    @property
+    def status(self) -> str:
+        """Queryable: status of the daemon."""
+        return f"{self.root}/status"
+
+    @property
+    def metrics(self) -> str:
+        """Queryable: OpenMetrics text."""
+        return f"{self.root}/metrics"
+
+    @property
+    def config(self) -> str:
+        """Queryable: effective configuration without secrets."""
+        return f"{self.root}/config"
+
+    def extrinsic(self, pair: str) -> str:
+        """Queryable, and published on change."""
+        return f"{self.root}/{pair}/extrinsic"
+
+    def health(self, pair: str) -> str:
+        """Queryable, and published on change."""
+        return f"{self.root}/{pair}/health"
+
+    def history(self, pair: str) -> str:
+        """Queryable: past results."""
+        return f"{self.root}/{pair}/history"
+
+    def windows(self, pair: str) -> str:
+        """Queryable: list of recorded windows."""
+        return f"{self.root}/{pair}/windows"
+
+    def window(self, pair: str, window_id: str) -> str:
+        """Queryable: bytes of one recorded window; `window_id` may be `*`."""
+        return f"{self.root}/{pair}/windows/{window_id}"
+
+    def overlay(self, pair: str) -> str:
+        """Queryable: JPEG of the latest window's points on the image."""
+        return f"{self.root}/{pair}/overlay"
+
+    def command(self, pair: str, name: str) -> str:
+        """Queryable with payload; `name` may be `*`."""
+        return f"{self.root}/{pair}/command/{name}"
+
+    def alive(self, pair: str) -> str:
+        """Liveliness token."""
+        return f"{self.root}/{pair}/alive"
+
+    def parse(self, key: str) -> Address:
+        """The inverse of the builders above.
+
+        Raises:
+            UsageError: not a key of this vehicle.
+        """
+        head = f"{self.root}/"
+        chunks = key.removeprefix(head).split("/")
+        if not key.startswith(head) or not all(chunks):
+            raise UsageError(f"the key is not below {self.root}")
+        match chunks:
+            case [("status" | "metrics" | "config") as resource]:
+                return Address(None, resource)
+            case [pair, ("extrinsic" | "health" | "history" | "windows" | "overlay" | "alive") as resource]:
+                return Address(pair, resource)
+            case [pair, ("windows" | "command") as resource, argument]:
+                return Address(pair, resource, argument)
+            case _:
+                raise UsageError(f"no such resource below {self.root}; see `{self.status}` for what is served")
+
+
+@dataclass(frozen=True, slots=True)
+class Selector:
+    """Parameters behind the `?` of a query that has none of its own."""
+
+    format: Format = "msgpack"
+
+
+@dataclass(frozen=True, slots=True)
+class HistorySelector:
+    """`since` and `until` bound `data_stamp_ns` (inclusive); `limit` keeps the newest of them."""
+
+    since_ns: int = 0
+    until_ns: int = 2**63 - 1
+    limit: int = 100
+    format: Format = "msgpack"
+
+
+@dataclass(frozen=True, slots=True)
+class RangeSelector:
+    """A range of bytes of a file."""
+
+    offset: int = 0
+    length: int = MAX_LENGTH
+    format: Format = "msgpack"
+
+
+def parse_selector(parameters: str) -> Selector:
+    """`format=json`.
+
+    Raises:
+        UsageError: unknown, doubled or malformed parameter; names it.
+    """
+    return Selector(format=_format(_split(parameters, ("format",))))
+
+
+def parse_history_selector(parameters: str) -> HistorySelector:
+    """`since=<ns>;until=<ns>;limit=<count>;format=json`, each optional.
+
+    Raises:
+        UsageError: unknown, doubled, malformed or out-of-range parameter; names it.
+    """
+    given = _split(parameters, ("since", "until", "limit", "format"))
+    default = HistorySelector()
+    since_ns = _integer(given, "since", default.since_ns, 0, 2**63 - 1)
+    until_ns = _integer(given, "until", default.until_ns, 0, 2**63 - 1)
+    if until_ns < since_ns:
+        raise UsageError("parameter `until` lies before `since`")
+    return HistorySelector(since_ns, until_ns, _integer(given, "limit", default.limit, 1, MAX_LIMIT), _format(given))
+
+
+def parse_range_selector(parameters: str) -> RangeSelector:
+    """`offset=<bytes>;length=<bytes>;format=...`, each optional.
+
+    Raises:
+        UsageError: unknown, doubled, malformed or out-of-range parameter; names it.
+    """
+    given = _split(parameters, ("offset", "length", "format"))
+    return RangeSelector(
+        _integer(given, "offset", 0, 0, 2**63 - 1),
+        _integer(given, "length", MAX_LENGTH, 1, MAX_LENGTH),
+        _format(given),
+    )
+
+
+def _split(parameters: str, allowed: tuple[str, ...]) -> dict[str, str]:
+    if len(parameters) > 1024:
+        raise UsageError("the parameters are longer than 1024 characters")
+    given: dict[str, str] = {}
+    for item in filter(None, parameters.split(";")):
+        name, _, value = item.partition("=")
+        if name.startswith("_"):  # reserved by Zenoh for itself (`_time`, `_anyke`)
+            continue
+        if name not in allowed:
+            raise UsageError(f"unknown parameter {name[:32]!a}; known here: {', '.join(allowed)}")
+        if name in given:
+            raise UsageError(f"parameter `{name}` is given twice")
+        given[name] = value
+    return given
+
+
+def _integer(given: dict[str, str], name: str, default: int, low: int, high: int) -> int:
+    text = given.get(name)
+    if text is None:
+        return default
+    # str.isdigit also accepts other scripts' digits, and int() signs, spaces and underscores: not here.
+    if not (text.isascii() and text.isdigit() and len(text) <= 19 and low <= int(text) <= high):
+        raise UsageError(f"parameter `{name}` must be a whole number from {low} to {high}")
+    return int(text)
+
+
+def _format(given: dict[str, str]) -> Format:
+    text = given.get("format", "msgpack")
+    if text not in _FORMATS:
+        raise UsageError(f"parameter `format` must be one of {', '.join(_FORMATS)}")
+    return _FORMATS[text]

@@ -1,0 +1,298 @@
+"""Wire models of everything that coec answers, publishes and writes into files.
+
+Conventions: `camera_from_lidar` maps LiDAR coordinates (x forward, y left, z up) to camera coordinates (x
+right, y down, z forward). Corrections are taken about the camera axes. A number that could not be computed is
+null.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from coec.schemas.base import Message, Part
+
+Vector3 = tuple[float, float, float]
+Row4 = tuple[float, float, float, float]
+Vector6 = tuple[float, float, float, float, float, float]
+Maybe6 = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
+Flags6 = tuple[bool, bool, bool, bool, bool, bool]
+Count = Annotated[int, Field(ge=0)]
+Counts = dict[str, Count]
+
+Provenance = Literal["nominal", "commissioned", "estimated", "restored"]
+Status = Literal["not_accepted", "accepted", "failed"]
+AxisStatus = Literal["not_solved", "not_accepted", "accepted", "failed"]
+Decision = Literal["accepted", "failed"]
+HealthState = Literal["unknown", "healthy", "suspect", "miscalibrated", "degraded", "stale"]
+
+ROS_LEVELS: dict[HealthState, Literal[0, 1, 2, 3]] = {
+    "healthy": 0,
+    "suspect": 1,
+    "degraded": 1,
+    "miscalibrated": 2,
+    "stale": 3,
+    "unknown": 3,
+}
+"""Level of `diagnostic_msgs/DiagnosticStatus`: 0 OK, 1 WARN, 2 ERROR, 3 STALE. Unknown never reads as OK."""
+
+
+# --- parts --------------------------------------------------------------------------------------------------
+
+
+class Transform(Part):
+    """A rigid transform in three forms. The matrix is the exact one (float64); the others follow from it."""
+
+    matrix: tuple[Row4, Row4, Row4, Row4] = Field(description="4×4, row-major; translation in m")
+    translation_m: Vector3 = Field(description="last column, m")
+    quaternion_xyzw: Row4 = Field(description="rotation, unit quaternion, w ≥ 0")
+
+
+class Reason(Part):
+    """Why."""
+
+    code: str = Field(description="machine-readable, stable")
+    text: str = Field(description="one sentence for people")
+
+
+class MetricReply(Part):
+    """A figure of self-diagnosis with its limit."""
+
+    value: float | None = Field(description="null when it could not be computed")
+    limit: float | None = Field(description="null when there is none")
+    at_least: bool = Field(description="true: good is value ≥ limit; false: good is value ≤ limit")
+    passed: bool
+
+
+class AxisReply(Part):
+    """One degree of freedom, about or along an axis of the camera."""
+
+    status: AxisStatus = Field(description="`not_solved`: the search did not move this axis")
+    sigma: float | None = Field(description="standard deviation in `unit`; null when not estimated")
+    correction: float = Field(description="from the nominal calibration, in `unit`")
+    unit: Literal["deg", "m"]
+
+
+class Axes(Part):
+    """All six degrees of freedom: rotation vector (deg), then translation (m)."""
+
+    rx: AxisReply
+    ry: AxisReply
+    rz: AxisReply
+    tx: AxisReply
+    ty: AxisReply
+    tz: AxisReply
+
+
+class Verdict(Part):
+    """The decision on one result, and why when it failed."""
+
+    decision: Decision
+    reasons: tuple[Reason, ...] = Field(description="empty when accepted")
+
+
+# --- one result ---------------------------------------------------------------------------------------------
+
+
+class CalibrationResult(Message):
+    """The result of calibrating one window. State, history, the window's file and `coec calibrate` carry the
+    same."""
+
+    vehicle: str
+    pair: str
+    camera_frame: str
+    lidar_frame: str
+    window_id: str
+    data_stamp_ns: int = Field(description="stamp of the last contributing pair, ns")
+    pairs: Count = Field(description="camera-LiDAR pairs in the window")
+    camera_from_lidar: Transform = Field(description="the estimate; served as current only when accepted")
+    correction: Vector6 = Field(description="rx ry rz (deg), tx ty tz (m), from the nominal calibration")
+    sigma: Maybe6 = Field(description="standard deviations (deg, m); null where not estimated")
+    correction_rad_m: Vector6 = Field(description="`correction` in rad and m, exact")
+    sigma_rad_m: Maybe6 = Field(description="`sigma` in rad and m, exact")
+    solved: Flags6 = Field(description="axes that the search moved")
+    status: Status
+    verdict: Verdict
+    metrics: dict[str, MetricReply] = Field(description="self-diagnosis by name")
+    score: float | None = Field(description="objective at the result, nats")
+    score_at_start: float | None = Field(description="objective at the start, nats")
+    mi: float | None = Field(description="mutual information at the result, equation (1), nats")
+    overlap: float | None = Field(description="share of the guarded points that lie in view, 0 to 1")
+    points_in_view: Count = Field(description="over all pairs")
+    evaluations: Count = Field(description="of the objective")
+    stop_reason: str
+    first_derivative: Maybe6 = Field(description="|dMI| per rad or m; null where not searched")
+    second_derivative: Maybe6 = Field(description="-d²MI per rad² or m²; null where not searched")
+    compensation: Counts = Field(description="pairs by outcome of motion compensation")
+    depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
+    config_hash: str = Field(description="of everything that decides the result")
+
+
+class CalibrationReport(CalibrationResult):
+    """What `coec calibrate --json` prints: the result, and how long it took (which is no part of the
+    result)."""
+
+    elapsed_s: dict[str, float] = Field(description="by stage, s")
+
+
+# --- replies ------------------------------------------------------------------------------------------------
+
+
+class Candidate(Part):
+    """A result that waits for `apply`."""
+
+    window_id: str
+    data_stamp_ns: int
+    camera_from_lidar: Transform
+
+
+class ExtrinsicReply(Message):
+    """The calibration to use now. A reply exists before the first result: nominal, not_accepted, 0 %."""
+
+    vehicle: str
+    pair: str
+    camera_frame: str
+    lidar_frame: str
+    camera_from_lidar: Transform = Field(description="current; an unaccepted estimate is never served here")
+    provenance: Provenance = Field(description="where `camera_from_lidar` comes from")
+    status: Status = Field(description="of the latest attempt; not_accepted before the first")
+    percent_complete: float = Field(ge=0, le=100, description="of the open window")
+    axes: Axes
+    valid_from_ns: int = Field(description="sensor time from which it holds, ns; 0 for nominal")
+    data_stamp_ns: int | None = Field(description="last contributing pair, ns; null for nominal")
+    window_id: str | None = Field(description="the window it came from; null for nominal")
+    config_hash: str
+    pending: Candidate | None = None
+
+
+class DataQuality(Part):
+    """What the streams look like."""
+
+    pair_rate_hz: float | None = Field(default=None, description="camera-LiDAR pairs per second of sensor time")
+    sync_error_s: float | None = Field(default=None, description="latest camera stamp minus LiDAR stamp")
+    drops: dict[str, Counts] = Field(default_factory=dict, description="frames lost, by stream, then by cause")
+    sharpness: float | None = Field(default=None, description="latest exposure; falls with blur")
+    mean_level: float | None = Field(default=None, description="latest exposure, mean grey value, 0 to 255")
+    clipped: float | None = Field(default=None, description="latest exposure, share of black or white pixels")
+    frozen_image: bool = Field(default=False, description="the camera repeats the same picture")
+
+
+class HealthReply(Message):
+    """Is the calibration right? `unknown` is the state of not having looked."""
+
+    vehicle: str
+    pair: str
+    state: HealthState
+    level: Literal[0, 1, 2, 3] = Field(description="ROS: 0 OK, 1 WARN, 2 ERROR, 3 STALE")
+    reasons: tuple[Reason, ...]
+    metrics: dict[str, MetricReply] = Field(description="of the latest result, by name")
+    axes: Axes
+    drift: Maybe6 | None = Field(default=None, description="from commissioned (deg, m); null before commissioning")
+    needs: tuple[str, ...] = Field(description="what is still missing, one sentence each")
+    data_quality: DataQuality
+    since_ns: int = Field(description="wall clock when this state began, ns since 1970")
+    evaluated_ns: int | None = Field(description="stamp of the last evaluated pair, ns; null before the first window")
+    age_s: float | None = Field(description="of the last evaluated window; null before the first")
+
+
+class HistoryReply(Message):
+    """Past results, oldest first."""
+
+    vehicle: str
+    pair: str
+    total: Count = Field(description="results kept, before the selector")
+    results: tuple[CalibrationResult, ...]
+
+
+class WindowInfo(Part):
+    """One recorded window."""
+
+    window_id: str
+    sha256: str = Field(description="of the whole file, hexadecimal")
+    size_bytes: Count
+    pairs: Count
+    decision: Decision | None = Field(description="null while it is not evaluated")
+
+
+class WindowsReply(Message):
+    """Recorded windows, oldest first."""
+
+    vehicle: str
+    pair: str
+    windows: tuple[WindowInfo, ...]
+
+
+class StreamStatus(Part):
+    """Counters of one stream since the daemon started."""
+
+    received: Count = 0
+    accepted: Count = 0
+    losses: Counts = Field(default_factory=dict, description="by cause")
+
+
+class PairStatus(Part):
+    """One camera-LiDAR pair."""
+
+    name: str
+    camera: StreamStatus = StreamStatus()
+    lidar: StreamStatus = StreamStatus()
+    ego: StreamStatus | None = Field(default=None, description="null when no ego-motion is configured")
+    pairs: Count = Field(default=0, description="pairs formed")
+    selected: Count = Field(default=0, description="pairs chosen for the open window")
+    rejections: Counts = Field(default_factory=dict, description="pairs not chosen, by cause")
+    losses: Counts = Field(default_factory=dict, description="frames that found no partner, and windows lost, by cause")
+    windows: Count = Field(default=0, description="windows recorded")
+    solved: Count = Field(default=0, description="windows evaluated")
+
+
+class WorkerStatus(Part):
+    """The process that infers and solves."""
+
+    state: Literal["starting", "idle", "busy", "stopped"]
+    pid: int | None = None
+    restarts: Count = 0
+    queued: Count = 0
+    losses: Counts = Field(default_factory=dict, description="workers or jobs lost, by cause")
+
+
+class StorageStatus(Part):
+    """The state directory."""
+
+    bytes_used: Count
+    bytes_free: Count
+    losses: Counts = Field(default_factory=dict, description="by cause")
+
+
+class StatusReply(Message):
+    """The daemon."""
+
+    version: str
+    vehicle: str
+    state: Literal["starting", "running", "stopping", "failing"]
+    reasons: tuple[Reason, ...] = ()
+    started_ns: int = Field(description="wall clock, ns since 1970")
+    uptime_s: float
+    config_hash: str
+    pairs: tuple[PairStatus, ...]
+    worker: WorkerStatus
+    storage: StorageStatus
+
+
+class Acknowledgement(Message):
+    """The answer to a command: it was understood, and is carried out or not."""
+
+    vehicle: str
+    pair: str
+    command: str
+    accepted: bool
+    code: str = Field(description="machine-readable outcome")
+    text: str = Field(description="one sentence")
+    window_id: str | None = Field(default=None, description="the window it acts on")
+
+
+class ErrorReply(Message):
+    """Payload of an error reply."""
+
+    code: str
+    message: str
