@@ -1,0 +1,366 @@
+"""Reading MCAP that nobody vouches for: every length is checked before it is used, every CRC that is there is verified.
+
+The readers of the `mcap` package hand out short reads as if they were whole and unpack whatever a chunk promises (a
+9.8 kB file can become 600 MB), so records are taken apart here (MCAP specification, "Records"). Writing is theirs.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame  # type: ignore[import-untyped]  # it has no stubs
+import zstandard
+from mcap.opcode import Opcode
+
+from coec.errors import CoecError
+
+MAGIC = b"\x89MCAP0\r\n"
+
+MAX_CHUNK_BYTES = 256 * 2**20
+"""Unpacked size of one chunk. Writers use 0.75 to 4 MiB, or one message more, and messages have up to
+some 32 MiB."""
+
+MAX_ZSTD_WINDOW = 2**27
+"""128 MiB, the default limit of the zstd tool: bounds the memory of a decompression."""
+
+_PREFIX = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQI")
+_ATTACHMENT_INDEX = struct.Struct("<QQQQQ")
+_FOOTER = struct.Struct("<QQI")
+_TAIL_BYTES = _PREFIX.size + _FOOTER.size + len(MAGIC)
+
+
+class McapDamaged(CoecError):  # noqa: N818 - caught by name where it becomes a SourceError or a WindowError
+    """The file is not MCAP, is cut off, or a CRC does not agree; the message begins with the byte."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """How the messages of a channel are laid out."""
+
+    schema_id: int
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A topic."""
+
+    channel_id: int
+    schema_id: int
+    topic: str
+    message_encoding: str
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message and where it lies: `chunk_at` is the file offset of its chunk record (None outside chunks), `at` the
+    offset of its data within the unpacked chunk (or the file)."""
+
+    channel_id: int
+    sequence: int
+    log_time_ns: int
+    data: bytes
+    chunk_at: int | None
+    at: int
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A file within the file."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """Named key-value pairs."""
+
+    name: str
+    values: dict[str, str]
+
+
+Record = Schema | Channel | Message | Attachment | Metadata
+
+
+def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> Iterator[Record]:
+    """The records of the data section in the order of the file, those of chunks among them.
+
+    What was yielded before the error is sound by itself, which is what salvaging a cut file relies on. Only a file that
+    is read to the end is known to be whole.
+
+    Args:
+        stream: positioned at the start of the file, seekable.
+        max_unpacked_bytes: bound on all chunks together, for readers that keep what they are given.
+
+    Raises:
+        McapDamaged: not MCAP, cut off, a CRC or a length that does not agree, or a chunk that would unpack to more than
+            `MAX_CHUNK_BYTES`.
+    """
+    size = _size(stream)
+    if _read(stream, len(MAGIC), 0, size) != MAGIC:
+        raise McapDamaged("byte 0: not an MCAP file")
+    crc = zlib.crc32(MAGIC)
+    unpacked = 0
+    at = len(MAGIC)
+    while True:
+        prefix = _read(stream, _PREFIX.size, at, size)
+        opcode, length = _PREFIX.unpack(prefix)
+        body_at = at + _PREFIX.size
+        if opcode == Opcode.FOOTER:
+            raise McapDamaged(f"byte {at}: the data section has no end")
+        body = _read(stream, length, body_at, size)
+        if opcode == Opcode.DATA_END:
+            expected = _Cursor(body, body_at).unpack(struct.Struct("<I"))[0]
+            if expected not in (0, crc):
+                raise McapDamaged(f"byte {at}: the CRC of the data section does not agree")
+            _check_summary(stream, body_at + length, size)
+            return
+        crc = zlib.crc32(body, zlib.crc32(prefix, crc))
+        if opcode == Opcode.CHUNK:
+            chunk = _unpack_chunk(body, body_at)
+            unpacked += len(chunk)
+            if max_unpacked_bytes is not None and unpacked > max_unpacked_bytes:
+                raise McapDamaged(f"byte {at}: the file unpacks to more than {max_unpacked_bytes} bytes")
+            yield from _chunk_records(chunk, at)
+        else:
+            yield from _parse(opcode, body, body_at, None)
+        at = body_at + length
+
+
+class MessageReader:
+    """Reads messages again by their place; keeps the chunk it unpacked last, so that reading in order unpacks once."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._size = _size(stream)
+        self._chunk_at: int | None = None
+        self._chunk = b""
+
+    def read(self, chunk_at: int | None, at: int, length: int) -> bytes:
+        """The data of the message that `read_records` found at this place.
+
+        Raises:
+            McapDamaged: the file is no longer what it was.
+        """
+        if chunk_at is None:
+            self._stream.seek(at)
+            return _read(self._stream, length, at, self._size)
+        if chunk_at != self._chunk_at:
+            self._stream.seek(chunk_at)
+            opcode, span = _PREFIX.unpack(_read(self._stream, _PREFIX.size, chunk_at, self._size))
+            if opcode != Opcode.CHUNK:
+                raise McapDamaged(f"byte {chunk_at}: there is no chunk here any more: the file has changed")
+            body_at = chunk_at + _PREFIX.size
+            self._chunk = _unpack_chunk(_read(self._stream, span, body_at, self._size), body_at)
+            self._chunk_at = chunk_at
+        return self._chunk[at : at + length]
+
+
+def read_attachment(path: Path, name: str) -> bytes | None:
+    """The last attachment of that name, found by the index at the end of the file, or None when there is none.
+
+    Raises:
+        McapDamaged: the file is cut off, or index or attachment are damaged.
+        OSError: the file cannot be read.
+    """
+    with path.open("rb") as stream:
+        size = _size(stream)
+        summary, summary_at = _summary(stream, size)
+        found: tuple[int, int] | None = None
+        cursor = _Cursor(summary, summary_at)
+        while cursor.left:
+            opcode, length = cursor.unpack(_PREFIX)
+            body = _Cursor(cursor.take(length), cursor.at - length)
+            if opcode == Opcode.ATTACHMENT_INDEX:
+                at, span, *_ = body.unpack(_ATTACHMENT_INDEX)
+                if body.text() == name:
+                    found = at, span
+        if found is None:
+            return None
+        at, span = found
+        stream.seek(min(at, size))
+        record = _read(stream, span, at, size)
+        cursor = _Cursor(record, at)
+        opcode, length = cursor.unpack(_PREFIX)
+        if opcode != Opcode.ATTACHMENT or length != cursor.left:
+            raise McapDamaged(f"byte {at}: the index points to something that is not an attachment")
+        return _attachment(cursor.take(length), at + _PREFIX.size).data
+
+
+# --- the end of the file ------------------------------------------------------------------------------------
+
+
+def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
+    """The summary section, its CRC verified, and where it begins. Empty when there is none."""
+    if size < len(MAGIC) + _TAIL_BYTES:
+        raise McapDamaged(f"byte {size}: the file is cut off")
+    footer_at = size - _TAIL_BYTES
+    stream.seek(footer_at)
+    tail = _read(stream, _TAIL_BYTES, footer_at, size)
+    opcode, length = _PREFIX.unpack_from(tail)
+    if (opcode, length) != (Opcode.FOOTER, _FOOTER.size) or tail[-len(MAGIC) :] != MAGIC:
+        raise McapDamaged(f"byte {size}: the file is cut off (it does not end as MCAP ends)")
+    summary_at, _, expected = _FOOTER.unpack_from(tail, _PREFIX.size)
+    if summary_at == 0:
+        return b"", footer_at
+    if not len(MAGIC) <= summary_at <= footer_at:
+        raise McapDamaged(f"byte {footer_at}: the footer points outside the file")
+    stream.seek(summary_at)
+    summary = _read(stream, footer_at - summary_at, summary_at, size)
+    if expected not in (0, zlib.crc32(tail[: _PREFIX.size + _FOOTER.size - 4], zlib.crc32(summary))):
+        raise McapDamaged(f"byte {summary_at}: the CRC of the summary does not agree")
+    return summary, summary_at
+
+
+def _check_summary(stream: BinaryIO, at: int, size: int) -> None:
+    """After the data section: a summary that begins right here (or none), a footer, and nothing behind it."""
+    _, summary_at = _summary(stream, size)
+    if summary_at != at:
+        raise McapDamaged(f"byte {at}: {summary_at - at} bytes between the data and the summary belong to neither")
+
+
+# --- records ------------------------------------------------------------------------------------------------
+
+
+def _chunk_records(chunk: bytes, chunk_at: int) -> Iterator[Record]:
+    at = 0
+    while at < len(chunk):
+        if at + _PREFIX.size > len(chunk):
+            raise McapDamaged(f"byte {chunk_at}: a record of this chunk is cut at its end")
+        opcode, length = _PREFIX.unpack_from(chunk, at)
+        at += _PREFIX.size
+        if at + length > len(chunk):
+            raise McapDamaged(f"byte {chunk_at}: a record of this chunk is cut at its end")
+        yield from _parse(opcode, chunk[at : at + length], at, chunk_at)
+        at += length
+
+
+def _parse(opcode: int, body: bytes, at: int, chunk_at: int | None) -> Iterator[Record]:
+    """None or one record; those that only repeat others (indexes, statistics) are passed over."""
+    cursor = _Cursor(body, at if chunk_at is None else chunk_at)
+    match opcode:
+        case Opcode.MESSAGE:
+            channel_id, sequence, log_time_ns, _ = cursor.unpack(_MESSAGE)
+            yield Message(channel_id, sequence, log_time_ns, body[_MESSAGE.size :], chunk_at, at + _MESSAGE.size)
+        case Opcode.SCHEMA:
+            (schema_id,) = cursor.unpack(struct.Struct("<H"))
+            yield Schema(schema_id, cursor.text(), cursor.text(), cursor.blob("<I"))
+        case Opcode.CHANNEL:
+            channel_id, schema_id = cursor.unpack(struct.Struct("<HH"))
+            yield Channel(channel_id, schema_id, cursor.text(), cursor.text())
+        case Opcode.ATTACHMENT:
+            yield _attachment(body, at)
+        case Opcode.METADATA:
+            name, pairs = cursor.text(), _Cursor(cursor.blob("<I"), at)
+            values: dict[str, str] = {}
+            while pairs.left:
+                key = pairs.text()
+                values[key] = pairs.text()
+            yield Metadata(name, values)
+
+
+def _attachment(body: bytes, at: int) -> Attachment:
+    cursor = _Cursor(body, at)
+    cursor.take(16)  # log time, create time
+    attachment = Attachment(cursor.text(), cursor.text(), cursor.blob("<Q"))
+    (expected,) = cursor.unpack(struct.Struct("<I"))
+    if expected not in (0, zlib.crc32(body[:-4])):
+        raise McapDamaged(f"byte {at}: the CRC of an attachment does not agree")
+    return attachment
+
+
+def _unpack_chunk(body: bytes, at: int) -> bytes:
+    cursor = _Cursor(body, at)
+    _, _, promised, expected = cursor.unpack(_CHUNK)
+    compression, packed = cursor.text(), cursor.blob("<Q")
+    if promised > MAX_CHUNK_BYTES:
+        raise McapDamaged(f"byte {at}: a chunk would unpack to {promised} bytes, the limit is {MAX_CHUNK_BYTES}")
+    try:
+        match compression:
+            case "":
+                data = packed
+            case "lz4":
+                data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=promised + 1)
+            case "zstd":
+                # `decompress` trusts the size in the frame; the stream reader makes no more than it is asked for.
+                reader = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW).stream_reader(
+                    packed, read_across_frames=True
+                )
+                data = reader.read(promised + 1)
+            case _:
+                raise McapDamaged(f"byte {at}: a chunk has a compression that is neither lz4 nor zstd")
+    except (RuntimeError, zstandard.ZstdError) as error:
+        raise McapDamaged(f"byte {at}: a chunk cannot be unpacked") from error
+    if len(data) != promised or (expected and zlib.crc32(data) != expected):
+        raise McapDamaged(f"byte {at}: size or CRC of a chunk does not agree")
+    return data
+
+
+def _size(stream: BinaryIO) -> int:
+    at = stream.tell()
+    size = stream.seek(0, 2)
+    stream.seek(at)
+    return size
+
+
+def _read(stream: BinaryIO, count: int, at: int, size: int) -> bytes:
+    """Exactly `count` bytes; nothing is allocated for what is not there."""
+    if at + count > size:
+        raise McapDamaged(f"byte {size}: the file is cut off ({at + count - size} bytes are missing here)")
+    data = stream.read(count)
+    if len(data) != count:
+        raise McapDamaged(f"byte {at + len(data)}: the file is cut off")
+    return data
+
+
+class _Cursor:
+    """Walks through a record; every step is checked against its end."""
+
+    def __init__(self, body: bytes, at: int) -> None:
+        self._body = body
+        self._start = at
+        self._offset = 0
+
+    @property
+    def at(self) -> int:
+        """File offset of the next byte."""
+        return self._start + self._offset
+
+    @property
+    def left(self) -> int:
+        """Bytes that remain."""
+        return len(self._body) - self._offset
+
+    def take(self, count: int) -> bytes:
+        """The next `count` bytes."""
+        if count > self.left:
+            raise McapDamaged(f"byte {self._start}: a length within a record passes its end")
+        self._offset += count
+        return self._body[self._offset - count : self._offset]
+
+    def unpack(self, layout: struct.Struct) -> tuple[int, ...]:
+        """The next integers."""
+        return layout.unpack(self.take(layout.size))
+
+    def blob(self, length: str) -> bytes:
+        """Bytes after their length."""
+        (count,) = self.unpack(struct.Struct(length))
+        return self.take(count)
+
+    def text(self) -> str:
+        """UTF-8 after its length in 32 bits."""
+        try:
+            return self.blob("<I").decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise McapDamaged(f"byte {self._start}: a name is not UTF-8") from error

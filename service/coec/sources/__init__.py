@@ -1,0 +1,49 @@
+"""Recordings as input: one door, `open_source`, for every layout."""
+
+from __future__ import annotations
+
+from coec.errors import SourceError, UsageError
+from coec.sources.recording import Recording
+from coec.sources.spec import FORMS, SourceSpec, parse_spec
+
+__all__ = ["Recording", "open_source"]
+
+
+def open_source(spec: str) -> Recording:
+    """Opens the recording that a SOURCE argument names (CONTRACT, "Command line"). Frames are loaded later.
+
+    Raises:
+        UsageError: the argument does not fit the grammar, or its query has an unknown key.
+        SourceError: the recording is absent, incomplete or not in the layout its name promises.
+        WindowError: a recorded window that is damaged.
+    """
+    parsed = parse_spec(spec)
+    # Each layout is imported when it is asked for: OpenCV, rosbags and the MCAP readers are not needed by all.
+    match parsed.layout:
+        case "kitti360":
+            from coec.sources.kitti360 import open_kitti360
+
+            return open_kitti360(parsed)
+        case "kitti-raw":
+            from coec.sources.kitti_raw import open_kitti_raw
+
+            return open_kitti_raw(parsed)
+        case "synthetic":
+            from coec.sources.synthetic import open_synthetic
+
+            return open_synthetic(parsed.query)
+    return _open_path(parsed)
+
+
+def _open_path(spec: SourceSpec) -> Recording:
+    if not spec.path.exists():
+        raise SourceError(f"{spec.path} does not exist\n{FORMS}")
+    if spec.path.suffix == ".mcap" and spec.path.is_file():
+        from coec.sources.mcap_bag import open_mcap
+
+        return open_mcap(spec)
+    if spec.path.is_dir() or spec.path.suffix in (".yaml", ".yml"):
+        from coec.sources.manifest import open_manifest
+
+        return open_manifest(spec)
+    raise UsageError(f"{spec.path} is neither a folder nor an .mcap, .yaml or .yml file\n{FORMS}")

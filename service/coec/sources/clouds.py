@@ -1,0 +1,116 @@
+"""Point clouds from files: `.bin`, `.npy`, `.npz` here, `.pcd` in `pcd.py`.
+
+Rows with a non-finite coordinate are dropped together with their intensity, ring and time.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from coec.calibration.values import LidarFrame
+from coec.errors import SourceError
+from coec.sources.pcd import MAX_POINTS, Columns, PcdError, parse_pcd
+
+VELODYNE_POINT_BYTES = 16
+"""x, y, z, reflectance as little-endian float32 (KITTI development kit)."""
+
+
+def load_cloud(stamp_ns: int, frame_id: str, path: Path) -> LidarFrame:
+    """A sweep from a `.pcd`, `.bin`, `.npy` or `.npz` file, by its suffix.
+
+    `.npy` holds (N, 3) or (N, 4): x y z [intensity]. `.npz` holds `xyz` (N, 3) and may hold `intensity`, `ring` and
+    `time_offset_s`, each (N,). Metres, seconds after `stamp_ns`.
+
+    Raises:
+        SourceError: unreadable, truncated, malformed or empty; names file, line or byte.
+    """
+    loader = {".pcd": _load_pcd, ".bin": _load_bin, ".npy": _load_npy, ".npz": _load_npz}.get(path.suffix.lower())
+    if loader is None:
+        raise SourceError(f"{path}: clouds are .pcd, .bin, .npy or .npz files")
+    try:
+        columns = loader(path)
+    except FileNotFoundError as error:
+        raise SourceError(f"{path} does not exist") from error
+    except (OSError, EOFError) as error:
+        raise SourceError(f"cannot read {path}: {error}") from error
+    return _frame(stamp_ns, frame_id, path, columns)
+
+
+def _frame(stamp_ns: int, frame_id: str, path: Path, columns: Columns) -> LidarFrame:
+    xyz_m = np.ascontiguousarray(columns["xyz"], dtype=np.float32)
+    keep = np.isfinite(xyz_m).all(axis=1)
+    if "time_offset_s" in columns:
+        keep &= np.isfinite(columns["time_offset_s"].astype(np.float64))
+    if not keep.any():
+        raise SourceError(f"{path} holds no finite point ({len(xyz_m)} rows)")
+    intensity, ring, time_offset_s = (
+        None if values is None else values[keep] for values in map(columns.get, ("intensity", "ring", "time_offset_s"))
+    )
+    return LidarFrame(
+        stamp_ns,
+        frame_id,
+        xyz_m[keep],
+        intensity=None if intensity is None else intensity.astype(np.float32),
+        ring=None if ring is None else ring.astype(np.uint16),
+        time_offset_s=None if time_offset_s is None else time_offset_s.astype(np.float32),
+    )
+
+
+def _load_bin(path: Path) -> Columns:
+    data = path.read_bytes()
+    if len(data) % VELODYNE_POINT_BYTES:
+        whole = len(data) - len(data) % VELODYNE_POINT_BYTES
+        raise SourceError(f"{path} is truncated: a point of 16 bytes (float32 x y z i) is cut at byte {whole}")
+    points = np.frombuffer(data, dtype="<f4").reshape(-1, 4)
+    return {"xyz": points[:, :3], "intensity": points[:, 3]}
+
+
+def _load_npy(path: Path) -> Columns:
+    try:
+        # A memory map checks the promised shape against the file before anything is allocated.
+        points = np.load(path, mmap_mode="r", allow_pickle=False)
+    except ValueError as error:
+        raise SourceError(f"{path} is not a NumPy array, or is truncated: {error}") from error
+    if (
+        not isinstance(points, np.ndarray)
+        or points.ndim != 2
+        or points.shape[1] not in (3, 4)
+        or points.dtype.kind != "f"
+    ):
+        raise SourceError(f"{path}: expected float (N, 3) or (N, 4), x y z [intensity]")
+    columns: Columns = {"xyz": np.asarray(points[:, :3])}
+    if points.shape[1] == 4:
+        columns["intensity"] = np.asarray(points[:, 3])
+    return columns
+
+
+_NPZ_KINDS = {"xyz": "f", "intensity": "fiu", "ring": "iu", "time_offset_s": "f"}
+
+
+def _load_npz(path: Path) -> Columns:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(item.file_size for item in archive.infolist())
+        if unpacked > MAX_POINTS * 64:
+            raise SourceError(f"{path} would unpack to {unpacked} bytes: refused")
+        with np.load(path, allow_pickle=False) as arrays:
+            columns = {name: arrays[name] for name in _NPZ_KINDS if name in arrays.files}
+    except (ValueError, zipfile.BadZipFile, NotImplementedError) as error:
+        raise SourceError(f"{path} is not an .npz file, or is damaged: {error}") from error
+    xyz = columns.get("xyz")
+    if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise SourceError(f"{path}: expected an array `xyz` of shape (N, 3)")
+    for name, values in columns.items():
+        if values.dtype.kind not in _NPZ_KINDS[name] or (name != "xyz" and values.shape != xyz.shape[:1]):
+            raise SourceError(f"{path}: array `{name}` has shape {values.shape} and type {values.dtype}")
+    return columns
+
+
+def _load_pcd(path: Path) -> Columns:
+    try:
+        return parse_pcd(path.read_bytes())
+    except PcdError as error:
+        raise SourceError(f"{path}, {error}") from error

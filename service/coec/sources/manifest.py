@@ -1,0 +1,212 @@
+"""`dataset.yaml`: images and clouds listed one by one (CONTRACT, "Command line").
+
+Frames are `camera` and `lidar`; a `twist` is the velocity of the LiDAR in its own frame at the stamp of the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coec.adapters.images import encode_depth_png, probe, raw_image
+from coec.adapters.rig import camera_of, load_mask, rigid_matrix
+from coec.calibration.values import CameraFrame, EgoMotion, EncodedImage, ImageFormat, Rig
+from coec.config import CameraIntrinsics, LimitsConfig, Matrix4x4, Name, describe, load_yaml
+from coec.errors import ConfigError, DecodeError, SourceError
+from coec.sources.clouds import load_cloud
+from coec.sources.kitti_files import load_image
+from coec.sources.recording import FramewiseRecording, RecordedFrame
+from coec.sources.spec import SourceSpec
+
+FILE_NAME = "dataset.yaml"
+CAMERA_FRAME = "camera"
+LIDAR_FRAME = "lidar"
+
+_MAX_STAMP_NS = 2**31 * 1_000_000_000
+"""ROS 2 time, in which frames are recorded, has signed 32-bit seconds."""
+
+_DEPTH_CODES = 65_534
+"""Codes of a 16-bit PNG that mean a value, less one: 1 ... 65535; 0 is "no value"."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class TwistDocument(_Strict):
+    """Velocity of the LiDAR in its own frame, m/s and rad/s."""
+
+    linear_mps: tuple[float, float, float]
+    angular_radps: tuple[float, float, float]
+
+
+class FrameDocument(_Strict):
+    """One image and its cloud; paths are relative to the manifest."""
+
+    image: Path
+    cloud: Path
+    stamp_ns: int = Field(ge=0, lt=_MAX_STAMP_NS)
+    cloud_stamp_ns: int | None = Field(default=None, ge=0, lt=_MAX_STAMP_NS)
+    depth: Path | None = None
+    twist: TwistDocument | None = None
+
+
+class ManifestDocument(_Strict):
+    """The whole of `dataset.yaml`."""
+
+    pair: Name
+    camera: CameraIntrinsics
+    mask: Path | None = None
+    T_camera_lidar: Matrix4x4
+    frames: tuple[FrameDocument, ...] = Field(min_length=1)
+
+
+def open_manifest(spec: SourceSpec) -> FramewiseRecording:
+    """A folder with a `dataset.yaml`, or such a file.
+
+    Raises:
+        UsageError: a query was given.
+        SourceError: absent, not YAML, an unknown or missing key, a file that is not there; names each place.
+    """
+    spec.only()
+    path = spec.path / FILE_NAME if spec.path.is_dir() else spec.path
+    if not path.is_file():
+        raise SourceError(f"{spec.path} has no {FILE_NAME}; for a KITTI folder write kitti360:... or kitti-raw:...")
+    try:
+        document = ManifestDocument.model_validate(load_yaml(path))
+        camera = camera_of(document.camera)
+        T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
+        mask = None if document.mask is None else load_mask(path.parent / document.mask, camera)
+    except ValidationError as error:
+        raise SourceError(f"{path}: {describe(error)}") from error
+    except ConfigError as error:
+        raise SourceError(f"{path}: {error}") from error
+    rig = Rig(
+        pair=document.pair,
+        camera=camera,
+        camera_frame=CAMERA_FRAME,
+        lidar_frame=LIDAR_FRAME,
+        T_camera_lidar_nominal=T_camera_lidar,
+        T_lidar_ego=np.eye(4),
+        mask=mask,
+    )
+    frames = sorted(document.frames, key=lambda frame: frame.stamp_ns)
+    _check_frames(path, frames)
+    depths = [path.parent / frame.depth for frame in frames if frame.depth is not None]
+    scale = _DepthScale([depth for depth in depths if depth.suffix == ".npy"])
+    motions = [
+        EgoMotion(frame.stamp_ns, LIDAR_FRAME, frame.twist.linear_mps, frame.twist.angular_radps)
+        for frame in frames
+        if frame.twist is not None
+    ]
+    return FramewiseRecording(
+        f"{path.parent.name}/{document.pair}",
+        rig,
+        T_camera_lidar,
+        tuple(_recorded(path.parent, frame, scale) for frame in frames),
+        tuple(motions),
+    )
+
+
+def _check_frames(path: Path, frames: Sequence[FrameDocument]) -> None:
+    for stream in ([f.stamp_ns for f in frames], [_cloud_stamp_ns(f) for f in frames]):
+        if any(later <= earlier for earlier, later in pairwise(stream)):
+            raise SourceError(f"{path}: two frames have the same stamp, or clouds are not in the order of their images")
+    for frame in frames:
+        for file in (frame.image, frame.cloud, frame.depth):
+            if file is not None and not (path.parent / file).is_file():
+                raise SourceError(f"{path}: there is no file {file}")
+        if frame.depth is not None and frame.depth.suffix not in (".png", ".npy"):
+            raise SourceError(f"{path}: depth {frame.depth} is neither .png nor .npy")
+
+
+def _cloud_stamp_ns(frame: FrameDocument) -> int:
+    return frame.stamp_ns if frame.cloud_stamp_ns is None else frame.cloud_stamp_ns
+
+
+def _recorded(folder: Path, frame: FrameDocument, scale: _DepthScale) -> RecordedFrame:
+    cloud_stamp_ns = _cloud_stamp_ns(frame)
+    return RecordedFrame(
+        frame.stamp_ns,
+        partial(_load_camera, folder, frame, scale),
+        cloud_stamp_ns,
+        partial(load_cloud, cloud_stamp_ns, LIDAR_FRAME, folder / frame.cloud),
+    )
+
+
+def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> CameraFrame:
+    depth = None
+    if frame.depth is not None:
+        file = folder / frame.depth
+        depth = scale.encode(file) if file.suffix == ".npy" else load_image(file)
+    return CameraFrame(frame.stamp_ns, CAMERA_FRAME, _load_any_image(folder / frame.image), depth=depth)
+
+
+def _load_any_image(path: Path) -> EncodedImage:
+    """JPEG and PNG as they are, anything else that OpenCV reads as raw 8-bit pixels."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror}") from error
+    try:
+        return probe(data, LimitsConfig())
+    except DecodeError as error:
+        if error.reason != "image_unknown_format":
+            raise SourceError(f"{path}: {error}") from error
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise SourceError(f"{path} is not an image that OpenCV reads")
+    height, width = pixels.shape[:2]
+    return raw_image(ImageFormat.BGR8, width, height, pixels.tobytes(), LimitsConfig())
+
+
+class _DepthScale:
+    """One linear scale from the float maps of a recording to 16-bit codes 1 ... 65535, so that a code means the same in
+    every frame. Values that are not finite or not above zero are "no value", as 0 is in a PNG. The scale keeps the
+    order of the values, which is all that mutual information looks at, up to 1/65534 of their span."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._least, self._span = 0.0, 0.0
+        extremes = []
+        for path in paths:
+            values = _load_float_map(path)
+            valid = values[_has_value(values)]
+            if valid.size:
+                extremes.append((float(valid.min()), float(valid.max())))
+        if extremes:
+            self._least = min(least for least, _ in extremes)
+            self._span = max(greatest for _, greatest in extremes) - self._least
+
+    def encode(self, path: Path) -> EncodedImage:
+        """The map as a 16-bit grey PNG.
+
+        Raises:
+            SourceError: unreadable or not a (h, w) array of floats.
+        """
+        values = _load_float_map(path)
+        share = (np.where(_has_value(values), values, self._least) - self._least) / (self._span or 1.0)
+        codes = np.where(_has_value(values), 1 + np.rint(np.clip(share, 0.0, 1.0) * _DEPTH_CODES), 0)
+        return probe(encode_depth_png(codes.astype(np.uint16)), LimitsConfig())
+
+
+def _has_value(values: NDArray[np.floating]) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(values) & (values > 0))
+
+
+def _load_float_map(path: Path) -> NDArray[np.floating]:
+    try:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise SourceError(f"{path} is not a NumPy array, or is truncated: {error}") from error
+    if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f" or not values.size:
+        raise SourceError(f"{path}: a depth map must be a float array of shape (height, width)")
+    if values.size > LimitsConfig().max_image_pixels:
+        raise SourceError(f"{path}: {values.shape} is larger than any depth map")
+    return np.asarray(values, dtype=np.float64)

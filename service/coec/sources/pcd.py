@@ -1,0 +1,236 @@
+"""PCD v0.7 (Point Cloud Library): ascii, binary and binary_compressed, organised or not, fields in any order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Columns = dict[str, NDArray[np.generic]]
+"""`xyz` (N, 3), and where there are: `intensity`, `ring`, `time_offset_s`, each (N,). Not filtered."""
+
+MAX_POINTS = 20_000_000
+"""No sweep is larger; bounds what a hostile header can make us allocate (a 128-beam LiDAR gives 0.3 million)."""
+
+MAX_HEADER_BYTES = 65_536
+"""PCL's headers have some 300 bytes."""
+
+_TIME_FIELDS = ("t", "time", "time_offset_s")
+"""Integer `t` is nanoseconds after the stamp (Ouster), the float ones are seconds after it (Velodyne driver)."""
+
+_NS = 1e-9
+
+
+class PcdError(ValueError):
+    """What is wrong, with the line or byte where."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    point: np.dtype[np.void]
+    points: int
+    encoding: str
+    body: int
+    body_line: int
+
+
+def parse_pcd(data: bytes) -> Columns:
+    """The columns of a PCD file.
+
+    Raises:
+        PcdError: not PCD, truncated or contradicting itself; the message begins with the line or byte.
+    """
+    header = _parse_header(data)
+    match header.encoding:
+        case "ascii":
+            table = _ascii_table(data, header)
+        case "binary":
+            need = header.points * header.point.itemsize
+            have = len(data) - header.body
+            if have < need:
+                raise PcdError(f"byte {len(data)}: the file ends after {have} of {need} bytes of points")
+            table = np.frombuffer(data, header.point, header.points, header.body)
+        case _:
+            table = _decompressed_table(data, header)
+    return _columns(table)
+
+
+def _parse_header(data: bytes) -> _Header:
+    values: dict[str, list[str]] = {}
+    start = line_number = 0
+    while "DATA" not in values:
+        end = data.find(b"\n", start, MAX_HEADER_BYTES)
+        line_number += 1
+        if end < 0:
+            raise PcdError(f"line {line_number}: the header ends without a DATA line")
+        try:
+            words = data[start:end].decode("ascii").split()
+        except UnicodeDecodeError as error:
+            raise PcdError(f"line {line_number}: not a PCD header") from error
+        if words and not words[0].startswith("#"):
+            values[words[0]] = words[1:]
+        start = end + 1
+
+    def integers(key: str, count: int | None = None) -> list[int]:
+        try:
+            numbers = [int(value) for value in values[key]]
+        except (KeyError, ValueError) as error:
+            raise PcdError(f"line {line_number}: the header has no valid {key}") from error
+        if (count is not None and len(numbers) != count) or any(number < 0 for number in numbers):
+            raise PcdError(f"line {line_number}: the header has no valid {key}")
+        return numbers
+
+    names = values.get("FIELDS", [])
+    sizes, types = integers("SIZE", len(names)), values.get("TYPE", [])
+    counts = integers("COUNT", len(names)) if "COUNT" in values else [1] * len(names)
+    width, height = integers("WIDTH", 1)[0], integers("HEIGHT", 1)[0]
+    points = integers("POINTS", 1)[0] if "POINTS" in values else width * height
+    if points != width * height or points > MAX_POINTS:
+        raise PcdError(f"line {line_number}: {points} POINTS do not agree with {width} x {height}, or are too many")
+    encoding = (values["DATA"] or [""])[0]
+    if encoding not in ("ascii", "binary", "binary_compressed"):
+        raise PcdError(f"line {line_number}: DATA must be ascii, binary or binary_compressed")
+    return _Header(_point_type(names, sizes, types, counts, line_number), points, encoding, start, line_number)
+
+
+def _point_type(
+    names: list[str], sizes: list[int], types: list[str], counts: list[int], line: int
+) -> np.dtype[np.void]:
+    """The packed row of one point. Padding fields (`_`) and repeated names get a name of their own."""
+    if len(types) != len(names) or any(not 1 <= count <= 4096 for count in counts):
+        raise PcdError(f"line {line}: FIELDS, SIZE, TYPE and COUNT do not agree")
+    fields: list[tuple[str, str, tuple[int, ...]]] = []
+    for place, (name, size, kind, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
+        if (kind, size) not in {("F", 4), ("F", 8), *((k, s) for k in "IU" for s in (1, 2, 4, 8))}:
+            raise PcdError(f"line {line}: field {name} has unknown type {kind}{size}")
+        unique = name if name != "_" and name not in names[:place] else f"_{place}"
+        fields.append((unique, f"<{kind.lower()}{size}", (count,) if count > 1 else ()))
+    missing = [axis for axis in "xyz" if axis not in names or counts[names.index(axis)] != 1]
+    if missing:
+        raise PcdError(f"line {line}: FIELDS lacks {' '.join(missing)}")
+    return np.dtype(fields)
+
+
+def _ascii_table(data: bytes, header: _Header) -> NDArray[np.void]:
+    """Rows of numbers. NumPy reads them in one go; only when it fails are the lines looked at one by one."""
+    width = sum(int(np.prod(header.point[name].shape)) for name in header.point.names or ())
+    lines = data[header.body :].decode("ascii", errors="replace").splitlines()
+    while lines and not lines[-1].strip():
+        lines.pop()
+    if len(lines) < header.points:
+        raise PcdError(
+            f"line {header.body_line + len(lines)}: the file ends after {len(lines)} of {header.points} points"
+        )
+    lines = lines[: header.points]
+    try:
+        values = np.array(" ".join(lines).split(), dtype=np.float64)
+    except ValueError:
+        values = np.empty(0)
+    if values.size != len(lines) * width:
+        for number, line in enumerate(lines, start=header.body_line + 1):
+            _check_row(line.split(), width, number)
+    rows = values.reshape(len(lines), width)
+    table = np.zeros(len(lines), header.point)
+    column = 0
+    for name in header.point.names or ():
+        shape = header.point[name].shape
+        span = int(np.prod(shape))
+        block = rows[:, column : column + span].reshape(len(lines), *shape)
+        if header.point[name].base.kind in "iu":
+            block = _bounded(block, header.point[name].base, header.body_line)
+        table[name] = block
+        column += span
+    return table
+
+
+def _check_row(words: list[str], width: int, number: int) -> None:
+    if len(words) != width:
+        raise PcdError(f"line {number}: expected {width} numbers, found {len(words)}")
+    for word in words:
+        try:
+            float(word)
+        except ValueError as error:
+            raise PcdError(f"line {number}: not a number") from error
+
+
+def _bounded(values: NDArray[np.float64], dtype: np.dtype[np.generic], body_line: int) -> NDArray[np.float64]:
+    """Integer columns written as text may be out of their type's range; a cast would be undefined."""
+    limits = np.iinfo(dtype.type)  # type: ignore[type-var]
+    bad = ~((values >= limits.min) & (values <= limits.max))
+    if bad.any():
+        raise PcdError(f"line {body_line + 1 + int(np.argwhere(bad)[0, 0])}: a value does not fit its type {dtype}")
+    return values
+
+
+def _decompressed_table(data: bytes, header: _Header) -> NDArray[np.void]:
+    """LZF over the concatenated columns (PCL stores them one after another, not by row)."""
+    start = header.body + 8
+    if len(data) < start:
+        raise PcdError(f"byte {len(data)}: the file ends before the size of its compressed points")
+    packed, unpacked = np.frombuffer(data, "<u4", 2, header.body).tolist()
+    if unpacked != header.points * header.point.itemsize:
+        raise PcdError(f"byte {header.body}: {unpacked} bytes are promised, the header needs {header.points} points")
+    if len(data) < start + packed:
+        raise PcdError(f"byte {len(data)}: the file ends after {len(data) - start} of {packed} compressed bytes")
+    columns = _lzf_decompress(data, start, start + packed, unpacked)
+    table = np.zeros(header.points, header.point)
+    offset = 0
+    for name in header.point.names or ():
+        field = header.point[name]
+        count = header.points * int(np.prod(field.shape))
+        table[name] = np.frombuffer(columns, field.base, count, offset).reshape(header.points, *field.shape)
+        offset += header.points * field.itemsize
+    return table
+
+
+def _lzf_decompress(data: bytes, start: int, end: int, size: int) -> bytes:
+    """LZF (Marc Lehmann's liblzf): literal runs of up to 32 bytes, back references of 3 to 264 bytes."""
+    out = bytearray()
+    at = start
+    while at < end:
+        control = data[at]
+        at += 1
+        if control < 32:
+            run = control + 1
+            if at + run > end:
+                raise PcdError(f"byte {at}: damaged compressed points (a run passes the end)")
+            out += data[at : at + run]
+            at += run
+        else:
+            length = control >> 5
+            if at + (2 if length == 7 else 1) > end:
+                raise PcdError(f"byte {at}: damaged compressed points (a reference is cut)")
+            if length == 7:
+                length += data[at]
+                at += 1
+            distance = ((control & 31) << 8 | data[at]) + 1
+            at += 1
+            length += 2
+            begin = len(out) - distance
+            if begin < 0:
+                raise PcdError(f"byte {at}: damaged compressed points (a reference before the start)")
+            if distance >= length:
+                out += out[begin : begin + length]
+            else:  # the reference overlaps what it writes: the last `distance` bytes repeat
+                out += (bytes(out[begin:]) * (length // distance + 1))[:length]
+        if len(out) > size:
+            raise PcdError(f"byte {at}: damaged compressed points (more than the {size} bytes promised)")
+    if len(out) != size:
+        raise PcdError(f"byte {end}: damaged compressed points ({len(out)} of {size} bytes)")
+    return bytes(out)
+
+
+def _columns(table: NDArray[np.void]) -> Columns:
+    names = table.dtype.names or ()
+    columns: Columns = {"xyz": np.stack([table[axis].astype(np.float32) for axis in "xyz"], axis=1)}
+    if "intensity" in names and table["intensity"].ndim == 1:
+        columns["intensity"] = table["intensity"].astype(np.float32)
+    if "ring" in names and table["ring"].ndim == 1 and table["ring"].dtype.kind in "iu":
+        columns["ring"] = table["ring"].astype(np.uint16)
+    for name in _TIME_FIELDS:
+        if name in names and table[name].ndim == 1:
+            scale = _NS if table[name].dtype.kind in "iu" else 1.0
+            columns["time_offset_s"] = (table[name].astype(np.float64) * scale).astype(np.float32)
+            break
+    return columns

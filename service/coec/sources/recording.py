@@ -1,0 +1,126 @@
+"""What a recording offers, whatever its layout on disk: its rig, and its frames in the order of sensor time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+from coec.config import CalibrationConfig
+from coec.errors import UsageError
+
+Message = CameraFrame | LidarFrame | EgoMotion
+
+MOTION_REACH_NS = 1_000_000_000
+"""Ego-motion this near to a chosen camera frame is handed out with it: five times the default motion tolerance."""
+
+_EGO, _LIDAR, _CAMERA = 0, 1, 2
+"""Order of messages with equal stamps: by the time a camera frame is seen, its partners are there."""
+
+
+class Recording(Protocol):
+    """A recorded drive of one camera-LiDAR pair."""
+
+    @property
+    def name(self) -> str:
+        """For people: layout, drive, camera."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """Rig of the pair, with the calibration that came with the recording as nominal."""
+        ...
+
+    @property
+    def T_camera_lidar_start(self) -> Matrix4:
+        """(4, 4) extrinsic that was current when the recording was made; the nominal one unless recorded."""
+        ...
+
+    @property
+    def configuration(self) -> CalibrationConfig | None:
+        """Configuration that a recorded window carries; None for every other recording."""
+        ...
+
+    @property
+    def camera_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the camera frames, ascending, nanoseconds."""
+        ...
+
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
+        """Messages in ascending order of their stamps, each loaded when it is its turn.
+
+        Args:
+            cameras: indices into `camera_stamps_ns`: only these camera frames, and the sweeps and the ego-motion
+                needed to pair them. None = everything.
+
+        Raises:
+            UsageError: an index out of range.
+            SourceError: a file that cannot be read, names the file.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedFrame:
+    """A camera frame and the sweep that was taken with it, not loaded yet."""
+
+    camera_stamp_ns: int
+    load_camera: Callable[[], CameraFrame]
+    lidar_stamp_ns: int
+    load_lidar: Callable[[], LidarFrame]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramewiseRecording:
+    """A `Recording` of layouts that number camera frames and sweeps together (KITTI, manifests, windows).
+
+    Attributes:
+        frames: ascending by `camera_stamp_ns`.
+        motions: ascending by `stamp_ns`.
+    """
+
+    name: str
+    rig: Rig
+    T_camera_lidar_start: Matrix4
+    frames: tuple[RecordedFrame, ...]
+    motions: tuple[EgoMotion, ...] = ()
+    configuration: CalibrationConfig | None = None
+
+    @property
+    def camera_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the camera frames, ascending, nanoseconds."""
+        return tuple(frame.camera_stamp_ns for frame in self.frames)
+
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
+        """See `Recording.messages`."""
+        frames = [self.frames[index] for index in chosen_indices(cameras, len(self.frames))]
+        stamps_ns = [frame.camera_stamp_ns for frame in frames]
+        motions = self.motions if cameras is None else motions_near(self.motions, stamps_ns)
+        queue: list[tuple[int, int, int, Callable[[], Message]]] = []
+        for place, frame in enumerate(frames):
+            queue.append((frame.lidar_stamp_ns, _LIDAR, place, frame.load_lidar))
+            queue.append((frame.camera_stamp_ns, _CAMERA, place, frame.load_camera))
+        for place, motion in enumerate(motions):
+            queue.append((motion.stamp_ns, _EGO, place, lambda motion=motion: motion))  # type: ignore[misc]
+        for _, _, _, load in sorted(queue, key=lambda entry: entry[:3]):
+            yield load()
+
+
+def chosen_indices(cameras: Collection[int] | None, count: int) -> list[int]:
+    """The indices asked for, ascending and once each; all of them for None.
+
+    Raises:
+        UsageError: an index outside 0 ... count - 1.
+    """
+    if cameras is None:
+        return list(range(count))
+    for index in cameras:
+        if not 0 <= index < count:
+            raise UsageError(f"there is no camera frame {index}: the recording has {count}, counted from 0")
+    return sorted(set(cameras))
+
+
+def motions_near(motions: Collection[EgoMotion], stamps_ns: Collection[int]) -> list[EgoMotion]:
+    """The ego-motion samples within `MOTION_REACH_NS` of any of the stamps, in their order."""
+    return [m for m in motions if any(abs(m.stamp_ns - stamp) <= MOTION_REACH_NS for stamp in stamps_ns)]

@@ -1,0 +1,72 @@
+"""The grammar of a SOURCE argument: `[layout:]path[?key=value&…]`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import parse_qsl
+
+from coec.errors import UsageError
+
+FORMS = """accepted forms of a source:
+  FILE.mcap                                     a recorded window
+  FILE.mcap?camera=/TOPIC&points=/TOPIC&...     any ROS 2 bag (topics are found by type where they are unique)
+  kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
+  kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
+  FOLDER or dataset.yaml                        images and clouds listed in a manifest
+  synthetic:?seed=0                             a seeded recording that needs no data"""
+
+LAYOUTS = ("kitti360", "kitti-raw", "synthetic")
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSpec:
+    """A parsed SOURCE: its layout (None for a plain path), its path and its query."""
+
+    text: str
+    layout: str | None
+    path: Path
+    query: dict[str, str] = field(default_factory=dict)
+
+    def only(self, *keys: str) -> dict[str, str]:
+        """The query, once it is certain that it holds no other keys.
+
+        Raises:
+            UsageError: names the unknown keys and the known ones.
+        """
+        unknown = sorted(set(self.query) - set(keys))
+        if unknown:
+            known = f"known here: {', '.join(keys)}" if keys else "this kind of source takes none"
+            raise UsageError(f"unknown query key {', '.join(unknown)} in {self.text}; {known}\n{FORMS}")
+        return self.query
+
+
+def parse_spec(text: str) -> SourceSpec:
+    """Splits a SOURCE argument.
+
+    Raises:
+        UsageError: an unknown layout, a malformed query or a missing path; lists the accepted forms.
+    """
+    prefix, colon, rest = text.partition(":")
+    layout = prefix if colon and prefix in LAYOUTS else None
+    if layout is None and colon and "/" not in prefix and "." not in prefix:
+        raise UsageError(f"unknown source layout {prefix!r} in {text}\n{FORMS}")
+    location, _, query = (rest if layout else text).partition("?")
+    if not location and layout != "synthetic":
+        raise UsageError(f"no path in source {text!r}\n{FORMS}")
+    return SourceSpec(text, layout, Path(location).expanduser(), _parse_query(query, text))
+
+
+def _parse_query(query: str, text: str) -> dict[str, str]:
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
+    except ValueError as error:
+        raise UsageError(f"malformed query in source {text}: {error}\n{FORMS}") from error
+    result: dict[str, str] = {}
+    for key, value in pairs:
+        if key in result:
+            raise UsageError(f"query key {key} given twice in source {text}")
+        if not value:
+            raise UsageError(f"query key {key} has no value in source {text}")
+        result[key] = value
+    return result

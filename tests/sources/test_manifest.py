@@ -1,0 +1,177 @@
+"""`dataset.yaml`: what CONTRACT allows, what it refuses, and the real recordings."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from coec.adapters.images import decode_bgr, decode_depth
+from coec.calibration.values import CameraFrame, EgoMotion, ImageFormat, LidarFrame
+from coec.config import LimitsConfig
+from coec.errors import SourceError
+from coec.geometry import cameras
+from coec.sources import open_source
+
+LIMITS = LimitsConfig()
+
+
+def a_dataset(folder: Path, **changes: Any) -> Path:
+    """Two frames, with everything that is optional in the first."""
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    cv2.imwrite(str(folder / "1.jpg"), pixels)
+    cv2.imwrite(str(folder / "2.png"), pixels)
+    cv2.imwrite(str(folder / "3.bmp"), pixels)
+    np.save(folder / "1.npy", np.ones((5, 3), np.float32))
+    np.save(folder / "2.npy", np.ones((5, 3), np.float32))
+    cv2.imwrite(str(folder / "depth.png"), np.full((12, 16), 1234, np.uint16))
+    cv2.imwrite(str(folder / "mask.png"), np.full((48, 64), 255, np.uint8))
+    document = {
+        "pair": "front",
+        "camera": {"model": "pinhole", "width": 64, "height": 48, "fx": 50, "fy": 51, "cx": 31.5, "cy": 23.5},
+        "T_camera_lidar": [[0, -1, 0, 0.1], [0, 0, -1, 0.2], [1, 0, 0, 0.3], [0, 0, 0, 1]],
+        "mask": "mask.png",
+        "frames": [
+            {
+                "image": "1.jpg",
+                "cloud": "1.npy",
+                "stamp_ns": 1000,
+                "cloud_stamp_ns": 900,
+                "depth": "depth.png",
+                "twist": {"linear_mps": [1, 2, 3], "angular_radps": [4, 5, 6]},
+            },
+            {"image": "2.png", "cloud": "2.npy", "stamp_ns": 2000},
+        ],
+        **changes,
+    }
+    with (folder / "dataset.yaml").open("w") as stream:
+        YAML().dump(document, stream)
+    return folder
+
+
+def frames_of(folder: Path) -> list[CameraFrame]:
+    return [m for m in open_source(str(folder)).messages() if isinstance(m, CameraFrame)]
+
+
+def test_everything_the_contract_names(tmp_path: Path) -> None:
+    a_dataset(tmp_path)
+    for spec in (tmp_path, tmp_path / "dataset.yaml"):
+        recording = open_source(str(spec))
+        assert recording.rig.pair == "front"
+        assert recording.rig.camera == cameras.build("pinhole", width=64, height=48, fx=50, fy=51, cx=31.5, cy=23.5)
+        assert recording.rig.mask is not None
+        assert recording.rig.mask.all()
+        assert recording.rig.T_camera_lidar_nominal[:3, 3].tolist() == [0.1, 0.2, 0.3]
+        messages = list(recording.messages())
+        assert [(type(m), m.stamp_ns) for m in messages] == [
+            (LidarFrame, 900),
+            (EgoMotion, 1000),
+            (CameraFrame, 1000),
+            (LidarFrame, 2000),
+            (CameraFrame, 2000),
+        ]
+        motion, camera = messages[1], messages[2]
+        assert isinstance(motion, EgoMotion)
+        assert (motion.linear_mps, motion.angular_radps) == ((1, 2, 3), (4, 5, 6))
+        assert motion.frame_id == recording.rig.lidar_frame
+        assert np.array_equal(recording.rig.T_lidar_ego, np.eye(4))
+        assert isinstance(camera, CameraFrame)
+        assert camera.image.data == (tmp_path / "1.jpg").read_bytes()
+        assert camera.depth is not None
+        assert camera.depth.data == (tmp_path / "depth.png").read_bytes()
+
+
+def test_images_are_passed_on_as_they_are_or_as_raw_pixels(tmp_path: Path) -> None:
+    frame = {"cloud": "1.npy", "stamp_ns": 0, "image": "3.bmp"}
+    (image,) = frames_of(a_dataset(tmp_path, frames=[frame]))
+    assert image.image.format is ImageFormat.BGR8
+    expected = cv2.imread(str(tmp_path / "2.png"))
+    assert expected is not None
+    assert np.array_equal(decode_bgr(image.image, LIMITS), expected)
+
+
+def test_float_depth_becomes_codes_in_the_same_order_on_one_scale(tmp_path: Path) -> None:
+    frames = [{"image": "1.jpg", "cloud": f"{i}.npy", "stamp_ns": i, "depth": f"d{i}.npy"} for i in (1, 2)]
+    a_dataset(tmp_path, frames=frames)
+    np.save(tmp_path / "d1.npy", np.array([[2.0, 1.0, np.nan], [0.0, -1.0, np.inf]], np.float32))
+    np.save(tmp_path / "d2.npy", np.array([[3.0, 1.5, 1.0]], np.float64))
+    first, second = (decode_depth(f.depth, LIMITS) for f in frames_of(tmp_path) if f.depth is not None)
+    assert first[0, :2].tolist() == [1 + 32767, 1]
+    assert np.isnan(first).tolist() == [[False, False, True], [True, True, True]]
+    assert second.tolist() == [[65535, 16385, 1]]
+    np.save(tmp_path / "d2.npy", np.full((2, 2), 7.0))
+    np.save(tmp_path / "d1.npy", np.full((2, 2), 7.0))
+    assert all((decode_depth(f.depth, LIMITS) == 1).all() for f in frames_of(tmp_path) if f.depth is not None)
+
+
+def test_frames_are_sorted_by_their_stamps(tmp_path: Path) -> None:
+    frames = [{"image": "1.jpg", "cloud": "1.npy", "stamp_ns": stamp} for stamp in (30, 10, 20)]
+    assert open_source(str(a_dataset(tmp_path, frames=frames))).camera_stamps_ns == (10, 20, 30)
+
+
+IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+FRAME = {"image": "1.jpg", "cloud": "1.npy", "stamp_ns": 0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"colour": "red"}, "colour: Extra inputs"),
+        ({"frames": []}, "frames: Tuple should have at least 1"),
+        ({"frames": [{**FRAME, "stamp": 1}]}, r"frames\.0\.stamp: Extra"),
+        ({"frames": [{"image": "1.jpg", "stamp_ns": 0}]}, r"frames\.0\.cloud: Field required"),
+        ({"frames": [{**FRAME, "stamp_ns": -1}]}, r"frames\.0\.stamp_ns"),
+        ({"frames": [{**FRAME, "stamp_ns": 2**63}]}, r"frames\.0\.stamp_ns"),
+        ({"frames": [{**FRAME, "image": "absent.jpg"}]}, r"there is no file absent\.jpg"),
+        ({"frames": [{**FRAME, "depth": "1.jpg"}]}, r"depth 1\.jpg is neither"),
+        ({"frames": [FRAME, FRAME]}, "same stamp"),
+        ({"frames": [{**FRAME, "cloud_stamp_ns": 5}, {**FRAME, "stamp_ns": 1}]}, "order of their images"),
+        ({"frames": [{**FRAME, "twist": {"linear_mps": [1, 2, 3]}}]}, "angular_radps: Field required"),
+        ({"T_camera_lidar": [*IDENTITY[:3], [0, 0, 0, 2]]}, "T_camera_lidar is not a rigid"),
+        ({"T_camera_lidar": IDENTITY[:3]}, "T_camera_lidar"),
+        ({"camera": {"model": "pinhole", "width": 64, "height": 48}}, r"camera\.fx: Field required"),
+        ({"mask": "absent.png"}, "cannot read mask"),
+        ({"mask": "depth.png"}, "the mask is 16 x 12 px"),
+        ({"pair": "front/left"}, "pair: String should match"),
+    ],
+)
+def test_what_the_contract_does_not_allow_is_refused_by_place(
+    tmp_path: Path, changes: dict[str, Any], complaint: str
+) -> None:
+    a_dataset(tmp_path, **changes)
+    with pytest.raises(SourceError, match=complaint) as caught:
+        open_source(str(tmp_path))
+    assert "dataset.yaml" in str(caught.value)
+
+
+def test_files_that_lie_are_named_when_it_is_their_turn(tmp_path: Path) -> None:
+    a_dataset(tmp_path)
+    (tmp_path / "2.png").write_bytes((tmp_path / "2.png").read_bytes()[:-20])
+    messages = open_source(str(tmp_path)).messages()
+    assert isinstance(next(messages), LidarFrame)
+    with pytest.raises(SourceError, match=r"2\.png: the PNG has no end"):
+        list(messages)
+    (tmp_path / "2.png").write_text("no image at all")
+    with pytest.raises(SourceError, match="not an image that OpenCV reads"):
+        list(open_source(str(tmp_path)).messages())
+    (tmp_path / "dataset.yaml").write_text("frames: [")
+    with pytest.raises(SourceError, match="not valid YAML"):
+        open_source(str(tmp_path))
+
+
+def test_the_garage(sample_data: Path) -> None:
+    recording = open_source(str(sample_data / "fisheye_garage"))
+    assert len(recording.camera_stamps_ns) == 5
+    assert cameras.name_of(recording.rig.camera) == "kannala_brandt"
+    messages = list(recording.messages([2]))
+    assert [type(m) for m in messages] == [LidarFrame, CameraFrame]
+
+
+def test_the_raw_fisheye_with_its_mask(sample_data: Path) -> None:
+    recording = open_source(str(sample_data / "kitti360_fisheye"))
+    assert recording.rig.mask is not None
+    assert 0.3 < recording.rig.mask.mean() < 0.95
+    assert len(list(recording.messages())) == 2

@@ -1,0 +1,343 @@
+"""ROS 2 bags as a source; the bags are written by `mcap` and `rosbags`, not by us."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.stores import ros2_humble as ros
+
+from coec.adapters.mcap_windows import WindowWriter, read_window
+from coec.calibration.pairing import Pairer
+from coec.calibration.values import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.config import CalibrationConfig, PairingConfig, SearchConfig
+from coec.errors import SourceError, UsageError, WindowError
+from coec.geometry import cameras, se3
+from coec.sources import open_source
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+WIDTH, HEIGHT = 64, 48
+FLOAT32 = 7  # sensor_msgs/PointField
+
+R_OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+T_BASE_LIDAR = se3.transform_from(se3.rotation_exp(np.array([0.0, 0.0, 0.3])), np.array([1.0, 0.0, 1.9]))
+T_BASE_MOUNT = se3.transform_from(np.eye(3), np.array([1.5, 0.2, 1.4]))
+T_MOUNT_OPTICAL = se3.transform_from(R_OPTICAL.T, np.array([0.01, 0.02, 0.03]))
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    return ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(stamp_ns, 10**9)), frame_id)
+
+
+def an_image(stamp_ns: int, frame_id: str = "optical") -> Any:
+    data = np.frombuffer(cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), 99, np.uint8))[1].tobytes(), np.uint8)
+    return ros.sensor_msgs__msg__CompressedImage(header(stamp_ns, frame_id), "jpeg", data)
+
+
+def a_raw_image(stamp_ns: int) -> Any:
+    data = np.zeros(HEIGHT * WIDTH, np.uint8)
+    return ros.sensor_msgs__msg__Image(header(stamp_ns, "optical"), HEIGHT, WIDTH, "mono8", 0, WIDTH, data)
+
+
+def a_cloud(stamp_ns: int, value: float = 1.0) -> Any:
+    fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, FLOAT32, 1) for i, name in enumerate("xyz")]
+    data = np.frombuffer(np.full((4, 3), value, "<f4").tobytes(), np.uint8)
+    return ros.sensor_msgs__msg__PointCloud2(header(stamp_ns, "lidar"), 1, 4, fields, False, 12, 48, data, True)
+
+
+def an_odometry(stamp_ns: int, forward_mps: float) -> Any:
+    zero, unit = ros.geometry_msgs__msg__Point(0.0, 0.0, 0.0), ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0)
+    twist = ros.geometry_msgs__msg__Twist(
+        ros.geometry_msgs__msg__Vector3(forward_mps, 0.0, 0.0), ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.1)
+    )
+    return ros.nav_msgs__msg__Odometry(
+        header(stamp_ns, "odom"),
+        "base",
+        ros.geometry_msgs__msg__PoseWithCovariance(ros.geometry_msgs__msg__Pose(zero, unit), np.zeros(36)),
+        ros.geometry_msgs__msg__TwistWithCovariance(twist, np.zeros(36)),
+    )
+
+
+def an_info(model: str, d: list[float], frame_id: str = "optical", width: int = WIDTH) -> Any:
+    return ros.sensor_msgs__msg__CameraInfo(
+        header(0, frame_id),
+        HEIGHT,
+        width,
+        model,
+        np.array(d, np.float64),
+        np.array([50.0, 0, 31.5, 0, 51, 23.5, 0, 0, 1]),
+        np.eye(3).reshape(-1),
+        np.zeros(12),
+        0,
+        0,
+        ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, False),
+    )
+
+
+def a_joint(parent: str, child: str, T: NDArray[np.float64]) -> Any:
+    return ros.geometry_msgs__msg__TransformStamped(
+        header(0, parent),
+        child,
+        ros.geometry_msgs__msg__Transform(
+            ros.geometry_msgs__msg__Vector3(*T[:3, 3].tolist()),
+            ros.geometry_msgs__msg__Quaternion(*se3.quaternion_xyzw_from_rotation(T[:3, :3]).tolist()),
+        ),
+    )
+
+
+TREE = [
+    a_joint("base", "lidar", T_BASE_LIDAR),
+    a_joint("base", "mount", T_BASE_MOUNT),
+    a_joint("mount", "optical", T_MOUNT_OPTICAL),
+]
+
+
+@dataclass
+class Bag:
+    """Messages by topic, written in the order of their list."""
+
+    messages: list[tuple[str, Any]] = field(default_factory=list)
+    compression: CompressionType = CompressionType.NONE
+    chunking: bool = True
+
+    def write(self, path: Path) -> Path:
+        with path.open("wb") as stream:
+            writer = Writer(stream, chunk_size=2000, compression=self.compression, use_chunking=self.chunking)
+            writer.start("ros2")
+            channels: dict[tuple[str, str], int] = {}
+            for time, (topic, message) in enumerate(self.messages):
+                name = message.__msgtype__
+                if (topic, name) not in channels:
+                    definition, _ = STORE.generate_msgdef(name, ros_version=2)
+                    schema = writer.register_schema(name, "ros2msg", definition.encode())
+                    channels[topic, name] = writer.register_channel(topic, "cdr", schema)
+                data = bytes(STORE.serialize_cdr(message, name))
+                writer.add_message(channels[topic, name], time, data, time)
+            writer.finish()  # type: ignore[no-untyped-call]
+        return path
+
+
+def a_drive(*, info: Any = None, tree: list[Any] | None = None, image: Any = an_image) -> list[tuple[str, Any]]:
+    """Camera at 10 Hz, LiDAR at 20 Hz and 4 ms later, odometry at 50 Hz; the recorder got them out of order."""
+    second = 10**9
+    images = [("/front/image", image(second + k * 100_000_000)) for k in range(4)]
+    clouds = [("/points", a_cloud(second + 4_000_000 + k * 50_000_000, float(k + 1))) for k in range(8)]
+    motions = [("/odom", an_odometry(second + k * 20_000_000, float(k))) for k in range(20)]
+    head = [
+        ("/tf_static", ros.tf2_msgs__msg__TFMessage(TREE if tree is None else tree)),
+        ("/front/camera_info", info or an_info("plumb_bob", [0.0] * 5)),
+    ]
+    return [*head, *motions[::-1], *clouds[::-1], *images]
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_bag_is_read_by_sensor_time_with_its_rig_from_the_bag(tmp_path: Path, compression: CompressionType) -> None:
+    path = Bag(a_drive(), compression).write(tmp_path / "drive one.mcap")
+    recording = open_source(str(path))
+    assert recording.rig.pair == "drive_one"
+    assert recording.rig.camera == cameras.build("pinhole", width=WIDTH, height=HEIGHT, fx=50, fy=51, cx=31.5, cy=23.5)
+    assert (recording.rig.camera_frame, recording.rig.lidar_frame) == ("optical", "lidar")
+    T_camera_lidar = se3.inverse(T_BASE_MOUNT @ T_MOUNT_OPTICAL) @ T_BASE_LIDAR
+    np.testing.assert_allclose(recording.rig.T_camera_lidar_nominal, T_camera_lidar, atol=1e-12)
+    np.testing.assert_allclose(recording.rig.T_lidar_ego, se3.inverse(T_BASE_LIDAR), atol=1e-12)
+    assert recording.rig.sweep is None
+    assert recording.configuration is None
+    messages = list(recording.messages())
+    assert [m.stamp_ns for m in messages] == sorted(m.stamp_ns for m in messages)
+    assert recording.camera_stamps_ns == tuple(m.stamp_ns for m in messages if isinstance(m, CameraFrame))
+    assert [m.xyz_m[0, 0] for m in messages if isinstance(m, LidarFrame)] == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert [m.linear_mps[0] for m in messages if isinstance(m, EgoMotion)] == list(range(20))
+    assert {m.frame_id for m in messages if isinstance(m, EgoMotion)} == {"base"}
+
+
+def test_a_bag_without_chunks(tmp_path: Path) -> None:
+    path = Bag(a_drive(), chunking=False).write(tmp_path / "bag.mcap")
+    assert len(list(open_source(str(path)).messages())) == 4 + 8 + 20
+
+
+def test_chosen_frames_form_the_pairs_that_they_form_in_the_whole(tmp_path: Path) -> None:
+    recording = open_source(str(Bag(a_drive()).write(tmp_path / "bag.mcap")))
+
+    def pairs(cameras: list[int] | None) -> list[tuple[int, int, EgoMotion | None]]:
+        pairer = Pairer(PairingConfig(), expects_motion=True)
+        made = [pair for message in recording.messages(cameras) for pair in pairer.push(message)]
+        return [(p.camera.stamp_ns, p.lidar.stamp_ns, p.motion) for p in (*made, *pairer.flush())]
+
+    whole = pairs(None)
+    assert len(whole) == 4
+    assert pairs([1, 3]) == [whole[1], whole[3]]
+    chosen = list(recording.messages([2]))
+    assert sum(isinstance(m, LidarFrame) for m in chosen) == 1
+
+
+def test_several_topics_of_a_type_have_to_be_chosen_from(tmp_path: Path) -> None:
+    path = Bag([*a_drive(), ("/rear/image", an_image(5)), ("/imu/odom", an_odometry(5, 1.0))]).write(
+        tmp_path / "b.mcap"
+    )
+    with pytest.raises(SourceError, match=r"several topics for camera, choose one with \?camera=.*/front/image, /rear"):
+        open_source(str(path))
+    recording = open_source(f"{path}?camera=/rear/image&odometry=/imu/odom")
+    assert recording.camera_stamps_ns == (5,)
+    with pytest.raises(SourceError, match="no topic /left for camera"):
+        open_source(f"{path}?camera=/left")
+    with pytest.raises(UsageError, match="unknown query key topic"):
+        open_source(f"{path}?topic=/left")
+
+
+@pytest.mark.parametrize(
+    ("info", "expected"),
+    [
+        (
+            an_info("plumb_bob", [0.1, 0.2, 0.3, 0.4, 0.5]),
+            ("radtan", {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5}),
+        ),
+        (
+            an_info("plumb_bob", [0.1, 0.2, 0.3, 0.4]),
+            ("radtan", {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.0}),
+        ),
+        (
+            an_info("rational_polynomial", [0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0]),
+            ("radtan", {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5}),
+        ),
+        (
+            an_info("equidistant", [0.1, 0.2, 0.3, 0.4]),
+            ("kannala_brandt", {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}),
+        ),
+        (an_info("fisheye", [0.1, 0.2, 0.3, 0.4]), ("kannala_brandt", {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4})),
+        (an_info("double_sphere", [-0.2, 0.6]), ("double_sphere", {"xi": -0.2, "alpha": 0.6})),
+        (an_info("", []), ("pinhole", {})),
+    ],
+)
+def test_camera_info_becomes_a_camera(tmp_path: Path, info: Any, expected: tuple[str, dict[str, float]]) -> None:
+    path = Bag(a_drive(info=info)).write(tmp_path / "bag.mcap")
+    model, distortion = expected
+    camera = cameras.build(model, width=WIDTH, height=HEIGHT, fx=50, fy=51, cx=31.5, cy=23.5, **distortion)
+    assert open_source(str(path)).rig.camera == camera
+
+
+@pytest.mark.parametrize(
+    ("info", "complaint"),
+    [
+        (an_info("rational_polynomial", [0.1] * 8), "'rational_polynomial' is not known"),
+        (an_info("equidistant", [0.1] * 3), "parameters k1 k2 k3 k4, the camera info only 3"),
+        (an_info("plumb_bob", [], width=63), "images are 64 x 48 px, the intrinsics are for 63 x 48"),
+        (an_info("plumb_bob", [float("nan")] * 5), "k1"),
+    ],
+)
+def test_camera_info_that_cannot_be_used(tmp_path: Path, info: Any, complaint: str) -> None:
+    path = Bag(a_drive(info=info)).write(tmp_path / "bag.mcap")
+    with pytest.raises(SourceError, match=complaint):
+        open_source(str(path))
+
+
+INTRINSICS = """
+camera: {model: pinhole, width: 64, height: 48, fx: 40, fy: 40, cx: 32, cy: 24}
+T_camera_lidar: [[0, -1, 0, 0.1], [0, 0, -1, 0.2], [1, 0, 0, 0.3], [0, 0, 0, 1]]
+mask: mask.png
+"""
+
+
+def test_a_file_gives_what_the_bag_lacks(tmp_path: Path) -> None:
+    messages = [(topic, message) for topic, message in a_drive(tree=[]) if topic != "/front/camera_info"]
+    path = Bag(messages).write(tmp_path / "bag.mcap")
+    with pytest.raises(SourceError, match=r"0 camera infos fit.*there: none"):
+        open_source(str(path))
+    (tmp_path / "rig.yaml").write_text(INTRINSICS)
+    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    rig = open_source(f"{path}?intrinsics={tmp_path / 'rig.yaml'}").rig
+    assert rig.camera.fx == 40
+    assert rig.T_camera_lidar_nominal[:3, 3].tolist() == [0.1, 0.2, 0.3]
+    assert rig.mask is not None
+    assert not rig.mask.any()
+    assert np.array_equal(rig.T_lidar_ego, np.eye(4))
+    (tmp_path / "rig.yaml").write_text("camera: {model: pinhole}")
+    with pytest.raises(SourceError, match=r"camera\.fx"):
+        open_source(f"{path}?intrinsics={tmp_path / 'rig.yaml'}")
+    with pytest.raises(SourceError, match="cannot read"):
+        open_source(f"{path}?intrinsics=/absent.yaml")
+
+
+def test_frames_that_no_transform_connects(tmp_path: Path) -> None:
+    path = Bag(a_drive(tree=TREE[:1])).write(tmp_path / "bag.mcap")
+    with pytest.raises(SourceError, match="/tf_static does not connect 'optical' and 'lidar'"):
+        open_source(str(path))
+    broken = a_joint("base", "lidar", T_BASE_LIDAR)
+    broken.transform.rotation = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 0.0)
+    path = Bag(a_drive(tree=[broken])).write(tmp_path / "bag.mcap")
+    with pytest.raises(SourceError, match="a transform on /tf_static is not one"):
+        open_source(str(path))
+
+
+def test_the_camera_info_of_the_cameras_frame_is_taken(tmp_path: Path) -> None:
+    other = ("/rear/camera_info", an_info("equidistant", [0.1] * 4, frame_id="rear"))
+    path = Bag([other, *a_drive()]).write(tmp_path / "bag.mcap")
+    assert cameras.name_of(open_source(str(path)).rig.camera) == "pinhole"
+    named = open_source(f"{path}?intrinsics=/rear/camera_info")
+    assert cameras.name_of(named.rig.camera) == "kannala_brandt"
+
+
+def test_raw_images(tmp_path: Path) -> None:
+    recording = open_source(str(Bag(a_drive(image=a_raw_image)).write(tmp_path / "bag.mcap")))
+    image = next(m for m in recording.messages([0]) if isinstance(m, CameraFrame))
+    assert (image.image.width, image.image.height, len(image.image.data)) == (WIDTH, HEIGHT, WIDTH * HEIGHT)
+
+
+def test_bags_that_lack_a_stream_or_are_damaged(tmp_path: Path) -> None:
+    path = Bag([m for m in a_drive() if m[0] != "/points"]).write(tmp_path / "bag.mcap")
+    with pytest.raises(SourceError, match="no message of type sensor_msgs/msg/PointCloud2"):
+        open_source(str(path))
+    whole = Bag(a_drive()).write(path).read_bytes()
+    rng = np.random.default_rng(0)
+    for size in rng.integers(0, len(whole), 20).tolist():
+        path.write_bytes(whole[:size])
+        with pytest.raises((SourceError, WindowError), match=r"damaged: byte \d+: .*`mcap recover`"):
+            open_source(str(path))
+    flipped = bytearray(whole)
+    flipped[len(whole) // 3] ^= 1
+    path.write_bytes(flipped)
+    with pytest.raises(SourceError, match="CRC"):
+        open_source(str(path))
+
+
+def test_a_message_that_is_not_what_its_channel_says(tmp_path: Path) -> None:
+    image = an_image(10**9)
+    image.data = image.data[:-30]
+    path = Bag([*a_drive(), ("/cut/image", image)]).write(tmp_path / "bag.mcap")
+    with pytest.raises(SourceError, match=r"CompressedImage of 1000000000 ns: .*cut off"):
+        open_source(f"{path}?camera=/cut/image")
+
+
+# --- recorded windows -----------------------------------------------------------------------------------------
+
+
+def test_a_recorded_window_is_a_recording_of_its_pairs(tmp_path: Path) -> None:
+    bag = open_source(str(Bag(a_drive()).write(tmp_path / "bag.mcap")))
+    pairer = Pairer(PairingConfig(), expects_motion=True)
+    pairs = [pair for message in bag.messages() for pair in pairer.push(message)] + pairer.flush()
+    configuration = CalibrationConfig(search=SearchConfig(dof=6))
+    start = se3.perturb(bag.rig.T_camera_lidar_nominal, np.full(6, 0.01))
+    path = tmp_path / "front-1.mcap"
+    writer = WindowWriter(path, bag.rig, start, "front-1", configuration, {})
+    for pair in pairs:
+        writer.add(pair)
+    writer.finish()
+
+    recording = open_source(str(path))
+
+    assert recording.name == "front-1"
+    assert recording.configuration == configuration
+    assert np.array_equal(recording.T_camera_lidar_start, start)
+    assert recording.camera_stamps_ns == bag.camera_stamps_ns
+    again = Pairer(PairingConfig(), expects_motion=True)
+    replayed = [pair for message in recording.messages() for pair in again.push(message)] + again.flush()
+    window, _ = read_window(path)
+    assert [stamps(p) for p in replayed] == [stamps(p) for p in window.pairs] == [stamps(p) for p in pairs]
+
+
+def stamps(pair: FramePair) -> tuple[int, int, EgoMotion | None]:
+    return pair.camera.stamp_ns, pair.lidar.stamp_ns, pair.motion
