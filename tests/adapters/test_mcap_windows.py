@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import lz4.frame  # type: ignore[import-untyped]  # it has no stubs
+import lz4.frame
 import numpy as np
 import pytest
 import zstandard

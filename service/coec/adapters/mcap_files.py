@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame  # type: ignore[import-untyped]  # it has no stubs
+import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
 

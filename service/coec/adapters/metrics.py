@@ -1,0 +1,92 @@
+"""The state of the daemon as OpenMetrics text: base units, `_total` for counters, one help line each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from coec.calibration.lifecycle import HealthState
+from coec.schemas.replies import PairStatus, StatusReply
+
+ENCODING = "application/openmetrics-text"
+
+Labels = Mapping[str, str]
+Sample = tuple[Labels, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Family:
+    name: str
+    kind: Literal["counter", "gauge", "info", "stateset"]
+    help: str
+    samples: tuple[Sample, ...]
+
+    def lines(self) -> Iterable[str]:
+        suffix = {"counter": "_total", "info": "_info"}.get(self.kind, "")
+        yield f"# TYPE {self.name} {self.kind}"
+        yield f"# HELP {self.name} {self.help}"
+        for labels, value in self.samples:
+            text = ",".join(f'{name}="{_escaped(label)}"' for name, label in labels.items())
+            yield f"{self.name}{suffix}{{{text}}} {value:.17g}" if text else f"{self.name}{suffix} {value:.17g}"
+
+
+def render(status: StatusReply, health: Mapping[str, HealthState], worker_rss_bytes: int) -> bytes:
+    """OpenMetrics text, UTF-8. `health` maps each pair to its state; the worker's memory is in bytes."""
+    pairs = status.pairs
+    families = (
+        _Family("coec_build", "info", "Version of the service.", (({"version": status.version}, 1.0),)),
+        _Family("coec_uptime_seconds", "gauge", "Time since the start.", (({}, status.uptime_s),)),
+        _Family(
+            "coec_health",
+            "stateset",
+            "State of each pair.",
+            tuple(
+                ({"pair": pair, "coec_health": state.value}, float(state is current))
+                for pair, current in health.items()
+                for state in HealthState
+            ),
+        ),
+        _Family("coec_samples_received", "counter", "Samples that came.", tuple(_streams(pairs, "received"))),
+        _Family("coec_frames_accepted", "counter", "Frames made of samples.", tuple(_streams(pairs, "accepted"))),
+        _Family("coec_losses", "counter", "What was lost, by cause.", tuple(_losses(status))),
+        _Family("coec_pairs", "counter", "Camera-LiDAR pairs formed.", _per_pair(pairs, "pairs")),
+        _Family("coec_window_pairs", "gauge", "Pairs in the open window.", _per_pair(pairs, "selected")),
+        _Family("coec_windows_recorded", "counter", "Windows recorded.", _per_pair(pairs, "windows")),
+        _Family("coec_windows_evaluated", "counter", "Windows evaluated.", _per_pair(pairs, "solved")),
+        _Family("coec_worker_restarts", "counter", "Workers replaced.", (({}, status.worker.restarts),)),
+        _Family("coec_worker_memory_bytes", "gauge", "Resident memory.", (({}, float(worker_rss_bytes)),)),
+        _Family("coec_storage_used_bytes", "gauge", "Bytes of all windows.", (({}, status.storage.bytes_used),)),
+        _Family("coec_storage_free_bytes", "gauge", "Bytes free on the disk.", (({}, status.storage.bytes_free),)),
+    )
+    lines = [line for family in families for line in family.lines()]
+    return "\n".join([*lines, "# EOF", ""]).encode()
+
+
+def _per_pair(pairs: Iterable[PairStatus], name: str) -> tuple[Sample, ...]:
+    return tuple(({"pair": pair.name}, float(getattr(pair, name))) for pair in pairs)
+
+
+def _streams(pairs: Iterable[PairStatus], name: str) -> Iterable[Sample]:
+    for pair in pairs:
+        for stream, counts in (("camera", pair.camera), ("lidar", pair.lidar), ("ego", pair.ego)):
+            if counts is not None:
+                yield {"pair": pair.name, "stream": stream}, float(getattr(counts, name))
+
+
+def _losses(status: StatusReply) -> Iterable[Sample]:
+    for pair in status.pairs:
+        places = {
+            "camera": pair.camera.losses,
+            "lidar": pair.lidar.losses,
+            "ego": pair.ego.losses if pair.ego else {},
+            "pairs": pair.rejections,
+            "window": pair.losses,
+        }
+        for place, causes in places.items():
+            for cause, count in causes.items():
+                yield {"pair": pair.name, "place": place, "cause": cause}, float(count)
+
+
+def _escaped(label: str) -> str:
+    return label.replace("\\", r"\\").replace("\n", r"\n").replace('"', r"\"")

@@ -1,0 +1,41 @@
+"""The readiness protocol of systemd (sd_notify), without a library: one datagram to the socket in NOTIFY_SOCKET."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Mapping
+
+
+class Notifier:
+    """Tells the service manager how the process is; does nothing where there is none."""
+
+    def __init__(self, address: str | None) -> None:
+        """`address` is the value of NOTIFY_SOCKET: a path, `@name` in the abstract namespace, or None."""
+        self._address = "\0" + address[1:] if address and address.startswith("@") else address
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Notifier:
+        """The notifier of the manager that started this process."""
+        return cls(environment.get("NOTIFY_SOCKET"))
+
+    def ready(self) -> None:
+        """The service answers and can calibrate."""
+        self._send("READY=1")
+
+    def watchdog(self) -> None:
+        """Every thread has made progress since the last call."""
+        self._send("WATCHDOG=1")
+
+    def stopping(self) -> None:
+        """The shutdown has begun."""
+        self._send("STOPPING=1")
+
+    def _send(self, message: str) -> None:
+        if not self._address:
+            return
+        # A manager that went away is no reason to stop calibrating.
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+            sock.connect(self._address)
+            sock.send(message.encode())

@@ -1,0 +1,64 @@
+"""What time it is for the sensors while none of them speaks: a slice must end even when the streams have stopped."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+
+NS_PER_S = 1_000_000_000
+
+OBSERVATIONS = 32
+"""Pairs from which the ratio of sensor time to wall time is taken: three seconds at 10 Hz."""
+
+MIN_SILENCE_S = 2.0
+"""Wall time without a pair before time is extrapolated at all."""
+
+SILENT_GAPS = 3.0
+"""The silence must also be so many times the longest recent pause: a slow replay is not a silent one."""
+
+MAX_RATIO = 1000.0
+
+
+class SensorClock:
+    """Extrapolates sensor time from the monotonic clock at the observed ratio of the two.
+
+    A replay at rate r shows r seconds of sensor time per second; so its slices end by the same sensor time as the
+    drive's did. The estimate only ever ends slices: while pairs come, their own stamps decide.
+    """
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[int, float]] = deque(maxlen=OBSERVATIONS)
+
+    def observe(self, stamp_ns: int, monotonic_s: float) -> None:
+        """A pair with this stamp was formed now. A stamp that steps back starts anew."""
+        if self._seen and stamp_ns <= self._seen[-1][0]:
+            self._seen.clear()
+        self._seen.append((stamp_ns, monotonic_s))
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Pairs per second of sensor time over the recent ones; None before the second."""
+        if len(self._seen) < 2:
+            return None
+        return (len(self._seen) - 1) * NS_PER_S / (self._seen[-1][0] - self._seen[0][0])
+
+    def is_silent(self, monotonic_s: float) -> bool:
+        """Whether no pair came for much longer than the recent ones were apart."""
+        if not self._seen:
+            return True
+        times_s = [seen_s for _, seen_s in self._seen]
+        longest_s = max((b - a for a, b in pairwise(times_s)), default=0.0)
+        return monotonic_s - times_s[-1] >= max(MIN_SILENCE_S, SILENT_GAPS * longest_s)
+
+    def silent_now_ns(self, monotonic_s: float) -> int | None:
+        """Extrapolated sensor time if the streams are silent, else None: then stamps tell the time."""
+        if not self._seen or not self.is_silent(monotonic_s):
+            return None
+        stamp_ns, seen_s = self._seen[-1]
+        return stamp_ns + round(self._ratio() * (monotonic_s - seen_s) * NS_PER_S)
+
+    def _ratio(self) -> float:
+        (first_ns, first_s), (last_ns, last_s) = self._seen[0], self._seen[-1]
+        if last_s <= first_s:
+            return 1.0
+        return min((last_ns - first_ns) / NS_PER_S / (last_s - first_s), MAX_RATIO)

@@ -1,0 +1,116 @@
+"""What a vehicle remembers over a restart: `state.json` with a checksum, and the previous good copy beside it.
+
+The file is the canonical JSON (sorted keys, no spaces) of `{"body": …, "checksum": sha256 of the canonical body,
+"schema_version": 1}`. A file that is not byte for byte what this module would write for its own body is damaged: no
+flipped bit can be read as a calibration. A write is a new file, flushed, renamed over the old one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from coec.errors import StateError
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedState:
+    """What was found. `body` is None when there was no good copy; `damage` holds one sentence per bad copy."""
+
+    body: dict[str, Any] | None
+    damage: tuple[str, ...]
+
+
+class StateFile:
+    """One state file. Not safe for use from several threads at once."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._previous = path.with_name(path.name + ".previous")
+        self._current_is_good = False
+
+    def load(self) -> LoadedState:
+        """The body of the current copy, else of the previous one, else None. Never raises for a bad file."""
+        damage = []
+        for path in (self._path, self._previous):
+            try:
+                body = _decode(path.read_bytes())
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                damage.append(f"{path.name}: {error.strerror}")
+            except StateError as error:
+                damage.append(f"{path.name}: {error}")
+            else:
+                self._current_is_good = path == self._path
+                return LoadedState(body, tuple(damage))
+        return LoadedState(None, tuple(damage))
+
+    def save(self, body: dict[str, Any]) -> None:
+        """Replace the file; the copy it replaces, if good, becomes the previous one. On the disk when this returns.
+
+        Raises:
+            StateError: the disk is full or the folder not writable; the copies on the disk are as they were.
+        """
+        fresh = self._path.with_name(self._path.name + ".new")
+        link = self._path.with_name(self._path.name + ".link")
+        try:
+            with fresh.open("wb") as stream:
+                stream.write(_encode(body))
+                stream.flush()
+                os.fsync(stream.fileno())
+            if self._current_is_good:
+                link.unlink(missing_ok=True)
+                link.hardlink_to(self._path)
+                link.replace(self._previous)
+            fresh.replace(self._path)
+            _sync_folder(self._path.parent)
+        except OSError as error:
+            for leftover in (fresh, link):
+                with contextlib.suppress(OSError):
+                    leftover.unlink(missing_ok=True)
+            raise StateError(f"cannot write {self._path}: {error.strerror}; it needs space and permission") from error
+        self._current_is_good = True
+
+
+def _canonical(value: Any) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _encode(body: dict[str, Any]) -> bytes:
+    checksum = hashlib.sha256(_canonical(body)).hexdigest()
+    return _canonical({"body": body, "checksum": checksum, "schema_version": SCHEMA_VERSION})
+
+
+def _decode(data: bytes) -> dict[str, Any]:
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise StateError("is not JSON") from error
+    body = document.get("body") if isinstance(document, dict) else None
+    if not isinstance(body, dict):
+        raise StateError("has no body")
+    if document.get("schema_version") != SCHEMA_VERSION:
+        raise StateError(f"is not of schema version {SCHEMA_VERSION}")
+    try:
+        expected = _encode(body)
+    except (ValueError, UnicodeEncodeError) as error:
+        raise StateError("holds values that were never written") from error
+    if expected != data:
+        raise StateError("does not match its checksum")
+    return body
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,83 @@
+"""The worker process: infers depth and solves windows, one job at a time, for the service that started it.
+
+Started as `python -m coec.adapters.worker_main SOCKET PARENT`; see `worker_link` for the wire. It dies with its parent,
+leaves signals meant for the service alone, and answers every job: a window that cannot be solved is an answer, too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coec.adapters import logs
+from coec.adapters.worker_link import Link
+from coec.config import Config
+from coec.errors import CoecError
+from coec.schemas.base import to_msgpack
+
+if TYPE_CHECKING:
+    from coec.adapters.solver import Solver
+
+PR_SET_PDEATHSIG = 1  # prctl(2)
+
+DEPTH_MAPS_KEPT = 64
+"""Maps kept per network: two windows of 25 and some; a map at network resolution is about 1 MB."""
+
+
+def main(arguments: list[str]) -> int:
+    """Serve until the service goes away; the exit status is 0 then."""
+    descriptor, parent = (int(argument) for argument in arguments)
+    _tie_to(parent)
+    link = Link(descriptor)
+    with contextlib.suppress(EOFError, OSError):
+        config = Config.model_validate_json(link.receive()["settings"])
+        logs.configure(config.log_level)
+        os.nice(config.worker.niceness)
+        _serve(link, config)
+    return 0
+
+
+def _serve(link: Link, config: Config) -> None:
+    # Imported here: numba and onnxruntime take seconds, and the ties to the parent come first.
+    from coec.adapters.solver import Solver
+
+    try:
+        solver = Solver(config, DEPTH_MAPS_KEPT)
+        solver.warm_up()
+    except CoecError as error:
+        link.send({"kind": "unusable", "code": error.reply_code, "text": str(error)})
+        return
+    link.send({"kind": "ready"})
+    while True:
+        link.send(_answer(solver, link.receive()))
+
+
+def _answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
+    """The answer to one job. What is not a `CoecError` ends the process: the service replaces it and tries again."""
+    try:
+        if message["kind"] == "prefetch":
+            solver.prefetch(message["pair"], message["frame"])
+            return {"kind": "done"}
+        solution = solver.solve(Path(message["path"]))
+    except CoecError as error:
+        return {"kind": "refused", "code": error.reply_code, "text": str(error)}
+    note = solution.note
+    return {"kind": "solved", "result": to_msgpack(solution.result), "note": (note.code, note.text) if note else None}
+
+
+def _tie_to(parent: int) -> None:
+    """Die with the parent thread that started this process; leave the signals of a terminal or a manager to it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # it died before the tie was made
+        sys.exit(0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

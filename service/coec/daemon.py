@@ -1,0 +1,309 @@
+"""The daemon: builds the objects, starts the threads, looks after them, orders the end. Nothing else.
+
+Any thread that dies takes the process down, after `health` has said why: no silent half-life.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+from coec import __version__
+from coec.adapters import logs, metrics
+from coec.adapters.answers import VehicleAnswers
+from coec.adapters.intake import CAMERA, EGO, LIDAR
+from coec.adapters.notify import Notifier
+from coec.adapters.pair_service import Outside, PairService
+from coec.adapters.snapshots import Snapshot, reasons_of, worker_status_of
+from coec.adapters.state_store import StateStore
+from coec.adapters.threads import ServiceThread
+from coec.adapters.window_folder import WindowFolder
+from coec.adapters.worker import Solved, SolveJob, Worker, WorkerState
+from coec.adapters.zenoh_bus import Answer, Bus, open_session
+from coec.calibration.values import Reason
+from coec.config import Config, config_hash
+from coec.errors import CoecError, ConfigError
+from coec.schemas import replies
+from coec.schemas.keys import Keys
+
+_log = logging.getLogger(__name__)
+
+EXIT_THREAD_DIED = 70
+"""EX_SOFTWARE of sysexits.h."""
+
+SWITCH_INTERVAL_S = 0.0005
+"""How long a thread may keep the interpreter while a query waits for it; Python's own 5 ms would be half the budget."""
+
+TICK_S = 1.0
+STALLED_S = 20.0
+"""A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed."""
+
+# Together with the worker, which is killed, these bound the end of the service below 15 s.
+INGEST_STOP_S, RECORDER_STOP_S, WORKER_STOP_S, QUERIES_STOP_S, SESSION_STOP_S = 2.0, 5.0, 2.0, 1.0, 3.0
+
+
+def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit status. `reread` reads the configuration again on SIGHUP."""
+    logs.configure(config.log_level)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    try:
+        with _signals() as signals, _state_folder(config.state.directory):
+            return Daemon(config, Notifier.from_environment()).serve(signals, reread)
+    except CoecError as error:
+        _log.error(str(error), extra={"fields": {"code": error.reply_code}})
+        return error.exit_code
+
+
+class Signals:
+    """What the process was asked from outside."""
+
+    def __init__(self) -> None:
+        self.stop = threading.Event()
+        self.reread = threading.Event()
+
+    def receive(self, number: int, _frame: FrameType | None) -> None:
+        """A signal handler."""
+        (self.reread if number == signal.SIGHUP else self.stop).set()
+
+
+class Daemon:
+    """The composition of the service."""
+
+    def __init__(self, config: Config, notifier: Notifier) -> None:
+        """Build everything; nothing runs yet, but the Zenoh session is open.
+
+        Raises:
+            ConfigError: a rig, an endpoint or a port cannot be used.
+            RecordingError: the state directory cannot be used.
+        """
+        self._config = config
+        self._notifier = notifier
+        self._started_s, self._started_ns = time.monotonic(), time.time_ns()
+        self._state: Literal["starting", "running", "stopping", "failing"] = "starting"
+        self._fault: Reason | None = None
+        self._keys = Keys(config.prefix, config.vehicle)
+        self._folder = WindowFolder(config.state.directory / "windows", config.state)
+        self._worker = Worker(config.worker, config.model_dump_json(), self._on_solved, self._on_failed)
+        store = StateStore(config.state.directory, config.vehicle)
+        outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
+        self._pairs = {pair.name: PairService(pair, config, outside) for pair in config.pairs}
+        self._bus = Bus(open_session(config.zenoh, config.limits))
+        self._status_reply = self._look()
+        self._status = Snapshot.of(self._status_reply)
+
+    def serve(self, signals: Signals, reread: Callable[[], Config] | None) -> int:
+        """Run until a signal or a fault; returns the exit status."""
+        status = 0
+        try:
+            self._start()
+            while status == 0 and not signals.stop.wait(TICK_S):
+                status = self._tick()
+                if signals.reread.is_set():
+                    signals.reread.clear()
+                    self._compare(reread)
+        except Exception:
+            _log.exception("the main loop failed")
+            status = EXIT_THREAD_DIED
+        finally:
+            if not self._stop():
+                logging.shutdown()
+                os._exit(status)  # a thread of Zenoh is stuck, and would keep the process for good
+        return status
+
+    # --- start, tick, stop ------------------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        for pair in self._pairs.values():
+            pair.refresh()
+        for thread in (self._bus.thread, *(pair.recorder.thread for pair in self._pairs.values())):
+            thread.start()
+        self._worker.start()
+        config = Snapshot.of_document(
+            {
+                "schema_version": 1,
+                "config_hash": self._status_reply.config_hash,
+                "config": self._config.model_dump(mode="json"),
+            }
+        )
+        VehicleAnswers(self._keys, self._pairs, lambda: self._status, self._metrics, config).declare(self._bus)
+        for pair_config in self._config.pairs:
+            pair = self._pairs[pair_config.name]
+            pair.ingest.start()
+            streams = {CAMERA: pair_config.camera, LIDAR: pair_config.lidar, EGO: pair_config.ego}
+            for stream, stream_config in streams.items():
+                if stream_config is not None:
+                    self._bus.subscribe(stream_config.key, partial(pair.take_sample, stream))
+            self._bus.declare_alive(self._keys.alive(pair.name))
+        fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
+        _log.info("serving", extra={"fields": {**fields, "pairs": list(self._pairs)}})
+
+    def _tick(self) -> int:
+        """Once a second: look at every thread, renew what is served. Returns an exit status, 0 to go on."""
+        threads = self._threads()
+        dead = [thread for thread in threads if thread.dead]
+        if dead:
+            self._fault = Reason("thread_died", f"The thread {dead[0].name} died: {dead[0].failure!r}.")
+        elif self._worker.unusable is not None:
+            self._fault = self._worker.unusable
+        elif self._state == "starting" and self._worker.status().state is not WorkerState.STARTING:
+            self._state = "running"
+            self._notifier.ready()
+            _log.info("ready: the worker is warm")
+        if self._fault is not None:
+            self._state = "failing"
+            _log.error(self._fault.text, extra={"fields": {"code": self._fault.code}})
+        self._renew()
+        if self._fault is not None:
+            return EXIT_THREAD_DIED if dead else CoecError.exit_code
+        if all(thread.silence_s < STALLED_S for thread in threads):
+            self._notifier.watchdog()
+        return 0
+
+    def _stop(self) -> bool:
+        """The orderly end; False when the session did not close in time."""
+        self._notifier.stopping()
+        _log.info("stopping")
+        if self._state != "failing":
+            self._state = "stopping"
+        self._renew()
+        self._bus.undeclare_inputs()
+        self._worker.request_stop()
+        pairs = self._pairs.values()
+        for pair in pairs:
+            pair.request_stop()
+        ingested = [pair for pair in pairs if _joined([pair.ingest], INGEST_STOP_S)]
+        for pair in pairs:
+            if pair in ingested:
+                pair.finish_window()
+            pair.recorder.request_stop()
+        _joined([pair.recorder.thread for pair in pairs], RECORDER_STOP_S)
+        for pair in pairs:
+            pair.save()
+        self._bus.thread.request_stop()
+        _joined([self._bus.thread], QUERIES_STOP_S)
+        self._bus.undeclare_queryables()
+        closed = self._bus.close(SESSION_STOP_S)
+        _joined([self._worker.thread], WORKER_STOP_S)
+        _log.info("stopped", extra={"fields": {"session_closed": closed}})
+        return closed
+
+    def _compare(self, reread: Callable[[], Config] | None) -> None:
+        """SIGHUP: validate the configuration, say what differs; it takes effect with the next start."""
+        if reread is None:
+            _log.warning("no configuration file to read again")
+            return
+        try:
+            fresh = reread()
+        except CoecError as error:
+            _log.error(f"the configuration on the disk is refused, the old one stays: {error}")
+            return
+        old, new = self._config.model_dump(), fresh.model_dump()
+        changed = [name for name in new if new[name] != old[name]]
+        text = f"changed: {', '.join(changed)}; restart to apply" if changed else "nothing has changed"
+        _log.info(f"the configuration on the disk is valid; {text}")
+
+    # --- what the parts ask of the whole ----------------------------------------------------------------------------
+
+    def _on_solved(self, solved: Solved) -> None:
+        self._pairs[solved.job.pair].on_solved(solved)
+
+    def _on_failed(self, job: SolveJob, reason: Reason) -> None:
+        self._pairs[job.pair].on_failed(job, reason)
+
+    def _publish(self, key: str, answer: Answer) -> None:
+        self._bus.publish(key, answer)
+
+    def _troubles(self) -> tuple[Reason, ...]:
+        """What ails every pair alike."""
+        worker = self._worker.status()
+        failing = worker.failure if worker.state is WorkerState.STARTING else None
+        return tuple(reason for reason in (self._fault, failing) if reason is not None)
+
+    # --- status -----------------------------------------------------------------------------------------------------
+
+    def _threads(self) -> list[ServiceThread]:
+        pairs = self._pairs.values()
+        own = [thread for pair in pairs for thread in (pair.ingest, pair.recorder.thread)]
+        return [self._bus.thread, self._worker.thread, *own]
+
+    def _renew(self) -> None:
+        for pair in self._pairs.values():
+            pair.refresh()
+        self._status_reply = self._look()
+        self._status = Snapshot.of(self._status_reply)
+
+    def _look(self) -> replies.StatusReply:
+        usage = self._folder.usage()
+        return replies.StatusReply(
+            version=__version__,
+            vehicle=self._config.vehicle,
+            state=self._state,
+            reasons=reasons_of(self._troubles()),
+            started_ns=self._started_ns,
+            uptime_s=time.monotonic() - self._started_s,
+            config_hash=config_hash(self._config),
+            pairs=tuple(pair.status() for pair in self._pairs.values()),
+            worker=worker_status_of(self._worker),
+            storage=replies.StorageStatus(
+                bytes_used=usage.used,
+                bytes_free=usage.free,
+                losses={"windows_removed": self._folder.removed} if self._folder.removed else {},
+            ),
+        )
+
+    def _metrics(self) -> bytes:
+        health = {name: pair.health_state for name, pair in self._pairs.items()}
+        return metrics.render(self._status_reply, health, self._worker.status().rss_bytes)
+
+
+def _joined(threads: Sequence[ServiceThread], timeout_s: float) -> bool:
+    """Wait for threads that were asked to stop; False, and a line in the log, when one does not within the time."""
+    deadline_s = time.monotonic() + timeout_s
+    late = [thread.name for thread in threads if not thread.join(max(deadline_s - time.monotonic(), 0.0))]
+    if late:
+        _log.error("threads did not stop in time", extra={"fields": {"threads": late}})
+    return not late
+
+
+@contextmanager
+def _signals() -> Iterator[Signals]:
+    """Signals of the process while the daemon serves."""
+    signals = Signals()
+    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    before = {number: signal.signal(number, signals.receive) for number in numbers}
+    try:
+        yield signals
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _state_folder(folder: Path) -> Iterator[None]:
+    """The state directory, made if need be, and nobody else's while the daemon serves.
+
+    Raises:
+        ConfigError: it cannot be made or written, or another daemon uses it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / "lock").open("w")
+    except OSError as error:
+        raise ConfigError(f"state.directory {folder} cannot be used: {error.strerror}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ConfigError(f"state.directory {folder} is in use by another daemon") from error
+        yield
