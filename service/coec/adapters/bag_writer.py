@@ -47,7 +47,7 @@ def write_bag(
             for topic, type_name, data in _messages(rig, frame):
                 topics.write(topic, type_name, frame.stamp_ns, data)
             heard(frame)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves the result open
 
 
 class _Topics:

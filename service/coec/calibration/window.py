@@ -19,6 +19,10 @@ from coec.geometry.projection import in_image, project
 
 NS_PER_S = 1_000_000_000
 
+LOOKS_PER_BIN = 16
+"""Pairs of a bin that are looked at before it stays empty: a look decodes an image, and a camera that is dirty, dark or
+standing for an hour must not cost a decode of every frame."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairSelected:
@@ -43,7 +47,7 @@ class _Slice:
     window_id: str
     start_ns: int
     filled: set[int]
-    last_selected_ns: int | None = None
+    next_look_ns: int
 
 
 class WindowCutter:
@@ -78,7 +82,7 @@ class WindowCutter:
         events: list[PairSelected | SliceEnded] = [*self._end_before(pair.stamp_ns)]
         if self._open is None:
             window_id = f"{self._rig.pair}-{pair.stamp_ns}"
-            self._open = _Slice(window_id, pair.stamp_ns, set())
+            self._open = _Slice(window_id, pair.stamp_ns, set(), pair.stamp_ns)
         if self._select(self._open, pair, T_camera_lidar):
             events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
         return events
@@ -103,15 +107,15 @@ class WindowCutter:
     def _select(self, current: _Slice, pair: FramePair, T_camera_lidar: Matrix4) -> bool:
         bin_ns = self._slice_ns // self._config.pairs
         index = min((pair.stamp_ns - current.start_ns) // bin_ns, self._config.pairs - 1)
-        too_close = current.last_selected_ns is not None and 2 * (pair.stamp_ns - current.last_selected_ns) < bin_ns
-        if index in current.filled or too_close:
+        if index in current.filled or pair.stamp_ns < current.next_look_ns:
             return False
         reason = self._objection(pair, T_camera_lidar)
         if reason is not None:
             self.rejections[reason] += 1
+            current.next_look_ns = pair.stamp_ns + bin_ns // LOOKS_PER_BIN
             return False
         current.filled.add(index)
-        current.last_selected_ns = pair.stamp_ns
+        current.next_look_ns = pair.stamp_ns + bin_ns // 2
         return True
 
     def _objection(self, pair: FramePair, T_camera_lidar: Matrix4) -> str | None:

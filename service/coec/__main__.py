@@ -1,0 +1,8 @@
+"""`python -m coec`."""
+
+import sys
+
+from coec.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

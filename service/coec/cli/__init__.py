@@ -1,0 +1,368 @@
+"""The command line: what every command takes. What it does is in the module of its name, imported when it is called.
+
+Exit codes (CONTRACT, "Command line"): 0 success, 1 the work failed or the verdict is negative, 2 usage, 70 a fault of
+coec itself, 78 bad configuration. With `--json`, standard output holds one JSON document and nothing else.
+"""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coec.errors import CoecError
+
+EXIT_USAGE = 2
+EXIT_FAULT = 70
+"""EX_SOFTWARE of sysexits.h."""
+EXIT_BROKEN_PIPE = 141
+"""As a shell reports a process that SIGPIPE ended."""
+
+SOURCE_HELP = (
+    "a recorded window or ROS 2 bag (.mcap), kitti360:ROOT?camera=image_00, kitti-raw:ROOT?..., a folder or "
+    "dataset.yaml, synthetic:?seed=0"
+)
+
+app = typer.Typer(
+    name="coec",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Continuous online extrinsic calibration of a camera and a LiDAR.",
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, nothing else.")]
+Source = Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP, show_default=False)]
+ConfigFile = Annotated[
+    Path, typer.Option("--config", help="Configuration of the daemon (YAML).", metavar="FILE", show_default=False)
+]
+Connect = Annotated[str, typer.Option(help="Zenoh endpoint of the router.", metavar="ENDPOINT")]
+
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
+
+
+class Encoding(StrEnum):
+    """Encodings of frames."""
+
+    MSGPACK = "msgpack"
+    CDR = "cdr"
+
+
+class DegreesOfFreedom(StrEnum):
+    """Of the search."""
+
+    ROTATION = "3"
+    ALL = "6"
+
+
+@app.command("calibrate")
+def _calibrate(
+    source: Source,
+    depth: Annotated[
+        str | None,
+        typer.Option(
+            help="An ONNX file, a built-in name (`coec models`), or `stereo`: the maps of the source. A recorded "
+            "window names its own.",
+            metavar="MODEL",
+        ),
+    ] = None,
+    objective: Annotated[str | None, typer.Option(help="What is maximised: mi.", metavar="NAME")] = None,
+    dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None,
+    perturb: Annotated[
+        str | None,
+        typer.Option(
+            help="Move the start: degrees and metres about and along the camera axes.", metavar="RX,RY,RZ[,TX,TY,TZ]"
+        ),
+    ] = None,
+    camera_model: Annotated[
+        str | None,
+        typer.Option(help="Fit this model to the camera, and use it instead: double_sphere.", metavar="NAME"),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Use at most so many camera frames, evenly chosen.", min=1, show_default="25")
+    ] = None,
+    no_motion_compensation: Annotated[
+        bool, typer.Option("--no-motion-compensation", help="Take the clouds as they were recorded.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option(help="Write overlay_before.png, overlay_after.png and result.json.", metavar="DIR")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Calibrate from a recording: exit 0 if the result is accepted, 1 if the self-diagnosis refuses it."""
+    from coec.cli import calibrate as command
+
+    options = command.Options(
+        source=source,
+        depth=depth,
+        objective=objective,
+        dof=None if dof is None else int(dof.value),
+        perturb=perturb,
+        camera_model=camera_model,
+        frames=frames,
+        no_motion_compensation=no_motion_compensation,
+        output=output,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("evaluate")
+def _evaluate(
+    source: Source,
+    rotation_deg: Annotated[
+        float, typer.Option(help="Radius of the sphere of starts, degrees.", metavar="R", min=0, show_default=False)
+    ],
+    directions: Annotated[int, typer.Option(help="Number of starts.", metavar="N", min=1)] = 200,
+    translation_m: Annotated[
+        float, typer.Option(help="Radius of the sphere of starts, metres.", metavar="T", min=0)
+    ] = 0.0,
+    depth: Annotated[
+        str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
+    ] = None,
+    objective: Annotated[str | None, typer.Option(help="What is maximised: mi.", metavar="NAME")] = None,
+    dof: Annotated[
+        DegreesOfFreedom | None,
+        typer.Option(help="Rotation only, or translation too; 6 if --translation-m is given.", show_default=False),
+    ] = None,
+    camera_model: Annotated[
+        str | None,
+        typer.Option(help="Fit this model to the camera, and use it instead: double_sphere.", metavar="NAME"),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Use at most so many camera frames, evenly chosen.", min=1, show_default="25")
+    ] = None,
+    no_motion_compensation: Annotated[
+        bool, typer.Option("--no-motion-compensation", help="Take the clouds as they were recorded.")
+    ] = False,
+    against_frames: Annotated[
+        bool, typer.Option("--against-frames", help="Also solve windows of 1, 2, 3, 5, ... frames: frames.png.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option(help="Write plots, overlays, starts.csv and report.json.", metavar="DIR")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Solve from starts all around the source's calibration: hit rate, bias, spread, and how good the verdicts are."""
+    from coec.cli import evaluate as command
+
+    options = command.Options(
+        source=source,
+        rotation_deg=rotation_deg,
+        directions=directions,
+        translation_m=translation_m,
+        depth=depth,
+        objective=objective,
+        dof=None if dof is None else int(dof.value),
+        camera_model=camera_model,
+        frames=frames,
+        no_motion_compensation=no_motion_compensation,
+        against_frames=against_frames,
+        output=output,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("run")
+def _run(
+    config: ConfigFile,
+    embedded_router: Annotated[
+        bool, typer.Option("--embedded-router", help="Be the Zenoh router too, listening on `zenoh.listen`.")
+    ] = False,
+    state_dir: Annotated[Path | None, typer.Option(help="Instead of `state.directory`.", metavar="DIR")] = None,
+) -> None:
+    """Run the service until SIGTERM or SIGINT; logs are JSON lines on standard output."""
+    from coec.cli import run as command
+
+    raise typer.Exit(command.run(config, embedded_router=embedded_router, state_dir=state_dir))
+
+
+@app.command("check-config")
+def _check_config(
+    file: Annotated[Path | None, typer.Argument(help="Configuration (YAML).", show_default=False)] = None,
+    defaults: Annotated[bool, typer.Option("--defaults", help="Print a commented template instead.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Print the effective configuration with every default; exit 78 if it, or a file it names, cannot be used."""
+    from coec.cli import check_config as command
+
+    raise typer.Exit(command.run(file, defaults=defaults, as_json=as_json))
+
+
+@app.command("play")
+def _play(
+    source: Source,
+    config: Annotated[
+        Path | None, typer.Option(help="Take the keys of the pair from this file.", metavar="FILE")
+    ] = None,
+    pair: Annotated[
+        str | None,
+        typer.Option(help="Pair of the configuration; without one, name in `sensors/<pair>/camera|lidar|ego`."),
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Times recorded speed; 0 = without waiting.", min=0)] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Again and again; sensor time goes on.")] = False,
+    connect: Annotated[
+        str | None, typer.Option(help="Zenoh endpoint of the router.", metavar="ENDPOINT", show_default=DEFAULT_CONNECT)
+    ] = None,
+    encoding: Annotated[Encoding, typer.Option(help="Of the frames.")] = Encoding.MSGPACK,
+    start_now: Annotated[bool, typer.Option("--start-now", help="Shift the stamps so that they begin now.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Publish a recording on Zenoh, as its sensors would have."""
+    from coec.cli import play as command
+
+    options = command.Options(
+        source=source,
+        config=config,
+        pair=pair,
+        rate=rate,
+        loop=loop,
+        connect=connect,
+        encoding="cdr" if encoding is Encoding.CDR else "msgpack",
+        start_now=start_now,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("query")
+def _query(
+    key: Annotated[
+        str,
+        typer.Argument(
+            help="extrinsic, health, history, windows, windows/ID, status, config, metrics, command/NAME, or a whole "
+            "key expression with @v1 in it.",
+            show_default=False,
+        ),
+    ],
+    pair: Annotated[
+        str | None, typer.Option(help="All pairs if not given; needed for commands if there are several.")
+    ] = None,
+    vehicle: Annotated[str, typer.Option()] = "vehicle",
+    prefix: Annotated[str, typer.Option()] = "coec",
+    connect: Connect = DEFAULT_CONNECT,
+    param: Annotated[
+        list[str] | None, typer.Option(help="Parameter of the query, for example limit=5; repeatable.", metavar="K=V")
+    ] = None,
+    payload: Annotated[str | None, typer.Option(help="Payload of a command, JSON.")] = None,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait, for the router and for the answer.", min=0.01)] = 5.0,
+    output: Annotated[
+        Path | None, typer.Option(help="Download windows/ID into this file and verify its sha256.", metavar="FILE")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Ask a running service."""
+    from coec.cli import query as command
+
+    options = command.Options(
+        key=key,
+        pair=pair,
+        vehicle=vehicle,
+        prefix=prefix,
+        connect=connect,
+        params=tuple(param or ()),
+        payload=payload,
+        timeout_s=timeout,
+        output=output,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("replay")
+def _replay(
+    window: Annotated[Path, typer.Argument(help="A recorded window with its result (.mcap).", show_default=False)],
+    depth: Annotated[
+        str | None, typer.Option(help="Where the depth network is now, if not where it was.", metavar="MODEL")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Reach the recorded decision again from the file alone; exit 1 if a byte of it differs."""
+    from coec.cli import replay as command
+
+    raise typer.Exit(command.run(window, depth=depth, as_json=as_json))
+
+
+@app.command("convert")
+def _convert(
+    source: Source,
+    out: Annotated[
+        Path,
+        typer.Argument(
+            help="OUT.mcap: one ROS 2 MCAP of all frames. OUT.yaml: a daemon configuration for this recording.",
+            show_default=False,
+        ),
+    ],
+    as_json: Json = False,
+) -> None:
+    """Turn a recording into a ROS 2 MCAP, or into a configuration with which `run` serves it."""
+    from coec.cli import convert as command
+
+    raise typer.Exit(command.run(source, out, as_json=as_json))
+
+
+@app.command("models")
+def _models(
+    action: Annotated[
+        str | None, typer.Argument(help="`show`, then a file.", metavar="[show", show_default=False)
+    ] = None,
+    file: Annotated[Path | None, typer.Argument(help="An ONNX file.", metavar="FILE]", show_default=False)] = None,
+    as_json: Json = False,
+) -> None:
+    """List the built-in model cards, or show which card a network file gets."""
+    from coec.cli import models as command
+
+    raise typer.Exit(command.run(action, file, as_json=as_json))
+
+
+@app.command("demo")
+def _demo(
+    output: Annotated[Path, typer.Option(help="Folder for pictures, window and result.", metavar="DIR")] = Path(
+        "coec-demo"
+    ),
+    as_json: Json = False,
+) -> None:
+    """The whole service on a small synthetic drive: no router, no network, no data; under a minute."""
+    from coec.cli import demo as command
+
+    raise typer.Exit(command.run(output, as_json=as_json))
+
+
+def main() -> int:
+    """Entry point; returns the exit status."""
+    as_json = "--json" in sys.argv[1:]
+    try:
+        app()
+    except SystemExit as ended:
+        status = ended.code if isinstance(ended.code, int) else 0
+        if status == EXIT_USAGE and as_json:
+            _print_error("bad_request", "the command line does not fit; standard error says how")
+        return status
+    except CoecError as error:
+        print(f"coec: {error}", file=sys.stderr)
+        if as_json:
+            _print_error(error.reply_code, str(error))
+        return error.exit_code
+    except BrokenPipeError:
+        # Whoever read our output has gone; nobody is left to be told, also not by the interpreter at its exit.
+        sys.stdout = None
+        return EXIT_BROKEN_PIPE
+    except Exception as error:
+        import traceback
+
+        traceback.print_exc()
+        if as_json:
+            _print_error("internal", f"{type(error).__name__}: {error}")
+        return EXIT_FAULT
+    return 0
+
+
+def _print_error(code: str, message: str) -> None:
+    import json
+
+    print(json.dumps({"error": {"code": code, "message": message}}, ensure_ascii=False))

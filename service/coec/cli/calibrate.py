@@ -1,0 +1,192 @@
+"""`coec calibrate`: one recording, one result."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+from rich.progress import Progress, TaskID
+
+from coec.adapters.depth import open_depth
+from coec.adapters.wire import result_of
+from coec.calibration.calibrator import calibrate
+from coec.calibration.values import Rig, Window
+from coec.cli import console, files, pictures, windows
+from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
+from coec.errors import UsageError
+from coec.geometry import se3
+from coec.geometry.cameras import name_of
+from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
+from coec.schemas.base import to_json
+from coec.schemas.replies import CalibrationReport, CalibrationResult
+
+FITTED = "double_sphere"
+"""The one model that can be fitted to the others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    source: str
+    depth: str | None = None
+    objective: str | None = None
+    dof: int | None = None
+    perturb: str | None = None
+    camera_model: str | None = None
+    frames: int | None = None
+    no_motion_compensation: bool = False
+    output: Path | None = None
+    as_json: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFit:
+    """What a fitted camera model misses of the one it stands for, pixels. `coverage`: share of the source's pixels."""
+
+    model: str
+    of: str
+    residual_rms_px: float
+    residual_max_px: float
+    coverage: float
+
+
+class StageTimes:
+    """Progress bars and the seconds that each stage took. A stage ends with its last step."""
+
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
+        self._tasks: dict[str, TaskID] = {}
+        self._mark_s = self._start_s = time.perf_counter()
+        self._elapsed_s: dict[str, float] = {}
+
+    def step(self, stage: str, done: int, total: int) -> None:
+        """See `ports.Progress`. The number of evaluations of a search is not known before it ends."""
+        now_s = time.perf_counter()
+        self._elapsed_s[stage] = self._elapsed_s.get(stage, 0.0) + now_s - self._mark_s
+        self._mark_s = now_s
+        if stage not in self._tasks:
+            open_end = stage == "search"
+            self._tasks[stage] = self._bars.add_task(stage, total=None if open_end else total, note="")
+        note = f"{done} evaluations" if stage == "search" else ""
+        self._bars.update(self._tasks[stage], completed=done, note=note)
+
+    def elapsed_s(self) -> dict[str, float]:
+        """By stage, and `total`."""
+        return {**self._elapsed_s, "total": time.perf_counter() - self._start_s}
+
+
+def run(options: Options) -> int:
+    """Prints the result; 1 if its verdict is negative.
+
+    Raises:
+        CoecError: there is no result.
+    """
+    xi = None if options.perturb is None else windows.perturbation_of(options.perturb)
+    with console.progress() as bars:
+        times = StageTimes(bars)
+        loaded = windows.load(
+            options.source, options.frames, WindowConfig().pairs, lambda done, total: times.step("load", done, total)
+        )
+        configuration = configuration_of(options, loaded.configuration)
+        window = loaded.window if xi is None else windows.started_at(loaded.window, xi)
+        window, fit = (window, None) if options.camera_model is None else refitted(window, options.camera_model)
+        depth = open_depth(configuration.depth, LimitsConfig())
+        times.step("prepare", 1, 1)
+        estimate = calibrate(window, depth, configuration, times)
+    result = result_of(estimate, window.rig, loaded.vehicle)
+    document = _document(result, times.elapsed_s(), fit)
+    if options.output is not None:
+        _write(options.output, window, result, configuration, document)
+    if options.as_json:
+        console.print_json(document)
+    else:
+        _show(window, result, document, fit)
+    if loaded.unpaired:
+        causes = ", ".join(f"{count} {cause}" for cause, count in sorted(loaded.unpaired.items()))
+        console.say(f"coec: frames without a partner: {causes}")
+    return 0 if result.verdict.decision == "accepted" else 1
+
+
+def configuration_of(options: Options, recorded: CalibrationConfig | None) -> CalibrationConfig:
+    """The recorded configuration, or the defaults, with what was given on the command line.
+
+    Raises:
+        UsageError: a value that does not exist, or no depth.
+    """
+    if recorded is None and options.depth is None:
+        raise UsageError("this source names no depth network: give --depth MODEL (`stereo` for maps of the source)")
+    values: dict[str, Any] = (recorded or CalibrationConfig()).model_dump()
+    if options.depth is not None:
+        values["depth"]["model"] = options.depth
+    if options.objective is not None:
+        values["objective"]["kind"] = options.objective
+    if options.dof is not None:
+        values["search"]["dof"] = options.dof
+    if options.no_motion_compensation:
+        values["motion_compensation"] = False
+    try:
+        return CalibrationConfig.model_validate(values)
+    except ValidationError as error:
+        raise UsageError(f"the options do not fit: {describe(error)}") from error
+
+
+def refitted(window: Window, model: str) -> tuple[Window, CameraFit]:
+    """The window seen through another camera model that was fitted to its own."""
+    if model != FITTED:
+        raise UsageError(f"--camera-model {model}: only {FITTED} can be fitted")
+    rig: Rig = window.rig
+    fit = fit_double_sphere(rig.camera)
+    quality = CameraFit(FITTED, name_of(rig.camera), fit.residual_rms_px, fit.residual_max_px, fit.coverage)
+    return windows.with_rig(window, replace(rig, camera=fit.camera)), quality
+
+
+def _document(result: CalibrationResult, elapsed_s: dict[str, float], fit: CameraFit | None) -> dict[str, Any]:
+    report = CalibrationReport(**dict(result), elapsed_s=elapsed_s)
+    document: dict[str, Any] = report.model_dump(mode="json")
+    if fit is not None:
+        document["camera_fit"] = {
+            "model": fit.model,
+            "of": fit.of,
+            "residual_rms_px": fit.residual_rms_px,
+            "residual_max_px": fit.residual_max_px,
+            "coverage": fit.coverage,
+        }
+    return document
+
+
+def _write(
+    folder: Path, window: Window, result: CalibrationResult, configuration: CalibrationConfig, document: dict[str, Any]
+) -> None:
+    T_found = np.array(result.camera_from_lidar.matrix)
+    moved_deg = windows.rotation_error_deg(T_found, window.T_camera_lidar_start)
+    where = f"{window.rig.pair}  {pictures.middle(window).stamp_ns} ns"
+    poses = {
+        "overlay_before": (window.T_camera_lidar_start, f"{where}  start"),
+        "overlay_after": (T_found, f"{where}  {result.verdict.decision}, {moved_deg:.2f} deg from the start"),
+    }
+    pictures.write_overlays(folder, window, poses, configuration.motion_compensation)
+    files.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
+
+
+def _show(window: Window, result: CalibrationResult, document: dict[str, Any], fit: CameraFit | None) -> None:
+    start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
+    start[:3] = np.degrees(start[:3])
+    console.show(f"{window.window_id}: {result.pairs} pairs, {result.points_in_view} points in view")
+    axes = console.table("axis", "start", "correction", "± σ", "unit", right=(1, 2, 3))
+    for axis, name in enumerate(console.AXIS_NAMES):
+        found = console.figure(result.correction[axis], sign=True) if result.solved[axis] else "not searched"
+        spread = console.figure(result.sigma[axis]) if result.solved[axis] else ""
+        axes.add_row(name, console.figure(start[axis], sign=True), found, spread, console.UNITS[axis])
+    console.out.print(axes)
+    console.show_verdict(result)
+    if fit is not None:
+        console.show(
+            f"{fit.model} fitted to {fit.of}: {fit.residual_rms_px:.4f} px rms, {fit.residual_max_px:.4f} px at most"
+        )
+    stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in document["elapsed_s"].items())
+    console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")

@@ -1,0 +1,105 @@
+"""`coec check-config`: what a configuration comes to, before a vehicle depends on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from coec.adapters.depth import open_depth
+from coec.adapters.rig import rig_of
+from coec.cli import console
+from coec.cli.commented_yaml import commented_yaml
+from coec.config import (
+    CameraConfig,
+    CameraIntrinsics,
+    Config,
+    EgoConfig,
+    LidarConfig,
+    PairConfig,
+    StateConfig,
+    SweepConfig,
+    config_hash,
+    load_config,
+)
+from coec.errors import ConfigError, ModelError, UsageError
+
+TEMPLATE_HEAD = """\
+# Configuration of coec. Every key stands here with its default, except for what only you can know: the names, keys,
+# intrinsics and extrinsic below `pairs` are an example. Unknown keys are refused. Relative paths are relative to this
+# file. `coec check-config FILE` prints what a configuration comes to.
+"""
+
+
+def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
+    """Prints the effective configuration of a file, or a template.
+
+    Raises:
+        ConfigError: the file, or a file it names, cannot be used.
+        UsageError: neither or both were asked for.
+    """
+    if defaults == (path is not None):
+        raise UsageError("give a configuration file, or --defaults")
+    if path is None:
+        if as_json:
+            console.print_json({"config": example().model_dump(mode="json")})
+        else:
+            console.show(template().rstrip("\n"))
+        return 0
+    config = load_config(path)
+    checks = [check for pair in config.pairs for check in _check(pair, config)]
+    if config.zenoh.file is not None:
+        checks.append(_check_file(config.zenoh.file, "zenoh.file"))
+    digest = config_hash(config)
+    if as_json:
+        document = {"config": config.model_dump(mode="json"), "config_hash": digest, "checks": checks}
+        console.print_json(document)
+        return 0
+    console.show(commented_yaml(config).strip("\n"))
+    console.show(f"\n# config hash {digest}")
+    for check in checks:
+        console.show(f"# ok: {check}")
+    return 0
+
+
+def template() -> str:
+    """The commented template."""
+    return TEMPLATE_HEAD + commented_yaml(example())
+
+
+def example() -> Config:
+    """A vehicle with one fisheye camera and one spinning LiDAR, defaults everywhere else."""
+    intrinsics = CameraIntrinsics(
+        model="double_sphere", width=1400, height=1400, fx=430.0, fy=430.0, cx=699.5, cy=699.5, xi=-0.2, alpha=0.6
+    )
+    pair = PairConfig(
+        name="front",
+        camera=CameraConfig(key="sensors/front/camera", intrinsics=intrinsics),
+        lidar=LidarConfig(key="sensors/front/lidar", sweep=SweepConfig()),
+        ego=EgoConfig(key="sensors/front/ego"),
+        # Camera looking ahead: its x, y, z axes are right, down, forward; those of the LiDAR forward, left, up.
+        T_camera_lidar=((0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, -0.4), (1.0, 0.0, 0.0, -0.9), (0.0, 0.0, 0.0, 1.0)),
+    )
+    return Config(state=StateConfig(directory=Path("/var/lib/coec")), pairs=(pair,))
+
+
+def _check(pair: PairConfig, config: Config) -> list[str]:
+    """What was found to be usable; reads the mask and opens the network.
+
+    Raises:
+        ConfigError: the rig or the network cannot be used.
+    """
+    rig = rig_of(pair)
+    mask = f", mask {pair.camera.mask}" if rig.mask is not None else ""
+    try:
+        depth = open_depth(pair.calibration.depth, config.limits)
+    except ModelError as error:
+        raise ConfigError(f"pair {pair.name}, calibration.depth.model: {error}") from error
+    return [
+        f"pair {pair.name}: rig {pair.camera.intrinsics.model}{mask}",
+        f"pair {pair.name}: depth {pair.calibration.depth.model}, identity {depth.identity}",
+    ]
+
+
+def _check_file(path: Path, key: str) -> str:
+    if not path.is_file():
+        raise ConfigError(f"{key}: there is no file {path}")
+    return f"{key} {path}"

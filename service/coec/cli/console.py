@@ -1,0 +1,111 @@
+"""How commands speak: documents and tables on standard output, progress and remarks on standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from coec.schemas import replies
+
+AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+AXIS_NAMES = ("rx pitch", "ry yaw", "rz roll", "tx right", "ty down", "tz forward")
+UNITS = ("deg", "deg", "deg", "m", "m", "m")
+
+STATE_STYLES = {
+    "healthy": "bold green",
+    "accepted": "bold green",
+    "suspect": "bold yellow",
+    "degraded": "bold yellow",
+    "failed": "bold red",
+    "miscalibrated": "bold red",
+}
+"""What is not here is neither good nor bad."""
+
+PIPE_WIDTH = 140
+"""Columns where standard output is no terminal: nothing is folded into the lines of a log."""
+
+out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+err = Console(stderr=True, highlight=False)
+
+
+def print_json(document: Any) -> None:
+    """The one document of `--json`: a line with sorted keys, floats in the shortest form that reads back exactly."""
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def say(text: str) -> None:
+    """A remark, as it is, on standard error."""
+    err.print(Text(text), soft_wrap=True)
+
+
+def show(text: str, style: str = "") -> None:
+    """A line, as it is, on standard output."""
+    out.print(Text(text, style=style), soft_wrap=True)
+
+
+def progress(*, counted: bool = True) -> Progress:
+    """A progress display on standard error that disappears when it is done; nothing where that is not a terminal."""
+    count = (MofNCompleteColumn(),) if counted else ()
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        *count,
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=err,
+        transient=True,
+        disable=not err.is_terminal,
+    )
+
+
+def table(*columns: str, right: Iterable[int] = ()) -> Table:
+    """A table; the columns whose index is in `right` hold numbers."""
+    made = Table(box=None, pad_edge=False, header_style="bold")
+    numbers = set(right)
+    for index, column in enumerate(columns):
+        made.add_column(column, justify="right" if index in numbers else "left", overflow="fold")
+    return made
+
+
+def figure(value: float | None, digits: int = 3, sign: bool = False) -> str:
+    """A number for people; `-` where there is none, no exponent below a million."""
+    if value is None:
+        return "-"
+    if abs(value) >= 1e6:
+        return f"{value:.1e}"
+    # Adding zero makes -0 of it 0.
+    return f"{round(value, digits) + 0.0:{'+' if sign else ''}.{digits}f}"
+
+
+def styled(state: str) -> Text:
+    """A state in its colour."""
+    return Text(state, style=STATE_STYLES.get(state, "bold"))
+
+
+def show_verdict(result: replies.CalibrationResult) -> None:
+    """The decision, every figure beside its limit, and the reasons in words."""
+    out.print("verdict ", styled(result.verdict.decision), sep="")
+    for reason in result.verdict.reasons:
+        show(f"  {reason.code}: {reason.text}", "yellow")
+    show_metrics(result.metrics)
+
+
+def show_metrics(metrics: dict[str, replies.MetricReply]) -> None:
+    """Every figure beside the limit it was judged by."""
+    if not metrics:
+        return
+    figures = table("figure", "value", "limit", "", right=(1,))
+    for name, metric in metrics.items():
+        limit = f"{'≥' if metric.at_least else '≤'} {figure(metric.limit)}"
+        figures.add_row(name, figure(metric.value), limit, Text("✓", "green") if metric.passed else Text("✗", "red"))
+    out.print(figures)

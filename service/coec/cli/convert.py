@@ -1,0 +1,138 @@
+"""`coec convert`: a recording for other tools, or the configuration that serves it."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from coec.adapters.bag_writer import write_bag
+from coec.adapters.player import Streams
+from coec.adapters.rig import mask_to_png, matrix_rows
+from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+from coec.cli import console
+from coec.cli.commented_yaml import commented_yaml
+from coec.cli.files import OutputError, write
+from coec.config import (
+    CalibrationConfig,
+    CameraConfig,
+    CameraIntrinsics,
+    Config,
+    EgoConfig,
+    LidarConfig,
+    PairConfig,
+    StateConfig,
+    SweepConfig,
+    WindowConfig,
+)
+from coec.errors import UsageError
+from coec.geometry import cameras
+from coec.sources import Recording, open_source
+
+
+def run(source: str, out: Path, *, as_json: bool) -> int:
+    """Writes OUT.
+
+    Raises:
+        UsageError: OUT is neither .mcap nor .yaml.
+        OutputError: it cannot be written.
+        SourceError: the recording cannot be read.
+    """
+    if out.suffix not in (".mcap", ".yaml", ".yml"):
+        raise UsageError(f"{out}: OUT must end in .mcap (ROS 2 bag) or .yaml (daemon configuration)")
+    recording = open_source(source)
+    written = _bag(recording, out) if out.suffix == ".mcap" else _configuration(recording, out)
+    if as_json:
+        console.print_json({"written": [str(path) for path in written]})
+    else:
+        for path in written:
+            console.show(f"{path}  {path.stat().st_size} bytes")
+    return 0
+
+
+def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path | None) -> PairConfig:
+    """A pair that takes the frames of a recording as they are, on `sensors/<pair>/camera|lidar|ego`.
+
+    A recording with less than twice as many camera frames as a window needs would make none as soon as a few are
+    refused (the vehicle stood): half of its frames are then enough.
+    """
+    rig = recording.rig
+    streams = Streams.default(rig.pair)
+    first = first_frames(recording)
+    motion = next((frame for frame in first if isinstance(frame, EgoMotion)), None)
+    camera = next(frame for frame in first if isinstance(frame, CameraFrame))
+    lidar = next(frame for frame in first if isinstance(frame, LidarFrame))
+    window = WindowConfig()
+    frames = len(recording.camera_stamps_ns)
+    if frames < 2 * window.min_pairs:
+        window = window.model_copy(update={"min_pairs": max(1, frames // 2)})
+    intrinsics = {"model": cameras.name_of(rig.camera), **cameras.intrinsics_of(rig.camera)}
+    return PairConfig(
+        name=rig.pair,
+        camera=CameraConfig(
+            key=streams.camera,
+            frame_id=camera.frame_id,
+            intrinsics=CameraIntrinsics.model_validate(intrinsics),
+            mask=mask,
+        ),
+        lidar=LidarConfig(key=streams.lidar, frame_id=lidar.frame_id, sweep=_sweep(rig)),
+        ego=None if motion is None else EgoConfig(key=str(streams.ego), T_lidar_ego=matrix_rows(rig.T_lidar_ego)),
+        T_camera_lidar=matrix_rows(T_camera_lidar),
+        window=window,
+        calibration=recording.configuration or CalibrationConfig(),
+    )
+
+
+def first_frames(recording: Recording) -> list[CameraFrame | LidarFrame | EgoMotion]:
+    """The first camera frame, and what is needed to pair it."""
+    return list(recording.messages([0]))
+
+
+def _configuration(recording: Recording, out: Path) -> list[Path]:
+    mask = recording.rig.mask
+    written = []
+    if mask is not None:
+        written.append(write(out.with_name(f"{out.stem}-mask.png"), mask_to_png(np.asarray(mask))))
+    name = Path(written[0].name) if written else None
+    pair = configuration_for(recording, recording.rig.T_camera_lidar_nominal, name)
+    config = Config(state=StateConfig(), pairs=(pair,))
+    head = f"# Configuration of coec for the recording {recording.name}. `coec play` publishes it on these keys.\n"
+    written.append(write(out, (head + commented_yaml(config)).encode()))
+    return written
+
+
+def _bag(recording: Recording, out: Path) -> list[Path]:
+    depth = any(isinstance(frame, CameraFrame) and frame.depth is not None for frame in first_frames(recording))
+    if depth:
+        console.say("coec: depth maps have no place in a ROS 2 bag of sensors and are left out")
+    total = len(recording.camera_stamps_ns)
+    part = out.with_name(f"{out.name}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with console.progress() as bars:
+            task = bars.add_task("camera frames", total=total, note="")
+            write_bag(
+                part,
+                recording.rig,
+                recording.T_camera_lidar_start,
+                (replace(f, depth=None) if isinstance(f, CameraFrame) else f for f in recording.messages()),
+                lambda frame: bars.advance(task) if isinstance(frame, CameraFrame) else None,
+            )
+        part.replace(out)
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror}") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+    return [out]
+
+
+def _sweep(rig: Rig) -> SweepConfig | None:
+    if rig.sweep is None:
+        return None
+    sign: Literal[-1, 1] = 1 if rig.sweep.sign > 0 else -1
+    azimuth_deg = float(np.degrees(rig.sweep.stamp_azimuth_rad))
+    return SweepConfig(period_s=rig.sweep.period_s, sign=sign, stamp_azimuth_deg=azimuth_deg)

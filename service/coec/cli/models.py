@@ -1,0 +1,49 @@
+"""`coec models`: which depth networks are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from coec.adapters.depth import models_folder
+from coec.adapters.model_cards import find_card, list_models
+from coec.adapters.onnx_depth import file_identity
+from coec.cli import console
+from coec.errors import ModelError, UsageError
+
+
+def run(action: str | None, file: Path | None, *, as_json: bool) -> int:
+    """Lists the built-in cards, or shows the card of a file.
+
+    Raises:
+        UsageError: another action, or no file.
+        ModelError: the file is absent or has no card.
+    """
+    if action is None:
+        return _list(as_json)
+    if action != "show" or file is None:
+        raise UsageError("write `coec models`, or `coec models show FILE.onnx`")
+    if not file.is_file():
+        raise ModelError(f"there is no file {file}")
+    digest, identity = file_identity(file)
+    card = find_card(file, digest)
+    document = {"file": str(file), "sha256": digest, "identity": identity, "card": card.model_dump(mode="json")}
+    if as_json:
+        console.print_json(document)
+    else:
+        console.out.print_json(data=document)
+    return 0
+
+
+def _list(as_json: bool) -> int:
+    cards = list_models()
+    if as_json:
+        folder = str(models_folder())
+        console.print_json({"folder": folder, "models": [card.model_dump(mode="json") for card in cards]})
+        return 0
+    listed = console.table("name", "file", "output", "sha256", "licence")
+    for card in cards:
+        digest = card.sha256[:12] if card.sha256 else "any"
+        listed.add_row(card.name, card.file or f"{card.name}.onnx", card.output.kind, digest, card.licence)
+    console.out.print(listed)
+    console.show(f"\nnetworks are looked for by name in {models_folder()}; any other ONNX file by its path")
+    return 0

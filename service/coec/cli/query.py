@@ -1,0 +1,224 @@
+"""`coec query`: what a running service says."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from coec.adapters.zenoh_client import RemoteError, Reply, ask, ask_one, connected, nobody
+from coec.cli import console, render
+from coec.cli.files import OutputError
+from coec.errors import UsageError
+from coec.schemas.base import from_json
+from coec.schemas.keys import MAX_LENGTH, VERSION_CHUNK, Keys
+from coec.schemas.replies import StatusReply, WindowInfo, WindowsReply
+
+VEHICLE_KEYS = ("status", "config", "metrics")
+PAIR_KEYS = ("extrinsic", "health", "history", "windows")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    key: str
+    pair: str | None
+    vehicle: str
+    prefix: str
+    connect: str
+    params: tuple[str, ...]
+    payload: str | None
+    timeout_s: float
+    output: Path | None
+    as_json: bool
+
+
+def run(options: Options) -> int:
+    """Asks and shows the answers; 1 if a command was not accepted.
+
+    Raises:
+        UsageError: no such key, or it is not clear of which pair.
+        NotFoundError: nobody answered.
+        RemoteError: an error reply.
+    """
+    keys = Keys(options.prefix, options.vehicle)
+    head, _, argument = options.key.partition("/")
+    whole = f"/{VERSION_CHUNK}/" in options.key
+    if not whole and head == "windows" and argument:
+        return _download(options, keys, argument)
+    if options.output is not None:
+        raise UsageError("--output belongs to windows/ID")
+    with connected([options.connect], options.timeout_s) as session:
+        key, kind = _resolve(session, options, keys)
+        replies = ask(session, _selector(key, options.params), options.timeout_s, _payload(options.payload))
+    if not replies:
+        raise nobody(key)
+    return _show(replies, kind, options, key)
+
+
+def _resolve(session: zenoh.Session, options: Options, keys: Keys) -> tuple[str, str | None]:
+    """The key expression, and what kind of reply is shown in words (None: as it comes)."""
+    head, _, argument = options.key.partition("/")
+    if f"/{VERSION_CHUNK}/" in options.key:
+        return options.key, None
+    if options.key in VEHICLE_KEYS:
+        return f"{keys.root}/{options.key}", options.key
+    if options.key in PAIR_KEYS:
+        return f"{keys.root}/{options.pair or '*'}/{options.key}", options.key
+    if head == "command" and argument:
+        return keys.command(options.pair or _only_pair(session, options, keys), argument), "command"
+    known = ", ".join((*PAIR_KEYS, "windows/ID", *VEHICLE_KEYS, "command/NAME"))
+    raise UsageError(f"unknown key {options.key}; known: {known}, or a whole key expression with {VERSION_CHUNK}")
+
+
+def _only_pair(session: zenoh.Session, options: Options, keys: Keys) -> str:
+    """The name of the vehicle's pair, if it has one."""
+    reply = ask_one(session, f"{keys.status}?format=json", options.timeout_s)
+    names = [pair.name for pair in from_json(StatusReply, reply.payload).pairs]
+    if len(names) != 1:
+        raise UsageError(f"several pairs are served, name one with --pair: {', '.join(names)}")
+    return names[0]
+
+
+def _selector(key: str, params: tuple[str, ...]) -> str:
+    for item in params:
+        if "=" not in item or ";" in item:
+            raise UsageError(f"--param {item}: write NAME=VALUE")
+    given = params if any(item.startswith("format=") for item in params) else (*params, "format=json")
+    return f"{key}?{';'.join(given)}"
+
+
+def _payload(text: str | None) -> bytes | None:
+    if text is None:
+        return None
+    try:
+        return json.dumps(json.loads(text), separators=(",", ":")).encode()
+    except ValueError as error:
+        raise UsageError(f"--payload is not JSON: {error}") from error
+
+
+def _show(replies: list[Reply], kind: str | None, options: Options, key: str) -> int:
+    if options.as_json:
+        values = [{"key": reply.key, "value": _value(reply)} for reply in replies]
+        if "*" in key and f"/{VERSION_CHUNK}/" in options.key:
+            console.print_json(values)
+        elif len(values) > 1:
+            pairs = ", ".join(reply.key.split("/")[-2] for reply in replies)
+            raise UsageError(f"several pairs answered, name one with --pair: {pairs}")
+        else:
+            console.print_json(values[0]["value"])
+    else:
+        for reply in replies:
+            _render(reply, kind)
+    return 0 if all(_succeeded(reply, kind) for reply in replies) else 1
+
+
+def _value(reply: Reply) -> Any:
+    """The payload as a JSON value: text where it is not JSON."""
+    if reply.encoding.startswith("application/json"):
+        return json.loads(reply.payload)
+    return reply.payload.decode("utf-8", errors="replace")
+
+
+def _render(reply: Reply, kind: str | None) -> None:
+    shown = render.BY_KIND.get(kind or "")
+    if shown is not None:
+        shown(reply.payload)
+    elif reply.encoding.startswith("application/json"):
+        console.out.print_json(reply.payload.decode())
+    else:
+        console.show(reply.payload.decode("utf-8", errors="replace").rstrip("\n"))
+
+
+def _succeeded(reply: Reply, kind: str | None) -> bool:
+    return kind != "command" or bool(json.loads(reply.payload).get("accepted", True))
+
+
+# --- windows/ID -----------------------------------------------------------------------------------------------
+
+
+def _download(options: Options, keys: Keys, window_id: str) -> int:
+    if options.output is None:
+        raise UsageError("say where to with --output FILE")
+    with connected([options.connect], options.timeout_s) as session, console.progress(counted=False) as bars:
+        pair = options.pair or window_id.rpartition("-")[0]
+        task = bars.add_task(window_id, note="")
+        info = download_window(
+            session,
+            keys,
+            pair,
+            window_id,
+            options.output,
+            options.timeout_s,
+            lambda done, total: bars.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} MB"),
+        )
+    if options.as_json:
+        console.print_json({"path": str(options.output), **info.model_dump(mode="json")})
+    else:
+        console.show(f"{options.output}  {info.size_bytes} bytes, sha256 {info.sha256} verified")
+    return 0
+
+
+def download_window(
+    session: zenoh.Session,
+    keys: Keys,
+    pair: str,
+    window_id: str,
+    path: Path,
+    timeout_s: float,
+    heard: Callable[[int, int], None],
+) -> WindowInfo:
+    """A recorded window, piece by piece, into a file that has its name only when its sha256 is right.
+
+    A window that is rewritten on the way (its result came) is fetched once more.
+
+    Raises:
+        RemoteError: no such window, or its bytes are not those that were promised.
+        OutputError: the file cannot be written.
+    """
+    info = _info(session, keys, pair, window_id, timeout_s)
+    for attempt in (1, 2):
+        data = _pieces(session, keys.window(pair, window_id), info.size_bytes, timeout_s, heard)
+        if hashlib.sha256(data).hexdigest() == info.sha256:
+            _save(path, data)
+            return info
+        renewed = _info(session, keys, pair, window_id, timeout_s)
+        if attempt == 2 or renewed.sha256 == info.sha256:
+            break
+        info = renewed
+    raise RemoteError("checksum", f"the bytes of window {window_id} do not have the sha256 of the list; try again")
+
+
+def _info(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> WindowInfo:
+    reply = ask_one(session, f"{keys.windows(pair)}?format=json", timeout_s)
+    for info in from_json(WindowsReply, reply.payload).windows:
+        if info.window_id == window_id:
+            return info
+    raise RemoteError("not_found", f"pair {pair} has no window {window_id}: see `coec query windows`")
+
+
+def _pieces(session: zenoh.Session, key: str, size: int, timeout_s: float, heard: Callable[[int, int], None]) -> bytes:
+    data = bytearray()
+    while len(data) < size:
+        piece = ask_one(session, f"{key}?offset={len(data)};length={MAX_LENGTH}", timeout_s).payload
+        if not piece:
+            break
+        data += piece
+        heard(len(data), size)
+    return bytes(data)
+
+
+def _save(path: Path, data: bytes) -> None:
+    part = path.with_name(f"{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(data)
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error

@@ -1,0 +1,32 @@
+"""`coec run`: the daemon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from coec.config import Config, load_config
+
+
+def run(path: Path, *, embedded_router: bool, state_dir: Path | None) -> int:
+    """Serves until told to stop.
+
+    Raises:
+        ConfigError: the configuration cannot be used.
+    """
+
+    def read() -> Config:
+        return _with_options(load_config(path), embedded_router, state_dir)
+
+    config = read()
+    # After the configuration has been read, so that a mistake in it is told at once.
+    from coec import daemon
+
+    return daemon.run(config, read)
+
+
+def _with_options(config: Config, embedded_router: bool, state_dir: Path | None) -> Config:
+    if embedded_router:
+        config = config.model_copy(update={"zenoh": config.zenoh.model_copy(update={"embedded_router": True})})
+    if state_dir is not None:
+        config = config.model_copy(update={"state": config.state.model_copy(update={"directory": state_dir})})
+    return config

@@ -1,0 +1,106 @@
+"""`coec calibrate` on a small synthetic recording."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cli.conftest import SMALL, Coec
+from coec.cli.calibrate import Options, configuration_of
+from coec.cli.windows import evenly, perturbation_of
+from coec.config import CalibrationConfig, DepthConfig, SearchConfig
+from coec.errors import UsageError
+
+TOLERANCE_DEG = 0.35
+
+
+def test_recovers_the_truth_from_a_perturbed_start(coec: Coec) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--perturb", "-2,1.5,1", "--json")
+    report = outcome.document
+    assert outcome.status == 0
+    assert report["verdict"]["decision"] == "accepted"
+    assert report["pairs"] == 6
+    assert max(abs(angle) for angle in report["correction"][:3]) < TOLERANCE_DEG
+    assert set(report["elapsed_s"]) >= {"load", "depth", "search", "diagnosis", "total"}
+    assert report["solved"] == [True, True, True, False, False, False]
+
+
+def test_failed_verdict_is_1_and_still_a_document(coec: Coec) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--perturb", "0,40,0", "--json")
+    assert outcome.status == 1
+    assert outcome.document["verdict"]["decision"] == "failed"
+    assert outcome.document["verdict"]["reasons"]
+
+
+def test_text_names_axes_verdict_and_reasons(coec: Coec) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--perturb", "0,40,0")
+    assert "ry yaw" in outcome.out
+    assert "+40.000" in outcome.out
+    assert "verdict failed" in outcome.out
+    assert not outcome.err
+
+
+def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--output", tmp_path / "out", "--json")
+    written = tmp_path / "out"
+    assert json.loads((written / "result.json").read_text())["correction"] == outcome.document["correction"]
+    for name in ("overlay_before.png", "overlay_after.png"):
+        assert (written / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_fitted_double_sphere_reports_its_residual(coec: Coec) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--camera-model", "double_sphere", "--json")
+    fit = outcome.document["camera_fit"]
+    assert fit["model"] == "double_sphere"
+    assert 0 <= fit["residual_rms_px"] <= fit["residual_max_px"] < 1e-6
+
+
+def test_frames_bounds_the_window(coec: Coec) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--frames", "3", "--json")
+    assert outcome.document["pairs"] == 3
+
+
+def test_without_motion_compensation(coec: Coec) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--no-motion-compensation", "--json")
+    assert outcome.document["compensation"]["disabled"] == 6
+
+
+def test_needs_a_depth_network(coec: Coec) -> None:
+    outcome = coec("calibrate", SMALL)
+    assert outcome.status == 2
+    assert "--depth" in outcome.err
+
+
+def test_unknown_objective_is_a_usage_error(coec: Coec) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--objective", "beauty")
+    assert outcome.status == 2
+    assert "objective.kind" in outcome.err
+
+
+def test_unknown_camera_model_is_a_usage_error(coec: Coec) -> None:
+    assert coec("calibrate", SMALL, "--depth", "stereo", "--camera-model", "eucm").status == 2
+
+
+def test_options_override_the_recorded_configuration_and_nothing_else() -> None:
+    recorded = CalibrationConfig(depth=DepthConfig(model="stereo", threads=7), search=SearchConfig(dof=3, step_deg=1.0))
+    assert configuration_of(Options(source=""), recorded) == recorded
+    changed = configuration_of(Options(source="", dof=6, no_motion_compensation=True), recorded)
+    assert changed.search == SearchConfig(dof=6, step_deg=1.0)
+    assert changed.depth == recorded.depth
+    assert not changed.motion_compensation
+
+
+@pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", ""])
+def test_malformed_perturbation(text: str) -> None:
+    with pytest.raises(UsageError):
+        perturbation_of(text)
+
+
+@pytest.mark.parametrize(
+    ("count", "wanted", "chosen"),
+    [(3, 25, [0, 1, 2]), (10, 1, [0]), (10, 2, [0, 9]), (101, 5, [0, 25, 50, 75, 100]), (4, 3, [0, 2, 3])],
+)
+def test_evenly_spreads_over_the_recording(count: int, wanted: int, chosen: list[int]) -> None:
+    assert evenly(count, wanted) == chosen

@@ -1,0 +1,80 @@
+"""What all commands have in common: help, exit codes, where things are printed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from cli.conftest import Coec
+
+COMMANDS = ("calibrate", "run", "check-config", "play", "query", "replay", "convert", "models", "demo")
+HEAVY = ("cv2", "mcap", "numba", "numpy", "onnxruntime", "rosbags", "zenoh")
+
+
+def test_help_lists_every_command(coec: Coec) -> None:
+    outcome = coec("--help")
+    assert outcome.status == 0
+    assert all(command in outcome.out for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(coec: Coec, command: str) -> None:
+    assert coec(command, "--help").status == 0
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; sys.argv = ['coec', 'calibrate', '--help']\n"
+        "from coec.cli import main; main()\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
+    )
+    path = ":".join(sys.path)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={"PYTHONPATH": path})
+    assert done.returncode == 0
+    assert done.stderr.strip() == "[]"
+
+
+def test_usage_error_is_2_on_standard_error(coec: Coec) -> None:
+    outcome = coec("calibrate", "--no-such-option")
+    assert outcome.status == 2
+    assert not outcome.out
+    assert "no-such-option" in outcome.err
+
+
+def test_usage_error_with_json_is_a_document_too(coec: Coec) -> None:
+    outcome = coec("calibrate", "--no-such-option", "--json")
+    assert outcome.status == 2
+    assert outcome.document["error"]["code"] == "bad_request"
+
+
+def test_deliberate_error_is_a_line_without_traceback(coec: Coec) -> None:
+    outcome = coec("calibrate", "/no/such/recording", "--depth", "stereo")
+    assert outcome.status == 1
+    assert outcome.err.startswith("coec: /no/such/recording does not exist")
+    assert "Traceback" not in outcome.err
+
+
+def test_deliberate_error_with_json(coec: Coec) -> None:
+    outcome = coec("calibrate", "/no/such/recording", "--depth", "stereo", "--json")
+    assert outcome.status == 1
+    assert outcome.document["error"]["code"] == "bad_source"
+    assert "does not exist" in outcome.document["error"]["message"]
+
+
+def test_fault_of_our_own_is_70_with_traceback(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> int:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("coec.cli.models.run", fail)
+    outcome = coec("models", "--json")
+    assert outcome.status == 70
+    assert "Traceback" in outcome.err
+    assert outcome.document["error"]["code"] == "internal"
+
+
+def test_without_a_command_says_how(coec: Coec) -> None:
+    outcome = coec()
+    assert outcome.status == 2
+    assert "Usage" in outcome.out + outcome.err

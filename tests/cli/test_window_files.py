@@ -1,0 +1,102 @@
+"""`calibrate` and `replay` on a recorded window: the decision is in the file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli.conftest import SMALL, Coec
+from coec.adapters.depth import open_depth
+from coec.adapters.mcap_windows import WindowWriter, read_result, read_window, write_result
+from coec.adapters.wire import result_of
+from coec.calibration.calibrator import calibrate
+from coec.calibration.ports import Silence
+from coec.cli import windows
+from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig
+from coec.geometry import se3
+
+CONFIGURATION = CalibrationConfig(objective=ObjectiveConfig(depth_bins=24, range_bins=20))
+"""Not the defaults: what the file says must be used."""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A window with its result, as the service leaves it."""
+    loaded = windows.load(SMALL, None, 25, lambda *_: None)
+    window = windows.started_at(loaded.window, np.array([0.02, -0.01, 0.01, 0, 0, 0]))
+    path = tmp_path_factory.mktemp("windows") / f"{window.window_id}.mcap"
+    writer = WindowWriter(
+        path, window.rig, window.T_camera_lidar_start, window.window_id, CONFIGURATION, {"vehicle": "v7"}
+    )
+    for pair in window.pairs:
+        writer.add(pair)
+    writer.finish()
+    read, configuration = read_window(path)
+    estimate = calibrate(read, open_depth(configuration.depth, LimitsConfig()), configuration, Silence())
+    write_result(path, result_of(estimate, read.rig, "v7"))
+    return path
+
+
+def test_calibrate_reaches_the_recorded_result_to_the_byte(coec: Coec, recorded: Path) -> None:
+    outcome = coec("calibrate", recorded, "--json")
+    result = read_result(recorded)
+    assert outcome.status == 0
+    assert result is not None
+    report = outcome.document
+    report.pop("elapsed_s")
+    assert report == result.model_dump(mode="json")
+
+
+def test_an_option_overrides_the_recorded_configuration(coec: Coec, recorded: Path) -> None:
+    plain = coec("calibrate", recorded, "--json").document
+    moved = coec("calibrate", recorded, "--no-motion-compensation", "--json").document
+    assert moved["config_hash"] != plain["config_hash"]
+
+
+def test_perturb_moves_the_recorded_start(coec: Coec, recorded: Path) -> None:
+    outcome = coec("calibrate", recorded, "--perturb", "1,0,0")
+    start = float(np.degrees(se3.rotation_exp(np.array([0.02, -0.01, 0.01]))[2, 1]))
+    assert outcome.status == 0
+    assert f"{start + 1:+.1f}" in outcome.out
+
+
+def test_replay_is_identical(coec: Coec, recorded: Path) -> None:
+    outcome = coec("replay", recorded, "--json")
+    assert outcome.status == 0
+    assert outcome.document["identical"] is True
+    assert outcome.document["differences"] == []
+
+
+def test_replay_names_the_fields_that_differ(coec: Coec, recorded: Path, tmp_path: Path) -> None:
+    result = read_result(recorded)
+    assert result is not None
+    altered = tmp_path / recorded.name
+    altered.write_bytes(recorded.read_bytes())
+    write_result(altered, result.model_copy(update={"evaluations": result.evaluations + 1}))
+    outcome = coec("replay", altered, "--json")
+    assert outcome.status == 1
+    assert outcome.document["differences"] == [
+        {"field": "evaluations", "recorded": result.evaluations + 1, "reached": result.evaluations}
+    ]
+    assert "evaluations" in coec("replay", altered).out
+
+
+def test_replay_without_a_result_says_so(coec: Coec, tmp_path: Path) -> None:
+    window = windows.load(SMALL, 1, 25, lambda *_: None).window
+    path = tmp_path / "bare-1.mcap"
+    writer = WindowWriter(path, window.rig, window.T_camera_lidar_start, "bare-1", CONFIGURATION, {})
+    writer.add(window.pairs[0])
+    writer.finish()
+    outcome = coec("replay", path)
+    assert outcome.status == 1
+    assert "holds no result" in outcome.err
+
+
+def test_replay_of_a_damaged_window(coec: Coec, recorded: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(recorded.read_bytes()[:-100])
+    outcome = coec("replay", path, "--json")
+    assert outcome.status == 1
+    assert outcome.document["error"]["code"] == "bad_window"
