@@ -31,7 +31,5 @@ def sample_data() -> Path:
     configured = os.environ.get("COEC_SAMPLE_DATA")
     folder = Path(configured) if configured else REPOSITORY.parent / "shared" / "data"
     if not folder.is_dir():
-        pytest.skip(
-            f"needs the sample recordings: {folder} is absent; COEC_SAMPLE_DATA may name another folder"
-        )
+        pytest.skip(f"needs the sample recordings: {folder} is absent; COEC_SAMPLE_DATA may name another folder")
     return folder

@@ -138,7 +138,7 @@ class WindowConfig(Stage):
     min_sharpness: float = Field(
         default=0.008,
         ge=0,
-        description="gradient energy over contrast, 0 to 1; sharp images were 0.011 to 0.057, a blur of 4 px below 0.006",
+        description="gradient energy over contrast, 0 to 1; sharp images had 0.011 to 0.057, blurred by 4 px below 0.006",
     )
     min_mean_level: float = Field(default=8.0, ge=0, le=255, description="mean grey value; darker tells nothing")
     max_clipped: float = Field(

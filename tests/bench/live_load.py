@@ -60,8 +60,10 @@ state: {{directory: {folder / "state"}, max_bytes: 2000000000, min_free_bytes: 0
 log_level: warning
 pairs:
   - name: front
-    camera: {{key: sensors/front/camera, intrinsics: {{model: double_sphere, width: {WIDTH}, height: {HEIGHT}, fx: 440.0,
-             fy: 440.0, cx: 699.5, cy: 699.5, xi: -0.2, alpha: 0.6}}}}
+    camera:
+      key: sensors/front/camera
+      intrinsics: {{model: double_sphere, width: {WIDTH}, height: {HEIGHT}, fx: 440.0, fy: 440.0, cx: 699.5, cy: 699.5,
+                   xi: -0.2, alpha: 0.6}}
     lidar: {{key: sensors/front/lidar, sweep: {{period_s: 0.1}}}}
     ego: {{key: sensors/front/ego}}
     T_camera_lidar: [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
@@ -99,7 +101,8 @@ def publish(port: int, hz: float, stop: multiprocessing.synchronize.Event) -> No
             ego = EgoMotion(stamp, "ego", (10.0, 0.0, 0.0), (0.0, 0.0, 0.1), count)
             streams["ego"].put(encode_ego(ego))
             streams["lidar"].put(encode_lidar(LidarFrame(stamp, "lidar", xyz, intensity, sequence=count)))
-            streams["camera"].put(encode_camera(CameraFrame(stamp, "camera", images[count % PICTURES], count, depth_png)))
+            picture = images[count % PICTURES]
+            streams["camera"].put(encode_camera(CameraFrame(stamp, "camera", picture, count, depth_png)))
             count += 1
 
 
@@ -151,7 +154,8 @@ def table(seen: Seen, final: dict[str, object], minutes: float) -> Table:
     shown.add_row("I/O process, one core", f"{np.mean(seen.cpu_percent[1:]):.0f} %")
     pairs = final["pairs"]
     assert isinstance(pairs, list)
-    shown.add_row("counters", json.dumps({k: pairs[0][k] for k in ("camera", "lidar", "pairs", "rejections", "windows", "solved")}))
+    counters = ("camera", "lidar", "pairs", "rejections", "windows", "solved")
+    shown.add_row("counters", json.dumps({name: pairs[0][name] for name in counters}))
     return shown
 
 

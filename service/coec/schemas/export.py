@@ -24,6 +24,7 @@ MESSAGES: tuple[type[Message], ...] = (
     replies.ErrorReply,
     replies.CalibrationResult,
     replies.CalibrationReport,
+    replies.EvaluationReport,
 )
 
 

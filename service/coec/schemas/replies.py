@@ -296,3 +296,73 @@ class ErrorReply(Message):
 
     code: str
     message: str
+
+
+# --- evaluation ---------------------------------------------------------------------------------------------
+
+
+class Spread(Part):
+    """Of a figure over the starts; null when it could not be computed."""
+
+    median: float | None
+    p95: float | None = Field(description="95th percentile, interpolated linearly")
+    max: float | None
+
+
+class VerdictCounts(Part):
+    """Starts by decision of the self-diagnosis and by truth."""
+
+    accepted_hits: Count
+    accepted_misses: Count = Field(description="the dangerous ones: wrong, and would be served")
+    failed_hits: Count
+    failed_misses: Count
+
+
+class FramesPoint(Part):
+    """Errors over several subsets of one number of frames, hits and misses."""
+
+    frames: Count
+    subsets: Count
+    hit_rate: float
+    rotation_deg: Spread
+    translation_m: Spread
+
+
+class EvaluationReport(Message):
+    """What `coec evaluate --json` prints: solves from starts all around the source's calibration, on one window."""
+
+    source: str
+    vehicle: str
+    pair: str
+    window_id: str
+    pairs: Count = Field(description="camera-LiDAR pairs in the window")
+    camera_model: str
+    objective: str
+    dof: Literal[3, 6]
+    start_rotation_deg: float = Field(description="radius of the sphere of starts")
+    start_translation_m: float = Field(description="radius of the sphere of starts")
+    search_rotation_deg: float = Field(description="half-width of the search box; widened to hold the starts")
+    search_translation_m: float = Field(description="likewise; 0 with 3 dof")
+    hit_rotation_deg: float = Field(description="a hit ends nearer to the source's calibration than this")
+    hit_translation_m: float | None = Field(description="and, with 6 dof, than this; null with 3 dof")
+    starts: Count
+    hits: Count
+    hit_rate: float = Field(ge=0, le=1)
+    rotation_deg: Spread = Field(description="error against the source's calibration, all starts")
+    translation_m: Spread = Field(description="error against the source's calibration, all starts")
+    median: Vector6 = Field(description="median error of all starts: rx ry rz (deg), tx ty tz (m)")
+    bias: Maybe6 = Field(description="mean error of the hits: rx ry rz (deg), tx ty tz (m); null without a hit")
+    std: Maybe6 = Field(description="standard deviation of the hits about it; null below two hits")
+    rms: Maybe6 = Field(description="root mean square error of the hits; null without a hit")
+    sigma: Maybe6 = Field(description="median of the standard deviations that the hits claim; null where none")
+    from_reference: Vector6 = Field(description="error of a solve that starts at the source's calibration (deg, m)")
+    solve_s: Spread = Field(description="one solve, without reading the source and inferring depth, s")
+    evaluations: Spread = Field(description="of the objective, per solve")
+    classified_correctly: float = Field(ge=0, le=1, description="share of starts whose verdict agrees with hit or miss")
+    verdicts: VerdictCounts
+    stop_reasons: Counts = Field(description="starts by the reason for which their search ended")
+    worst_start: Count = Field(description="index of the start that ended furthest from a hit")
+    frames: tuple[FramesPoint, ...] = Field(description="error against the number of frames; empty if not asked for")
+    depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
+    config_hash: str = Field(description="of everything that decides the results, but for the start")
+    elapsed_s: dict[str, float] = Field(description="by stage, s")

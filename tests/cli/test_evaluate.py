@@ -1,0 +1,148 @@
+"""`coec evaluate` on a small synthetic recording."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli.conftest import SMALL, Coec
+from coec.calibration.starts import perturbations
+from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, Options, configuration_of
+from coec.config import CalibrationConfig, SearchConfig
+from coec.errors import UsageError
+from coec.schemas.replies import EvaluationReport
+
+CONTRACT = {
+    "starts", "hits", "hit_rate", "rotation_deg", "translation_m", "bias", "std", "solve_s", "classified_correctly",
+}  # fmt: skip
+
+
+def test_report_has_the_figures_of_the_contract(coec: Coec) -> None:
+    outcome = coec(
+        "evaluate",
+        SMALL,
+        "--depth",
+        "stereo",
+        "--rotation-deg",
+        "3",
+        "--directions",
+        "6",
+        "--objective",
+        "mi",
+        "--json",
+    )
+    report = outcome.document
+    assert outcome.status == 0
+    assert set(report) >= CONTRACT
+    assert EvaluationReport.model_validate(report).model_dump(mode="json") == report
+    assert report["starts"] == sum(report["verdicts"].values()) == sum(report["stop_reasons"].values()) == 6
+    assert report["hits"] == 6
+    assert report["hit_rate"] == 1.0
+    assert 0 < report["rotation_deg"]["median"] <= report["rotation_deg"]["p95"] <= report["rotation_deg"]["max"] < 0.5
+    assert report["translation_m"]["max"] == pytest.approx(0.0, abs=1e-9)
+    assert report["hit_translation_m"] is None
+    assert max(map(abs, report["bias"])) < 0.5
+    assert report["frames"] == []
+
+
+def test_starts_that_cannot_be_solved_are_counted_and_the_exit_is_0(coec: Coec) -> None:
+    report = coec(
+        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "40", "--directions", "4", "--json"
+    ).document
+    assert report["starts"] == 4
+    assert report["hits"] < 4
+    assert report["rotation_deg"]["max"] > 0.5
+    assert report["search_rotation_deg"] == 45.0
+
+
+def test_output_folder_holds_table_report_and_pictures(coec: Coec, tmp_path: Path) -> None:
+    outcome = coec(
+        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--translation-m", "0.1", "--directions", "3",
+        "--dof", "3", "--frames", "2", "--against-frames", "--output", tmp_path / "out", "--json",
+    )  # fmt: skip
+    written = tmp_path / "out"
+    assert json.loads((written / "report.json").read_text()) == outcome.document
+    for name in ("bullseye", "landscape", "frames", "overlay_before", "overlay_after"):
+        assert (written / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert [point["frames"] for point in outcome.document["frames"]] == [1, 2]
+
+    rows = list(csv.DictReader((written / "starts.csv").read_text().splitlines()))
+    wanted = perturbations(3, np.radians(2.0), 0.1)
+    for row, xi in zip(rows, wanted, strict=True):
+        assert np.radians(float(row["start_ry_deg"])) == pytest.approx(xi[1], abs=1e-9)
+        assert float(row["start_tz_m"]) == pytest.approx(xi[5], abs=1e-9)
+    errors = [float(row["rotation_deg"]) for row in rows]
+    assert max(errors) == outcome.document["rotation_deg"]["max"]
+    assert sum(int(row["hit"]) for row in rows) == outcome.document["hits"]
+
+
+def test_six_degrees_of_freedom_are_searched_and_judged(coec: Coec) -> None:
+    report = coec(
+        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "1", "--translation-m", "0.3", "--directions", "2",
+        "--frames", "2", "--json",
+    ).document  # fmt: skip
+    assert report["dof"] == 6
+    assert report["search_translation_m"] == 0.5
+    assert report["hit_translation_m"] == 0.2
+    assert 0 < report["translation_m"]["max"] < 0.7
+
+
+def test_equal_evaluations_are_equal_but_for_the_time(coec: Coec) -> None:
+    arguments = ("evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "4", "--directions", "3", "--json")
+    first, second = coec(*arguments).document, coec(*arguments).document
+    for report in (first, second):
+        report.pop("elapsed_s")
+        report.pop("solve_s")
+    assert first == second
+
+
+def test_text_separates_bias_from_noise_and_counts_verdicts(coec: Coec) -> None:
+    outcome = coec("evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "3", "--directions", "3")
+    assert "3 starts 3 deg away" in outcome.out
+    assert "3 hits within 0.5 deg: 100.0 %" in outcome.out
+    assert "std of hits" in outcome.out
+    assert "classified correctly: 100.0 %" in outcome.out
+    assert not outcome.err
+
+
+def test_fitted_camera_and_uncompensated_clouds(coec: Coec) -> None:
+    report = coec(
+        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1",
+        "--camera-model", "double_sphere", "--no-motion-compensation", "--json",
+    ).document  # fmt: skip
+    assert report["camera_model"] == "double_sphere"
+    assert report["std"] == [None] * 6
+
+
+def test_needs_a_radius_and_a_depth_network(coec: Coec) -> None:
+    assert coec("evaluate", SMALL, "--depth", "stereo").status == 2
+    assert coec("evaluate", SMALL, "--rotation-deg", "5").status == 2
+
+
+def test_search_box_holds_the_starts() -> None:
+    def search(rotation_deg: float, translation_m: float = 0.0) -> SearchConfig:
+        options = Options(
+            source="", depth="stereo", directions=1, rotation_deg=rotation_deg, translation_m=translation_m
+        )
+        return configuration_of(options, None).search
+
+    default = SearchConfig()
+    assert search(1.0).rotation_deg == default.rotation_deg
+    assert search(25.0).rotation_deg == 25.0 + MARGIN_DEG
+    assert search(5.0, 0.5).translation_m == 0.5 + MARGIN_M
+    assert search(5.0, 0.5).dof == 6
+    assert search(25.0).dof == 3
+
+
+def test_degrees_of_freedom_are_those_that_were_asked_for() -> None:
+    options = Options(source="", depth="stereo", directions=1, rotation_deg=5.0, translation_m=0.5, dof=3)
+    assert configuration_of(options, CalibrationConfig()).search.dof == 3
+
+
+def test_starts_too_far_for_any_box_are_a_usage_error() -> None:
+    with pytest.raises(UsageError, match=r"search\.rotation_deg"):
+        configuration_of(Options(source="", depth="stereo", directions=1, rotation_deg=50.0), None)
