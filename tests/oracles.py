@@ -89,7 +89,8 @@ def mutual_information_of_frame(
 ) -> tuple[float, int]:
     """Equation (1) of one frame, term by term: (MI in nats, number of points).
 
-    uv_px (N, 2) and valid (N,): where the points fall; range_bin (N,); depth_bin (h, w), bins[0] where there is no value.
+    uv_px (N, 2) and valid (N,): where the points fall; range_bin (N,); depth_bin (h, w), bins[0] where
+    there is no value.
     """
     h, w = depth_bin.shape
     column, row = np.floor(uv_px[:, 0] + 0.5), np.floor(uv_px[:, 1] + 0.5)
@@ -102,3 +103,73 @@ def mutual_information_of_frame(
     joint, _, _ = np.histogram2d(d, r, bins=bins, range=((-0.5, bins[0] - 0.5), (-0.5, bins[1] - 0.5)))
     p = joint / joint.sum()
     return entropy(p.sum(axis=1)) + entropy(p.sum(axis=0)) - entropy(p.ravel()), len(d)
+
+
+# ------------------------------------------------------------------------------------------------ edge alignment
+def sobel_magnitude(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """|∇I| in grey values per pixel; zero on the border."""
+    image = grey.astype(np.float64)
+    out = np.zeros(grey.shape)
+    across = np.array([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8.0
+    for y in range(1, grey.shape[0] - 1):
+        for x in range(1, grey.shape[1] - 1):
+            patch = image[y - 1 : y + 2, x - 1 : x + 2]
+            out[y, x] = np.hypot((across * patch).sum(), (across.T * patch).sum())
+    return out
+
+
+def local_mean(values: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+    """Mean over the square around each pixel, as far as it lies in the image."""
+    out = np.empty(values.shape)
+    for y in range(values.shape[0]):
+        for x in range(values.shape[1]):
+            out[y, x] = values[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1].mean()
+    return out
+
+
+def gaussian_blur(values: NDArray[np.float64], sigma: float, taps: int) -> NDArray[np.float64]:
+    """Convolved with a Gaussian cut off at `taps` pixels; the border pixel is repeated outside."""
+    kernel = np.exp(-0.5 * (np.arange(-taps, taps + 1) / sigma) ** 2)
+    kernel = np.outer(kernel, kernel) / kernel.sum() ** 2
+    padded = np.pad(values, taps, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, kernel.shape)
+    return np.asarray((windows * kernel).sum(axis=(2, 3)))
+
+
+def standardised_over(values: NDArray[np.float64], lit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Zero mean, unit standard deviation over the pixels that count; NaN at the others."""
+    return np.where(lit, (values - values[lit].mean()) / values[lit].std(), np.nan)
+
+
+def alignment_sums(
+    uv_px: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+    weight: NDArray[np.floating],
+    edges: NDArray[np.floating],
+    between_pixels: bool,
+) -> tuple[float, float]:
+    """Σ w·e and Σ w² of one frame, point by point.
+
+    uv_px (N, 2) and valid (N,): where the points fall; edges (h, w), NaN = masked. `between_pixels`: e is interpolated
+    from the four pixels around, all of which must exist and count; else e is that of the nearest pixel.
+    """
+    h, w = edges.shape
+    strength, square = 0.0, 0.0
+    for (u, v), visible, weighs in zip(uv_px, valid, weight.astype(np.float64), strict=True):
+        if not visible:
+            continue
+        if between_pixels:
+            column, row = int(np.floor(u)), int(np.floor(v))
+            if column < 0 or row < 0 or column + 1 >= w or row + 1 >= h:
+                continue
+            a, b = u - column, v - row
+            e = np.array([1 - b, b]) @ edges[row : row + 2, column : column + 2].astype(np.float64) @ [1 - a, a]
+        else:
+            column, row = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+            if column < 0 or row < 0 or column >= w or row >= h:
+                continue
+            e = float(edges[row, column])
+        if np.isfinite(e):
+            strength += weighs * e
+            square += weighs**2
+    return strength, square

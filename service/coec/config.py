@@ -138,7 +138,7 @@ class WindowConfig(Stage):
     min_sharpness: float = Field(
         default=0.008,
         ge=0,
-        description="gradient energy over contrast, 0 to 1; sharp images had 0.011 to 0.057, blurred by 4 px below 0.006",
+        description="gradient energy over contrast, 0 to 1; sharp: 0.011 to 0.057, blurred by 4 px: below 0.006",
     )
     min_mean_level: float = Field(default=8.0, ge=0, le=255, description="mean grey value; darker tells nothing")
     max_clipped: float = Field(
@@ -168,7 +168,10 @@ class DepthConfig(Stage):
 class ObjectiveConfig(Stage):
     """Equation (1) and the guard against looking away."""
 
-    kind: Literal["mi"] = "mi"
+    kind: Literal["mi", "fused", "intensity"] = Field(
+        default="fused",
+        description="fused: edges and depth, from far away; mi: the paper's; intensity: reflectance against grey value",
+    )
     depth_bins: int = Field(default=32, ge=2, le=4096)
     range_bins: int = Field(default=32, ge=2, le=4096)
     min_range_m: float = Field(default=2.0, ge=0, description="nearer points are the vehicle itself")
@@ -193,6 +196,10 @@ class SearchConfig(Stage):
     step_m: float = Field(default=0.05, gt=0, description="first trust region, translation")
     tolerance_deg: float = Field(default=0.002, gt=0, description="last trust region, rotation")
     max_evaluations: int = Field(default=600, ge=20, le=100_000)
+    reach_deg: float = Field(
+        default=28.0, gt=0, le=60, description="radius of the global stage about the start (fused)"
+    )
+    reach_m: float = Field(default=0.55, gt=0, le=2, description="radius of the global stage about the start (fused)")
 
 
 class VerdictConfig(Stage):
@@ -201,9 +208,19 @@ class VerdictConfig(Stage):
 
     min_mi_over_unrelated: float = Field(default=1.2, gt=0, description="MI over the MI with other frames' depth maps")
     max_newton_step_deg: float = Field(default=0.25, gt=0, description="|f'|/f'': distance to the zero of f', degrees")
+    max_newton_step_m: float = Field(default=0.02, gt=0, description="|f'|/f'' of the translations, metres (6 dof)")
     min_peakedness_per_deg2: float = Field(default=0.01, description="f''/score, per degree²; least of the rotations")
     min_overlap: float = Field(
         default=0.5, ge=0, le=1, description="points in view over the most any pose of the box sees"
+    )
+    min_edges_over_unrelated: float = Field(
+        default=1.5, gt=0, description="significance of the edges over that with other frames' images (fused)"
+    )
+    min_contrast: float = Field(
+        default=4.0, gt=0, description="fused score, in standard deviations of the scores of other poses within reach"
+    )
+    max_runner_up: float = Field(
+        default=0.9, gt=0, le=1, description="fused score of the next best basin over the best one's; above: ambiguous"
     )
 
 

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from coec.adapters.depth import open_depth
+from coec.adapters.images import GreyImages
+from coec.calibration.edges import EdgeWitness, build_edges
+from coec.calibration.motion import compensate
 from coec.calibration.pairing import Pairer
 from coec.calibration.ports import DepthModel
 from coec.calibration.values import FramePair, Window
@@ -29,6 +32,20 @@ def street() -> Window:
 def stereo() -> DepthModel:
     """Hands out the maps that come with the frames."""
     return open_depth(DepthConfig(model="stereo"), LimitsConfig())
+
+
+@pytest.fixture(scope="session")
+def sharp_street() -> Window:
+    """The same street at twice the resolution: 0.35° per pixel, below which its edges do not tell pitch from height."""
+    return pairs_of("synthetic:?seed=3&frames=8&width=640")[1]
+
+
+@pytest.fixture(scope="session")
+def sharp_edges(sharp_street: Window) -> EdgeWitness:
+    """The edge witness of the sharp street."""
+    rig, pairs, images = sharp_street.rig, sharp_street.pairs, GreyImages(LimitsConfig())
+    clouds = [compensate(pair, rig, enabled=True).xyz_m for pair in pairs]
+    return build_edges(pairs, clouds, [images.grey(pair.camera) for pair in pairs], rig)
 
 
 @pytest.fixture

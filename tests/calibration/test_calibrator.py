@@ -6,19 +6,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coec.adapters.images import GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.values import CameraFrame, Decision, DepthMap, Estimate, StopReason, Window
-from coec.config import CalibrationConfig, ObjectiveConfig, SearchConfig
+from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
 
-CONFIG = CalibrationConfig()
-SIX = CalibrationConfig(search=SearchConfig(dof=6))
+MI = ObjectiveConfig(kind="mi")
+CONFIG = CalibrationConfig(objective=MI)
+SIX = CalibrationConfig(objective=MI, search=SearchConfig(dof=6))
+GREY = GreyImages(LimitsConfig())
 
 
 def solve(window: Window, depth: DepthModel, config: CalibrationConfig = CONFIG) -> Estimate:
-    return calibrate(window, depth, config, Silence())
+    return calibrate(window, depth, GREY, config, Silence())
 
 
 def from_start(window: Window, *deg_and_m: float) -> Window:
@@ -60,7 +63,7 @@ def test_same_input_same_bits(street: Window, stereo: DepthModel) -> None:
 def test_turning_the_lidar_turns_the_optimum_back(street: Window, stereo: DepthModel) -> None:
     """Metamorphic: clouds turned by S about the LiDAR have their optimum at T·S⁻¹."""
     turn = se3.perturbation(np.array([0.0, 0.0, np.radians(30.0), 0.0, 0.0, 0.0]))
-    off = CalibrationConfig(motion_compensation=False)
+    off = CalibrationConfig(objective=MI, motion_compensation=False)
     start = from_start(street, 2, 1, -1)
     turned = replace(
         start,
@@ -127,7 +130,7 @@ def test_depth_of_other_frames_is_not_believed(street: Window, stereo: DepthMode
 
 
 def test_a_truth_outside_the_box_is_not_believed(street: Window, stereo: DepthModel) -> None:
-    config = CalibrationConfig(search=SearchConfig(rotation_deg=2.0))
+    config = CalibrationConfig(objective=MI, search=SearchConfig(rotation_deg=2.0))
     estimate = solve(from_start(street, 0, 6, 0), stereo, config)
     assert estimate.optimum.stop_reason is StopReason.AT_BOUND
     assert estimate.verdict.decision is Decision.FAILED
@@ -162,7 +165,7 @@ def test_a_window_without_pairs_is_an_error(street: Window, stereo: DepthModel) 
 
 
 def test_a_window_without_a_point_in_the_range_limits_is_an_error(street: Window, stereo: DepthModel) -> None:
-    config = CalibrationConfig(objective=ObjectiveConfig(min_range_m=150.0, max_range_m=151.0))
+    config = CalibrationConfig(objective=ObjectiveConfig(kind="mi", min_range_m=150.0, max_range_m=151.0))
     with pytest.raises(CalibrationError, match="no LiDAR point"):
         solve(street, stereo, config)
 
@@ -192,6 +195,6 @@ def test_progress_is_told(street: Window, stereo: DepthModel) -> None:
             self.heard[stage] = done
 
     listener = Listener()
-    estimate = calibrate(street, stereo, CONFIG, listener)
+    estimate = calibrate(street, stereo, GREY, CONFIG, listener)
     assert listener.heard["depth"] == len(street.pairs)
     assert listener.heard["search"] == estimate.optimum.evaluations

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from coec.adapters.images import GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.lifecycle import (
     HealthState,
@@ -18,7 +19,7 @@ from coec.calibration.lifecycle import (
 )
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.values import Decision, Estimate, Reason, Window
-from coec.config import CalibrationConfig
+from coec.config import CalibrationConfig, LimitsConfig
 
 DAY_S = 86_400.0
 CRASH = Reason("worker_failed", "The worker crashed twice.")
@@ -26,7 +27,7 @@ CRASH = Reason("worker_failed", "The worker crashed twice.")
 
 @pytest.fixture(scope="module")
 def accepted(street: Window, stereo: DepthModel) -> Estimate:
-    return calibrate(street, stereo, CalibrationConfig(), Silence())
+    return calibrate(street, stereo, GreyImages(LimitsConfig()), CalibrationConfig(), Silence())
 
 
 @pytest.fixture(scope="module")

@@ -3,26 +3,31 @@
 import numpy as np
 import pytest
 
-from coec.calibration.objective import GUARD_OVERLAP, Objective, SearchBox, build_objective
+from coec.calibration.objective import (
+    GUARD_OVERLAP,
+    MutualInformation,
+    SearchBox,
+    build_mutual_information,
+    range_and_depth,
+)
 from coec.calibration.ports import DepthModel
 from coec.calibration.values import Window
 from coec.config import ObjectiveConfig
 from coec.geometry import se3
 
 
-def objective_of(window: Window, depth: DepthModel, box: SearchBox, config: ObjectiveConfig | None = None) -> Objective:
-    return build_objective(
-        [pair.lidar.xyz_m for pair in window.pairs],
-        [depth.infer(pair.camera) for pair in window.pairs],
+def objective_of(window: Window, depth: DepthModel, box: SearchBox) -> MutualInformation:
+    return build_mutual_information(
+        [range_and_depth(pair.lidar.xyz_m, depth.infer(pair.camera)) for pair in window.pairs],
         window.rig,
         window.T_camera_lidar_start,
         box,
-        config or ObjectiveConfig(),
+        ObjectiveConfig(),
     )
 
 
 @pytest.fixture(scope="module")
-def objective(street: Window, stereo: DepthModel) -> Objective:
+def objective(street: Window, stereo: DepthModel) -> MutualInformation:
     return objective_of(street, stereo, SearchBox(np.radians(10.0), 0.0))
 
 
@@ -38,14 +43,14 @@ def test_points_that_no_pose_of_the_box_can_see_are_all_that_is_left_out(street:
         assert culled.evaluate(pose).points_in_view == full.evaluate(pose).points_in_view
 
 
-def test_the_score_is_mutual_information_while_enough_is_in_view(objective: Objective, street: Window) -> None:
+def test_the_score_is_mutual_information_while_enough_is_in_view(objective: MutualInformation, street: Window) -> None:
     at_truth = objective.evaluate(street.T_camera_lidar_start)
     assert at_truth.overlap > GUARD_OVERLAP
     assert at_truth.score == pytest.approx(at_truth.mi)
     assert at_truth.frame_scores.mean() == pytest.approx(at_truth.score)
 
 
-def test_looking_away_does_not_pay(objective: Objective, street: Window) -> None:
+def test_looking_away_does_not_pay(objective: MutualInformation, street: Window) -> None:
     """Points leave the view when the camera looks up; the guarded score must not rise for it."""
     truth = objective.evaluate(street.T_camera_lidar_start)
     for pitch_deg in (40, 60, 80, 100, 120):
@@ -55,7 +60,7 @@ def test_looking_away_does_not_pay(objective: Objective, street: Window) -> None
         assert away.score <= away.mi
 
 
-def test_the_truth_is_a_maximum_along_every_rotation(objective: Objective, street: Window) -> None:
+def test_the_truth_is_a_maximum_along_every_rotation(objective: MutualInformation, street: Window) -> None:
     truth = objective.evaluate(street.T_camera_lidar_start).score
     for axis in range(3):
         for degrees in (-6, -3, -1, 1, 3, 6):
@@ -64,6 +69,6 @@ def test_the_truth_is_a_maximum_along_every_rotation(objective: Objective, stree
             assert objective.evaluate(se3.perturb(street.T_camera_lidar_start, xi)).score < truth
 
 
-def test_unrelated_depth_tells_less(objective: Objective, street: Window) -> None:
+def test_unrelated_depth_tells_less(objective: MutualInformation, street: Window) -> None:
     truth = objective.evaluate(street.T_camera_lidar_start)
     assert objective.mi_of_unrelated(street.T_camera_lidar_start) < truth.mi / 1.2

@@ -7,8 +7,8 @@ import pytest
 
 from coec.calibration.confidence import Curvature
 from coec.calibration.objective import Evaluation
-from coec.calibration.values import Decision, Metric, StopReason
-from coec.calibration.verdict import judge
+from coec.calibration.values import Decision, Metric, StopReason, Verdict
+from coec.calibration.verdict import judge, shape_metrics
 from coec.config import VerdictConfig
 
 LIMITS = VerdictConfig()
@@ -19,39 +19,62 @@ PEAK = Curvature(
     sigma=np.full(6, np.nan),
 )
 SLOPE = replace(PEAK, first_derivative=PEAK.first_derivative * 100)
-PLAIN = replace(PEAK, second_derivative=PEAK.second_derivative / 100)
+PLAIN = replace(PEAK, first_derivative=PEAK.first_derivative / 100, second_derivative=PEAK.second_derivative / 100)
+OUTSTANDING = (
+    Metric("contrast", 9.0, LIMITS.min_contrast, at_least=True),
+    Metric("runner_up", 0.5, LIMITS.max_runner_up, at_least=False),
+)
+
+
+def verdict_on(
+    evaluation: Evaluation = GOOD,
+    curvature: Curvature = PEAK,
+    stop: StopReason = StopReason.TOLERANCE,
+    of_objective: tuple[Metric, ...] = OUTSTANDING,
+    sigma_known: bool = True,
+) -> Verdict:
+    return judge((*of_objective, *shape_metrics(evaluation, curvature, LIMITS)), sigma_known, stop)
 
 
 def test_a_peak_with_everything_in_view_is_accepted() -> None:
-    verdict = judge(GOOD, 0.9, PEAK, StopReason.TOLERANCE, LIMITS)
+    verdict = verdict_on()
     assert verdict.decision is Decision.ACCEPTED
     assert verdict.reasons == ()
+    assert len(verdict.metrics) == 5
     assert all(metric.passed for metric in verdict.metrics)
 
 
 @pytest.mark.parametrize(
-    ("evaluation", "unrelated", "curvature", "stop", "code"),
+    ("verdict", "code"),
     [
-        (GOOD, 1.3, PEAK, StopReason.TOLERANCE, "mi_over_unrelated"),
-        (replace(GOOD, overlap=0.2), 0.9, PEAK, StopReason.TOLERANCE, "overlap"),
-        (GOOD, 0.9, SLOPE, StopReason.TOLERANCE, "newton_step_deg"),
-        (GOOD, 0.9, PLAIN, StopReason.TOLERANCE, "peakedness_per_deg2"),
-        (GOOD, 0.9, PEAK, StopReason.AT_BOUND, "optimum_at_bound"),
-        (GOOD, 0.9, PEAK, StopReason.EVALUATIONS, "evaluations_exhausted"),
+        (verdict_on(replace(GOOD, overlap=0.2)), "overlap"),
+        (verdict_on(curvature=SLOPE), "newton_step_deg"),
+        (verdict_on(curvature=PLAIN), "peakedness_per_deg2"),
+        (verdict_on(stop=StopReason.AT_BOUND), "optimum_at_bound"),
+        (verdict_on(stop=StopReason.EVALUATIONS), "evaluations_exhausted"),
+        (verdict_on(sigma_known=False), "sigma_unknown"),
+        (verdict_on(of_objective=(replace(OUTSTANDING[0], value=3.0),)), "contrast"),
+        (verdict_on(of_objective=(replace(OUTSTANDING[1], value=0.95),)), "runner_up"),
+        (verdict_on(of_objective=(Metric("mi_over_unrelated", 1.1, 1.2, at_least=True),)), "mi_over_unrelated"),
     ],
-)  # fmt: skip
-def test_each_limit_fails_with_its_own_reason(
-    evaluation: Evaluation, unrelated: float, curvature: Curvature, stop: StopReason, code: str
-) -> None:
-    verdict = judge(evaluation, unrelated, curvature, stop, LIMITS)
+)
+def test_each_limit_fails_with_its_own_reason(verdict: Verdict, code: str) -> None:
     assert verdict.decision is Decision.FAILED
-    assert code in {reason.code for reason in verdict.reasons}
+    assert [reason.code for reason in verdict.reasons] == [code]
+
+
+def test_a_metric_that_fails_says_its_value_and_its_limit() -> None:
+    (reason,) = verdict_on(replace(GOOD, overlap=0.25)).reasons
+    assert "0.25" in reason.text
+    assert f"{LIMITS.min_overlap:g}" in reason.text
 
 
 def test_a_saddle_is_not_a_maximum() -> None:
     saddle = replace(PEAK, second_derivative=PEAK.second_derivative * [1, -1, 1, 1, 1, 1])
-    codes = {reason.code for reason in judge(GOOD, 0.9, saddle, StopReason.TOLERANCE, LIMITS).reasons}
-    assert codes == {"newton_step_deg", "peakedness_per_deg2"}
+    assert [reason.code for reason in verdict_on(curvature=saddle).reasons] == [
+        "newton_step_deg",
+        "peakedness_per_deg2",
+    ]
 
 
 @pytest.mark.parametrize("at_least", [True, False])

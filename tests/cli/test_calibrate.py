@@ -17,7 +17,7 @@ TOLERANCE_DEG = 0.35
 
 
 def test_recovers_the_truth_from_a_perturbed_start(coec: Coec) -> None:
-    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--perturb", "-2,1.5,1", "--json")
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--perturb", "-2,1.5,1", "--json")
     report = outcome.document
     assert outcome.status == 0
     assert report["verdict"]["decision"] == "accepted"

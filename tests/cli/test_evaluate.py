@@ -83,7 +83,7 @@ def test_output_folder_holds_table_report_and_pictures(coec: Coec, tmp_path: Pat
 def test_six_degrees_of_freedom_are_searched_and_judged(coec: Coec) -> None:
     report = coec(
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "1", "--translation-m", "0.3", "--directions", "2",
-        "--frames", "2", "--json",
+        "--frames", "2", "--objective", "mi", "--json",
     ).document  # fmt: skip
     assert report["dof"] == 6
     assert report["search_translation_m"] == 0.5
@@ -101,7 +101,9 @@ def test_equal_evaluations_are_equal_but_for_the_time(coec: Coec) -> None:
 
 
 def test_text_separates_bias_from_noise_and_counts_verdicts(coec: Coec) -> None:
-    outcome = coec("evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "3", "--directions", "3")
+    outcome = coec(
+        "evaluate", SMALL, "--depth", "stereo", "--objective", "mi", "--rotation-deg", "3", "--directions", "3"
+    )
     assert "3 starts 3 deg away" in outcome.out
     assert "3 hits within 0.5 deg: 100.0 %" in outcome.out
     assert "std of hits" in outcome.out

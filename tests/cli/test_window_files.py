@@ -9,6 +9,7 @@ import pytest
 
 from cli.conftest import SMALL, Coec
 from coec.adapters.depth import open_depth
+from coec.adapters.images import GreyImages
 from coec.adapters.mcap_windows import WindowWriter, read_result, read_window, write_result
 from coec.adapters.wire import result_of
 from coec.calibration.calibrator import calibrate
@@ -17,7 +18,8 @@ from coec.cli import windows
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig
 from coec.geometry import se3
 
-CONFIGURATION = CalibrationConfig(objective=ObjectiveConfig(depth_bins=24, range_bins=20))
+LIMITS = LimitsConfig()
+CONFIGURATION = CalibrationConfig(objective=ObjectiveConfig(kind="mi", depth_bins=24, range_bins=20))
 """Not the defaults: what the file says must be used."""
 
 
@@ -34,7 +36,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writer.add(pair)
     writer.finish()
     read, configuration = read_window(path)
-    estimate = calibrate(read, open_depth(configuration.depth, LimitsConfig()), configuration, Silence())
+    estimate = calibrate(read, open_depth(configuration.depth, LIMITS), GreyImages(LIMITS), configuration, Silence())
     write_result(path, result_of(estimate, read.rig, "v7"))
     return path
 

@@ -88,25 +88,33 @@ def decode_bgr(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
     return pixels[:, :, ::-1] if image.format is ImageFormat.RGB8 else pixels
 
 
+def decode_grey(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
+    """(height, width) uint8 grey.
+
+    Raises:
+        DecodeError: the reasons of `probe` and `raw_image`.
+    """
+    if image.format not in CHANNELS:
+        return _expect(_imdecode(image, cv2.IMREAD_GRAYSCALE, limits), (image.height, image.width))
+    pixels = _raw(image, limits)
+    if image.format is ImageFormat.MONO8:
+        return pixels[:, :, 0]
+    code = cv2.COLOR_RGB2GRAY if image.format is ImageFormat.RGB8 else cv2.COLOR_BGR2GRAY
+    return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
+
+
 def decode_grey_reduced(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
     """(about height/2, about width/2) uint8 grey; images with a side below 64 px keep their size.
 
     Raises:
         DecodeError: the reasons of `probe` and `raw_image`.
     """
-    reduce = min(image.width, image.height) >= _REDUCE_FROM_PX
+    if min(image.width, image.height) < _REDUCE_FROM_PX:
+        return decode_grey(image, limits)
     if image.format not in CHANNELS:
-        return _imdecode(image, cv2.IMREAD_REDUCED_GRAYSCALE_2 if reduce else cv2.IMREAD_GRAYSCALE, limits)
-    pixels = _raw(image, limits)
-    if image.format is ImageFormat.MONO8:
-        grey = pixels[:, :, 0]
-    else:
-        code = cv2.COLOR_RGB2GRAY if image.format is ImageFormat.RGB8 else cv2.COLOR_BGR2GRAY
-        grey = np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
-    if not reduce:
-        return grey
+        return _imdecode(image, cv2.IMREAD_REDUCED_GRAYSCALE_2, limits)
     size = ((image.width + 1) // 2, (image.height + 1) // 2)
-    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(cv2.resize(decode_grey(image, limits), size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def decode_depth(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.float32]:
@@ -174,6 +182,43 @@ def _raw(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
 
 
 # --- quality ------------------------------------------------------------------------------------------------
+
+
+class GreyImages:
+    """Implements `ports.ImageReader`."""
+
+    def __init__(self, limits: LimitsConfig) -> None:
+        self._limits = limits
+
+    def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
+        """(height, width) grey values.
+
+        Raises:
+            DecodeError: the reasons of `probe` and `raw_image`.
+        """
+        return decode_grey(frame.image, self._limits)
+
+
+class CachedGreys:
+    """Keeps the grey images of the last frames: for solving one window many times. Implements `ports.ImageReader`."""
+
+    def __init__(self, reader: GreyImages, entries: int) -> None:
+        self._reader = reader
+        self._entries = entries
+        self._kept: dict[bytes, NDArray[np.uint8]] = {}
+
+    def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
+        """(height, width) grey values.
+
+        Raises:
+            DecodeError: the reasons of `probe` and `raw_image`.
+        """
+        digest = hashlib.sha256(frame.image.data).digest()
+        if digest not in self._kept:
+            if len(self._kept) == self._entries:
+                del self._kept[next(iter(self._kept))]
+            self._kept[digest] = self._reader.grey(frame)
+        return self._kept[digest]
 
 
 class Inspector:

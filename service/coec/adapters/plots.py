@@ -63,18 +63,19 @@ def bullseye(outcomes: Sequence[Outcome], directions: Mapping[str, NDArray[np.fl
 
 
 def landscape(curves: Mapping[str, Sequence[Scan]], title: str) -> bytes:
-    """Each named objective along the six axes about the reference. Several are drawn as shares of their highest value,
-    so that they can be compared; one is drawn as it is."""
+    """Each named objective along the six axes about the reference. Several are drawn between their lowest (0) and
+    highest value (1) over all axes, so that units do not matter; one is drawn as it is."""
     figure = Figure(figsize=(13.0, 7.0), layout="constrained")
     figure.suptitle(title)
     panels = figure.subplots(2, 3, sharey=True)
     shared = len(curves) > 1
     for name, scans in curves.items():
-        highest = max(float(scan.scores.max()) for scan in scans)
+        every = np.concatenate([scan.scores for scan in scans])
+        lowest, height = every.min(), np.ptp(every) or 1.0
         for scan in scans:
             axes = panels[divmod(scan.axis, 3)]
             scale, unit = (degrees(1.0), "deg") if scan.axis < 3 else (1.0, "m")
-            scores = scan.scores / highest if shared else scan.scores
+            scores = (scan.scores - lowest) / height if shared else scan.scores
             best = scan.best_offset * scale
             (line,) = axes.plot(scan.offsets * scale, scores, label=f"{name}, best at {best:+.2f} {unit}")
             axes.plot(best, scores.max(), "o", color=line.get_color(), markersize=5)
@@ -84,7 +85,7 @@ def landscape(curves: Mapping[str, Sequence[Scan]], title: str) -> bytes:
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small", loc="lower center")
     for axes in panels[:, 0]:
-        axes.set_ylabel("share of the highest score" if shared else "score, nats")
+        axes.set_ylabel("score, from its lowest to its highest" if shared else "score")
     return _png(figure)
 
 

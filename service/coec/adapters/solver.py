@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from coec.adapters.depth import CachedDepth, open_depth
+from coec.adapters.images import GreyImages
 from coec.adapters.mcap_windows import read_window, write_result
 from coec.adapters.msgpack_frames import decode_camera
 from coec.adapters.rig import rig_of
@@ -57,6 +58,7 @@ class Solver:
         """
         self._config = config
         self._depth_maps_kept = depth_maps_kept
+        self._images = GreyImages(config.limits)
         self._networks: dict[DepthConfig, CachedDepth] = {}
         self._depth_of_pair = {pair.name: pair.calibration.depth for pair in config.pairs}
         for depth in self._depth_of_pair.values():
@@ -69,7 +71,7 @@ class Solver:
             configuration = pair.calibration.model_copy(update={"search": search})
             # An invented window need not lead to a calibration; that it ran is enough.
             with contextlib.suppress(CalibrationError, DecodeError):
-                calibrate(_invented_window(rig_of(pair)), _Ramp(), configuration, Silence())
+                calibrate(_invented_window(rig_of(pair)), _Ramp(), self._images, configuration, Silence())
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
@@ -86,7 +88,7 @@ class Solver:
             WindowError, CalibrationError, DecodeError, ModelError: there is no result.
         """
         window, configuration = read_window(path)
-        estimate = calibrate(window, self._network(configuration.depth), configuration, Silence())
+        estimate = calibrate(window, self._network(configuration.depth), self._images, configuration, Silence())
         result = result_of(estimate, window.rig, self._config.vehicle)
         try:
             write_result(path, result)
@@ -117,9 +119,12 @@ class _Ramp:
 
 def _invented_window(rig: Rig) -> Window:
     """Two pairs with points all around the LiDAR, seeded."""
-    direction = np.random.default_rng(0).normal(size=(WARM_UP_POINTS, 3))
-    xyz_m = (10.0 * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
-    image = EncodedImage(ImageFormat.JPEG, rig.camera.width, rig.camera.height, b"")
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(WARM_UP_POINTS, 3))
+    range_m = rng.uniform(5.0, 30.0, size=(WARM_UP_POINTS, 1))
+    xyz_m = (range_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    width, height = rig.camera.width, rig.camera.height
+    image = EncodedImage(ImageFormat.MONO8, width, height, rng.bytes(width * height))
     pairs = tuple(
         FramePair(CameraFrame(stamp, rig.camera_frame, image), LidarFrame(stamp, rig.lidar_frame, xyz_m))
         for stamp in (0, 100_000_000)

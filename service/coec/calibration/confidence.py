@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,8 @@ from coec.calibration.objective import Objective
 from coec.calibration.values import Matrix4
 from coec.geometry import se3
 
-STEP_RAD = radians(0.5)
-"""Difference step, rotation: several cells of a depth map, so that the derivative is that of the hill."""
-
-STEP_M = 0.05
-"""Difference step, translation: moves a point 6 m away as far as `STEP_RAD` does."""
+METRES_PER_RADIAN = 6.0
+"""Difference step of a translation per step of a rotation: moves a point 6 m away as far."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +38,7 @@ class Curvature:
 
 def measure_curvature(objective: Objective, pose: Matrix4, dof: int) -> Curvature:
     """Central differences per frame about `pose` (4, 4) on the first `dof` axes."""
-    steps = np.array([STEP_RAD] * 3 + [STEP_M] * 3)[:dof]
+    steps = objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)[:dof]
 
     def at(offset: NDArray[np.float64]) -> NDArray[np.float64]:
         perturbation = np.zeros(6)

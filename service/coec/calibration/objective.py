@@ -11,6 +11,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from math import radians
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,8 +61,24 @@ class Evaluation:
     points_in_view: int
 
 
-class Objective:
-    """Mutual information of one window as a function of the pose."""
+class Objective(Protocol):
+    """What a search maximises and a diagnosis probes."""
+
+    @property
+    def step_rad(self) -> float:
+        """Difference step for derivatives on rotations: spans the ripples of the objective, not its hill."""
+        ...
+
+    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
+        """The objective at `T_camera_lidar` (4, 4)."""
+        ...
+
+
+class MutualInformation:
+    """Mutual information of one window as a function of the pose, guarded."""
+
+    step_rad = radians(0.5)
+    """Several cells of a depth map."""
 
     def __init__(self, frames: BinnedFrames, start: Matrix4, box: SearchBox) -> None:
         """Freezes the reference of the guard: the most points each frame has in view at the start and on the faces and
@@ -108,45 +126,62 @@ class Objective:
         return float(mutual_information(unrelated, T_camera_lidar).mi.mean())
 
 
-def build_objective(
-    clouds: Sequence[NDArray[np.float32]],
-    depths: Sequence[DepthMap],
-    rig: Rig,
-    start: Matrix4,
-    box: SearchBox,
-    config: ObjectiveConfig,
-) -> Objective:
-    """Bins the clouds ((N_i, 3) float32, motion-compensated) and depth maps of a window.
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """What is compared in one frame: a value of every point and a map of the image.
 
-    Bins hold equal shares of the values of their frame: MI is then blind to any monotonic code of depth, so inverse
-    depth as it comes, metric depth and disparity are the same to it.
+    Attributes:
+        xyz_m: (N, 3) float32 points in the LiDAR frame, motion-compensated.
+        of_points: (N,) float32, does not depend on the pose.
+        of_pixels: (h, w) float32 over the whole field of view of the image; NaN = no value.
+    """
+
+    xyz_m: NDArray[np.float32]
+    of_points: NDArray[np.float32]
+    of_pixels: NDArray[np.float32]
+
+
+def range_and_depth(xyz_m: NDArray[np.float32], depth: DepthMap) -> Features:
+    """The paper's features: Euclidean range from the LiDAR origin, and the network's output as it comes."""
+    return Features(xyz_m, np.linalg.norm(xyz_m, axis=1).astype(np.float32), depth.values)
+
+
+def build_mutual_information(
+    frames: Sequence[Features], rig: Rig, start: Matrix4, box: SearchBox, config: ObjectiveConfig
+) -> MutualInformation:
+    """Bins the features of a window.
+
+    Bins hold equal shares of the values of their frame: MI is then blind to any monotonic code, so inverse depth as it
+    comes, metric depth and disparity are the same to it.
 
     Raises:
         CalibrationError: no point is left between the range limits, or none can come into view.
     """
-    heights = {depth.values.shape for depth in depths}
-    if len(heights) != 1:
-        raise CalibrationError(f"the depth maps of a window must have one size, found {sorted(heights)}")
-    (shape,) = heights
+    shapes = {frame.of_pixels.shape for frame in frames}
+    if len(shapes) != 1:
+        raise CalibrationError(f"the maps of a window must have one size, found {sorted(shapes)}")
+    (shape,) = shapes
     camera = scaled(rig.camera, shape[1] / rig.camera.width, shape[0] / rig.camera.height)
     lit = _mask_at(rig.mask, shape)
     reach = _Reach(camera, start, box)
-    kept = [_visible(cloud, reach, config) for cloud in clouds]
-    first_point = np.concatenate([[0], np.cumsum([len(cloud) for cloud in kept])]).astype(np.int64)
+    kept = [_visible(frame.xyz_m, reach, config) for frame in frames]
+    first_point = np.concatenate([[0], np.cumsum([np.count_nonzero(rows) for rows in kept])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError(
             f"no LiDAR point from {config.min_range_m} m to {config.max_range_m} m can come into view from the start"
         )
-    frames = BinnedFrames(
+    binned = BinnedFrames(
         camera=camera,
-        xyz_m=np.ascontiguousarray(np.concatenate(kept).T),
-        range_bin=np.concatenate([_range_bins(cloud, config.range_bins) for cloud in kept]),
+        xyz_m=np.ascontiguousarray(np.concatenate([f.xyz_m[rows] for f, rows in zip(frames, kept, strict=True)]).T),
+        range_bin=np.concatenate(
+            [_point_bins(f.of_points[rows], config.range_bins) for f, rows in zip(frames, kept, strict=True)]
+        ),
         first_point=first_point,
-        depth_bin=np.stack([_depth_bins(depth, lit, config.depth_bins) for depth in depths]),
+        depth_bin=np.stack([_pixel_bins(frame.of_pixels, lit, config.depth_bins) for frame in frames]),
         depth_bins=config.depth_bins,
         range_bins=config.range_bins,
     )
-    return Objective(frames, start, box)
+    return MutualInformation(binned, start, box)
 
 
 def _poses_of_box(start: Matrix4, box: SearchBox) -> list[Matrix4]:
@@ -192,23 +227,22 @@ def _half_field_of_view_rad(camera: Camera) -> float:
     return float(np.arccos(np.clip(rays[:, 2].min(), -1.0, 1.0))) + 1.0 / min(camera.fx, camera.fy)
 
 
-def _visible(xyz_m: NDArray[np.float32], reach: _Reach, config: ObjectiveConfig) -> NDArray[np.float32]:
+def _visible(xyz_m: NDArray[np.float32], reach: _Reach, config: ObjectiveConfig) -> NDArray[np.bool_]:
     range_m = np.linalg.norm(xyz_m, axis=1)
-    xyz_m = xyz_m[(range_m >= config.min_range_m) & (range_m <= config.max_range_m)]
-    return xyz_m[reach(xyz_m)]
+    kept: NDArray[np.bool_] = (range_m >= config.min_range_m) & (range_m <= config.max_range_m) & reach(xyz_m)
+    return kept
 
 
-def _range_bins(xyz_m: NDArray[np.float32], bins: int) -> NDArray[np.unsignedinteger]:
-    """f^P: the Euclidean range from the LiDAR origin, as a bin index."""
-    range_m = np.linalg.norm(xyz_m, axis=1)
-    return _indices(np.searchsorted(_equal_shares(range_m, bins), range_m, side="right"), bins)
+def _point_bins(values: NDArray[np.float32], bins: int) -> NDArray[np.unsignedinteger]:
+    """f^P as a bin index."""
+    return _indices(np.searchsorted(_equal_shares(values, bins), values, side="right"), bins)
 
 
-def _depth_bins(depth: DepthMap, lit: NDArray[np.bool_], bins: int) -> NDArray[np.unsignedinteger]:
+def _pixel_bins(values: NDArray[np.float32], lit: NDArray[np.bool_], bins: int) -> NDArray[np.unsignedinteger]:
     """f^D at every pixel as a bin index, `bins` where there is no value, with the entry for "outside" at the end."""
-    usable = lit & np.isfinite(depth.values)
-    edges = _equal_shares(depth.values[usable], bins)
-    binned = np.where(usable, np.searchsorted(edges, depth.values, side="right"), bins)
+    usable = lit & np.isfinite(values)
+    edges = _equal_shares(values[usable], bins)
+    binned = np.where(usable, np.searchsorted(edges, values, side="right"), bins)
     return _indices(np.append(binned.ravel(), bins), bins)
 
 

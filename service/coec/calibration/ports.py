@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from coec.calibration.values import CameraFrame, DepthMap, ImageQuality
 
 
@@ -20,6 +23,18 @@ class DepthModel(Protocol):
 
         Raises:
             DecodeError: the image or the precomputed map cannot be decoded, or there is no map.
+        """
+        ...
+
+
+class ImageReader(Protocol):
+    """Pixels of an exposure, for the witnesses that look at the image itself."""
+
+    def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
+        """(height, width) grey values.
+
+        Raises:
+            DecodeError: the image cannot be decoded within the limits.
         """
         ...
 

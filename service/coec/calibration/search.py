@@ -27,6 +27,9 @@ quadratic model sees the hill and not the ripple."""
 REFINE_BOX_M, REFINE_STEP_M = 0.10, 0.04
 """Second stage, translation: the shifts that move a point 4 m away as far as the rotations above."""
 
+POLISH_METRES_PER_RADIAN = 10.0
+"""Step of a translation per step of a rotation when a basin is polished."""
+
 AT_BOUND = 0.995
 """Share of the half-width of the box beyond which an optimum counts as lying on the bound."""
 
@@ -77,6 +80,23 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, heard: 
     elif (np.abs(found) >= AT_BOUND * half_width).any():
         stop_reason = StopReason.AT_BOUND
     return SearchResult(_pose(start, found), score(found), score_at_start, evaluations, stop_reason)
+
+
+def polish(objective: Objective, basin: Matrix4, config: SearchConfig, heard: Callable[[int], None]) -> SearchResult:
+    """The maximum next to `basin` (4, 4), which lies within a few of the objective's difference steps of it."""
+    evaluations = 0
+
+    def score(coordinates: NDArray[np.float64]) -> float:
+        nonlocal evaluations
+        evaluations += 1
+        heard(evaluations)
+        return objective.evaluate(_pose(basin, coordinates)).score
+
+    step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)
+    at_basin = score(np.zeros(config.dof))
+    found, exhausted = _bobyqa(score, np.zeros(config.dof), 4.0 * step, 4.0 * step, 0.5 * step, config)
+    stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
+    return SearchResult(_pose(basin, found), score(found), at_basin, evaluations, stop_reason)
 
 
 def _bobyqa(

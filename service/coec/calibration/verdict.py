@@ -18,33 +18,52 @@ from coec.calibration.objective import Evaluation
 from coec.calibration.values import Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
+ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
+
 _MEANING = {
     "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",
-    "newton_step_deg": "the objective is not at a maximum here",
+    "edges_over_unrelated": "the sweeps fit their own images no better than those of other frames",
+    "contrast": "no pose stands out from the others",
+    "runner_up": "ambiguous: another pose explains the window nearly as well",
+    "newton_step_deg": "the objective is not at a maximum on every rotation axis",
+    "newton_step_m": "the objective is not at a maximum on every translation axis",
     "peakedness_per_deg2": "the objective is too flat on at least one rotation axis",
     "overlap": "too few LiDAR points are in view",
 }
 
 
-def judge(
-    evaluation: Evaluation, mi_of_unrelated: float, curvature: Curvature, stop: StopReason, limits: VerdictConfig
-) -> Verdict:
-    """Equation (2) over the optimum's evaluation, its curvature and the MI of unrelated frames (nats)."""
-    first = curvature.first_derivative[:3]
-    second = curvature.second_derivative[:3]
-    newton_step_deg = degrees(float(np.max(np.abs(first) / second))) if (second > 0.0).all() else float("inf")
-    peakedness = float(np.min(second)) * radians(1.0) ** 2 / max(evaluation.score, 1e-12)
-    metrics = (
-        Metric("mi_over_unrelated", evaluation.mi / max(mi_of_unrelated, 1e-12), limits.min_mi_over_unrelated, True),
-        Metric("newton_step_deg", newton_step_deg, limits.max_newton_step_deg, False),
-        Metric("peakedness_per_deg2", peakedness, limits.min_peakedness_per_deg2, True),
-        Metric("overlap", evaluation.overlap, limits.min_overlap, True),
-    )
+def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictConfig) -> tuple[Metric, ...]:
+    """What any objective has to show at an optimum: no slope, a peak, and enough in view."""
+    peakedness = float(np.min(curvature.second_derivative[:3])) * radians(1.0) ** 2 / max(evaluation.score, 1e-12)
+    metrics = [
+        Metric(
+            "newton_step_deg", degrees(_newton_step(curvature, ROTATION)), limits.max_newton_step_deg, at_least=False
+        ),
+        Metric("peakedness_per_deg2", peakedness, limits.min_peakedness_per_deg2, at_least=True),
+        Metric("overlap", evaluation.overlap, limits.min_overlap, at_least=True),
+    ]
+    if np.isfinite(curvature.first_derivative[TRANSLATION]).all():
+        step_m = _newton_step(curvature, TRANSLATION)
+        metrics.append(Metric("newton_step_m", step_m, limits.max_newton_step_m, at_least=False))
+    return tuple(metrics)
+
+
+def _newton_step(curvature: Curvature, axes: slice) -> float:
+    """Largest |f'| / f'' over some axes: how far away each axis alone puts its maximum; infinite without one."""
+    first, second = curvature.first_derivative[axes], curvature.second_derivative[axes]
+    return float(np.max(np.abs(first) / second)) if (second > 0.0).all() else float("inf")
+
+
+def judge(metrics: tuple[Metric, ...], sigma_known: bool, stop: StopReason) -> Verdict:
+    """Equation (2) over the metrics of the objective and of its optimum. A result without an uncertainty (too few
+    frames to tell noise from signal) is not believed."""
     reasons = [
         Reason(metric.name, f"{_MEANING[metric.name]}: {metric.value:.3g}, limit {metric.limit:.3g}")
         for metric in metrics
         if not metric.passed
     ]
+    if not sigma_known:
+        reasons.append(Reason("sigma_unknown", "too few frames, or no maximum, to tell how far off the result may be"))
     if stop is not StopReason.TOLERANCE:
         reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

@@ -70,7 +70,10 @@ def _calibrate(
             metavar="MODEL",
         ),
     ] = None,
-    objective: Annotated[str | None, typer.Option(help="What is maximised: mi.", metavar="NAME")] = None,
+    objective: Annotated[
+        str | None,
+        typer.Option(help="What is maximised: fused (edges and depth), mi (the paper), intensity.", metavar="NAME"),
+    ] = None,
     dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None,
     perturb: Annotated[
         str | None,
@@ -124,7 +127,10 @@ def _evaluate(
     depth: Annotated[
         str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
     ] = None,
-    objective: Annotated[str | None, typer.Option(help="What is maximised: mi.", metavar="NAME")] = None,
+    objective: Annotated[
+        str | None,
+        typer.Option(help="What is maximised: fused (edges and depth), mi (the paper), intensity.", metavar="NAME"),
+    ] = None,
     dof: Annotated[
         DegreesOfFreedom | None,
         typer.Option(help="Rotation only, or translation too; 6 if --translation-m is given.", show_default=False),

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from rich.progress import Progress, TaskID
 
 from coec.adapters.depth import open_depth
+from coec.adapters.images import GreyImages
 from coec.adapters.wire import result_of
 from coec.calibration.calibrator import calibrate
 from coec.calibration.values import Rig, Window
@@ -97,7 +98,7 @@ def run(options: Options) -> int:
         window, fit = (window, None) if options.camera_model is None else refitted(window, options.camera_model)
         depth = open_depth(configuration.depth, LimitsConfig())
         times.step("prepare", 1, 1)
-        estimate = calibrate(window, depth, configuration, times)
+        estimate = calibrate(window, depth, GreyImages(LimitsConfig()), configuration, times)
     result = result_of(estimate, window.rig, loaded.vehicle)
     document = _document(result, times.elapsed_s(), fit)
     if options.output is not None:

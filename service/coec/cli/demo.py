@@ -32,7 +32,7 @@ from coec.cli import console, files, pictures, windows
 from coec.cli.commented_yaml import commented_yaml
 from coec.cli.convert import configuration_for
 from coec.cli.query import download_window
-from coec.config import Config, StateConfig, ZenohConfig
+from coec.config import Config, ObjectiveConfig, StateConfig, ZenohConfig
 from coec.errors import CoecError, NotFoundError
 from coec.geometry import se3
 from coec.schemas import replies
@@ -160,6 +160,9 @@ def _configuration(recording: Recording, nominal: Matrix4, folder: Path) -> Conf
         files.write(folder / "mask.png", mask_to_png(mask))
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     pair = configuration_for(recording, nominal, None if mask is None else Path("mask.png"))
+    # The drive comes with exact depth, and its pictures have 0.4° to a pixel: the paper's objective is sharper here.
+    paper = pair.calibration.model_copy(update={"objective": ObjectiveConfig(kind="mi")})
+    pair = pair.model_copy(update={"calibration": paper})
     config = Config(
         zenoh=ZenohConfig(connect=(endpoint,), listen=(endpoint,)),
         state=StateConfig(directory=Path("state"), min_free_bytes=MIN_FREE_BYTES),

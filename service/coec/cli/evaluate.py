@@ -16,13 +16,13 @@ from rich.progress import Progress
 
 from coec.adapters.depth import CachedDepth, open_depth
 from coec.adapters.evaluation_report import angle_spread_of, frames_point_of, in_degrees, spread_of, verdicts_of
+from coec.adapters.images import CachedGreys, GreyImages
 from coec.calibration import evaluation, landscape, starts
 from coec.calibration.calibrator import calibrate
+from coec.calibration.estimators import ESTIMATORS, look
 from coec.calibration.evaluation import FramesPoint, Outcome, Statistics, Trial
-from coec.calibration.motion import compensate
-from coec.calibration.objective import Objective, SearchBox, build_objective
-from coec.calibration.ports import DepthModel, Silence
-from coec.calibration.search import box_of
+from coec.calibration.objective import Objective
+from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.values import Matrix4, Window
 from coec.cli import calibrate as calibrate_command
 from coec.cli import console, files, pictures, windows
@@ -34,6 +34,7 @@ from coec.schemas.base import to_json
 from coec.schemas.replies import EvaluationReport, Spread, Vector6
 
 MARGIN_DEG, MARGIN_M = 5.0, 0.2
+REACH_MARGIN_DEG, REACH_MARGIN_M = 3.0, 0.05
 """How far the search box reaches beyond the starts at least, so that the reference never lies on its bound and a search
 may overshoot."""
 
@@ -73,6 +74,7 @@ class Bench:
 
     window: Window
     depth: DepthModel
+    images: ImageReader
     configuration: CalibrationConfig
 
     @property
@@ -86,7 +88,7 @@ class Bench:
         window = replace(self.window, T_camera_lidar_start=start, pairs=pairs)
         began_s = time.perf_counter()
         try:
-            estimate = calibrate(window, self.depth, self.configuration, Silence())
+            estimate = calibrate(window, self.depth, self.images, self.configuration, Silence())
         except CalibrationError:
             estimate = None
         trial = Trial(start, estimate, time.perf_counter() - began_s)
@@ -142,7 +144,8 @@ def run(options: Options) -> int:
         window = loaded.window
         if options.camera_model is not None:
             window, _ = calibrate_command.refitted(window, options.camera_model)
-        bench = Bench(window, _inferred(window, configuration, stages), configuration)
+        images = CachedGreys(GreyImages(LimitsConfig()), len(window.pairs))
+        bench = Bench(window, _inferred(window, configuration, stages), images, configuration)
         from_reference = _from_reference(bench, stages)
         poses = starts.starts(bench.reference, options.directions, radians(options.rotation_deg), options.translation_m)
         outcomes = _solve_all(bench, poses, stages)
@@ -185,6 +188,9 @@ def configuration_of(options: Options, recorded: CalibrationConfig | None) -> Ca
     search = values["search"]
     search["rotation_deg"] = max(search["rotation_deg"], options.rotation_deg + MARGIN_DEG)
     search["translation_m"] = max(search["translation_m"], options.translation_m + MARGIN_M)
+    # The protocol tells how far away the starts are; the global stage looks no further.
+    search["reach_deg"] = options.rotation_deg + REACH_MARGIN_DEG
+    search["reach_m"] = options.translation_m + REACH_MARGIN_M
     try:
         return CalibrationConfig.model_validate(values)
     except ValidationError as error:
@@ -218,7 +224,8 @@ def _from_reference(bench: Bench, stages: _Stages) -> Outcome:
         CalibrationError: from no start there would be an estimate.
     """
     heard = stages.begin("reference", 1)
-    calibrate(replace(bench.window, T_camera_lidar_start=bench.reference), bench.depth, bench.configuration, Silence())
+    window = replace(bench.window, T_camera_lidar_start=bench.reference)
+    calibrate(window, bench.depth, bench.images, bench.configuration, Silence())
     outcome = bench.solve(bench.reference)
     heard(1, "")
     return outcome
@@ -252,13 +259,10 @@ def _against_frames(bench: Bench, poses: Sequence[Matrix4], stages: _Stages) -> 
 
 
 def _landscape(bench: Bench) -> landscape.Landscape:
-    """The objective about the reference, with room for the scans."""
-    window, configuration = bench.window, bench.configuration
-    box = box_of(configuration.search)
-    reach = SearchBox(max(box.rotation_rad, landscape.REACH_RAD), max(box.translation_m, landscape.REACH_M))
-    clouds = [compensate(pair, window.rig, enabled=configuration.motion_compensation).xyz_m for pair in window.pairs]
-    depths = [bench.depth.infer(pair.camera) for pair in window.pairs]
-    return _Score(build_objective(clouds, depths, window.rig, bench.reference, reach, configuration.objective))
+    """The objective about the reference."""
+    window = replace(bench.window, T_camera_lidar_start=bench.reference)
+    sight = look(window, bench.depth, bench.images, bench.configuration, Silence())
+    return _Score(ESTIMATORS[bench.configuration.objective.kind](sight, bench.configuration).objective)
 
 
 def _write_pictures(

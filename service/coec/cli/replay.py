@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.adapters.depth import open_depth
+from coec.adapters.images import GreyImages
 from coec.adapters.mcap_windows import read_result, read_window
 from coec.adapters.wire import result_of
 from coec.calibration.calibrator import calibrate
@@ -28,8 +29,9 @@ def run(path: Path, *, depth: str | None, as_json: bool) -> int:
         raise WindowError(f"{path} holds no result to compare with: `coec calibrate {path}` makes one")
     window, configuration = read_window(path)
     network = configuration.depth if depth is None else configuration.depth.model_copy(update={"model": depth})
+    limits = LimitsConfig()
     with console.progress() as bars:
-        estimate = calibrate(window, open_depth(network, LimitsConfig()), configuration, StageTimes(bars))
+        estimate = calibrate(window, open_depth(network, limits), GreyImages(limits), configuration, StageTimes(bars))
     reached = result_of(estimate, window.rig, recorded.vehicle)
     identical = to_json(reached) == to_json(recorded)
     differences = _differences(recorded.model_dump(mode="json"), reached.model_dump(mode="json"))

@@ -68,6 +68,10 @@ def kernel_cache_directory(package: Path) -> Path:
     return Path(tempfile.mkdtemp(prefix=f"coec-{name}-"))
 
 
+# Threads of a parallel kernel must not spin while they wait: with other processes on the cores, spinning made a small
+# solve take 1 to 5 s instead of 0.1 s. Read by the OpenMP runtime when numba loads it; a choice of the user's wins.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 if not os.environ.get("NUMBA_CACHE_DIR"):  # a directory chosen by the user wins
     # numba's configuration is a module that fills itself at run time.
     numba.config.CACHE_DIR = str(kernel_cache_directory(Path(__file__).parent))  # type: ignore[attr-defined]

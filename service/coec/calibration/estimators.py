@@ -1,0 +1,188 @@
+"""The ways to find the extrinsic of a window, by the name of their objective. One line in `ESTIMATORS` adds another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from math import radians
+from types import MappingProxyType
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.basins import at_rim, find_basins
+from coec.calibration.edges import build_edges
+from coec.calibration.fused import FusedObjective
+from coec.calibration.motion import CompensatedCloud, compensate
+from coec.calibration.objective import (
+    Features,
+    MutualInformation,
+    Objective,
+    SearchBox,
+    build_mutual_information,
+    range_and_depth,
+)
+from coec.calibration.ports import DepthModel, ImageReader, Progress
+from coec.calibration.search import SearchResult, box_of, maximise, polish
+from coec.calibration.values import DepthMap, Matrix4, Metric, StopReason, Window
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError, DecodeError
+from coec.geometry import se3
+from coec.geometry.image_edges import halved
+
+Seen = TypeVar("Seen")
+
+POLISHED_BASINS = 3
+"""Basins that are polished on the fused objective: the true one was never below the second place."""
+
+DEPTH_THINNING = 4
+"""One in so many points carries the depth witness of a fusion: its hill is degrees wide, the edges settle the rest."""
+
+SAME_BASIN_RAD = radians(1.5)
+"""Poses nearer than this are one basin, not rivals."""
+
+MAX_GREY_WIDTH_PX = 800
+"""Images are halved to at most this width before grey values are compared: about the spacing of a sweep's points."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """A window as an estimator sees it: its pairs, P_i as the clouds at the instants of the exposures, and how to look
+    at the images. Depth is inferred, and images are decoded, only when an estimator asks."""
+
+    window: Window
+    clouds: tuple[CompensatedCloud, ...]
+    depth: DepthModel
+    images: ImageReader
+    progress: Progress
+
+    def depths(self) -> list[DepthMap]:
+        """D_i of every pair.
+
+        Raises:
+            CalibrationError: a frame has no usable depth.
+        """
+        return self._each("depth", lambda index: self.depth.infer(self.window.pairs[index].camera))
+
+    def greys(self) -> list[NDArray[np.uint8]]:
+        """The images of every pair, (height, width) grey values.
+
+        Raises:
+            CalibrationError: an image cannot be decoded.
+        """
+        return self._each("images", lambda index: self.images.grey(self.window.pairs[index].camera))
+
+    def _each(self, stage: str, look: Callable[[int], Seen]) -> list[Seen]:
+        seen = []
+        for index, pair in enumerate(self.window.pairs):
+            try:
+                seen.append(look(index))
+            except DecodeError as error:
+                raise CalibrationError(f"no {stage} for the camera frame at {pair.stamp_ns} ns: {error}") from error
+            self.progress.step(stage, index + 1, len(self.window.pairs))
+        return seen
+
+
+def look(
+    window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, progress: Progress
+) -> Sight:
+    """The window with its sweeps motion-compensated."""
+    clouds = tuple(compensate(pair, window.rig, enabled=config.motion_compensation) for pair in window.pairs)
+    return Sight(window, clouds, depth, images, progress)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What an estimator found: its objective, the search on it, and the metrics that only this objective has."""
+
+    objective: Objective
+    search: SearchResult
+    metrics: tuple[Metric, ...]
+
+
+Estimator = Callable[[Sight, CalibrationConfig], Found]
+
+
+def by_depth(sight: Sight, config: CalibrationConfig) -> Found:
+    """The paper's: BOBYQA on the mutual information of depth and range."""
+    return _by_mutual_information(_depth_features(sight), sight, config)
+
+
+def by_intensity(sight: Sight, config: CalibrationConfig) -> Found:
+    """Pandey, McBride, Savarese, Eustice 2012: BOBYQA on the mutual information of reflectance and grey value.
+
+    Raises:
+        CalibrationError: the sweeps carry no intensity.
+    """
+    frames = []
+    for pair, cloud, grey in zip(sight.window.pairs, sight.clouds, sight.greys(), strict=True):
+        if pair.lidar.intensity is None:
+            raise CalibrationError(f"the sweep at {pair.lidar.stamp_ns} ns carries no intensity: use another objective")
+        pixels = grey.astype(np.float32)
+        while pixels.shape[1] > MAX_GREY_WIDTH_PX:
+            pixels = halved(pixels)
+        frames.append(Features(cloud.xyz_m, pair.lidar.intensity, pixels))
+    return _by_mutual_information(frames, sight, config)
+
+
+def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
+    """Edges and depth: every basin of the edge witness within reach, ranked by both, the best polished on both."""
+    window, progress = sight.window, sight.progress
+    start = window.T_camera_lidar_start
+    reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
+    features = [_thinned(frame) for frame in _depth_features(sight)]
+    depth = build_mutual_information(features, window.rig, start, reach, config.objective)
+    edges = build_edges(window.pairs, [cloud.xyz_m for cloud in sight.clouds], sight.greys(), window.rig)
+    basins = find_basins(edges, start, reach)
+    progress.step("basins", 1, 1)
+    fused = FusedObjective(edges, depth, start, reach)
+    ranked = sorted(((fused.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
+    ends = [
+        polish(fused, pose, config.search, lambda count: progress.step("search", count, config.search.max_evaluations))
+        for _, pose in ranked[:POLISHED_BASINS]
+    ]
+    ranks = [fused.rank(end.T_camera_lidar) for end in ends]
+    best = int(np.argmax(ranks))
+    rivals = [rank for rank, end in zip(ranks, ends, strict=True) if _differ(end, ends[best])]
+    related = fused.edges_over_unrelated(ends[best].T_camera_lidar)
+    metrics = (
+        Metric("edges_over_unrelated", related, config.verdict.min_edges_over_unrelated, at_least=True),
+        Metric("contrast", ranks[best], config.verdict.min_contrast, at_least=True),
+        Metric(
+            "runner_up", max(rivals, default=0.0) / max(ranks[best], 1e-9), config.verdict.max_runner_up, at_least=False
+        ),
+    )
+    found = ends[best]
+    if at_rim(found.T_camera_lidar, start, reach):
+        found = replace(found, stop_reason=StopReason.AT_BOUND)
+    return Found(fused, found, metrics)
+
+
+ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
+
+
+def _depth_features(sight: Sight) -> list[Features]:
+    return [range_and_depth(cloud.xyz_m, depth) for cloud, depth in zip(sight.clouds, sight.depths(), strict=True)]
+
+
+def _thinned(frame: Features) -> Features:
+    return Features(frame.xyz_m[::DEPTH_THINNING], frame.of_points[::DEPTH_THINNING], frame.of_pixels)
+
+
+def _by_mutual_information(frames: list[Features], sight: Sight, config: CalibrationConfig) -> Found:
+    start, progress = sight.window.T_camera_lidar_start, sight.progress
+    objective: MutualInformation = build_mutual_information(
+        frames, sight.window.rig, start, box_of(config.search), config.objective
+    )
+    search = maximise(
+        objective, start, config.search, lambda count: progress.step("search", count, config.search.max_evaluations)
+    )
+    mi, unrelated = objective.evaluate(search.T_camera_lidar).mi, objective.mi_of_unrelated(search.T_camera_lidar)
+    ratio = Metric("mi_over_unrelated", mi / max(unrelated, 1e-12), config.verdict.min_mi_over_unrelated, at_least=True)
+    return Found(objective, search, (ratio,))
+
+
+def _differ(a: SearchResult, b: SearchResult) -> bool:
+    apart: Matrix4 = a.T_camera_lidar @ se3.inverse(b.T_camera_lidar)
+    return se3.rotation_angle_rad(apart) > SAME_BASIN_RAD

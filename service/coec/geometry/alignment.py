@@ -1,0 +1,238 @@
+"""How significantly range edges fall on image edges at a pose: the second witness beside mutual information.
+
+    z = Σ w·e / √Σ w²
+
+over the range edges in view, with e the standardised edge strength at their pixel and w their weight. Were the edges
+laid at random, z would have mean 0 and standard deviation about 1, however many are in view: looking away does not pay
+(METHOD, section 3, "significance").
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from coec.geometry.cameras import Camera, project_point
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeFrames:
+    """Range edges and edge maps of the frames of a window, at one level.
+
+    Attributes:
+        camera: intrinsics at the resolution of the maps.
+        xyz_m: (3, E) float32 LiDAR frame, frames one after the other, motion-compensated.
+        weight: (E,) float32.
+        first_point: (F + 1,) int64.
+        maps: (F, h, w) float32, standardised; NaN where masked.
+    """
+
+    camera: Camera
+    xyz_m: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    first_point: NDArray[np.int64]
+    maps: NDArray[np.float32]
+
+
+def frame_alignment(
+    frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Per frame Σ w·e and Σ w² (F,) at one pose (4, 4), with e interpolated between pixels: smooth in the pose."""
+    pose = np.ascontiguousarray(T_camera_lidar, np.float64)
+    sums = _smooth_sums(frames.camera, pose, frames.xyz_m, frames.weight, frames.first_point, frames.maps)
+    return sums[:, 0], sums[:, 1]
+
+
+def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """z at many poses (K, 4, 4), with e at the nearest pixel: (K,)."""
+    return np.asarray(
+        _significances(frames.camera, poses, frames.xyz_m, frames.weight, frames.first_point, frames.maps)
+    )
+
+
+def climb(
+    frames: EdgeFrames,
+    starts: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    halvings: int,
+    centre: NDArray[np.float64],
+    reach: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pattern search from many poses at once (Hooke and Jeeves 1961): the axes in turn, steps halved when none helps.
+
+    Args:
+        frames: edges and maps of one level.
+        starts: (K, 4, 4) poses.
+        steps: (6,) first steps, radians and metres, about the camera axes; 0 leaves an axis alone.
+        halvings: how often the steps are halved before the search ends.
+        centre: (4, 4) pose about which the search is bounded.
+        reach: (2,) largest rotation, radians, and translation, metres, from the centre; no step leaves it.
+
+    Returns:
+        Poses (K, 4, 4) and their z (K,).
+    """
+    ends, z = _climb(
+        frames.camera, np.ascontiguousarray(starts), steps, halvings, np.ascontiguousarray(centre), reach,
+        frames.xyz_m, frames.weight, frames.first_point, frames.maps,
+    )  # fmt: skip
+    return ends, z
+
+
+@njit(cache=True, parallel=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+def _smooth_sums(
+    camera: Camera,
+    T: NDArray[np.float64],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    frames = first_point.shape[0] - 1
+    sums = np.zeros((frames, 2))
+    for f in prange(frames):
+        strength, square = 0.0, 0.0
+        for i in range(first_point[f], first_point[f + 1]):
+            u, v, valid = _pixel(camera, T, xyz, i)
+            if valid and u >= 0.0 and v >= 0.0 and u < camera.width - 1.0 and v < camera.height - 1.0:
+                column, row = int(u), int(v)
+                a, b = u - column, v - row
+                e = (1.0 - b) * ((1.0 - a) * maps[f, row, column] + a * maps[f, row, column + 1]) + b * (
+                    (1.0 - a) * maps[f, row + 1, column] + a * maps[f, row + 1, column + 1]
+                )
+                if e == e:  # not masked
+                    w = float(weight[i])
+                    strength += w * e
+                    square += w * w
+        sums[f, 0], sums[f, 1] = strength, square
+    return sums
+
+
+@njit(cache=True, parallel=True)
+def _significances(
+    camera: Camera,
+    poses: NDArray[np.float64],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    z = np.empty(poses.shape[0])
+    for k in prange(poses.shape[0]):
+        z[k] = _significance(camera, poses[k], xyz, weight, first_point, maps)
+    return z
+
+
+@njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+def _significance(
+    camera: Camera,
+    T: NDArray[np.float64],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.float32],
+) -> float:
+    strength, square = 0.0, 0.0
+    for f in range(first_point.shape[0] - 1):
+        for i in range(first_point[f], first_point[f + 1]):
+            u, v, valid = _pixel(camera, T, xyz, i)
+            if valid and u >= -0.5 and v >= -0.5 and u < camera.width - 0.5 and v < camera.height - 0.5:
+                e = maps[f, int(v + 0.5), int(u + 0.5)]
+                if e == e:
+                    w = float(weight[i])
+                    strength += w * e
+                    square += w * w
+    return strength / math.sqrt(max(square, 1e-9))
+
+
+@njit(cache=True, inline="always")
+def _pixel(camera: Camera, T: NDArray[np.float64], xyz: NDArray[np.float32], i: int) -> tuple[float, float, bool]:
+    x, y, z = float(xyz[0, i]), float(xyz[1, i]), float(xyz[2, i])
+    return project_point(
+        camera,
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@njit(cache=True, parallel=True)
+def _climb(
+    camera: Camera,
+    starts: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    halvings: int,
+    centre: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.float32],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ends = starts.copy()
+    scores = np.empty(starts.shape[0])
+    for k in prange(starts.shape[0]):
+        pose = starts[k].copy()
+        best = _significance(camera, pose, xyz, weight, first_point, maps)
+        step = steps.copy()
+        halved = 0
+        for _ in range(MAX_SWEEPS):
+            improved = False
+            for axis in range(6):
+                if step[axis] == 0.0:
+                    continue
+                for sign in (-1.0, 1.0):
+                    trial = _moved(pose, axis, sign * step[axis])
+                    if not _within(trial, centre, reach):
+                        continue
+                    score = _significance(camera, trial, xyz, weight, first_point, maps)
+                    if score > best:
+                        best, pose, improved = score, trial, True
+                        break
+            if not improved:
+                halved += 1
+                if halved > halvings:
+                    break
+                step *= 0.5
+        ends[k] = pose
+        scores[k] = best
+    return ends, scores
+
+
+@njit(cache=True)
+def _within(pose: NDArray[np.float64], centre: NDArray[np.float64], reach: NDArray[np.float64]) -> bool:
+    """Whether pose · centre⁻¹ turns and shifts by no more than the reach."""
+    # The trace of R·Cᵀ is the sum of the products of the entries; the shift is t - R·(Cᵀ·c).
+    trace, shift2 = 0.0, 0.0
+    for i in range(3):
+        moved = 0.0
+        for j in range(3):
+            trace += pose[i, j] * centre[i, j]
+            moved += pose[i, j] * (
+                centre[0, j] * centre[0, 3] + centre[1, j] * centre[1, 3] + centre[2, j] * centre[2, 3]
+            )
+        shift2 += (pose[i, 3] - moved) ** 2
+    # A micrometre of grace: with no translation to search, rounding must not stop the rotation.
+    return bool(trace >= 1.0 + 2.0 * math.cos(min(reach[0], math.pi)) and shift2 <= (reach[1] + 1e-6) ** 2)
+
+
+MAX_SWEEPS = 40
+"""Bound on the sweeps over the axes of one climb: a basin is some ten steps wide."""
+
+
+@njit(cache=True)
+def _moved(pose: NDArray[np.float64], axis: int, amount: float) -> NDArray[np.float64]:
+    """The pose perturbed on the left along one axis of [rx ry rz tx ty tz]."""
+    out = pose.copy()
+    if axis >= 3:
+        out[axis - 3, 3] += amount
+        return out
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    c, s = np.cos(amount), np.sin(amount)
+    for j in range(4):
+        out[a, j] = c * pose[a, j] - s * pose[b, j]
+        out[b, j] = s * pose[a, j] + c * pose[b, j]
+    return out

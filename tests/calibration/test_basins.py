@@ -1,0 +1,107 @@
+"""The global stage: an even cover of the reach, and the true basin from far away."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.calibration.basins import ROUNDS, find_basins, sample_reach
+from coec.calibration.edges import EdgeWitness
+from coec.calibration.estimators import SAME_BASIN_RAD
+from coec.calibration.objective import SearchBox
+from coec.calibration.values import Matrix4, Window
+from coec.geometry import se3
+from coec.geometry.alignment import significances
+
+START = se3.perturbation(np.array([0.4, -0.3, 1.2, 0.5, -1.0, 2.0]))
+TURN = SearchBox(np.radians(28.0), 0.0)
+BOTH = SearchBox(np.radians(28.0), 0.55)
+
+
+def moves(poses: NDArray[np.float64], start: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation vectors and shifts (K, 3) that lead from the start to the poses."""
+    steps = [se3.perturbation_log(pose @ se3.inverse(start)) for pose in poses]
+    shifts = [pose[:3, 3] - pose[:3, :3] @ start[:3, :3].T @ start[:3, 3] for pose in poses]
+    return np.array(steps)[:, :3], np.array(shifts)
+
+
+def angle_deg(a: Matrix4, b: Matrix4) -> float:
+    return float(np.degrees(se3.rotation_angle_rad(a @ se3.inverse(b))))
+
+
+def away_from(truth: Matrix4, angle_deg: float, seed: int) -> Matrix4:
+    axis = np.random.default_rng(seed).normal(size=3)
+    axis *= np.radians(angle_deg) / np.linalg.norm(axis)
+    return se3.perturb(truth, np.array([*axis, 0.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize("reach", [TURN, BOTH], ids=["turn", "both"])
+def test_the_cover_stays_within_the_reach(reach: SearchBox) -> None:
+    poses = sample_reach(START, reach, 3000)
+    assert poses.shape == (3000, 4, 4)
+    assert all(se3.is_rigid(pose) for pose in poses)
+    turns, shifts = moves(poses, START)
+    assert np.linalg.norm(turns, axis=1).max() <= reach.rotation_rad + 1e-9
+    assert np.linalg.norm(shifts, axis=1).max() <= reach.translation_m + 1e-9
+
+
+def test_the_cover_is_deterministic() -> None:
+    assert sample_reach(START, BOTH, 500).tobytes() == sample_reach(START, BOTH, 500).tobytes()
+
+
+def test_the_cover_is_even() -> None:
+    turns, shifts = moves(sample_reach(START, BOTH, 4000), START)
+    for vectors, radius in ((turns / BOTH.rotation_rad, 1.0), (shifts / BOTH.translation_m, 1.0)):
+        # As many points in each octant, and an eighth of them within half the radius.
+        octants = np.bincount((vectors > 0.0) @ [1, 2, 4], minlength=8)
+        assert np.abs(octants / 4000 - 1 / 8).max() < 0.01
+        assert np.mean(np.linalg.norm(vectors, axis=1) < radius / 2) == pytest.approx(1 / 8, abs=0.01)
+    # Where the LiDAR turns tells nothing about where it shifts.
+    correlation = np.corrcoef(turns.T, shifts.T)[:3, 3:]
+    assert np.abs(correlation).max() < 0.05
+
+
+def test_no_pose_of_the_reach_is_far_from_the_cover() -> None:
+    turns, _ = moves(sample_reach(START, TURN, 4000), START)
+    rng = np.random.default_rng(0)
+    anywhere = rng.normal(size=(300, 3))
+    anywhere *= TURN.rotation_rad * rng.random((300, 1)) ** (1 / 3) / np.linalg.norm(anywhere, axis=1, keepdims=True)
+    gaps = np.linalg.norm(anywhere[:, None] - turns[None], axis=2).min(axis=1)
+    # Side of the cube that each of 4000 poses has to itself.
+    side = TURN.rotation_rad * (4.0 / 3.0 * np.pi / 4000) ** (1 / 3)
+    assert gaps.max() < 1.5 * side
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_true_basin_is_found_from_twenty_degrees_away(
+    sharp_street: Window, sharp_edges: EdgeWitness, seed: int
+) -> None:
+    truth = sharp_street.rig.T_camera_lidar_nominal
+    basins = find_basins(sharp_edges, away_from(truth, 20.0, seed), TURN)
+    # Nearer than what is taken for a rival.
+    assert min(angle_deg(basin.T_camera_lidar, truth) for basin in basins) < np.degrees(SAME_BASIN_RAD)
+
+
+def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    basins = find_basins(sharp_edges, away_from(sharp_street.rig.T_camera_lidar_nominal, 10.0, 4), TURN)
+    assert 1 <= len(basins) <= ROUNDS[-1].poses
+    z = [basin.significance for basin in basins]
+    assert z == sorted(z, reverse=True)
+    poses = np.stack([basin.T_camera_lidar for basin in basins])
+    assert z == pytest.approx(significances(sharp_edges.levels[0], poses).tolist())
+    for index, a in enumerate(basins):
+        for b in basins[:index]:
+            assert angle_deg(a.T_camera_lidar, b.T_camera_lidar) >= np.degrees(ROUNDS[-1].apart_rad) - 1e-6
+
+
+def test_rotation_only_leaves_the_lidar_where_the_start_has_it(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    start = away_from(sharp_street.rig.T_camera_lidar_nominal, 8.0, 6)
+    poses = np.stack([basin.T_camera_lidar for basin in find_basins(sharp_edges, start, TURN)])
+    _, shifts = moves(poses, start)
+    assert np.abs(shifts).max() < 1e-9
+
+
+def test_basins_lie_within_the_reach(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    start = away_from(sharp_street.rig.T_camera_lidar_nominal, 15.0, 0)
+    turns, shifts = moves(np.stack([b.T_camera_lidar for b in find_basins(sharp_edges, start, BOTH)]), start)
+    assert np.linalg.norm(turns, axis=1).max() <= BOTH.rotation_rad + 1e-6
+    assert np.linalg.norm(shifts, axis=1).max() <= BOTH.translation_m + 2e-6
