@@ -209,6 +209,8 @@ class VerdictConfig(Stage):
     min_mi_over_unrelated: float = Field(default=1.2, gt=0, description="MI over the MI with other frames' depth maps")
     max_newton_step_deg: float = Field(default=0.25, gt=0, description="|f'|/f'': distance to the zero of f', degrees")
     max_newton_step_m: float = Field(default=0.02, gt=0, description="|f'|/f'' of the translations, metres (6 dof)")
+    max_sigma_deg: float = Field(default=0.25, gt=0, description="largest standard deviation of a rotation, degrees")
+    max_sigma_m: float = Field(default=0.1, gt=0, description="largest standard deviation of a translation, m (6 dof)")
     min_peakedness_per_deg2: float = Field(default=0.01, description="f''/score, per degree²; least of the rotations")
     min_overlap: float = Field(
         default=0.5, ge=0, le=1, description="points in view over the most any pose of the box sees"

@@ -16,10 +16,12 @@ GOOD = Evaluation(score=1.4, frame_scores=np.full(10, 1.4), mi=1.4, overlap=0.9,
 PEAK = Curvature(
     first_derivative=np.array([0.1, -0.1, 0.05, np.nan, np.nan, np.nan]),
     second_derivative=np.array([250.0, 260.0, 300.0, np.nan, np.nan, np.nan]),
-    sigma=np.full(6, np.nan),
+    sigma=np.array([6e-4, 6e-4, 1e-3, np.nan, np.nan, np.nan]),
 )
 SLOPE = replace(PEAK, first_derivative=PEAK.first_derivative * 100)
 PLAIN = replace(PEAK, first_derivative=PEAK.first_derivative / 100, second_derivative=PEAK.second_derivative / 100)
+VAGUE = replace(PEAK, sigma=PEAK.sigma * 100)
+UNKNOWN = replace(PEAK, sigma=np.full(6, np.nan))
 OUTSTANDING = (
     Metric("contrast", 9.0, LIMITS.min_contrast, at_least=True),
     Metric("runner_up", 0.5, LIMITS.max_runner_up, at_least=False),
@@ -31,16 +33,15 @@ def verdict_on(
     curvature: Curvature = PEAK,
     stop: StopReason = StopReason.TOLERANCE,
     of_objective: tuple[Metric, ...] = OUTSTANDING,
-    sigma_known: bool = True,
 ) -> Verdict:
-    return judge((*of_objective, *shape_metrics(evaluation, curvature, LIMITS)), sigma_known, stop)
+    return judge((*of_objective, *shape_metrics(evaluation, curvature, LIMITS)), stop)
 
 
 def test_a_peak_with_everything_in_view_is_accepted() -> None:
     verdict = verdict_on()
     assert verdict.decision is Decision.ACCEPTED
     assert verdict.reasons == ()
-    assert len(verdict.metrics) == 5
+    assert len(verdict.metrics) == 6
     assert all(metric.passed for metric in verdict.metrics)
 
 
@@ -52,7 +53,8 @@ def test_a_peak_with_everything_in_view_is_accepted() -> None:
         (verdict_on(curvature=PLAIN), "peakedness_per_deg2"),
         (verdict_on(stop=StopReason.AT_BOUND), "optimum_at_bound"),
         (verdict_on(stop=StopReason.EVALUATIONS), "evaluations_exhausted"),
-        (verdict_on(sigma_known=False), "sigma_unknown"),
+        (verdict_on(curvature=VAGUE), "sigma_deg"),
+        (verdict_on(curvature=UNKNOWN), "sigma_deg"),
         (verdict_on(of_objective=(replace(OUTSTANDING[0], value=3.0),)), "contrast"),
         (verdict_on(of_objective=(replace(OUTSTANDING[1], value=0.95),)), "runner_up"),
         (verdict_on(of_objective=(Metric("mi_over_unrelated", 1.1, 1.2, at_least=True),)), "mi_over_unrelated"),

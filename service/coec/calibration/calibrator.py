@@ -38,8 +38,7 @@ def calibrate(
     at_optimum = found.objective.evaluate(pose)
     curvature = measure_curvature(found.objective, pose, dof)
     metrics = (*found.metrics, *shape_metrics(at_optimum, curvature, config.verdict))
-    sigma_known = bool(np.isfinite(curvature.sigma[:dof]).all())
-    verdict = judge(metrics, sigma_known, found.search.stop_reason)
+    verdict = judge(metrics, found.search.stop_reason)
     progress.step("diagnosis", 1, 1)
 
     outcomes = Counter(cloud.outcome for cloud in sight.clouds)

@@ -26,8 +26,8 @@ class Curvature:
     """Shape of the objective at a pose, over the axes rx ry rz tx ty tz; NaN on axes that were not searched.
 
     Attributes:
-        first_derivative: (6,) ∂S/∂ξ, nats per radian or metre.
-        second_derivative: (6,) -∂²S/∂ξ², nats per radian² or metre²; positive at a maximum.
+        first_derivative: (6,) ∂S/∂ξ, units of the objective per radian or metre.
+        second_derivative: (6,) -∂²S/∂ξ², units of the objective per radian² or metre²; positive at a maximum.
         sigma: (6,) standard deviation, radians or metres; NaN where the objective has no maximum or frames are too few.
     """
 

@@ -139,22 +139,23 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     fused = FusedObjective(edges, depth, start, reach)
     ranked = sorted(((fused.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
     ends = [
-        polish(fused, pose, config.search, lambda count: progress.step("search", count, config.search.max_evaluations))
-        for _, pose in ranked[:POLISHED_BASINS]
+        polish(fused, basin, config.search, lambda count: progress.step("search", count, config.search.max_evaluations))
+        for _, basin in ranked[:POLISHED_BASINS]
     ]
-    ranks = [fused.rank(end.T_camera_lidar) for end in ends]
-    best = int(np.argmax(ranks))
-    rivals = [rank for rank, end in zip(ranks, ends, strict=True) if _differ(end, ends[best])]
-    related = fused.edges_over_unrelated(ends[best].T_camera_lidar)
+    polished = [(fused.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
+    best = max(range(len(ends)), key=lambda k: polished[k][0])
+    contrast, pose = polished[best]
+    rivals = [rank for rank, other in (*polished, *ranked[POLISHED_BASINS:]) if _differ(other, pose)]
+    related = fused.edges_over_unrelated(pose)
     metrics = (
         Metric("edges_over_unrelated", related, config.verdict.min_edges_over_unrelated, at_least=True),
-        Metric("contrast", ranks[best], config.verdict.min_contrast, at_least=True),
+        Metric("contrast", contrast, config.verdict.min_contrast, at_least=True),
         Metric(
-            "runner_up", max(rivals, default=0.0) / max(ranks[best], 1e-9), config.verdict.max_runner_up, at_least=False
+            "runner_up", max(rivals, default=0.0) / max(contrast, 1e-9), config.verdict.max_runner_up, at_least=False
         ),
     )
     found = ends[best]
-    if at_rim(found.T_camera_lidar, start, reach):
+    if at_rim(pose, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
     return Found(fused, found, metrics)
 
@@ -183,6 +184,5 @@ def _by_mutual_information(frames: list[Features], sight: Sight, config: Calibra
     return Found(objective, search, (ratio,))
 
 
-def _differ(a: SearchResult, b: SearchResult) -> bool:
-    apart: Matrix4 = a.T_camera_lidar @ se3.inverse(b.T_camera_lidar)
-    return se3.rotation_angle_rad(apart) > SAME_BASIN_RAD
+def _differ(a: Matrix4, b: Matrix4) -> bool:
+    return se3.rotation_angle_rad(a @ se3.inverse(b)) > SAME_BASIN_RAD

@@ -47,7 +47,7 @@ class Evaluation:
     """The objective at one pose.
 
     Attributes:
-        score: mean over the frames of MI times the guard, nats: what the search maximises.
+        score: what the search maximises: nats, for the fused objective standard deviations.
         frame_scores: (F,) the same per frame.
         mi: mean over the frames of equation (1), nats.
         overlap: points in view over the most that any pose of the box sees.

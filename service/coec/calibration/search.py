@@ -36,11 +36,9 @@ AT_BOUND = 0.995
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
-    """Where the search ended: pose (4, 4), objective there and at the start, and its effort."""
+    """Where the search ended: pose (4, 4), its effort, and why it ended."""
 
     T_camera_lidar: Matrix4
-    score: float
-    score_at_start: float
     evaluations: int
     stop_reason: StopReason
 
@@ -65,7 +63,6 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, heard: 
         return objective.evaluate(_pose(start, coordinates)).score
 
     half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
-    score_at_start = score(np.zeros(config.dof))
     found, exhausted = _bobyqa(
         score, np.zeros(config.dof), half_width, half_width,
         _per_axis(config.dof, radians(config.step_deg), config.step_m), config,
@@ -79,7 +76,7 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, heard: 
         stop_reason = StopReason.EVALUATIONS
     elif (np.abs(found) >= AT_BOUND * half_width).any():
         stop_reason = StopReason.AT_BOUND
-    return SearchResult(_pose(start, found), score(found), score_at_start, evaluations, stop_reason)
+    return SearchResult(_pose(start, found), evaluations, stop_reason)
 
 
 def polish(objective: Objective, basin: Matrix4, config: SearchConfig, heard: Callable[[int], None]) -> SearchResult:
@@ -93,10 +90,9 @@ def polish(objective: Objective, basin: Matrix4, config: SearchConfig, heard: Ca
         return objective.evaluate(_pose(basin, coordinates)).score
 
     step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)
-    at_basin = score(np.zeros(config.dof))
     found, exhausted = _bobyqa(score, np.zeros(config.dof), 4.0 * step, 4.0 * step, 0.5 * step, config)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
-    return SearchResult(_pose(basin, found), score(found), at_basin, evaluations, stop_reason)
+    return SearchResult(_pose(basin, found), evaluations, stop_reason)
 
 
 def _bobyqa(

@@ -217,13 +217,13 @@ class Optimum:
 
     Attributes:
         T_camera_lidar: (4, 4).
-        score, score_at_start: objective values (nats) at the end and at the start.
+        score, score_at_start: the objective at the end and at the start: nats, for `fused` standard deviations.
         mi: mutual information (nats), equation (1), without the overlap guard.
         overlap: share of the guarded points that lie in view, 0 to 1.
         points_in_view: number of points that entered the histograms, over all frames.
         evaluations: number of objective evaluations.
-        first_derivative: (6,) dS/dξ per axis, nats per radian or metre; NaN for axes that were not searched.
-        second_derivative: (6,) -d²S/dξ² per axis, nats per radian² or metre²; positive at a maximum; NaN likewise.
+        first_derivative: (6,) dS/dξ per axis, per radian or metre; NaN for axes that were not searched.
+        second_derivative: (6,) -d²S/dξ² per axis, per radian² or metre²; positive at a maximum; NaN likewise.
     """
 
     T_camera_lidar: Matrix4

@@ -28,23 +28,28 @@ _MEANING = {
     "newton_step_deg": "the objective is not at a maximum on every rotation axis",
     "newton_step_m": "the objective is not at a maximum on every translation axis",
     "peakedness_per_deg2": "the objective is too flat on at least one rotation axis",
+    "sigma_deg": "the frames disagree on a rotation, or are too few to tell",
+    "sigma_m": "the frames disagree on a translation, or are too few to tell",
     "overlap": "too few LiDAR points are in view",
 }
 
 
 def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictConfig) -> tuple[Metric, ...]:
-    """What any objective has to show at an optimum: no slope, a peak, and enough in view."""
+    """What any objective has to show at an optimum: no slope, a peak, an uncertainty worth the name, enough in view."""
     peakedness = float(np.min(curvature.second_derivative[:3])) * radians(1.0) ** 2 / max(evaluation.score, 1e-12)
     metrics = [
         Metric(
             "newton_step_deg", degrees(_newton_step(curvature, ROTATION)), limits.max_newton_step_deg, at_least=False
         ),
         Metric("peakedness_per_deg2", peakedness, limits.min_peakedness_per_deg2, at_least=True),
+        Metric("sigma_deg", degrees(float(np.max(curvature.sigma[ROTATION]))), limits.max_sigma_deg, at_least=False),
         Metric("overlap", evaluation.overlap, limits.min_overlap, at_least=True),
     ]
     if np.isfinite(curvature.first_derivative[TRANSLATION]).all():
         step_m = _newton_step(curvature, TRANSLATION)
+        sigma_m = float(np.max(curvature.sigma[TRANSLATION]))
         metrics.append(Metric("newton_step_m", step_m, limits.max_newton_step_m, at_least=False))
+        metrics.append(Metric("sigma_m", sigma_m, limits.max_sigma_m, at_least=False))
     return tuple(metrics)
 
 
@@ -54,16 +59,13 @@ def _newton_step(curvature: Curvature, axes: slice) -> float:
     return float(np.max(np.abs(first) / second)) if (second > 0.0).all() else float("inf")
 
 
-def judge(metrics: tuple[Metric, ...], sigma_known: bool, stop: StopReason) -> Verdict:
-    """Equation (2) over the metrics of the objective and of its optimum. A result without an uncertainty (too few
-    frames to tell noise from signal) is not believed."""
+def judge(metrics: tuple[Metric, ...], stop: StopReason) -> Verdict:
+    """Equation (2) over the metrics of the objective and of its optimum."""
     reasons = [
         Reason(metric.name, f"{_MEANING[metric.name]}: {metric.value:.3g}, limit {metric.limit:.3g}")
         for metric in metrics
         if not metric.passed
     ]
-    if not sigma_known:
-        reasons.append(Reason("sigma_unknown", "too few frames, or no maximum, to tell how far off the result may be"))
     if stop is not StopReason.TOLERANCE:
         reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

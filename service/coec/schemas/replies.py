@@ -115,8 +115,8 @@ class CalibrationResult(Message):
     status: Status
     verdict: Verdict
     metrics: dict[str, MetricReply] = Field(description="self-diagnosis by name")
-    score: float | None = Field(description="objective at the result, nats")
-    score_at_start: float | None = Field(description="objective at the start, nats")
+    score: float | None = Field(description="objective at the result: nats, for `fused` standard deviations")
+    score_at_start: float | None = Field(description="objective at the start, likewise")
     mi: float | None = Field(description="mutual information at the result, equation (1), nats")
     overlap: float | None = Field(description="share of the guarded points that lie in view, 0 to 1")
     points_in_view: Count = Field(description="over all pairs")
