@@ -93,8 +93,9 @@ def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.flo
     shift = _ball(count)[(np.arange(count) * 7919) % count] * reach.translation_m
     turn = _rotations(rotation)
     poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = turn @ start[:3, :3]
-    poses[:, :3, 3] = turn @ start[:3, 3] + shift
+    # einsum and not @: the last bit of a BLAS product may differ between two processes.
+    poses[:, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
+    poses[:, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
     return poses
 
 
@@ -124,7 +125,7 @@ def _apart(poses: NDArray[np.float64], z: NDArray[np.float64], count: int, apart
         kept.append(int(index))
         if len(kept) == count:
             break
-        free &= rotations @ rotations[index] <= limit
+        free &= np.einsum("ni,i->n", rotations, rotations[index]) <= limit
     return kept
 
 
@@ -146,5 +147,6 @@ def _rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
     cross -= np.swapaxes(cross, 1, 2)
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    turns: NDArray[np.float64] = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
+    along = axis[:, :, None] * axis[:, None, :]
+    turns: NDArray[np.float64] = cosine * np.eye(3) + sine * cross + (1.0 - cosine) * along
     return turns

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from math import fsum, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,15 +64,39 @@ def measure_curvature(objective: Objective, pose: Matrix4, dof: int) -> Curvatur
 
 
 def _sandwich(gradients: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(dof,) standard deviations from per-frame gradients (dof, F) and the negative Hessian of their mean (dof,
-    dof)."""
+    """(dof,) standard deviations from per-frame gradients (dof, F) and the negative Hessian of their mean (dof, dof).
+
+    In plain floats: the last bit of a BLAS product may differ between two processes, and a decision has to replay to
+    the byte.
+    """
     dof, frames = gradients.shape
+    inverse = _inverse(information.tolist())
     # Fewer frames than axes cannot span the noise; without a maximum there is no spread to speak of.
-    if frames <= dof or np.linalg.eigvalsh(information)[0] <= 0.0:
+    if frames <= dof or inverse is None:
         return np.full(dof, np.nan)
-    inverse = np.linalg.inv(information)
-    noise = np.atleast_2d(np.cov(gradients)) / frames
-    return np.asarray(np.sqrt(np.diag(inverse @ noise @ inverse)))
+    centred = [[g - fsum(row) / frames for g in row] for row in gradients.tolist()]
+    # J⁻¹·g of every frame: its own Newton step. Their spread over the root of F is that of the mean.
+    steps = [[fsum(inverse[i][j] * centred[j][f] for j in range(dof)) for f in range(frames)] for i in range(dof)]
+    return np.array([sqrt(fsum(s * s for s in row) / (frames - 1) / frames) for row in steps])
+
+
+def _inverse(matrix: list[list[float]]) -> list[list[float]] | None:
+    """Inverse of a symmetric matrix by its Cholesky factor; None when it is not positive definite."""
+    n = len(matrix)
+    factor = [[0.0] * n for _ in range(n)]
+    for i in range(n):
+        for j in range(i + 1):
+            rest = matrix[i][j] - fsum(factor[i][k] * factor[j][k] for k in range(j))
+            if i == j and not rest > 0.0:
+                return None
+            factor[i][j] = sqrt(rest) if i == j else rest / factor[j][j]
+    # L⁻¹ by forward substitution, column by column; the inverse is L⁻ᵀ·L⁻¹.
+    lower = [[0.0] * n for _ in range(n)]
+    for column in range(n):
+        for i in range(column, n):
+            unit = 1.0 if i == column else 0.0
+            lower[i][column] = (unit - fsum(factor[i][k] * lower[k][column] for k in range(column, i))) / factor[i][i]
+    return [[fsum(lower[k][i] * lower[k][j] for k in range(n)) for j in range(n)] for i in range(n)]
 
 
 def _padded(values: NDArray[np.float64]) -> NDArray[np.float64]:
