@@ -342,7 +342,8 @@ def test_project_point_in_a_kernel_equals_project_even_under_fastmath(camera: Ca
     careless_loop(camera, points, uv_px, valid)
     expected_px, expected_valid = project(camera, points)
     np.testing.assert_array_equal(valid, expected_valid)
-    np.testing.assert_allclose(uv_px[valid], expected_px[valid], rtol=1e-13)
+    # A careless caller may fuse the last sum, fx·m + cx: near pixel 0 its terms cancel, so the error is that of cx.
+    np.testing.assert_allclose(uv_px[valid], expected_px[valid], rtol=1e-13, atol=1e-12)
 
 
 @every_model

@@ -82,7 +82,7 @@ def climb(
     return ends, z
 
 
-@njit(cache=True, parallel=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+@njit(cache=True, parallel=True)
 def _smooth_sums(
     camera: Camera,
     T: NDArray[np.float64],
@@ -126,7 +126,7 @@ def _significances(
     return z
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+@njit(cache=True)
 def _significance(
     camera: Camera,
     T: NDArray[np.float64],

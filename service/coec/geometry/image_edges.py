@@ -114,7 +114,7 @@ def _blurred(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return _blurred_along_rows(_blurred_along_rows(values).T.copy()).T.copy()
 
 
-@njit(cache=True, parallel=True, fastmath={"contract", "reassoc"})
+@njit(cache=True, parallel=True)
 def _blurred_along_rows(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Gaussian along the second axis; the border pixel is repeated outside."""
     h, w = values.shape
@@ -124,11 +124,12 @@ def _blurred_along_rows(values: NDArray[np.float32]) -> NDArray[np.float32]:
         row[:_TAPS] = values[y, 0]
         row[_TAPS : _TAPS + w] = values[y]
         row[_TAPS + w :] = values[y, w - 1]
-        for x in range(w):
-            total = np.float32(0.0)
-            for k in range(2 * _TAPS + 1):
-                total += _KERNEL[k] * row[x + k]
-            out[y, x] = total
+        total = np.zeros(w, np.float32)
+        for k in range(2 * _TAPS + 1):
+            tap, shifted = _KERNEL[k], row[k : k + w]
+            for x in range(w):
+                total[x] += tap * shifted[x]
+        out[y] = total
     return out
 
 

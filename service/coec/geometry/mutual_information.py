@@ -95,8 +95,7 @@ def _tasks(
     return frame, start, np.minimum(start + TASK, first_point[frame + 1])
 
 
-# fastmath without nnan/ninf: validity of a projection is decided by comparisons that must see NaN as false.
-@njit(cache=True, parallel=True, fastmath={"contract", "arcp", "nsz"})
+@njit(cache=True, parallel=True)
 def _count(
     camera: Camera, T: NDArray[np.float64], xyz: NDArray[np.float32], range_bin: NDArray[np.unsignedinteger],
     depth_bin: NDArray[np.unsignedinteger], task_frame: NDArray[np.int64], task_start: NDArray[np.int64],

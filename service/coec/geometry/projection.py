@@ -5,10 +5,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera, project_point, unproject_point
-from coec.geometry.cameras.kernel import FASTMATH
 
 
-@njit(cache=True, fastmath=FASTMATH, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _project(camera: Camera, p_camera: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     count = p_camera.shape[0]
     uv_px = np.empty((count, 2))
@@ -18,7 +17,7 @@ def _project(camera: Camera, p_camera: NDArray[np.float64]) -> tuple[NDArray[np.
     return uv_px, valid
 
 
-@njit(cache=True, fastmath=FASTMATH, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _unproject(camera: Camera, uv_px: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     count = uv_px.shape[0]
     rays = np.empty((count, 3))

@@ -10,7 +10,6 @@ import math
 
 from numba.extending import register_jitable
 
-from coec.geometry.cameras.kernel import FASTMATH
 from coec.geometry.cameras.polynomial import odd_polynomial, solve_odd_polynomial
 
 # Newton's method converges quadratically from the radial solution; real lenses need three to five steps.
@@ -20,7 +19,7 @@ _MAX_STEPS = 30
 _TOLERANCE = 1e-9
 
 
-@register_jitable(fastmath=FASTMATH, error_model="numpy")
+@register_jitable(error_model="numpy")
 def distort(k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float) -> tuple[float, float]:
     """Distorted normalised coordinates of (x, y)."""
     r2 = x * x + y * y
@@ -31,7 +30,7 @@ def distort(k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: 
     )
 
 
-@register_jitable(fastmath=FASTMATH, error_model="numpy")
+@register_jitable(error_model="numpy")
 def undistort(
     k1: float, k2: float, p1: float, p2: float, k3: float, max_radius2: float, xd: float, yd: float
 ) -> tuple[float, float, bool]:

@@ -10,7 +10,6 @@ from typing import Any
 from numba import types
 from numba.extending import overload
 
-from coec.geometry.cameras.kernel import FASTMATH
 from coec.geometry.cameras.registry import Camera, model_of
 
 
@@ -28,8 +27,8 @@ def unproject_point(camera: Camera, u: float, v: float) -> tuple[float, float, f
 
 
 # Each formula is compiled with its own options, not with those of the loop around it: NaN stays invalid in a caller
-# with fastmath=True. `strict=False`: the annotations differ between the two signatures, and numba would compare them.
-@overload(project_point, jit_options={"fastmath": FASTMATH, "error_model": "numpy"}, strict=False)
+# with fastmath. `strict=False`: the annotations differ between the two signatures, and numba would compare them.
+@overload(project_point, jit_options={"error_model": "numpy"}, strict=False)
 def _project_point(
     camera: types.NamedTuple,
     x: types.Type,  # noqa: ARG001  (numba matches the names)
@@ -39,7 +38,7 @@ def _project_point(
     return model_of(camera.instance_class).project_point
 
 
-@overload(unproject_point, jit_options={"fastmath": FASTMATH, "error_model": "numpy"}, strict=False)
+@overload(unproject_point, jit_options={"error_model": "numpy"}, strict=False)
 def _unproject_point(
     camera: types.NamedTuple,
     u: types.Type,  # noqa: ARG001

@@ -5,10 +5,10 @@ from typing import Protocol
 
 from numba.extending import register_jitable
 
-# Re-association, fused multiply-add and reciprocals let a loop over points vectorise. The flags that assume that
-# no NaN and no infinity occur ("nnan", "ninf", and so fastmath=True) are left out: validity rests on comparisons with
-# NaN being false. With it goes error_model="numpy": a division by zero gives an infinity, not a branch to an exception.
-FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+# No fastmath anywhere in this package. numba compiles a parallel kernel anew for the process that first runs it and for
+# the cache; with leave to re-associate and to fuse, the two differ in the last bit, and a decision has to replay to the
+# byte. The loops vectorise all the same. error_model="numpy": a division by zero gives an infinity, not a branch to an
+# exception.
 
 # A pixel further out than this is on no sensor; the bound keeps every coordinate inside int32. Unit: px.
 MAX_PIXEL_PX = 1e9
@@ -37,14 +37,14 @@ class _Sensor(Protocol):
     def cy(self) -> float: ...
 
 
-@register_jitable(fastmath=FASTMATH, error_model="numpy")
+@register_jitable(error_model="numpy")
 def guarded_pixel(camera: _Sensor, u: float, v: float, in_domain: bool) -> tuple[float, float, bool]:
     """(u, v, True) for a point in the model's domain with a sane pixel, else the principal point and False."""
     valid = in_domain & (abs(u) < MAX_PIXEL_PX) & (abs(v) < MAX_PIXEL_PX)  # false for NaN
     return (u if valid else camera.cx), (v if valid else camera.cy), valid
 
 
-@register_jitable(fastmath=FASTMATH, error_model="numpy")
+@register_jitable(error_model="numpy")
 def guarded_ray(x: float, y: float, z: float, in_domain: bool) -> tuple[float, float, float, bool]:
     """The unit vector along (x, y, z) and True, else the optical axis and False."""
     norm2 = x * x + y * y + z * z
@@ -53,7 +53,7 @@ def guarded_ray(x: float, y: float, z: float, in_domain: bool) -> tuple[float, f
     return (x * scale if valid else 0.0), (y * scale if valid else 0.0), (z * scale if valid else 1.0), valid
 
 
-@register_jitable(fastmath=FASTMATH, error_model="numpy")
+@register_jitable(error_model="numpy")
 def polar_angle(radius: float, z: float) -> float:
     """atan2(radius, z) for radius >= 0, in [0, pi], without a branch or a library call: a loop over it vectorises.
 
