@@ -65,12 +65,6 @@ class RecordingError(CoecError):
     reply_code = "recording_failed"
 
 
-class WorkerError(CoecError):
-    """The worker process crashed, hung or outgrew its memory while it had a job."""
-
-    reply_code = "worker_failed"
-
-
 class NotFoundError(CoecError):
     """A window, pair or key that does not exist."""
 

@@ -59,6 +59,23 @@ class DegreesOfFreedom(StrEnum):
     ALL = "6"
 
 
+# What `calibrate` and `evaluate` both take.
+Objective = Annotated[
+    str | None,
+    typer.Option(help="What is maximised: fused (edges and depth), mi (the paper), intensity.", metavar="NAME"),
+]
+CameraModel = Annotated[
+    str | None,
+    typer.Option(help="Fit this model to the camera, and use it instead: double_sphere.", metavar="NAME"),
+]
+Frames = Annotated[
+    int | None, typer.Option(help="Use at most so many camera frames, evenly chosen.", min=1, show_default="25")
+]
+NoMotionCompensation = Annotated[
+    bool, typer.Option("--no-motion-compensation", help="Take the clouds as they were recorded.")
+]
+
+
 @app.command("calibrate")
 def _calibrate(
     source: Source,
@@ -70,10 +87,7 @@ def _calibrate(
             metavar="MODEL",
         ),
     ] = None,
-    objective: Annotated[
-        str | None,
-        typer.Option(help="What is maximised: fused (edges and depth), mi (the paper), intensity.", metavar="NAME"),
-    ] = None,
+    objective: Objective = None,
     dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None,
     perturb: Annotated[
         str | None,
@@ -81,16 +95,9 @@ def _calibrate(
             help="Move the start: degrees and metres about and along the camera axes.", metavar="RX,RY,RZ[,TX,TY,TZ]"
         ),
     ] = None,
-    camera_model: Annotated[
-        str | None,
-        typer.Option(help="Fit this model to the camera, and use it instead: double_sphere.", metavar="NAME"),
-    ] = None,
-    frames: Annotated[
-        int | None, typer.Option(help="Use at most so many camera frames, evenly chosen.", min=1, show_default="25")
-    ] = None,
-    no_motion_compensation: Annotated[
-        bool, typer.Option("--no-motion-compensation", help="Take the clouds as they were recorded.")
-    ] = False,
+    camera_model: CameraModel = None,
+    frames: Frames = None,
+    no_motion_compensation: NoMotionCompensation = False,
     output: Annotated[
         Path | None, typer.Option(help="Write overlay_before.png, overlay_after.png and result.json.", metavar="DIR")
     ] = None,
@@ -127,24 +134,14 @@ def _evaluate(
     depth: Annotated[
         str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
     ] = None,
-    objective: Annotated[
-        str | None,
-        typer.Option(help="What is maximised: fused (edges and depth), mi (the paper), intensity.", metavar="NAME"),
-    ] = None,
+    objective: Objective = None,
     dof: Annotated[
         DegreesOfFreedom | None,
         typer.Option(help="Rotation only, or translation too; 6 if --translation-m is given.", show_default=False),
     ] = None,
-    camera_model: Annotated[
-        str | None,
-        typer.Option(help="Fit this model to the camera, and use it instead: double_sphere.", metavar="NAME"),
-    ] = None,
-    frames: Annotated[
-        int | None, typer.Option(help="Use at most so many camera frames, evenly chosen.", min=1, show_default="25")
-    ] = None,
-    no_motion_compensation: Annotated[
-        bool, typer.Option("--no-motion-compensation", help="Take the clouds as they were recorded.")
-    ] = False,
+    camera_model: CameraModel = None,
+    frames: Frames = None,
+    no_motion_compensation: NoMotionCompensation = False,
     against_frames: Annotated[
         bool, typer.Option("--against-frames", help="Also solve windows of 1, 2, 3, 5, ... frames: frames.png.")
     ] = False,

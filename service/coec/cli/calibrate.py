@@ -143,7 +143,7 @@ def refitted(window: Window, model: str) -> tuple[Window, CameraFit]:
     rig: Rig = window.rig
     fit = fit_double_sphere(rig.camera)
     quality = CameraFit(FITTED, name_of(rig.camera), fit.residual_rms_px, fit.residual_max_px, fit.coverage)
-    return windows.with_rig(window, replace(rig, camera=fit.camera)), quality
+    return replace(window, rig=replace(rig, camera=fit.camera)), quality
 
 
 def _document(result: CalibrationResult, elapsed_s: dict[str, float], fit: CameraFit | None) -> dict[str, Any]:

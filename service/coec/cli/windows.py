@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coec.adapters.mcap_windows import is_window, read_result, read_window
 from coec.calibration.pairing import Pairer
-from coec.calibration.values import FramePair, Matrix4, Rig, Window
+from coec.calibration.values import FramePair, Matrix4, Window
 from coec.config import CalibrationConfig, Config, PairingConfig
 from coec.errors import SourceError, UsageError
 from coec.geometry import se3
@@ -108,11 +108,6 @@ def started_at(window: Window, xi: NDArray[np.float64]) -> Window:
 def rotation_error_deg(T_a: Matrix4, T_b: Matrix4) -> float:
     """Geodesic angle between the rotations of two transforms (4, 4)."""
     return float(np.degrees(se3.rotation_angle_rad(T_a @ se3.inverse(T_b))))
-
-
-def with_rig(window: Window, rig: Rig) -> Window:
-    """The window with another rig."""
-    return replace(window, rig=rig)
 
 
 def _recorded(path: Path, frames: int | None) -> Loaded:
