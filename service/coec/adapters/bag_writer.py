@@ -17,12 +17,17 @@ from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, Matrix4,
 Frame = CameraFrame | LidarFrame | EgoMotion
 
 
+def _nothing(_: Frame) -> list[tuple[str, str, bytes]]:
+    return []
+
+
 def write_bag(
     path: Path,
     rig: Rig,
     T_camera_lidar: Matrix4,
     frames: Iterable[Frame],
     heard: Callable[[Frame], None],
+    beside: Callable[[Frame], Iterable[tuple[str, str, bytes]]] = _nothing,
 ) -> None:
     """Writes the frames below `/<pair>/` with the camera info of each image and one `/tf_static`.
 
@@ -30,6 +35,7 @@ def write_bag(
         T_camera_lidar: (4, 4), what `/tf_static` says.
         frames: in the order in which they are written; depth maps are left out.
         heard: told of each frame.
+        beside: further messages (topic, type, CDR) at the stamp of a frame.
 
     Raises:
         OSError: the file cannot be written.
@@ -45,6 +51,8 @@ def write_bag(
                     topics.write("/tf_static", cdr.TF, frame.stamp_ns, joint)
                     joined.add(child)
             for topic, type_name, data in _messages(rig, frame):
+                topics.write(topic, type_name, frame.stamp_ns, data)
+            for topic, type_name, data in beside(frame):
                 topics.write(topic, type_name, frame.stamp_ns, data)
             heard(frame)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves the result open

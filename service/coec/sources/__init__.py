@@ -32,6 +32,10 @@ def open_source(spec: str) -> Recording:
             from coec.sources.synthetic import open_synthetic
 
             return open_synthetic(parsed.query)
+        case "sim":
+            from coec.simulation.source import open_sim
+
+            return open_sim(parsed.query)
     return _open_path(parsed)
 
 

@@ -1,0 +1,87 @@
+"""From the light at the lens to the bytes of a picture: blur, vignetting, gain, noise, dirt, JPEG."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.simulation.mesh import Floats
+from coec.simulation.render import tone
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """What a camera adds to a picture.
+
+    Attributes:
+        blur_px: standard deviation of the point spread at full sharpness, pixels.
+        vignetting: share of the light that is lost at the rim.
+        full_well: electrons at full exposure: shot noise is its square root.
+        read_noise: standard deviation, share of full exposure.
+        target: mean level to which the exposure is driven, linear, 0 to 1.
+        gain: least and greatest factor on the light.
+        jpeg_quality: 1 to 100.
+    """
+
+    blur_px: float = 0.55
+    vignetting: float = 0.35
+    full_well: float = 6000.0
+    read_noise: float = 0.003
+    target: float = 0.22
+    gain: tuple[float, float] = (0.15, 8.0)
+    jpeg_quality: int = 90
+
+
+def expose(
+    linear: Floats, seen: NDArray[np.bool_], lens: Lens, rng: np.random.Generator, *, light: float, dirt: Floats | None
+) -> NDArray[np.uint8]:
+    """(h, w, 3) uint8 BGR of (h, w, 3) radiance.
+
+    Args:
+        seen: (h, w), false outside the lens's circle: black.
+        light: share of the scene's light that is there.
+        dirt: (h, w) cover of the lens, 0 clean to 1 opaque.
+    """
+    light_in = np.minimum(linear, np.float32(4.0)) * np.float32(light)  # the sun's disc blooms, but not over everything
+    if dirt is not None:
+        veil = cv2.GaussianBlur(light_in, (0, 0), linear.shape[0] / 25)
+        cover = dirt[:, :, None]
+        light_in = light_in * (1 - cover) + cover * (0.35 * veil + np.float32(0.05 * light))
+    picture = np.asarray(cv2.GaussianBlur(light_in, (0, 0), lens.blur_px), np.float32)
+    picture *= _falloff((seen.shape[0], seen.shape[1]), lens.vignetting)[:, :, None]
+    level = float(np.minimum(picture[seen], 1.0).mean(dtype=np.float64)) if seen.any() else lens.target
+    gain = float(np.clip(lens.target / max(level, 1e-6), *lens.gain))
+    picture *= np.float32(gain)
+    # A gain multiplies the noise with the light: fewer electrons stand for full exposure.
+    spread = np.sqrt(
+        np.maximum(picture, 0) * np.float32(gain / lens.full_well) + np.float32((lens.read_noise * gain) ** 2)
+    )
+    picture += spread * rng.standard_normal(picture.shape, dtype=np.float32)
+    picture[~seen] = 0.0
+    return tone(np.maximum(picture, np.float32(0)), 1.0)
+
+
+def dirt_cover(shape: tuple[int, int], share: float, seed: int) -> Floats:
+    """(h, w): blotches of all sizes over about this share of the picture."""
+    rng = np.random.default_rng([seed, 120])
+    cover = np.zeros(shape, np.float32)
+    for cells, weight in ((5, 1.0), (11, 0.6), (29, 0.35)):
+        noise = rng.standard_normal((cells, cells)).astype(np.float32)
+        cover += weight * cv2.resize(noise, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+    limit = float(np.quantile(cover, 1 - share)) if share > 0 else np.inf
+    return (
+        np.clip((cover - limit) * 2.5 + 0.5, 0, 0.97).astype(np.float32) if share > 0 else np.zeros(shape, np.float32)
+    )
+
+
+@lru_cache(maxsize=2)
+def _falloff(shape: tuple[int, int], vignetting: float) -> Floats:
+    height, width = shape
+    y = (np.arange(height) - (height - 1) / 2) / (height / 2)
+    x = (np.arange(width) - (width - 1) / 2) / (width / 2)
+    squared = np.minimum(y[:, None] ** 2 + x[None, :] ** 2, 1.5)
+    return (1 - vignetting * squared).astype(np.float32)

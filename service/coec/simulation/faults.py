@@ -1,0 +1,169 @@
+"""What goes wrong on a drive, and when: one value per fault, and the words by which it is ordered.
+
+`KIND:BEGIN[-END][:KEY=VALUE,...]`, seconds from the start of the drive; without an end, to the end of the drive.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.errors import UsageError
+from coec.geometry.se3 import perturb
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that is so from `begin_s` until `end_s`, seconds from the start of the drive."""
+
+    begin_s: float
+    end_s: float
+
+    def active(self, time_s: float) -> bool:
+        """Whether it is so at this time."""
+        return self.begin_s <= time_s < self.end_s
+
+
+@dataclass(frozen=True, slots=True)
+class _Shift(Fault):
+    """A change of the mount: T_camera_lidar becomes exp(ξ)·T_camera_lidar. Degrees and metres, camera axes."""
+
+    rx: float = 0.0
+    ry: float = 0.0
+    rz: float = 0.0
+    tx: float = 0.0
+    ty: float = 0.0
+    tz: float = 0.0
+
+    def xi(self) -> NDArray[np.float64]:
+        """(6,) radians and metres."""
+        return np.array([*np.deg2rad([self.rx, self.ry, self.rz]), self.tx, self.ty, self.tz])
+
+
+@dataclass(frozen=True, slots=True)
+class Step(_Shift):
+    """The mount is knocked at once, and back again at the end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drift(_Shift):
+    """The mount creeps evenly from begin to end, and stays where it then is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dirt(Fault):
+    """Blotches on the lens over this share of the picture."""
+
+    share: float = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Dark(Fault):
+    """This share of the light is left, with the gain of the camera at its end."""
+
+    light: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Frozen(Fault):
+    """The camera repeats its last picture with fresh stamps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Beams(Fault):
+    """This share of the beams is dead."""
+
+    share: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class NoEgo(Fault):
+    """No ego-motion is sent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Offset(Fault):
+    """The stamps of the camera are late by this many seconds (early if negative)."""
+
+    seconds: float = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Loss(Fault):
+    """This share of the messages of every sensor is lost on the way."""
+
+    share: float = 0.3
+
+
+KINDS: dict[str, type[Fault]] = {
+    "step": Step,
+    "drift": Drift,
+    "dirt": Dirt,
+    "dark": Dark,
+    "frozen": Frozen,
+    "beams": Beams,
+    "no-ego": NoEgo,
+    "offset": Offset,
+    "loss": Loss,
+}
+FORMS = (
+    "step:30:rx=3,tz=0.1 | drift:30-90:ry=2 | dirt:30-60:share=0.3 | dark:30-60:light=0.02 | frozen:30-60 | "
+    "beams:30-60:share=0.5 | no-ego:30-60 | offset:30-60:seconds=0.05 | loss:30-60:share=0.3"
+)
+"""One of each, for help and errors."""
+
+
+def parse_fault(text: str) -> Fault:
+    """A fault from its words.
+
+    Raises:
+        UsageError: says what does not fit, and what to write.
+    """
+    kind, _, rest = text.partition(":")
+    span, _, settings = rest.partition(":")
+    if kind not in KINDS:
+        raise UsageError(f"unknown fault {kind!r} in {text!r}; write one of {FORMS}")
+    begin, dash, end = span.partition("-")
+    begin_s = _number(text, "begin", begin)
+    end_s = _number(text, "end", end) if dash else math.inf
+    if not 0 <= begin_s < end_s:
+        raise UsageError(f"fault {text!r}: it must begin at 0 s or later and end after that; write for example {FORMS}")
+    if kind == "drift" and math.isinf(end_s):
+        raise UsageError(f"fault {text!r}: a drift needs an end: write for example drift:30-90:ry=2")
+    known = [field.name for field in fields(KINDS[kind])][2:]
+    values: dict[str, float] = {}
+    for setting in filter(None, settings.split(",")):
+        key, _, value = setting.partition("=")
+        if key not in known:
+            takes = f"it takes {', '.join(known)}" if known else "it takes no settings"
+            raise UsageError(f"fault {text!r}: unknown setting {key!r}; {takes}. Write for example {FORMS}")
+        values[key] = _number(text, key, value)
+    for key in ("share", "light"):
+        if not 0 <= values.get(key, 0.0) <= 1:
+            raise UsageError(f"fault {text!r}: {key} must lie between 0 and 1")
+    return KINDS[kind](begin_s, end_s, **values)
+
+
+def _number(text: str, name: str, value: str) -> float:
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise UsageError(f"fault {text!r}: {name} must be a number, not {value!r}; write for example {FORMS}")
+    return number
+
+
+def shifted(T_camera_lidar: NDArray[np.float64], faults: tuple[Fault, ...], time_s: float) -> NDArray[np.float64]:
+    """(4, 4): the extrinsic after all steps and drifts up to a time, in their order."""
+    result = T_camera_lidar
+    for fault in faults:
+        if isinstance(fault, Drift):
+            share = min(max((time_s - fault.begin_s) / (fault.end_s - fault.begin_s), 0.0), 1.0)
+            result = perturb(result, share * fault.xi()) if share > 0 else result
+        elif isinstance(fault, Step) and fault.active(time_s):
+            result = perturb(result, fault.xi())
+    return result

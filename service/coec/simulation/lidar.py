@@ -1,0 +1,190 @@
+"""A spinning LiDAR: every column of a turn is measured from where the vehicle is at that instant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.simulation.mesh import Floats, Material
+from coec.simulation.scene import Hits, Scene
+
+Doubles = NDArray[np.float64]
+
+WEAKEST = 4.0e-6
+"""Returns below this (reflectance · cosine / range², 1/m²) are not detected: a tenth reflectance at 110 m, head on."""
+CLUSTER_M = 0.35
+"""Echoes nearer to each other than the pulse is long come back as one, at their mean range."""
+SPREAD: tuple[tuple[float, float], ...] = ((1.0, 0.0), (-0.5, 0.866), (-0.5, -0.866))
+"""Directions of the outer rays of a beam, in units of its half angle."""
+JUMP = 0.03
+"""A beam is looked at as a cone where its neighbours' ranges differ by more than this share."""
+
+REFLECTANCE = np.full(16, np.nan)
+"""Of each material at the laser's 905 nm; NaN: as bright as it looks."""
+REFLECTANCE[[Material.ASPHALT, Material.GRASS, Material.FOLIAGE, Material.RUBBER]] = [0.17, 0.45, 0.5, 0.06]
+REFLECTANCE[[Material.MARKING, Material.SIGN, Material.GLASS]] = [0.75, 1.0, 0.03]
+
+
+@dataclass(frozen=True, slots=True)
+class LidarModel:
+    """Data of a sensor: angles in radians, lengths in metres.
+
+    `elevations_rad` from the lowest beam up; `columns` per turn of `period_s`, clockwise from the rear, so that the
+    middle of the turn, its stamp, looks forward. `divergence_rad` is half the opening angle of a beam.
+    """
+
+    elevations_rad: tuple[float, ...]
+    columns: int
+    period_s: float = 0.1
+    reach_m: float = 120.0
+    nearest_m: float = 1.0
+    noise_m: float = 0.02
+    divergence_rad: float = 0.0015
+    dropout: float = 0.01
+
+
+def _spread(low_deg: float, high_deg: float, beams: int) -> tuple[float, ...]:
+    return tuple(float(angle) for angle in np.deg2rad(np.linspace(low_deg, high_deg, beams)))
+
+
+LIDARS: dict[int, LidarModel] = {
+    64: LidarModel(_spread(-24.8, 2.0, 64), columns=1800),
+    32: LidarModel(_spread(-25.0, 15.0, 32), columns=1800, reach_m=100.0),
+    16: LidarModel(_spread(-15.0, 15.0, 16), columns=1800, reach_m=100.0),
+}
+"""By number of beams; angles as those of HDL-64E, a common 32-beam sensor and VLP-16."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """Points of a turn, in the LiDAR's axes at each point's own instant.
+
+    Attributes:
+        xyz_m: (N, 3) float32.
+        intensity: (N,) float32, 0 to 1.
+        ring: (N,) uint16, 0 the lowest beam.
+        time_offset_s: (N,) float32, from the stamp of the turn.
+    """
+
+    xyz_m: Floats
+    intensity: Floats
+    ring: NDArray[np.uint16]
+    time_offset_s: Floats
+
+
+def sweep(
+    scene: Scene,
+    model: LidarModel,
+    poses: Callable[[Doubles], Doubles],
+    time_s: float,
+    rng: np.random.Generator,
+    dead: NDArray[np.bool_] | None = None,
+) -> Sweep:
+    """One turn whose middle is at `time_s`.
+
+    Args:
+        poses: (N, 4, 4) from the LiDAR to the world at times (N,).
+        dead: (beams,) beams that measure nothing.
+    """
+    beams = len(model.elevations_rad)
+    azimuth = np.pi - 2 * np.pi * (np.arange(model.columns) + 0.5) / model.columns
+    offset_s = -model.period_s * azimuth / (2 * np.pi)
+    pose = poses(time_s + offset_s)
+    up = np.asarray(model.elevations_rad)
+    rays = np.stack(
+        [
+            np.outer(np.cos(azimuth), np.cos(up)),
+            np.outer(np.sin(azimuth), np.cos(up)),
+            np.broadcast_to(np.sin(up), (model.columns, beams)),
+        ],
+        axis=-1,
+    )
+    times = np.repeat(time_s + offset_s, beams)
+    origins = np.repeat(pose[:, :3, 3], beams, axis=0)
+
+    def cast(local: Doubles, chosen: NDArray[np.int64]) -> Hits:
+        turned = np.einsum("nij,nj->ni", pose[chosen // beams, :3, :3], local).astype(np.float32)
+        return scene.cast(origins[chosen], turned, times[chosen], model.reach_m)
+
+    everything = np.arange(model.columns * beams)
+    flat = rays.reshape(-1, 3)
+    hits = cast(flat, everything)
+    range_m = hits.range_m.astype(np.float64)
+    strength = _reflectance(scene, hits) * _cosine(hits, flat, pose, beams)
+    edge = np.flatnonzero(_jumps(range_m.reshape(model.columns, beams)).ravel())
+    range_m[edge], strength[edge] = _cones(model, flat[edge], edge, range_m[edge], strength[edge], cast, scene)
+    with np.errstate(invalid="ignore"):
+        seen = np.isfinite(range_m) & (range_m > model.nearest_m) & (strength / range_m**2 > WEAKEST)
+    seen &= rng.random(len(range_m)) >= model.dropout
+    if dead is not None:
+        seen &= ~np.tile(dead, model.columns)
+    noise = rng.normal(0.0, model.noise_m, len(range_m))
+    measured = (range_m + noise)[seen]
+    return Sweep(
+        (flat[seen] * measured[:, None]).astype(np.float32),
+        np.clip(strength[seen] + 0.02 * noise[seen] / model.noise_m, 0.0, 1.0).astype(np.float32),
+        np.tile(np.arange(beams, dtype=np.uint16), model.columns)[seen],
+        np.repeat(offset_s, beams)[seen].astype(np.float32),
+    )
+
+
+def _reflectance(scene: Scene, hits: Hits) -> Doubles:
+    own = scene.colour[hits.triangle].mean(axis=1, dtype=np.float64)
+    fixed = REFLECTANCE[scene.material[hits.triangle]]
+    return np.where(hits.triangle < 0, 0.0, np.where(np.isnan(fixed), own, fixed))
+
+
+def _cosine(hits: Hits, flat: Doubles, pose: Doubles, beams: int) -> Doubles:
+    turned = np.einsum("nij,nj->ni", np.repeat(pose[:, :3, :3], beams, axis=0), flat)
+    cosine: Doubles = np.abs(np.einsum("ni,ni->n", turned, hits.normal.astype(np.float64)))
+    return cosine
+
+
+def _jumps(range_m: Doubles) -> NDArray[np.bool_]:
+    """(columns, beams): whether a neighbour's range differs."""
+    result = np.zeros(range_m.shape, dtype=bool)
+    held = np.where(np.isfinite(range_m), range_m, 1e4)
+    across = np.abs(np.diff(held, axis=0, append=held[:1])) > JUMP * np.minimum(held, np.roll(held, -1, axis=0))
+    result |= across | np.roll(across, 1, axis=0)
+    apart = np.abs(np.diff(held, axis=1))
+    # Neighbouring beams on a slanted floor differ, too: only what is far beyond that is an edge.
+    up = apart > 0.12 * np.minimum(held[:, 1:], held[:, :-1])
+    result[:, 1:] |= up
+    result[:, :-1] |= up
+    return result
+
+
+def _cones(
+    model: LidarModel, flat: Doubles, chosen: NDArray[np.int64], middle_m: Doubles, middle: Doubles,
+    cast: Callable[[Doubles, NDArray[np.int64]], Hits], scene: Scene,
+) -> tuple[Doubles, Doubles]:  # fmt: skip
+    """Range and strength of beams that are cones: the strongest echo, mixed with those within a pulse's length."""
+    if not len(chosen):
+        return middle_m, middle
+    ranges, strengths = [middle_m], [middle]
+    side = np.column_stack([-flat[:, 1], flat[:, 0], np.zeros(len(flat))])
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    above = np.cross(flat, side)
+    for across, over in SPREAD:
+        ray = flat + model.divergence_rad * (across * side + over * above)
+        ray /= np.linalg.norm(ray, axis=1)[:, None]
+        hits = cast(ray, chosen)
+        ranges.append(hits.range_m.astype(np.float64))
+        strengths.append(_reflectance(scene, hits) * np.where(np.isfinite(hits.range_m), 0.7, 0.0))
+    echo, weight = np.stack(ranges, axis=1), np.stack(strengths, axis=1)
+    power = np.where(np.isfinite(echo), weight / np.maximum(echo, 0.1) ** 2, 0.0)
+    held_m = np.where(np.isfinite(echo), echo, 1e6)  # no echo: together with nothing
+    together = np.abs(held_m[:, :, None] - held_m[:, None, :]) < CLUSTER_M
+    cluster = np.where(together, power[:, None, :], 0.0).sum(axis=2)
+    best = cluster.argmax(axis=1)
+    rows = np.arange(len(echo))
+    member = np.where(together[rows, best], power, 0.0)
+    total = member.sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mixed = (member * held_m).sum(axis=1) / total
+        held = (member * weight).sum(axis=1) / total
+    share = (member > 0).sum(axis=1) / echo.shape[1]
+    return np.where(total > 0, mixed, np.inf), np.where(total > 0, held * share, 0.0)

@@ -1,0 +1,60 @@
+"""A drive made by several processes: Embree's binding holds Python's lock, so threads would not share the work."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+
+from coec.simulation.drive import DriveConfig, SimulatedDrive
+from coec.sources.recording import Message
+
+PART = 128
+"""Messages per piece of work: about 2 s of a drive at the usual rates, some 45 MB of sweeps on their way."""
+
+_drive: SimulatedDrive | None = None
+
+
+def messages_by(config: DriveConfig, processes: int) -> Iterator[Message]:
+    """The messages of the drive, the same to the byte and in the same order as from `SimulatedDrive.messages`.
+
+    At most two pieces of work per process are under way or wait, whatever the length of the drive.
+    """
+    whole = SimulatedDrive(config)
+    count = whole.message_count
+    if processes == 1 or count <= PART:
+        yield from whole.messages()
+        return
+    # A compiled loop of one process must not take the cores of the other; read when numba is imported there.
+    before = os.environ.get("NUMBA_NUM_THREADS")
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    try:
+        spawn = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(processes, mp_context=spawn, initializer=_open, initargs=(config,))
+        try:
+            waiting: deque[Future[list[Message]]] = deque()
+            for begin in range(0, count, PART):
+                waiting.append(pool.submit(_part, begin))
+                if len(waiting) > 2 * processes:
+                    yield from waiting.popleft().result()
+            while waiting:
+                yield from waiting.popleft().result()
+        finally:  # also where the reader has gone before the end
+            pool.shutdown(cancel_futures=True)
+    finally:
+        if before is None:
+            del os.environ["NUMBA_NUM_THREADS"]
+        else:
+            os.environ["NUMBA_NUM_THREADS"] = before
+
+
+def _open(config: DriveConfig) -> None:
+    global _drive  # one drive per process, as the pool's initializer gives it
+    _drive = SimulatedDrive(config)
+
+
+def _part(begin: int) -> list[Message]:
+    assert _drive is not None
+    return _drive.part(begin, begin + PART)

@@ -1,0 +1,218 @@
+"""Pictures of a scene, with their exact range: one ray per pixel, more where neighbouring pixels differ."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from coec.calibration.values import Matrix4
+from coec.geometry.cameras import Camera
+from coec.geometry.projection import unproject
+from coec.simulation.mesh import Floats
+from coec.simulation.scene import Hits, Scene
+from coec.simulation.shading import shade
+
+Doubles = NDArray[np.float64]
+
+SHADOW_LIFT_M = 0.02
+"""Rays to the sun start this far off the surface: it must not shade itself."""
+EDGE_SAMPLES: tuple[tuple[float, float], ...] = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
+"""Further samples (u, v) of a pixel on an edge, pixels: the rotated grid of four."""
+EDGE_RANGE = 0.06
+"""Neighbours whose ranges differ by more than this share are on an edge."""
+GAMMA = 1 / 2.2
+
+
+class PixelRays(NamedTuple):
+    """Rays of the pixels of a camera that see something.
+
+    Attributes:
+        pixel: (P,) flat pixel index, ascending.
+        directions: (P, 3) float32 unit, camera frame.
+        pixel_rad: mean angle between neighbouring pixels.
+    """
+
+    pixel: NDArray[np.int64]
+    directions: Floats
+    pixel_rad: float
+
+
+class View(NamedTuple):
+    """A picture.
+
+    Attributes:
+        bgr: (height, width, 3) uint8; black where the camera sees nothing.
+        range_m: (height, width) float32, Euclidean distance from the camera to what the middle of each pixel shows;
+            NaN for the sky and where the camera sees nothing.
+    """
+
+    bgr: NDArray[np.uint8]
+    range_m: Floats
+
+
+class Radiance(NamedTuple):
+    """What reaches the lens, before exposure. `linear`: (height, width, 3) float32 BGR; `range_m` as in `View`."""
+
+    linear: Floats
+    range_m: Floats
+
+
+@lru_cache(maxsize=4)
+def pixel_rays(camera: Camera, half_view_rad: float = np.pi) -> PixelRays:
+    """Rays of the pixels with a valid unprojection, at most `half_view_rad` off the optical axis."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    rays, valid = unproject(camera, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
+    index = np.flatnonzero(valid & (rays[:, 2] >= np.cos(half_view_rad)))
+    pixel_rad = float(1.0 / np.sqrt(camera.fx * camera.fy))
+    return PixelRays(index, np.ascontiguousarray(rays[index], np.float32), pixel_rad)
+
+
+def render_view(
+    scene: Scene,
+    camera: Camera,
+    T_world_camera: Matrix4,
+    *,
+    time_s: float = 0.0,
+    half_view_rad: float = np.pi,
+    smooth_edges: bool = True,
+    exposure: float = 0.9,
+) -> View:
+    """A perfect camera's picture: no noise, no blur, no vignetting.
+
+    Args:
+        T_world_camera: (4, 4) maps camera coordinates (x right, y down, z forward) to the world (z up).
+        time_s: where the moving cars are.
+        half_view_rad: pixels further off the axis stay black (the lens's circle).
+        smooth_edges: further rays where neighbouring pixels differ.
+        exposure: factor on the light before the gamma curve.
+    """
+    radiance = render_radiance(
+        scene, camera, T_world_camera, time_s=time_s, half_view_rad=half_view_rad, smooth_edges=smooth_edges
+    )
+    return View(tone(radiance.linear, exposure), radiance.range_m)
+
+
+def tone(linear: Floats, exposure: float) -> NDArray[np.uint8]:
+    """8-bit values: exposure, soft shoulder, gamma."""
+    return np.asarray(_tone(linear.reshape(-1), float(exposure))).reshape(linear.shape)
+
+
+def render_radiance(
+    scene: Scene,
+    camera: Camera,
+    T_world_camera: Matrix4,
+    *,
+    time_s: float = 0.0,
+    half_view_rad: float = np.pi,
+    smooth_edges: bool = True,
+) -> Radiance:
+    """See `render_view`."""
+    rays = pixel_rays(camera, half_view_rad)
+    rotation = np.ascontiguousarray(T_world_camera[:3, :3], np.float64)
+    origin = np.asarray(T_world_camera[:3, 3], np.float64)
+    directions = _rotated(rays.directions, rotation)
+    hits = scene.cast(origin, directions, time_s)
+    light = _lit(scene, origin, directions, hits, time_s, rays.pixel_rad)
+    size = camera.height * camera.width
+    linear = np.zeros((size, 3), np.float32)
+    linear[rays.pixel] = light
+    range_m = np.full(size, np.nan, np.float32)
+    range_m[rays.pixel] = np.where(hits.triangle < 0, np.float32(np.nan), hits.range_m)
+    shape = (camera.height, camera.width)
+    if smooth_edges:
+        seen = np.zeros(size, bool)
+        seen[rays.pixel] = True
+        edge = np.flatnonzero(_edges(linear.reshape(*shape, 3), range_m.reshape(shape), seen.reshape(shape)).ravel())
+        linear[edge] = _supersampled(scene, camera, rotation, origin, edge, linear[edge], time_s, rays.pixel_rad)
+    return Radiance(linear.reshape(*shape, 3), range_m.reshape(shape))
+
+
+def _lit(scene: Scene, origin: Doubles, directions: Floats, hits: Hits, time_s: float, pixel_rad: float) -> Floats:
+    shadowed = np.zeros(len(directions), np.float32)
+    if any(scene.sky.sun):
+        facing = _facing_sun(hits.triangle, hits.normal, scene.sky.towards_sun)
+        points = _points(hits, directions, (origin - scene.origin_m).astype(np.float32), facing)
+        shadowed[facing] = scene.shadowed(points, time_s)
+    return shade(scene, origin, directions, hits, shadowed, pixel_rad)
+
+
+def _supersampled(
+    scene: Scene, camera: Camera, rotation: Doubles, origin: Doubles, pixels: NDArray[np.int64], first: Floats,
+    time_s: float, pixel_rad: float,
+) -> Floats:  # fmt: skip
+    """Mean radiance of the pixels over the middle and `EDGE_SAMPLES`; bright light is cut as a sensor would."""
+    v, u = np.divmod(pixels, camera.width)
+    total: Floats = np.minimum(first, np.float32(1.5))
+    count = np.ones((len(pixels), 1), np.float32)
+    for du, dv in EDGE_SAMPLES:
+        rays, valid = unproject(camera, np.column_stack([u + du, v + dv]))
+        directions = _rotated(rays.astype(np.float32), rotation)
+        hits = scene.cast(origin, directions, time_s)
+        light = _lit(scene, origin, directions, hits, time_s, 0.5 * pixel_rad)
+        total += np.where(valid[:, None], np.minimum(light, np.float32(1.5)), np.float32(0))
+        count += valid[:, None]
+    return np.asarray(total / count, np.float32)
+
+
+def _facing_sun(triangle: NDArray[np.int32], normal: Floats, sun: Floats) -> NDArray[np.int64]:
+    # Without BLAS: the same bits whatever its threads.
+    cosine = normal[:, 0] * sun[0] + normal[:, 1] * sun[1] + normal[:, 2] * sun[2]
+    return np.flatnonzero((triangle >= 0) & (cosine > 0))
+
+
+def _points(hits: Hits, directions: Floats, origin: Floats, chosen: NDArray[np.int64]) -> Floats:
+    return np.asarray(
+        origin
+        + directions[chosen] * hits.range_m[chosen, None]
+        + hits.normal[chosen] * np.float32(SHADOW_LIFT_M)
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _rotated(vectors: Floats, rotation: Doubles) -> Floats:
+    out = np.empty_like(vectors)
+    for i in range(len(vectors)):
+        x, y, z = vectors[i, 0], vectors[i, 1], vectors[i, 2]
+        for r in range(3):
+            out[i, r] = rotation[r, 0] * x + rotation[r, 1] * y + rotation[r, 2] * z
+    return out
+
+
+@njit(cache=True, parallel=True)
+def _tone(linear: Floats, exposure: float) -> NDArray[np.uint8]:
+    out = np.empty(len(linear), np.uint8)
+    for i in prange(len(linear)):
+        value = exposure * linear[i]
+        if value > 0.7:  # a shoulder instead of a hard cut
+            value = 0.7 + 0.3 * (1.0 - np.exp((0.7 - value) / 0.3))
+        out[i] = np.uint8(255.0 * max(value, 0.0) ** GAMMA + 0.5)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _edges(linear: Floats, range_m: Floats, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w): pixels that differ in range or brightness from a neighbour."""
+    h, w = range_m.shape
+    out = np.zeros((h, w), np.bool_)
+    for y in range(h):
+        for x in range(w):
+            if not seen[y, x]:
+                continue
+            for k in range(2):
+                y2, x2 = y + k, x + 1 - k
+                if y2 >= h or x2 >= w or not seen[y2, x2]:
+                    continue
+                a, b = range_m[y, x], range_m[y2, x2]
+                gone_a, gone_b = a != a, b != b
+                apart = gone_a != gone_b or (not gone_a and abs(a - b) > EDGE_RANGE * min(a, b))
+                if not apart:
+                    low, high = min(linear[y, x, 1], 1.5), min(linear[y2, x2, 1], 1.5)
+                    apart = abs(low - high) > 0.15 * (low + high) + 0.01
+                if apart:
+                    out[y, x] = True
+                    out[y2, x2] = True
+    return out

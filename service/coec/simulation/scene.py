@@ -1,0 +1,303 @@
+"""The town of a seed and the part of it around the vehicle, against which rays are cast by Embree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from coec.simulation import props
+from coec.simulation.mesh import Floats, Mesh, join
+from coec.simulation.road import Road, build_road
+from coec.simulation.sky import Sky, draw_sky
+from coec.simulation.street import STRETCH_M, Stretch, Style, backdrop, build_stretch, draw_style
+
+Doubles = NDArray[np.float64]
+Progress = Callable[[Doubles], Doubles]
+"""Arc length in metres at times in seconds."""
+
+BEHIND, AHEAD = 3, 4
+"""Stretches kept behind and ahead of the one that the vehicle is in: at least 144 m each way."""
+RAYS_AT_ONCE = 1 << 18
+"""Rays per call of Embree: bounds the memory of an image of any size."""
+MODELS = 10
+ONCOMING_MPS, ONCOMING_GAP_M = 9.0, 55.0
+OWN_GAPS_M = (34.0, 71.0, 113.0, -27.0)
+"""Places of the other cars in the own lane, ahead of the vehicle."""
+MISSED = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """What rays met first.
+
+    Attributes:
+        range_m: (N,) float32, inf for the sky.
+        triangle: (N,) int32 index into the scene's `colour` and `material`, `MISSED` for the sky.
+        normal: (N, 3) float32 unit normal, towards the origin of the ray; 0 for the sky.
+    """
+
+    range_m: Floats
+    triangle: NDArray[np.int32]
+    normal: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mover:
+    """A car on its way: which model, where along the road at a time, in which lane."""
+
+    model: int
+    progress: Progress
+    left_m: float
+    oncoming: bool
+
+    def poses(self, road: Road, time_s: Doubles) -> Doubles:
+        """(N, 4): x, y, z in metres and heading in radians."""
+        s = self.progress(time_s)
+        xyz = road.points(s, self.left_m, 0.0)
+        heading = road.at(s)[:, 3] + (np.pi if self.oncoming else 0.0)
+        return np.column_stack([xyz, heading])
+
+
+class Solid:
+    """A mesh that Embree has indexed."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self.radius_m = float(np.sqrt((mesh.corners_m.astype(np.float64) ** 2).sum(axis=-1)).max())
+        self._scene = EmbreeScene()
+        self._geometry = TriangleMesh(self._scene, np.ascontiguousarray(mesh.corners_m))
+
+    def cast(self, origins_m: Floats, directions: Floats, reach_m: float) -> Hits:
+        """Origins in the frame of the mesh."""
+        count = len(directions)
+        range_m = np.empty(count, np.float32)
+        triangle = np.empty(count, np.int32)
+        normal = np.empty((count, 3), np.float32)
+        for low in range(0, count, RAYS_AT_ONCE):
+            part = slice(low, low + RAYS_AT_ONCE)
+            found = self._scene.run(origins_m[part], directions[part], query="INTERSECT", output=1)
+            _take(found["tfar"], found["primID"], found["Ng"], directions[part], float(reach_m),
+                  range_m[part], triangle[part], normal[part])  # fmt: skip
+        return Hits(range_m, triangle, normal)
+
+    def blocked(self, origins_m: Floats, directions: Floats) -> NDArray[np.bool_]:
+        """(N,): whether anything stands in the way."""
+        result = np.empty(len(directions), bool)
+        for low in range(0, len(directions), RAYS_AT_ONCE):
+            part = slice(low, low + RAYS_AT_ONCE)
+            result[part] = self._scene.run(origins_m[part], directions[part], query="OCCLUDED") != MISSED
+        return result
+
+
+class Scene:
+    """The street around one place, at any time.
+
+    Attributes:
+        origin_m: (3,) world position from which the coordinates of its meshes are counted.
+        street: what stands still, without the models of the cars.
+        colour, material: (T, 3) float32 and (T,) int8 of all triangles: street, then each model of car.
+        sky: light and weather.
+    """
+
+    def __init__(self, road: Road, sky: Sky, origin_m: Doubles, street: Mesh, models: list[Solid]) -> None:
+        self.road = road
+        self.sky = sky
+        self.origin_m = origin_m
+        self.movers: tuple[Mover, ...] = ()
+        self.street = street
+        self._solid = Solid(street)
+        self._models = models
+        self._first = np.cumsum([len(street.colour)] + [len(model.mesh.colour) for model in models])
+        self.colour = np.concatenate([street.colour, *(model.mesh.colour for model in models)])
+        self.material = np.concatenate([street.material, *(model.mesh.material for model in models)])
+
+    def cast(self, origins_m: Doubles, directions: Floats, time_s: ArrayLike, reach_m: float = 400.0) -> Hits:
+        """The first surface along each ray.
+
+        Args:
+            origins_m: (N, 3) world positions, or (3,).
+            directions: (N, 3) unit, world axes.
+            time_s: when each ray is cast, (N,) or one.
+        """
+        local = np.empty(directions.shape, np.float32)
+        local[:] = np.asarray(origins_m, np.float64) - self.origin_m
+        hits = self._solid.cast(local, directions, reach_m)
+        for mover in self.movers:
+            self._cast_mover(mover, local, directions, np.asarray(time_s, np.float64), hits)
+        return hits
+
+    def shadowed(self, points_m: Floats, time_s: float) -> NDArray[np.bool_]:
+        """(N,): whether something keeps the sun from points (N, 3), which are counted from `origin_m`."""
+        sun = np.empty_like(points_m)
+        sun[:] = self.sky.towards_sun
+        dark = self._solid.blocked(points_m, sun)
+        time = np.array([time_s])
+        for mover in self.movers:
+            model = self._models[mover.model]
+            x, y, z, heading = mover.poses(self.road, time)[0]
+            centre = np.array([x, y, z]) - self.origin_m
+            rays = np.flatnonzero(_near(points_m, sun, centre, model.radius_m) & ~dark)
+            if len(rays):
+                turn = np.array([-heading])
+                start = _turned(points_m[rays] - centre, np.broadcast_to(turn, len(rays)))
+                way = _turned(sun[rays].astype(np.float64), np.broadcast_to(turn, len(rays)))
+                dark[rays] = model.blocked(start, way)
+        return dark
+
+    def _cast_mover(self, mover: Mover, local: Floats, directions: Floats, time_s: Doubles, hits: Hits) -> None:
+        """Where a moving car is nearer than the street, the car; each ray meets it where it is at the ray's time."""
+        model = self._models[mover.model]
+        ends = mover.poses(self.road, np.array([time_s.min(), time_s.max()]))[:, :3] - self.origin_m
+        margin = float(np.linalg.norm(ends[1] - ends[0])) / 2
+        near = _near(local, directions, ends.mean(axis=0), model.radius_m + margin)
+        rays = np.flatnonzero(near)
+        if not len(rays):
+            return
+        times = time_s[rays] if time_s.ndim else time_s[None]
+        poses = np.broadcast_to(mover.poses(self.road, times), (len(rays), 4))
+        start = _turned(local[rays] - (poses[:, :3] - self.origin_m), -poses[:, 3])
+        way = _turned(directions[rays].astype(np.float64), -poses[:, 3])
+        found = model.cast(start, way, float(np.inf))
+        nearer = found.range_m < hits.range_m[rays]
+        chosen = rays[nearer]
+        hits.range_m[chosen] = found.range_m[nearer]
+        hits.triangle[chosen] = found.triangle[nearer] + np.int32(self._first[mover.model])
+        hits.normal[chosen] = _turned(found.normal[nearer].astype(np.float64), poses[nearer, 3])
+
+
+class Town:
+    """The streets of one seed. Builds what is around a place, and keeps only that."""
+
+    def __init__(self, seed: int, length_m: float = 1000.0) -> None:
+        self.seed = seed
+        self.style: Style = draw_style(seed)
+        self.sky: Sky = draw_sky(seed)
+        margin = STRETCH_M * (BEHIND + AHEAD + 2) + 300.0
+        self.road = build_road(seed, -margin, length_m + margin)
+        rng = np.random.default_rng([seed, 103])
+        self._models = [Solid(props.car(rng)) for _ in range(MODELS)]
+        self._stretches: dict[int, Stretch] = {}
+        self._scene: tuple[int, Scene] | None = None
+
+    @property
+    def stretches_kept(self) -> int:
+        """How many stretches are in memory."""
+        return len(self._stretches)
+
+    def lane_left_m(self) -> float:
+        """Middle of the own (right) lane, to the left of the centre line: negative."""
+        return -self.style.lane_m / 2
+
+    def scene(self, at_m: float, time_s: float = 0.0, progress: Progress | None = None) -> Scene:
+        """The street around arc length `at_m`, with traffic at `time_s`.
+
+        progress: of the vehicle, which the cars in its lane keep their distance from; else it does 8 m/s from `at_m`.
+        """
+        place = int(np.floor(at_m / STRETCH_M))
+        if self._scene is None or self._scene[0] != place:
+            self._scene = (place, self._build(place))
+        scene = self._scene[1]
+        own = progress if progress is not None else _steady(at_m, time_s)
+        scene.movers = tuple(self._traffic(at_m, time_s, own))
+        return scene
+
+    def _build(self, place: int) -> Scene:
+        wanted = range(place - BEHIND, place + AHEAD + 1)
+        # In the order of the road, wherever the vehicle comes from: the order of triangles shows in the bytes.
+        kept = {
+            index: self._stretches.get(index) or build_stretch(self.seed, index, self.road, self.style)
+            for index in wanted
+        }
+        self._stretches = kept
+        origin = self.road.points(place * STRETCH_M, 0.0, 0.0)
+        parts = []
+        for stretch in kept.values():
+            shift = (stretch.origin_m - origin).astype(np.float32)
+            parts.append(Mesh(stretch.mesh.corners_m + shift, stretch.mesh.colour, stretch.mesh.material))
+        lowest = min(float(mesh.corners_m[:, :, 2].min()) for mesh in parts)
+        return Scene(
+            self.road, self.sky, origin, join([*parts, backdrop().placed(0, 0, min(lowest, 0.0), 0)]), self._models
+        )
+
+    def _traffic(self, at_m: float, time_s: float, own: Progress) -> list[Mover]:
+        lane = self.style.lane_m / 2
+        movers = []
+        for place, gap in enumerate(OWN_GAPS_M):
+            rng = np.random.default_rng([self.seed, 104, place])
+            if rng.random() < 0.75:
+                movers.append(Mover(int(rng.integers(MODELS)), _shifted(own, gap), -lane, oncoming=False))
+        middle = int(np.floor((at_m + ONCOMING_MPS * time_s) / ONCOMING_GAP_M))
+        for number in range(middle - 1, middle + 3):
+            rng = np.random.default_rng([self.seed, 105, number + 2**20])
+            if rng.random() < 0.6:
+                start = number * ONCOMING_GAP_M + rng.uniform(0, ONCOMING_GAP_M - 12)
+                movers.append(Mover(int(rng.integers(MODELS)), _against(float(start)), lane, oncoming=True))
+        return movers
+
+
+def _steady(at_m: float, since_s: float) -> Progress:
+    return lambda time_s: at_m + 8.0 * (time_s - since_s)
+
+
+def _shifted(progress: Progress, gap_m: float) -> Progress:
+    return lambda time_s: progress(time_s) + gap_m
+
+
+def _against(start_m: float) -> Progress:
+    return lambda time_s: start_m - ONCOMING_MPS * time_s
+
+
+def _turned(vectors: NDArray[np.floating], angle_rad: Doubles) -> Floats:
+    """(N, 3) turned about the vertical by (N,)."""
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.column_stack([cosine * x - sine * y, sine * x + cosine * y, vectors[:, 2]]).astype(np.float32)
+
+
+@njit(cache=True, nogil=True)
+def _take(
+    tfar: Floats,
+    triangle: NDArray[np.int32],
+    raw: Floats,
+    directions: Floats,
+    reach_m: float,
+    out_range: Floats,
+    out_triangle: NDArray[np.int32],
+    out_normal: Floats,
+) -> None:
+    """Turns Embree's answers into those of `Hits`."""
+    for i in range(len(tfar)):
+        if triangle[i] < 0 or not tfar[i] <= reach_m:
+            out_range[i] = np.inf
+            out_triangle[i] = -1
+            out_normal[i, 0] = out_normal[i, 1] = out_normal[i, 2] = 0.0
+            continue
+        x, y, z = float(raw[i, 0]), float(raw[i, 1]), float(raw[i, 2])
+        length = np.sqrt(x * x + y * y + z * z)
+        if x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2] > 0.0:
+            length = -length
+        out_range[i] = tfar[i]
+        out_triangle[i] = triangle[i]
+        out_normal[i, 0] = x / length
+        out_normal[i, 1] = y / length
+        out_normal[i, 2] = z / length
+
+
+@njit(cache=True, nogil=True)
+def _near(origins: Floats, directions: Floats, centre: Doubles, radius_m: float) -> NDArray[np.bool_]:
+    """(N,): whether each ray passes a sphere."""
+    result = np.empty(len(directions), np.bool_)
+    for i in range(len(directions)):
+        x = centre[0] - origins[i, 0]
+        y = centre[1] - origins[i, 1]
+        z = centre[2] - origins[i, 2]
+        along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
+        apart = x * x + y * y + z * z - along * along
+        result[i] = along > -radius_m and apart < radius_m * radius_m
+    return result

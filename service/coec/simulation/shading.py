@@ -1,0 +1,228 @@
+"""The light that comes back along each ray: procedural textures, sun and sky, haze.
+
+Textures are sums of value noise (Perlin, "An image synthesizer", SIGGRAPH 1985, with hashed lattice values) at places
+in the world, each octave faded out before a pixel covers its wavelength: what cannot be resolved does not flicker.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from coec.simulation.mesh import Floats
+from coec.simulation.scene import Hits, Scene
+from coec.simulation.sky import Sky
+
+Doubles = NDArray[np.float64]
+
+# The numbers of `Material`, as constants of the compiled code.
+ASPHALT, PAVING, GRASS, BRICK, PLASTER, GLASS, LACQUER, FOLIAGE, BARK, TILES, MARKING = range(1, 12)
+RUBBER, CONCRETE = 13, 14
+
+
+def shade(
+    scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits, shadowed: Floats, pixel_rad: float
+) -> Floats:
+    """(N, 3) linear radiance in blue, green, red.
+
+    Args:
+        origin_m: (3,) of the rays, world.
+        shadowed: (N,) share of the sun that is kept off, 0 to 1.
+        pixel_rad: angle between neighbouring rays.
+    """
+    sky = scene.sky
+    out = np.empty((len(directions), 3), np.float32)
+    _shade(
+        np.asarray(origin_m, np.float64), directions, hits.range_m, hits.triangle, hits.normal, shadowed,
+        scene.colour, scene.material, _light(sky), float(sky.clouds), float(sky.haze_m), pixel_rad, out,
+    )  # fmt: skip
+    return out
+
+
+def _light(sky: Sky) -> Doubles:
+    """(4, 3): direction of the sun, its colour, the zenith's and the horizon's."""
+    return np.array([sky.towards_sun, sky.sun, sky.zenith, sky.horizon], np.float64)
+
+
+@njit(cache=True, inline="always")
+def _hash(i: np.int64, j: np.int64, salt: int) -> float:
+    """0 to 1 for an integer cell."""
+    h = (np.uint32(i) * np.uint32(0x8DA6B343)) ^ (np.uint32(j) * np.uint32(0xD8163841)) ^ np.uint32(salt)
+    h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
+    h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
+    return float((h ^ (h >> np.uint32(15))) >> np.uint32(8)) * (1.0 / 16777216.0)
+
+
+@njit(cache=True)
+def _noise(u: float, v: float, salt: int) -> float:
+    """Value noise, 0 to 1, of wavelength 1."""
+    fu, fv = math.floor(u), math.floor(v)
+    i, j = np.int64(fu), np.int64(fv)
+    a, b = u - fu, v - fv
+    a = a * a * (3.0 - 2.0 * a)
+    b = b * b * (3.0 - 2.0 * b)
+    low = _hash(i, j, salt) * (1 - a) + _hash(i + np.int64(1), j, salt) * a
+    high = _hash(i, j + np.int64(1), salt) * (1 - a) + _hash(i + np.int64(1), j + np.int64(1), salt) * a
+    return low * (1 - b) + high * b
+
+
+@njit(cache=True)
+def _grain(u: float, v: float, wave_m: float, footprint_m: float, salt: int) -> float:
+    """Noise about 0 (-0.5 to 0.5) of one wavelength, faded where it cannot be resolved."""
+    fade = 1.5 - 2.0 * footprint_m / wave_m
+    if fade <= 0.0:
+        return 0.0
+    return min(fade, 1.0) * (_noise(u / wave_m, v / wave_m, salt) - 0.5)
+
+
+@njit(cache=True)
+def _line(u: float, period_m: float, width_m: float, footprint_m: float) -> float:
+    """How much of a pixel lies in the lines of this width that repeat along u, 0 to 1."""
+    place = abs(u - period_m * math.floor(u / period_m) - 0.5 * period_m)
+    place = 0.5 * period_m - place  # distance to the nearest line
+    wide = 0.5 * max(width_m, footprint_m)
+    cover = 0.0 if place > wide + 0.5 * footprint_m else min(1.0, width_m / (2.0 * wide))
+    blend = min(1.0, footprint_m / (0.5 * period_m))
+    return cover * (1 - blend) + blend * width_m / period_m
+
+
+@njit(cache=True)
+def _texture(kind: int, u: float, v: float, foot: float) -> float:
+    """Factor on the colour of a surface at its coordinates u, v (m; v is the height on walls)."""
+    if kind == ASPHALT:
+        return (1.0 + 0.5 * _grain(u, v, 0.04, foot, 1) + 0.3 * _grain(u, v, 0.25, foot, 2)
+                + 0.3 * _grain(u, v, 2.5, foot, 3) + 0.2 * _grain(u, v, 11.0, foot, 4))  # fmt: skip
+    if kind == PAVING:
+        joint = max(_line(u, 0.5, 0.02, foot), _line(v, 0.5, 0.02, foot))
+        slab = _hash(np.int64(math.floor(u / 0.5)), np.int64(math.floor(v / 0.5)), 5) - 0.5
+        fade = max(0.0, min(1.0, 1.5 - 2 * foot / 0.5))
+        return (1.0 - 0.5 * joint) * (1.0 + 0.22 * fade * slab + 0.3 * _grain(u, v, 0.1, foot, 6)
+                                      + 0.25 * _grain(u, v, 3.0, foot, 7))  # fmt: skip
+    if kind == GRASS:
+        return (1.0 + 0.8 * _grain(u, v, 0.07, foot, 8) + 0.6 * _grain(u, v, 0.4, foot, 9)
+                + 0.5 * _grain(u, v, 2.0, foot, 10) + 0.4 * _grain(u, v, 9.0, foot, 11))  # fmt: skip
+    if kind == BRICK:
+        row = math.floor(v / 0.08)
+        shifted = u + 0.12 * (row - 2 * math.floor(row / 2))
+        joint = max(_line(v, 0.08, 0.012, foot), _line(shifted, 0.24, 0.012, foot))
+        brick = _hash(np.int64(math.floor(shifted / 0.24)), np.int64(row), 12) - 0.5
+        fade = max(0.0, min(1.0, 1.5 - 2 * foot / 0.1))
+        return (1.0 + 0.35 * joint) * (1.0 + 0.5 * fade * brick + 0.3 * _grain(u, v, 1.7, foot, 13))
+    if kind in (PLASTER, CONCRETE):
+        return (1.0 + 0.15 * _grain(u, v, 0.05, foot, 14) + 0.12 * _grain(u, v, 0.6, foot, 15)
+                + 0.22 * _grain(u, 0.4 * v, 2.4, foot, 16))  # fmt: skip
+    if kind == FOLIAGE:
+        return 1.0 + 0.9 * _grain(u, v, 0.12, foot, 17) + 0.7 * _grain(u, v, 0.5, foot, 18)
+    if kind == BARK:
+        return 1.0 + 0.8 * _grain(4 * u, v, 0.2, foot, 19)
+    if kind == TILES:
+        return (1.0 - 0.45 * max(_line(v, 0.3, 0.04, foot), 0.6 * _line(u, 0.22, 0.03, foot))) * (
+            1.0 + 0.3 * _grain(u, v, 0.3, foot, 20) + 0.3 * _grain(u, v, 2.0, foot, 21)
+        )
+    if kind == MARKING:
+        worn = _grain(u, v, 0.3, foot, 22) + _grain(u, v, 0.05, foot, 23)
+        return 1.0 + 0.35 * worn
+    return 1.0 + 0.08 * _grain(u, v, 0.6, foot, 24)
+
+
+@njit(cache=True)
+def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: bool, colour: Doubles) -> None:
+    """Radiance of the sky in a direction, into `colour`: with a far skyline, and the sun if `clear`."""
+    up = max(z, 0.0)
+    blend = math.sqrt(up)
+    towards = x * light[0, 0] + y * light[0, 1] + z * light[0, 2]
+    glow = math.exp(-12.0 * (1.0 - towards)) * 0.5 + math.exp(-180.0 * (1.0 - towards)) * 1.5
+    cloud = 0.0
+    if clouds > 0.0 and z > 0.02:
+        u, v = x / (z + 0.12), y / (z + 0.12)
+        amount = (0.5 * _noise(1.3 * u, 1.3 * v, 31) + 0.3 * _noise(3.1 * u, 3.1 * v, 32)
+                  + 0.2 * _noise(7.7 * u, 7.7 * v, 33))  # fmt: skip
+        cloud = min(max((amount - (0.75 - 0.5 * clouds)) * 5.0, 0.0), 1.0)
+    for c in range(3):
+        value = light[3, c] * (1 - blend) + light[2, c] * blend
+        bright = 0.75 * light[3, c] + 0.35 * light[1, c]
+        value = value * (1 - 0.8 * cloud) + 0.8 * cloud * bright * (0.8 + 0.3 * blend)
+        colour[c] = value + light[1, c] * glow * (1 - 0.6 * cloud)
+        if clear and towards > 0.99996 and cloud < 0.5:
+            colour[c] += 30.0 * light[1, c]
+    line = 0.012 + 0.05 * _noise(9.0 * math.atan2(y, x), 0.5, 34) + 0.012 * _noise(70.0 * math.atan2(y, x), 0.5, 35)
+    if z < line:
+        dark = min(max((line - z) / 0.004, 0.0), 1.0) * 0.55
+        colour[0] = colour[0] * (1 - dark) + dark * 0.30
+        colour[1] = colour[1] * (1 - dark) + dark * 0.33
+        colour[2] = colour[2] * (1 - dark) + dark * 0.27
+
+
+@njit(cache=True, parallel=True)
+def _shade(
+    origin: Doubles,
+    directions: Floats,
+    range_m: Floats,
+    triangle: NDArray[np.int32],
+    normal: Floats,
+    shadowed: Floats,
+    paint: Floats,
+    material: NDArray[np.int8],
+    light: Doubles,
+    clouds: float,
+    haze_m: float,
+    pixel_rad: float,
+    out: Floats,
+) -> None:
+    for i in prange(len(directions)):
+        dx, dy, dz = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
+        colour = np.empty(3)
+        t = triangle[i]
+        if t < 0:
+            _sky(dx, dy, dz, light, clouds, True, colour)
+            for c in range(3):
+                out[i, c] = colour[c]
+            continue
+        r = float(range_m[i])
+        nx, ny, nz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
+        x, y, z = origin[0] + r * dx, origin[1] + r * dy, origin[2] + r * dz
+        facing = max(-(nx * dx + ny * dy + nz * dz), 0.02)
+        foot = r * pixel_rad / math.sqrt(facing)
+        if abs(nz) > 0.7:
+            u, v = x, y
+        else:
+            flat = math.sqrt(nx * nx + ny * ny)
+            u, v = (ny * x - nx * y) / flat, z
+        kind = material[t]
+        shiny = 0.0
+        if kind == GLASS:
+            shiny = 0.08 + 0.92 * (1 - facing) ** 5
+        elif kind == LACQUER:
+            shiny = 0.05 + 0.6 * (1 - facing) ** 5
+        factor = 1.0 if kind in (GLASS, LACQUER) else _texture(kind, u, v, foot)
+        sunny = max(nx * light[0, 0] + ny * light[0, 1] + nz * light[0, 2], 0.0)
+        if kind == FOLIAGE:
+            sunny = 0.35 + 0.5 * sunny  # leaves of every direction, lit through
+        sunny *= 1.0 - shadowed[i]
+        open_sky = 0.62 + 0.38 * nz
+        # Light comes less into corners near the ground, and from below as a warm reflection.
+        if abs(nz) < 0.7:
+            open_sky *= 0.72
+        for c in range(3):
+            ambient = 0.55 * (light[2, c] + light[3, c]) * 0.5 * open_sky + 0.06 * light[1, c] * (1 - 0.5 * nz)
+            colour[c] = paint[t, c] * factor * (light[1, c] * sunny + ambient)
+        if shiny > 0.0:
+            along = 2.0 * (nx * dx + ny * dy + nz * dz)
+            rx, ry, rz = dx - along * nx, dy - along * ny, dz - along * nz
+            mirrored = np.empty(3)
+            if rz > 0.25 or (kind == LACQUER and rz > 0.02):
+                _sky(rx, ry, rz, light, clouds, False, mirrored)
+            else:  # what stands opposite, a blotch
+                shade_of = 0.10 + 0.25 * _noise(0.35 * u + 3 * rx, 0.35 * v + 3 * rz, 40)
+                for c in range(3):
+                    mirrored[c] = shade_of * (light[3, c] + 0.3 * light[1, c])
+            glint = rx * light[0, 0] + ry * light[0, 1] + rz * light[0, 2]
+            spot = 6.0 * max(glint, 0.0) ** 400 * (1.0 - shadowed[i]) if glint > 0.9 else 0.0
+            for c in range(3):
+                colour[c] = colour[c] * (1 - shiny) + shiny * mirrored[c] + spot * light[1, c]
+        air = math.exp(-r / haze_m)
+        for c in range(3):
+            out[i, c] = colour[c] * air + (1 - air) * light[3, c] * 0.95

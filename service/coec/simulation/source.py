@@ -1,0 +1,87 @@
+"""A simulated drive as a SOURCE: `sim:seed=1&seconds=60&camera=fisheye700&faults=step:30:rx=3;dark:50-55`."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from typing import TYPE_CHECKING
+
+from coec.errors import SourceError, UsageError
+from coec.simulation.faults import parse_fault
+
+if TYPE_CHECKING:
+    from coec.simulation.drive import SimulatedDrive
+
+NUMBERS: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**31 - 1),
+    "seconds": (0.1, 86400),
+    "half_view_deg": (20, 110),
+    "lidar": (1, 1024),
+    "camera_hz": (0.01, 100),
+    "lidar_hz": (0.01, 10),
+    "ego_hz": (0.1, 1000),
+    "camera_delay_s": (0, 1),
+    "start_m": (0, 1e6),
+}
+"""Query keys with a number: least and greatest value. The defaults are those of `DriveConfig`."""
+WHOLE = ("seed", "lidar")
+WORDS = ("camera", "faults", "workshop", "depth")
+
+
+def open_sim(query: dict[str, str]) -> SimulatedDrive:
+    """The drive of `sim:KEY=VALUE&...`; every key may be left out.
+
+    `faults` are separated by `;` (see `faults.FORMS`), `workshop` is rx,ry,rz[,tx,ty,tz] in degrees and metres, `depth`
+    is `yes` or `no`.
+
+    Raises:
+        UsageError: an unknown key, or a value that does not fit; names the key.
+        SourceError: the optional extra is not installed.
+    """
+    require_extra()
+    from coec.simulation.drive import DriveConfig, SimulatedDrive
+
+    known = (*NUMBERS, *WORDS)
+    if unknown := sorted(set(query) - set(known)):
+        raise UsageError(f"unknown query key {', '.join(unknown)} of a simulated drive; known: {', '.join(known)}")
+    values: dict[str, object] = {key: _number(key, query[key]) for key in NUMBERS if key in query}
+    values |= {key: int(query[key]) for key in WHOLE if key in query}
+    if "camera" in query:
+        values["camera"] = query["camera"]
+    if "faults" in query:
+        values["faults"] = tuple(parse_fault(text) for text in query["faults"].split(";"))
+    if "workshop" in query:
+        values["workshop"] = _six(query["workshop"])
+    if "depth" in query:
+        if query["depth"] not in ("yes", "no"):
+            raise UsageError(f"depth={query['depth']} of a simulated drive: write yes or no")
+        values["depth"] = query["depth"] == "yes"
+    return SimulatedDrive(DriveConfig(**values))  # type: ignore[arg-type]  # checked key by key above
+
+
+def require_extra() -> None:
+    """Raises SourceError, which says what to install, where ray casting is not installed."""
+    if importlib.util.find_spec("embreex") is None:
+        raise SourceError("a simulated drive needs the optional extra `sim`: pip install 'coec[sim]'")
+
+
+def _number(key: str, text: str) -> float:
+    low, high = NUMBERS[key]
+    try:
+        value = float(int(text)) if key in WHOLE else float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        kind = "a whole number" if key in WHOLE else "a number"
+        raise UsageError(f"{key}={text} of a simulated drive: expected {kind} from {low:g} to {high:g}")
+    return value
+
+
+def _six(text: str) -> tuple[float, ...]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (3, 6) or not all(math.isfinite(number) for number in numbers):
+        raise UsageError(f"workshop={text} of a simulated drive: write rx,ry,rz or rx,ry,rz,tx,ty,tz (degrees, metres)")
+    return (*numbers, 0.0, 0.0, 0.0)[:6]

@@ -1,0 +1,152 @@
+"""How the vehicle moves, where its sensors sit, and what of its body the camera sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.values import Matrix4
+from coec.geometry.se3 import rotation_exp, rotation_log
+from coec.simulation.mesh import Material, Mesh, join, quads
+from coec.simulation.road import Road
+
+Doubles = NDArray[np.float64]
+
+SPEED_MPS, SPEED_SWING, SPEED_PERIOD_S = 8.5, 0.25, 31.0
+"""Mean speed, the share by which it swings about it, and how fast."""
+WANDER_M, WANDER_PERIOD_M = 0.25, 83.0
+"""The vehicle sways this far within its lane."""
+PITCH_RAD, PITCH_HZ = 0.004, (1.3, 0.41)
+ROLL_RAD, ROLL_HZ = 0.003, (1.1, 0.33)
+HEAVE_M, HEAVE_HZ = 0.008, 1.2
+"""Movements on the springs: usual for a car on an even street."""
+TWIST_STEP_S = 0.005
+"""Half the span of the central difference that gives velocities."""
+
+P_EGO_LIDAR_M = np.array([1.35, 0.0, 1.95])
+P_EGO_CAMERA_M = np.array([1.62, 0.06, 1.72])
+"""On the roof; the ego frame is the rear axle's middle on the ground. The range of a point is measured from the LiDAR
+(METHOD, section 1): the further the camera, the more differs its depth, so both are near each other."""
+CAMERA_MOUNT_RAD = np.deg2rad([4.0, -2.0, 1.0])
+"""Rotation of the camera about its x, y, z axes from looking straight ahead."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trip:
+    """The true way of the vehicle along a road in its own lane.
+
+    Attributes:
+        start_m: arc length at time 0.
+        left_m: middle of the lane.
+        phases: (7,) of the swings, radians.
+    """
+
+    road: Road
+    start_m: float
+    left_m: float
+    phases: Doubles
+
+    def progress(self, time_s: Doubles) -> Doubles:
+        """Arc length, metres."""
+        omega = 2 * np.pi / SPEED_PERIOD_S
+        swing = SPEED_MPS * SPEED_SWING / omega
+        result: Doubles = (
+            self.start_m
+            + SPEED_MPS * time_s
+            + swing * (np.cos(self.phases[0]) - np.cos(omega * time_s + self.phases[0]))
+        )
+        return result
+
+    def poses(self, time_s: Doubles) -> Doubles:
+        """(N, 4, 4) maps ego coordinates (x forward, y left, z up) to the world."""
+        time = np.asarray(time_s, np.float64)
+        s = self.progress(time)
+        wave = 2 * np.pi * s / WANDER_PERIOD_M + self.phases[1]
+        left = self.left_m + WANDER_M * np.sin(wave)
+        turn = np.arctan(WANDER_M * 2 * np.pi / WANDER_PERIOD_M * np.cos(wave))
+        heading = self.road.at(s)[:, 3] + turn
+        pitch = -self.road.at(s)[:, 4] + _swing(time, PITCH_RAD, PITCH_HZ, self.phases[2:4])
+        roll = _swing(time, ROLL_RAD, ROLL_HZ, self.phases[4:6])
+        heave = HEAVE_M * np.sin(2 * np.pi * HEAVE_HZ * time + self.phases[6])
+        result = np.zeros((len(time), 4, 4))
+        result[:, :3, :3] = _rotations(heading, pitch, roll)
+        result[:, :3, 3] = self.road.points(s, left, heave)
+        result[:, 3, 3] = 1.0
+        return result
+
+    def twist(self, time_s: float) -> tuple[Doubles, Doubles]:
+        """True linear (m/s) and angular (rad/s) velocity in the ego frame."""
+        before, now, after = self.poses(time_s + np.array([-TWIST_STEP_S, 0.0, TWIST_STEP_S]))
+        linear = _through(now[:3, :3].T, after[:3, 3] - before[:3, 3]) / (2 * TWIST_STEP_S)
+        turned = np.einsum("ji,jk->ik", before[:3, :3], after[:3, :3])
+        return linear, rotation_log(turned) / (2 * TWIST_STEP_S)
+
+
+def build_trip(seed: int, road: Road, left_m: float, start_m: float) -> Trip:
+    """The trip of a seed."""
+    phases = np.random.default_rng([seed, 110]).uniform(0, 2 * np.pi, 7)
+    return Trip(road, start_m, left_m, phases)
+
+
+def T_ego_lidar() -> Matrix4:
+    """(4, 4): upright above the axle."""
+    transform = np.eye(4)
+    transform[:3, 3] = P_EGO_LIDAR_M
+    return transform
+
+
+def workshop_T_camera_lidar() -> Matrix4:
+    """(4, 4): where the camera was mounted."""
+    ahead = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    axes = np.einsum("ij,jk->ik", ahead, rotation_exp(CAMERA_MOUNT_RAD))
+    transform = np.eye(4)
+    transform[:3, :3] = axes.T
+    transform[:3, 3] = _through(axes.T, P_EGO_LIDAR_M - P_EGO_CAMERA_M)
+    return transform
+
+
+@lru_cache(maxsize=1)
+def body() -> Mesh:
+    """Roof front, windscreen, bonnet and mirrors in the ego frame: what a camera on the roof has of its own car."""
+    dark = (0.035, 0.03, 0.03)
+    rails = [(1.75, 0.60, 1.50), (2.35, 0.72, 0.98), (3.15, 0.74, 0.80), (3.45, 0.66, 0.55), (3.5, 0.6, 0.3)]
+    rows = np.array([[[x, -y, z], [x, y, z]] for x, y, z in rails])
+    skin = np.stack([rows[:-1, 0], rows[1:, 0], rows[1:, 1], rows[:-1, 1]], axis=1)
+    roof = np.array([[0.9, -0.6, 1.52], [0.9, 0.6, 1.52], [1.75, 0.6, 1.5], [1.75, -0.6, 1.5]])
+    sides = [
+        [[0.9, s * 0.6, 1.52], [1.75, s * 0.6, 1.5], [2.35, s * 0.72, 0.98], [2.35, s * 0.86, 0.5], [0.9, s * 0.9, 0.5]]
+        for s in (-1.0, 1.0)
+    ]
+    flanks = [[side[a] for a in corner] for side in sides for corner in ((0, 1, 2, 2), (0, 2, 3, 4))]
+    parts = [quads(roof[None], dark, Material.LACQUER), quads(skin[1:], dark, Material.LACQUER)]
+    parts.append(quads(skin[:1], (0.06, 0.05, 0.045), Material.GLASS))
+    parts.append(quads(flanks, dark, Material.LACQUER))
+    for s in (-1.0, 1.0):
+        mirror = [[2.2, s * 0.9, 1.0], [2.2, s * 1.12, 1.0], [2.2, s * 1.12, 1.18], [2.2, s * 0.9, 1.18]]
+        parts.append(quads([mirror], dark, Material.LACQUER))
+    return join(parts)
+
+
+def _swing(time_s: Doubles, size: float, hertz: tuple[float, float], phases: Doubles) -> Doubles:
+    first = np.sin(2 * np.pi * hertz[0] * time_s + phases[0])
+    result: Doubles = size * (0.4 * first + 0.6 * np.sin(2 * np.pi * hertz[1] * time_s + phases[1]))
+    return result
+
+
+def _rotations(heading: Doubles, pitch: Doubles, roll: Doubles) -> Doubles:
+    """(N, 3, 3) = Rz(heading) · Ry(pitch) · Rx(roll); positive pitch looks down."""
+    ch, sh, cp, sp, cr, sr = (f(a) for a in (heading, pitch, roll) for f in (np.cos, np.sin))
+    rows = [
+        [ch * cp, ch * sp * sr - sh * cr, ch * sp * cr + sh * sr],
+        [sh * cp, sh * sp * sr + ch * cr, sh * sp * cr - ch * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _through(rotation: Doubles, vector: Doubles) -> Doubles:
+    result: Doubles = np.einsum("ij,j->i", rotation, vector)
+    return result

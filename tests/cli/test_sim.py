@@ -1,0 +1,74 @@
+"""`coec sim`: a drive as a file, and as a source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from cli.conftest import Coec
+from coec.calibration.values import CameraFrame, LidarFrame
+from coec.sources import open_source
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+SHORT = ("--seed", 4, "--seconds", 0.6, "--camera", "fisheye96", "--lidar", 16, "--camera-hz", 5, "--lidar-hz", 5)
+
+
+def test_a_drive_reads_back_with_its_truth_beside_it(coec: Coec, tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    outcome = coec(
+        "sim", "drive", "--output", path, *SHORT, "--fault", "step:0.3:rx=3", "--workshop", "0,2,0", "--json"
+    )
+    assert outcome.status == 0
+    assert outcome.document["frames"] == 3
+    back = open_source(str(path))
+    drive = open_source(
+        "sim:seed=4&seconds=0.6&camera=fisheye96&lidar=16&camera_hz=5&lidar_hz=5&faults=step:0.3:rx=3&workshop=0,2,0"
+    )
+    np.testing.assert_allclose(back.rig.T_camera_lidar_nominal, drive.rig.T_camera_lidar_nominal, atol=1e-12)
+    assert back.camera_stamps_ns == drive.camera_stamps_ns
+    for ours, theirs in zip(drive.messages(), back.messages(), strict=True):
+        assert (type(ours), ours.stamp_ns) == (type(theirs), theirs.stamp_ns)
+        if isinstance(ours, CameraFrame) and isinstance(theirs, CameraFrame):
+            assert ours.image == theirs.image
+        if isinstance(ours, LidarFrame) and isinstance(theirs, LidarFrame):
+            np.testing.assert_array_equal(ours.xyz_m, theirs.xyz_m)
+    with AnyReader([path]) as reader:
+        chosen = [connection for connection in reader.connections if connection.topic == "/ground_truth/tf"]
+        messages: list[Any] = [reader.deserialize(data, of.msgtype) for of, _, data in reader.messages(chosen)]
+    truth = [message.transforms[0].transform.translation for message in messages]
+    camera_lidar = [np.array([t.x, t.y, t.z]) for t in truth[::2]]
+    assert len(camera_lidar) == 3
+    np.testing.assert_array_equal(camera_lidar[0], camera_lidar[1])
+    assert np.abs(camera_lidar[2] - camera_lidar[0]).max() > 0.005  # turned about the camera by 3°
+
+
+def test_a_picture(coec: Coec, tmp_path: Path) -> None:
+    path = tmp_path / "view.jpg"
+    assert coec("sim", "view", "--output", path, "--camera", "fisheye96", "--at-s", 2).status == 0
+    assert path.read_bytes()[:2] == b"\xff\xd8"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("drive", "--output", "drive.bag"), ".mcap"),
+        (("drive", "--output", "drive.mcap", "--fault", "rust:3"), "unknown fault"),
+        (("drive", "--output", "drive.mcap", "--camera", "box"), "fisheye700"),
+        (("view", "--output", "view.png"), ".jpg"),
+    ],
+)
+def test_what_does_not_fit_is_refused(coec: Coec, arguments: tuple[str, ...], said: str) -> None:
+    outcome = coec("sim", *arguments)
+    assert outcome.status == 2
+    assert said in outcome.err
+
+
+def test_failure_leaves_nothing_behind(coec: Coec, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    assert coec("sim", "drive", "--output", tmp_path / "file" / "drive.mcap", *SHORT).status == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

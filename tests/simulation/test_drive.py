@@ -1,0 +1,196 @@
+"""The drive as a recording: bytes, order, truth, faults."""
+
+from collections.abc import Iterable
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+from coec.adapters.images import decode_depth
+from coec.calibration.motion import compensate
+from coec.calibration.values import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.config import LimitsConfig
+from coec.errors import UsageError
+from coec.geometry import cameras
+from coec.geometry.projection import in_image, project
+from coec.geometry.se3 import difference, exp
+from coec.simulation.drive import NEAREST_M, START_NS, DriveConfig, SimulatedDrive
+from coec.simulation.faults import parse_fault
+from coec.simulation.parallel import messages_by
+from coec.sources.recording import Message
+
+
+def small(*faults: str, seconds: float = 1.0, depth: bool = False, **more: object) -> SimulatedDrive:
+    config = {"seed": 4, "camera": "fisheye128", "lidar": 16, "camera_hz": 5.0, "lidar_hz": 5.0} | more
+    chosen = tuple(parse_fault(text) for text in faults)
+    return SimulatedDrive(DriveConfig(seconds=seconds, faults=chosen, depth=depth, **config))  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=1)
+def plain() -> tuple[Message, ...]:
+    """The drive without any fault."""
+    return tuple(small().messages())
+
+
+def fingerprint(messages: Iterable[Message]) -> list[object]:
+    def of(message: Message) -> object:
+        match message:
+            case CameraFrame():
+                return message.stamp_ns, message.sequence, message.image.data, message.depth and message.depth.data
+            case LidarFrame():
+                arrays = (message.xyz_m, message.intensity, message.ring, message.time_offset_s)
+                return message.stamp_ns, message.sequence, *(b"" if a is None else a.tobytes() for a in arrays)
+        return message
+
+    return [of(message) for message in messages]
+
+
+def pictures(messages: Iterable[Message]) -> list[CameraFrame]:
+    return [message for message in messages if isinstance(message, CameraFrame)]
+
+
+def sweeps(messages: Iterable[Message]) -> list[LidarFrame]:
+    return [message for message in messages if isinstance(message, LidarFrame)]
+
+
+def pixels(frame: CameraFrame) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imdecode(np.frombuffer(frame.image.data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
+    assert fingerprint(small().messages()) == fingerprint(plain())
+    other = fingerprint(small(seed=5).messages())
+    assert all(a != b for a, b in zip(other, fingerprint(plain()), strict=True))
+
+
+def test_several_processes_give_the_same_bytes_in_the_same_order() -> None:
+    config = small(camera_hz=2.0, lidar_hz=2.0, ego_hz=200.0).config
+    assert fingerprint(messages_by(config, 2)) == fingerprint(SimulatedDrive(config).messages())
+
+
+def test_chosen_frames_are_those_of_the_whole_drive() -> None:
+    whole = fingerprint(plain())
+    part = list(small().messages([2]))
+    assert [frame.sequence for frame in pictures(part)] == [2]
+    assert [frame.sequence for frame in sweeps(part)] == [2]
+    assert all(entry in whole for entry in fingerprint(part))
+    with pytest.raises(UsageError, match="no camera frame 5"):
+        list(small().messages([5]))
+
+
+def test_messages_come_in_the_order_of_their_stamps() -> None:
+    drive, messages = small(), plain()
+    stamps = [message.stamp_ns for message in messages]
+    assert stamps == sorted(stamps)
+    assert tuple(frame.stamp_ns for frame in pictures(messages)) == drive.camera_stamps_ns
+    assert [len(pictures(messages)), len(sweeps(messages)), len(messages)] == [5, 5, 60]
+    assert drive.camera_stamps_ns[0] == START_NS + 10_000_000
+
+
+def share_consistent(drive: SimulatedDrive, pair: FramePair, *, compensated: bool) -> float:
+    """Share of the points in view whose range is that of the depth map at their pixel."""
+    xyz = compensate(pair, drive.rig, enabled=compensated).xyz_m.astype(np.float64)
+    T = drive.truth(pair.camera.stamp_ns)
+    p_camera = xyz @ T[:3, :3].T + T[:3, 3]
+    uv, valid = project(drive.camera, p_camera)
+    kept = valid & in_image(drive.camera, uv)
+    u, v = np.rint(uv[kept]).astype(int).T
+    assert pair.camera.depth is not None
+    assert drive.rig.mask is not None
+    code = decode_depth(pair.camera.depth, LimitsConfig())[v, u].astype(np.float64)
+    used = (code > 1) & drive.rig.mask[v, u]
+    error = np.linalg.norm(p_camera[kept][used], axis=1) - 65535 * NEAREST_M / code[used]
+    assert used.sum() > 1000
+    return float((np.abs(error) < 0.1 + 0.02 * np.abs(65535 * NEAREST_M / code[used])).mean())
+
+
+@pytest.mark.parametrize("camera", ["fisheye500", "pinhole600x300"])
+def test_points_project_onto_their_depth_once_motion_is_compensated(camera: str) -> None:
+    drive = small(depth=True, camera=camera, seconds=0.3, lidar=32, camera_delay_s=0.03)
+    messages = list(drive.messages())
+    exposed = pictures(messages)[1]
+    motion = min((m for m in messages if isinstance(m, EgoMotion)), key=lambda m: abs(m.stamp_ns - exposed.stamp_ns))
+    pair = FramePair(exposed, sweeps(messages)[1], motion)
+    good, bad = (share_consistent(drive, pair, compensated=done) for done in (True, False))
+    assert good > 0.85
+    assert good > bad + 0.04
+
+
+def test_the_twist_leads_from_one_pose_to_the_next() -> None:
+    drive = small()
+    step_s = 0.02
+    motion = drive._trip
+    for time_s in (0.0, 3.3, 17.0):
+        linear, angular = motion.twist(time_s)
+        before, after = motion.poses(time_s + np.array([-step_s / 2, step_s / 2]))
+        moved = before @ exp(step_s * np.concatenate([angular, linear]))
+        np.testing.assert_allclose(difference(moved, after), 0.0, atol=2e-4)
+        assert 5.0 < linear[0] < 12.0
+
+
+def test_the_truth_follows_the_faults_and_the_rig_knows_nothing_of_them() -> None:
+    drive = small("step:10:rx=3", "drift:20-30:tz=0.1", workshop=(0.0, 2.0, 0.0, 0.0, 0.0, 0.0))
+    start, knocked, crept = (drive.truth(START_NS + round(t * 1e9)) for t in (0.0, 15.0, 40.0))
+    np.testing.assert_allclose(np.rad2deg(difference(knocked, start)[:3]), [3, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(difference(crept, knocked), [0, 0, 0, 0, 0, 0.1], atol=1e-9)
+    nominal = difference(drive.rig.T_camera_lidar_nominal, start)
+    np.testing.assert_allclose(np.rad2deg(nominal[:3]), [0, 2, 0], atol=1e-9)
+    assert np.array_equal(drive.T_camera_lidar_start, drive.rig.T_camera_lidar_nominal)
+
+
+def test_a_knocked_camera_sees_something_else_from_then_on() -> None:
+    before, after = pictures(plain()), pictures(small("step:0.5:rx=3").messages())
+    same = [a.image == b.image for a, b in zip(before, after, strict=True)]
+    assert same == [True, True, True, False, False]
+    lidar = zip(sweeps(plain()), sweeps(small("step:0.5:rx=3").messages()), strict=True)
+    assert all(np.array_equal(a.xyz_m, b.xyz_m) for a, b in lidar)
+
+
+def test_dirt_blurs_and_darkness_is_dark() -> None:
+    clean, dirty, dark = (
+        pixels(pictures(small(*f, seconds=0.1).messages())[0]) for f in ((), ("dirt:0",), ("dark:0",))
+    )
+    assert dark.mean() < 0.6 * clean.mean()
+    assert 0.1 < (np.abs(clean.astype(int) - dirty).max(axis=2) > 25).mean() < 0.6
+
+
+def test_a_frozen_camera_repeats_its_last_picture_with_fresh_stamps() -> None:
+    frames = pictures(small("frozen:0.35-0.7").messages())
+    assert [frame.image == frames[1].image for frame in frames] == [False, True, True, True, False]
+    assert len({frame.stamp_ns for frame in frames}) == 5
+    assert frames[1].image == pictures(plain())[1].image
+
+
+def test_dead_beams_lost_motion_late_stamps_and_loss() -> None:
+    dead = sweeps(small("beams:0:share=0.5", seconds=0.1).messages())[0]
+    assert dead.ring is not None
+    assert 4 <= len(set(dead.ring.tolist())) <= 12
+    plan = small("no-ego:0.2-0.6", "offset:0.3:seconds=0.05", "loss:0.8:share=1")
+    stamps = [stamp - START_NS for stamp in plan.camera_stamps_ns]
+    assert stamps == [10_000_000, 210_000_000, 460_000_000, 660_000_000]
+    ego = [m for m in plan.messages([0, 1, 2, 3]) if isinstance(m, EgoMotion)]
+    times = [(m.stamp_ns - START_NS) / 1e9 for m in ego]
+    assert not [t for t in times if 0.2 <= t < 0.6 or t >= 0.8]
+    assert len(times) == 10 + 10
+    assert 30 < len(small("loss:0:share=0.5", seconds=20.0).camera_stamps_ns) < 70
+
+
+def test_the_body_is_masked() -> None:
+    mask = small().rig.mask
+    assert mask is not None
+    assert not mask[0, 0]
+    assert not mask[-10, 64]
+    assert mask[64, 64]
+
+
+def test_any_camera_of_the_registry_can_drive_along() -> None:
+    camera = cameras.build(
+        "kannala_brandt", width=96, height=64, fx=40.0, fy=40.0, cx=47.5, cy=31.5, k1=-0.05, k2=0.01, k3=0.0, k4=0.0
+    )
+    frame = pictures(small(camera=camera, seconds=0.1).messages())[0]
+    assert pixels(frame).shape == (64, 96, 3)
+    assert pixels(frame).std() > 10

@@ -1,0 +1,43 @@
+"""A simulated drive by its words."""
+
+import sys
+
+import pytest
+
+from coec.errors import SourceError, UsageError
+from coec.simulation import source
+from coec.sources import open_source
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("sim:sead=1", "unknown query key sead"),
+        ("sim:seed=x", "seed=x"),
+        ("sim:seconds=0", "seconds=0"),
+        ("sim:camera=box", "fisheye700"),
+        ("sim:lidar=63", "choose one of 64, 32, 16"),
+        ("sim:workshop=1,2", "rx,ry,rz"),
+        ("sim:depth=maybe", "yes or no"),
+        ("sim:faults=rust:3", "unknown fault"),
+    ],
+)
+def test_what_does_not_fit_is_refused(text: str, said: str) -> None:
+    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    with pytest.raises(UsageError, match=said):
+        open_source(text)
+
+
+def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    with pytest.raises(SourceError, match=r"pip install 'coec\[sim\]'"):
+        source.open_sim({})
+
+
+def test_the_question_mark_may_be_left_out() -> None:
+    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    for text in ("sim:seed=3&seconds=1&camera=fisheye64&lidar=16", "sim:?seed=3&seconds=1&camera=fisheye64&lidar=16"):
+        recording = open_source(text)
+        assert recording.name == "simulated drive, seed 3"
+        assert len(recording.camera_stamps_ns) == 10
+        assert recording.rig.camera.width == 64
