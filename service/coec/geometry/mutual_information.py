@@ -11,17 +11,17 @@ never interpolated. So the inner loop is: transform, project, one 8-bit look-up,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import Camera, project_point
+from coec.geometry.bundles import BUNDLE, Bundles
+from coec.geometry.cameras import Camera
+from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Limits, certain_pixels, exact_pixel, filter_of
 
-BLOCK = 1024
-"""Points per block: the index buffer of a block (4 kB) stays in the first-level cache between its two passes."""
-
-TASK = 16_384
+TASK = 32 * BUNDLE
 """Points per parallel task: small enough to balance two to sixteen threads over a handful of frames, large enough
 that zeroing and adding up a task's histograms (8 kB each at 32 bins) does not count."""
 
@@ -38,6 +38,7 @@ class BinnedFrames:
         depth_bin: (F, h·w + 1) uint8 or uint16, bin of the depth at each pixel, row by row; `depth_bins` where there is
             none (masked, no value). The last entry stands for "not in the image" and is `depth_bins`, too.
         depth_bins, range_bins: numbers of bins.
+        bundles: which runs of points a pose can leave out; None = none.
     """
 
     camera: Camera
@@ -47,6 +48,7 @@ class BinnedFrames:
     depth_bin: NDArray[np.unsignedinteger]
     depth_bins: int
     range_bins: int
+    bundles: Bundles | None = None
 
     @property
     def frames(self) -> int:
@@ -69,113 +71,137 @@ def mutual_information(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]
         frames: the window, binned.
         T_camera_lidar: (4, 4) float64, LiDAR to camera.
     """
-    joint = joint_histograms(frames, T_camera_lidar)
-    mi, points = _information(joint)
+    mi, points = _information(*_histograms_of_tasks(frames, T_camera_lidar))
     return FrameInformation(mi, points)
 
 
 def joint_histograms(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.int64]:
     """(F, depth_bins, range_bins) int64 counts of points by depth bin at their pixel and by range bin."""
-    task_frame, task_start, task_stop = _tasks(frames.first_point)
+    counts, first_task = _histograms_of_tasks(frames, T_camera_lidar)
+    summed = [counts[a:b, :-1].sum(axis=0, dtype=np.int64) for a, b in pairwise(first_task)]
+    return np.stack(summed)
+
+
+def _histograms_of_tasks(
+    frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """The joint histogram of each task, with one more row for points on no value, and the first task of each frame."""
+    T = np.ascontiguousarray(T_camera_lidar, np.float64)
+    task_frame, task_start, task_stop, task_bundle = _tasks(frames.first_point)
+    in_view = np.ones(int(task_bundle[-1]), np.bool_) if frames.bundles is None else frames.bundles.at(T)
+    single = filter_of(frames.camera)
     counts = _count(
-        frames.camera, np.ascontiguousarray(T_camera_lidar, np.float64), frames.xyz_m, frames.range_bin,
-        frames.depth_bin, task_frame, task_start, task_stop, frames.depth_bins, frames.range_bins,
+        frames.camera, single.camera, single.at(T), T, frames.xyz_m, frames.range_bin, frames.depth_bin,
+        task_frame, task_start, task_stop, task_bundle, in_view, frames.depth_bins, frames.range_bins,
     )  # fmt: skip
-    return _merge(counts, np.searchsorted(task_frame, np.arange(frames.frames + 1)))
+    return counts, np.searchsorted(task_frame, np.arange(frames.frames + 1))
 
 
 def _tasks(
     first_point: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Frame, first and last-but-one point of each task, in order of the frames."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Frame, first point, end of the points and first bundle of each task, in order of the frames; the number of
+    bundles at the end of the last."""
     per_frame = -(-np.diff(first_point) // TASK)
     frame = np.repeat(np.arange(len(per_frame)), per_frame)
     within = np.arange(len(frame)) - np.repeat(np.cumsum(per_frame) - per_frame, per_frame)
     start = first_point[frame] + within * TASK
-    return frame, start, np.minimum(start + TASK, first_point[frame + 1])
+    stop = np.minimum(start + TASK, first_point[frame + 1])
+    return frame, start, stop, np.concatenate([[0], np.cumsum(-(-(stop - start) // BUNDLE))])
 
 
 @njit(cache=True, parallel=True)
 def _count(
-    camera: Camera, T: NDArray[np.float64], xyz: NDArray[np.float32], range_bin: NDArray[np.unsignedinteger],
-    depth_bin: NDArray[np.unsignedinteger], task_frame: NDArray[np.int64], task_start: NDArray[np.int64],
-    task_stop: NDArray[np.int64], depth_bins: int, range_bins: int,
+    camera: Camera, single: Camera, limits: Limits, T: NDArray[np.float64], xyz: NDArray[np.float32],
+    range_bin: NDArray[np.unsignedinteger], depth_bin: NDArray[np.unsignedinteger], task_frame: NDArray[np.int64],
+    task_start: NDArray[np.int64], task_stop: NDArray[np.int64], task_bundle: NDArray[np.int64],
+    in_view: NDArray[np.bool_], depth_bins: int, range_bins: int,
 ) -> NDArray[np.int32]:  # fmt: skip
     """Joint histogram of each task. Integer counts: the sum does not depend on the number of threads."""
     tasks = task_frame.shape[0]
-    # One row more than there are depth bins: points that fall on no value are counted there, so that the loop over the
-    # points has no branch.
-    counts = np.zeros((tasks, depth_bins, range_bins), np.int32)
-    width, height = camera.width, camera.height
-    width_limit, height_limit = width - 0.5, height - 0.5
-    stride, outside, columns = np.int32(width), np.int32(width * height), np.uint32(range_bins)
+    # One row more than there are depth bins: points that fall on no value are counted there, without a branch.
+    counts = np.zeros((tasks, depth_bins + 1, range_bins), np.int32)
+    T_single = T.astype(np.float32)
     for task in prange(tasks):
-        r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
-        r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
-        r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-        lookup = depth_bin[task_frame[task]]
-        pixel = np.empty(BLOCK, np.uint32)
-        # Two histograms, used in turn: neighbouring points often share a cell, and an increment that follows another
-        # on the same address has to wait for it.
-        even = np.zeros((depth_bins + 1) * range_bins, np.int32)
-        odd = np.zeros((depth_bins + 1) * range_bins, np.int32)
-        for block in range(task_start[task], task_stop[task], BLOCK):
-            n = min(BLOCK, task_stop[task] - block)
-            # Slices and unsigned indices: numba would otherwise test every index for being negative, and the loads
-            # below would become gathers.
-            xs, ys, zs = xyz[0, block : block + n], xyz[1, block : block + n], xyz[2, block : block + n]
-            bins = range_bin[block : block + n]
-            # Pass 1, no branch and no look-up, so that it runs in vector registers.
-            for i in range(n):
-                x, y, z = float(xs[i]), float(ys[i]), float(zs[i])
-                u, v, valid = project_point(
-                    camera,
-                    r00 * x + r01 * y + r02 * z + t0,
-                    r10 * x + r11 * y + r12 * z + t1,
-                    r20 * x + r21 * y + r22 * z + t2,
-                )
-                seen = valid & (u >= -0.5) & (v >= -0.5) & (u < width_limit) & (v < height_limit)
-                column = np.int32(u + 0.5 if seen else 0.0)
-                row = np.int32(v + 0.5 if seen else 0.0)
-                pixel[i] = row * stride + column if seen else outside
-            # Pass 2: look up and count.
-            for i in range(0, n - 1, 2):
-                even[np.uint32(lookup[pixel[i]]) * columns + np.uint32(bins[i])] += 1
-                odd[np.uint32(lookup[pixel[i + 1]]) * columns + np.uint32(bins[i + 1])] += 1
-            if n % 2:
-                even[np.uint32(lookup[pixel[n - 1]]) * columns + np.uint32(bins[n - 1])] += 1
-        for d in range(depth_bins):
-            for r in range(range_bins):
-                counts[task, d, r] = even[d * range_bins + r] + odd[d * range_bins + r]
+        start, stop = task_start[task], task_stop[task]
+        _count_points(
+            camera, single, limits, T, T_single, xyz[0, start:stop], xyz[1, start:stop], xyz[2, start:stop],
+            range_bin[start:stop], in_view[task_bundle[task] : task_bundle[task + 1]], depth_bin[task_frame[task]],
+            counts[task],
+        )  # fmt: skip
     return counts
 
 
-@njit(cache=True, parallel=True)
-def _merge(counts: NDArray[np.int32], first_task: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Adds up the histograms of each frame's tasks."""
-    frames = first_task.shape[0] - 1
-    joint = np.zeros((frames, counts.shape[1], counts.shape[2]), np.int64)
-    for f in prange(frames):
-        for task in range(first_task[f], first_task[f + 1]):
-            for d in range(counts.shape[1]):
-                for r in range(counts.shape[2]):
-                    joint[f, d, r] += counts[task, d, r]
-    return joint
+@njit(cache=True, error_model="numpy")
+def _count_points(
+    camera: Camera, single: Camera, limits: Limits, T: NDArray[np.float64], T_single: NDArray[np.float32],
+    x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], range_bin: NDArray[np.unsignedinteger],
+    in_view: NDArray[np.bool_], depth_bin: NDArray[np.unsignedinteger], counts: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Adds the points of one task to its joint histogram (depth_bins + 1, range_bins)."""
+    pixel = np.empty(BUNDLE, np.int32)
+    columns, one = np.uint64(counts.shape[1]), np.int32(1)
+    # Two histograms, used in turn: neighbouring points often share a cell, and an increment that follows another on the
+    # same address has to wait for it.
+    even, odd = counts.ravel(), np.zeros(counts.size, np.int32)
+    for index in range(in_view.shape[0]):
+        if not in_view[index]:
+            continue
+        begin = index * BUNDLE
+        end = min(begin + BUNDLE, x.shape[0])
+        xs, ys, zs, bins, pixels = x[begin:end], y[begin:end], z[begin:end], range_bin[begin:end], pixel[: end - begin]
+        # Pass 1, in vector registers.
+        if certain_pixels(single, limits, T_single, xs, ys, zs, pixels) == OUTSIDE:
+            continue
+        # Pass 2: look up and count. A sweep enters and leaves the view in long runs: the branches cost next to nothing.
+        # Unsigned indices: numba would otherwise test each of them for being negative.
+        for pair in range(np.uint64(pixels.shape[0] // 2)):
+            i = pair * np.uint64(2)
+            j = i + np.uint64(1)
+            p, q = pixels[i], pixels[j]
+            if p >= 0:
+                even[np.uint64(depth_bin[np.uint64(p)]) * columns + np.uint64(bins[i])] += one
+            elif p == UNSURE:
+                _count_exactly(camera, T, xs[i], ys[i], zs[i], bins[i], depth_bin, columns, even)
+            if q >= 0:
+                odd[np.uint64(depth_bin[np.uint64(q)]) * columns + np.uint64(bins[j])] += one
+            elif q == UNSURE:
+                _count_exactly(camera, T, xs[j], ys[j], zs[j], bins[j], depth_bin, columns, odd)
+        if pixels.shape[0] % 2 == 1:
+            _count_exactly(camera, T, xs[-1], ys[-1], zs[-1], bins[-1], depth_bin, columns, even)
+    even += odd
+
+
+@njit(cache=True, error_model="numpy")
+def _count_exactly(
+    camera: Camera, T: NDArray[np.float64], x: np.float32, y: np.float32, z: np.float32,
+    range_bin: np.unsignedinteger, depth_bin: NDArray[np.unsignedinteger], columns: np.uint64,
+    counts: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Adds one point in double precision."""
+    pixel = exact_pixel(camera, T, float(x), float(y), float(z))
+    if pixel >= 0:
+        counts[np.uint64(depth_bin[np.uint64(pixel)]) * columns + np.uint64(range_bin)] += np.int32(1)
 
 
 @njit(cache=True, parallel=True)
-def _information(joint: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _information(
+    counts: NDArray[np.int32], first_task: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """MI in nats and number of points of each frame, with H = log n - (1/n) Σ c·log c over the counts c."""
-    frames, depth_bins, range_bins = joint.shape
+    frames, depth_bins, range_bins = len(first_task) - 1, counts.shape[1] - 1, counts.shape[2]
     mi = np.zeros(frames)
     points = np.zeros(frames, np.int64)
     for f in prange(frames):
+        joint = np.zeros((depth_bins, range_bins), np.int64)
+        for task in range(first_task[f], first_task[f + 1]):
+            joint += counts[task, :depth_bins]
         of_depth = np.zeros(depth_bins)
         of_range = np.zeros(range_bins)
         cells = 0.0
         for d in range(depth_bins):
             for r in range(range_bins):
-                count = float(joint[f, d, r])
+                count = float(joint[d, r])
                 if count > 0.0:
                     of_depth[d] += count
                     of_range[r] += count

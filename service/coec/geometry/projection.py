@@ -1,5 +1,7 @@
 """Projection of arrays by any camera model. The formulas are those of `coec.geometry.cameras`, compiled into a loop."""
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -59,3 +61,20 @@ def in_image(camera: Camera, uv_px: NDArray[np.floating]) -> NDArray[np.bool_]:
     u, v = _rows("uv_px", uv_px, 2).T
     inside: NDArray[np.bool_] = (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
     return inside
+
+
+def domain_angle_rad(camera: Camera) -> float:
+    """The angle from the optical axis, in (0, π], up to which a point has a pixel. In every model the domain is a cone
+    about the axis."""
+    low, high = 0.0, math.pi
+    for angle in np.linspace(0.0, math.pi, 257)[1:].tolist():
+        if not project_point(camera, math.sin(angle), 0.0, math.cos(angle))[2]:
+            high = angle
+            break
+        low = angle
+    while low < (middle := 0.5 * (low + high)) < high:  # bisection down to the last bit
+        if project_point(camera, math.sin(middle), 0.0, math.cos(middle))[2]:
+            low = middle
+        else:
+            high = middle
+    return low

@@ -4,7 +4,7 @@ A camera is an immutable named tuple, so that compiled code takes it as it is an
 Points of the camera frame: x right, y down, z forward, metres. Pixel centres lie at integer coordinates (OpenCV).
 """
 
-from coec.geometry.cameras.dispatch import project_point, unproject_point
+from coec.geometry.cameras.dispatch import image_point, project_point, unproject_point
 from coec.geometry.cameras.double_sphere import DoubleSphere
 from coec.geometry.cameras.eucm import Eucm
 from coec.geometry.cameras.kannala_brandt import KannalaBrandt
@@ -24,6 +24,7 @@ __all__ = [
     "Pinhole",
     "RadTan",
     "build",
+    "image_point",
     "intrinsics_of",
     "name_of",
     "project_point",

@@ -10,6 +10,7 @@ import math
 
 from numba.extending import register_jitable
 
+from coec.geometry.cameras.kernel import like
 from coec.geometry.cameras.polynomial import odd_polynomial, solve_odd_polynomial
 
 # Newton's method converges quadratically from the radial solution; real lenses need three to five steps.
@@ -22,11 +23,12 @@ _TOLERANCE = 1e-9
 @register_jitable(error_model="numpy")
 def distort(k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float) -> tuple[float, float]:
     """Distorted normalised coordinates of (x, y)."""
+    two = like(2.0, x)
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = like(1.0, x) + r2 * (k1 + r2 * (k2 + r2 * k3))
     return (
-        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        x * radial + two * p1 * x * y + p2 * (r2 + two * x * x),
+        y * radial + p1 * (r2 + two * y * y) + two * p2 * x * y,
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from numba import types
 from numba.extending import overload
 
+from coec.geometry.cameras.kernel import guarded_pixel
 from coec.geometry.cameras.registry import Camera, model_of
 
 
@@ -18,7 +19,17 @@ def project_point(camera: Camera, x: float, y: float, z: float) -> tuple[float, 
 
     NaN and infinity are invalid. A valid point need not lie in the image.
     """
-    return model_of(type(camera)).project_point(camera, x, y, z)
+    u, v, in_domain = image_point(camera, x, y, z)
+    return guarded_pixel(camera, x, y, z, u, v, in_domain)
+
+
+def image_point(camera: Camera, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """(u, v, in_domain): the model's formula alone. Outside its domain, and for what is no point (NaN, infinity, the
+    origin), u and v are anything.
+
+    Compiled for the precision of the point, which must be that of the camera's fields: see `kernel.like`.
+    """
+    return model_of(type(camera)).image_point(camera, x, y, z)
 
 
 def unproject_point(camera: Camera, u: float, v: float) -> tuple[float, float, float, bool]:
@@ -28,14 +39,28 @@ def unproject_point(camera: Camera, u: float, v: float) -> tuple[float, float, f
 
 # Each formula is compiled with its own options, not with those of the loop around it: NaN stays invalid in a caller
 # with fastmath. `strict=False`: the annotations differ between the two signatures, and numba would compare them.
-@overload(project_point, jit_options={"error_model": "numpy"}, strict=False)
-def _project_point(
+@overload(image_point, jit_options={"error_model": "numpy"}, strict=False)
+def _image_point(
     camera: types.NamedTuple,
     x: types.Type,  # noqa: ARG001  (numba matches the names)
     y: types.Type,  # noqa: ARG001
     z: types.Type,  # noqa: ARG001
 ) -> Callable[..., Any]:
-    return model_of(camera.instance_class).project_point
+    return model_of(camera.instance_class).image_point
+
+
+@overload(project_point, jit_options={"error_model": "numpy"}, strict=False)
+def _project_point(
+    camera: types.NamedTuple,  # noqa: ARG001
+    x: types.Type,  # noqa: ARG001
+    y: types.Type,  # noqa: ARG001
+    z: types.Type,  # noqa: ARG001
+) -> Callable[..., Any]:
+    def compiled(camera: Camera, x: float, y: float, z: float) -> tuple[float, float, bool]:
+        u, v, in_domain = image_point(camera, x, y, z)
+        return guarded_pixel(camera, x, y, z, u, v, in_domain)
+
+    return compiled
 
 
 @overload(unproject_point, jit_options={"error_model": "numpy"}, strict=False)

@@ -19,7 +19,7 @@ import math
 from typing import NamedTuple
 
 from coec.geometry.cameras.intrinsics import sensor, within
-from coec.geometry.cameras.kernel import MAX_RANGE2_M2, MIN_RANGE2_M2, guarded_pixel, guarded_ray
+from coec.geometry.cameras.kernel import guarded_ray, like
 
 # At xi = -1 the second sphere's centre lies on the first sphere and the optical axis itself has no image.
 MIN_XI, MAX_XI = -0.999, 1.0
@@ -65,22 +65,17 @@ def build(
     return DoubleSphere(*sensor(width, height, fx, fy, cx, cy), xi, alpha, _min_cosine(xi, alpha))
 
 
-def project_point(camera: DoubleSphere, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Pixel of a point in the camera frame, and whether it has one."""
+def image_point(camera: DoubleSphere, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """Pixel of a point in the camera frame, and whether the point is in the domain."""
+    zero, one = like(0.0, z), like(1.0, z)
     radius2 = x * x + y * y
-    range2 = radius2 + z * z
-    d1 = math.sqrt(range2)
+    d1 = math.sqrt(radius2 + z * z)
     shifted_z = camera.xi * d1 + z
     d2 = math.sqrt(radius2 + shifted_z * shifted_z)
-    depth = camera.alpha * d2 + (1.0 - camera.alpha) * shifted_z
-    in_domain = (z > camera.min_cosine * d1) & (depth > 0.0) & (range2 > MIN_RANGE2_M2) & (range2 < MAX_RANGE2_M2)
-    inverse_depth = 1.0 / (depth if in_domain else 1.0)
-    return guarded_pixel(
-        camera,
-        camera.fx * (x * inverse_depth) + camera.cx,
-        camera.fy * (y * inverse_depth) + camera.cy,
-        in_domain,
-    )
+    depth = camera.alpha * d2 + (one - camera.alpha) * shifted_z
+    in_domain = (z > camera.min_cosine * d1) & (depth > zero)
+    inverse_depth = one / (depth if in_domain else one)
+    return camera.fx * (x * inverse_depth) + camera.cx, camera.fy * (y * inverse_depth) + camera.cy, in_domain
 
 
 def unproject_point(camera: DoubleSphere, u: float, v: float) -> tuple[float, float, float, bool]:

@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 from coec.geometry.cameras.intrinsics import positive, sensor, within
-from coec.geometry.cameras.kernel import MAX_RANGE2_M2, MIN_RANGE2_M2, guarded_pixel, guarded_ray
+from coec.geometry.cameras.kernel import guarded_ray, like
 
 
 class Eucm(NamedTuple):
@@ -49,19 +49,14 @@ def build(
     )
 
 
-def project_point(camera: Eucm, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Pixel of a point in the camera frame, and whether it has one."""
-    range2 = camera.beta * (x * x + y * y) + z * z
-    distance = math.sqrt(range2)
-    depth = camera.alpha * distance + (1.0 - camera.alpha) * z
-    in_domain = (z > camera.min_cosine * distance) & (depth > 0.0) & (range2 > MIN_RANGE2_M2) & (range2 < MAX_RANGE2_M2)
-    inverse_depth = 1.0 / (depth if in_domain else 1.0)
-    return guarded_pixel(
-        camera,
-        camera.fx * (x * inverse_depth) + camera.cx,
-        camera.fy * (y * inverse_depth) + camera.cy,
-        in_domain,
-    )
+def image_point(camera: Eucm, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """Pixel of a point in the camera frame, and whether the point is in the domain."""
+    zero, one = like(0.0, z), like(1.0, z)
+    distance = math.sqrt(camera.beta * (x * x + y * y) + z * z)
+    depth = camera.alpha * distance + (one - camera.alpha) * z
+    in_domain = (z > camera.min_cosine * distance) & (depth > zero)
+    inverse_depth = one / (depth if in_domain else one)
+    return camera.fx * (x * inverse_depth) + camera.cx, camera.fy * (y * inverse_depth) + camera.cy, in_domain
 
 
 def unproject_point(camera: Eucm, u: float, v: float) -> tuple[float, float, float, bool]:

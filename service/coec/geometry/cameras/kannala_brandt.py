@@ -14,22 +14,16 @@ import math
 from typing import NamedTuple
 
 from coec.geometry.cameras.intrinsics import finite, sensor
-from coec.geometry.cameras.kernel import (
-    MAX_RANGE2_M2,
-    MIN_RANGE2_M2,
-    guarded_pixel,
-    guarded_ray,
-    polar_angle,
-)
+from coec.geometry.cameras.kernel import guarded_ray, like, polar_angle
 from coec.geometry.cameras.polynomial import (
     monotonic_limit_squared,
     odd_polynomial,
     solve_odd_polynomial,
 )
 
-# Keeps x/r finite on the optical axis, where x = r = 0 (then theta = 0 too). Far below any r of a point in the domain
-# that is not on the axis: squares of smaller numbers underflow. Unit: m.
-_MIN_RADIUS_M = 1e-150
+# Keeps x/r finite on the optical axis, where x = r = 0 (then theta = 0 too). Nearer to the axis than this, the pixel is
+# the principal point to the last bit, with or without; and a float32 can hold it. Unit: m.
+_MIN_RADIUS_M = 1e-30
 
 
 class KannalaBrandt(NamedTuple):
@@ -72,16 +66,15 @@ def build(
     )
 
 
-def project_point(camera: KannalaBrandt, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Pixel of a point in the camera frame, and whether it has one."""
-    radius2 = x * x + y * y
-    range2 = radius2 + z * z
-    radius = math.sqrt(radius2)
+def image_point(camera: KannalaBrandt, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """Pixel of a point in the camera frame, and whether the point is in the domain."""
+    radius = math.sqrt(x * x + y * y)
     theta = polar_angle(radius, z)
-    in_domain = (theta < camera.max_theta_rad) & (range2 > MIN_RANGE2_M2) & (range2 < MAX_RANGE2_M2)
+    in_domain = theta < camera.max_theta_rad
     distorted = odd_polynomial(camera.k1, camera.k2, camera.k3, camera.k4, theta)
-    scale = distorted / (radius if radius > _MIN_RADIUS_M else _MIN_RADIUS_M)
-    return guarded_pixel(camera, camera.fx * (x * scale) + camera.cx, camera.fy * (y * scale) + camera.cy, in_domain)
+    least = like(_MIN_RADIUS_M, z)
+    scale = distorted / (radius if radius > least else least)
+    return camera.fx * (x * scale) + camera.cx, camera.fy * (y * scale) + camera.cy, in_domain
 
 
 def unproject_point(camera: KannalaBrandt, u: float, v: float) -> tuple[float, float, float, bool]:

@@ -1,14 +1,18 @@
 """What every camera model's compiled formula shares: compiler options, guards and an arc tangent that vectorises."""
 
 import math
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
-from numba.extending import register_jitable
+import numpy as np
+from numba import types
+from numba.extending import overload, register_jitable
 
-# No fastmath anywhere in this package. numba compiles a parallel kernel anew for the process that first runs it and for
+# No fastmath in any of the formulas. numba compiles a parallel kernel anew for the process that first runs it and for
 # the cache; with leave to re-associate and to fuse, the two differ in the last bit, and a decision has to replay to the
-# byte. The loops vectorise all the same. error_model="numpy": a division by zero gives an infinity, not a branch to an
-# exception.
+# byte. The loops vectorise all the same. (The one exception, `pixel_lookup.certain_pixels`, compiles these formulas for
+# itself and answers only where the last bits do not matter.) error_model="numpy": a division by zero gives an infinity,
+# not a branch to an exception.
 
 # A pixel further out than this is on no sensor; the bound keeps every coordinate inside int32. Unit: px.
 MAX_PIXEL_PX = 1e9
@@ -28,6 +32,22 @@ _A4, _A5, _A6 = 0.11111106180425145, -0.09090773074092884, 0.07689953486227682
 _A7, _A8, _A9, _A10 = -0.06640233842869744, 0.056883487686028446, -0.04348050891958043, 0.02113535694575133
 
 
+def like(constant: float, value: float) -> float:  # noqa: ARG001  (only its type counts)
+    """The constant in the precision of the value.
+
+    The formulas are compiled for float64, and for float32 where speed asks for it (`coec.geometry.pixel_lookup`). A
+    bare constant is a float64 and would make a float64 of everything that it touches.
+    """
+    return constant
+
+
+@overload(like, strict=False)  # the annotations differ between the two signatures
+def _like(constant: types.Type, value: types.Type) -> Callable[..., Any]:  # noqa: ARG001
+    if value == types.float32:
+        return lambda constant, value: np.float32(constant)  # noqa: ARG005
+    return lambda constant, value: constant  # noqa: ARG005
+
+
 class _Sensor(Protocol):
     """The fields that every camera model has and that the guards read."""
 
@@ -38,9 +58,13 @@ class _Sensor(Protocol):
 
 
 @register_jitable(error_model="numpy")
-def guarded_pixel(camera: _Sensor, u: float, v: float, in_domain: bool) -> tuple[float, float, bool]:
-    """(u, v, True) for a point in the model's domain with a sane pixel, else the principal point and False."""
-    valid = in_domain & (abs(u) < MAX_PIXEL_PX) & (abs(v) < MAX_PIXEL_PX)  # false for NaN
+def guarded_pixel(
+    camera: _Sensor, x: float, y: float, z: float, u: float, v: float, in_domain: bool
+) -> tuple[float, float, bool]:
+    """(u, v, True) for a point (x, y, z) in the domain with a sane pixel, else the principal point and False."""
+    range2 = x * x + y * y + z * z
+    valid = in_domain & (range2 > MIN_RANGE2_M2) & (range2 < MAX_RANGE2_M2)  # false for NaN
+    valid &= (abs(u) < MAX_PIXEL_PX) & (abs(v) < MAX_PIXEL_PX)
     return (u if valid else camera.cx), (v if valid else camera.cy), valid
 
 
@@ -64,13 +88,15 @@ def polar_angle(radius: float, z: float) -> float:
     small = depth if steep else radius
     large = radius if steep else depth
     # Past tan(pi/8) measure from the diagonal instead: atan(s/l) = pi/4 + atan((s - l)/(s + l)).
-    diagonal = small > _TAN_PI_8 * large
+    diagonal = small > like(_TAN_PI_8, z) * large
     numerator = small - large if diagonal else small
     denominator = small + large if diagonal else large
-    t = numerator / (denominator if denominator > 0.0 else 1.0)
+    zero, one = like(0.0, z), like(1.0, z)
+    t = numerator / (denominator if denominator > zero else one)
     s = t * t
-    p = _A6 + s * (_A7 + s * (_A8 + s * (_A9 + s * _A10)))
-    p = 1.0 + s * (_A1 + s * (_A2 + s * (_A3 + s * (_A4 + s * (_A5 + s * p)))))
-    angle = (0.25 * math.pi if diagonal else 0.0) + t * p
-    angle = 0.5 * math.pi - angle if steep else angle
-    return math.pi - angle if z < 0.0 else angle
+    p = like(_A8, z) + s * (like(_A9, z) + s * like(_A10, z))
+    p = like(_A5, z) + s * (like(_A6, z) + s * (like(_A7, z) + s * p))
+    p = one + s * (like(_A1, z) + s * (like(_A2, z) + s * (like(_A3, z) + s * (like(_A4, z) + s * p))))
+    angle = (like(0.25 * math.pi, z) if diagonal else zero) + t * p
+    angle = like(0.5 * math.pi, z) - angle if steep else angle
+    return like(math.pi, z) - angle if z < zero else angle

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from coec.geometry.cameras.brown_conrady import distort, undistort
 from coec.geometry.cameras.intrinsics import finite, sensor, within
-from coec.geometry.cameras.kernel import MAX_RANGE2_M2, MIN_RANGE2_M2, guarded_pixel, guarded_ray
+from coec.geometry.cameras.kernel import guarded_ray, like
 from coec.geometry.cameras.polynomial import monotonic_limit_squared
 
 # Calibrations of real lenses have xi of 0 to 4; far above, the image no longer depends on it.
@@ -70,20 +70,18 @@ def build(
     )
 
 
-def project_point(camera: Mei, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Pixel of a point in the camera frame, and whether it has one."""
-    range2 = x * x + y * y + z * z
-    distance = math.sqrt(range2)
+def image_point(camera: Mei, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """Pixel of a point in the camera frame, and whether the point is in the domain."""
+    zero, one = like(0.0, z), like(1.0, z)
+    distance = math.sqrt(x * x + y * y + z * z)
     depth = z + camera.xi * distance
-    in_front = (z > camera.min_cosine * distance) & (depth > 0.0)
-    inverse_depth = 1.0 / (depth if in_front else 1.0)
+    in_front = (z > camera.min_cosine * distance) & (depth > zero)
+    inverse_depth = one / (depth if in_front else one)
     mx = x * inverse_depth
     my = y * inverse_depth
-    in_domain = (
-        in_front & (mx * mx + my * my < camera.max_radius2) & (range2 > MIN_RANGE2_M2) & (range2 < MAX_RANGE2_M2)
-    )
-    dx, dy = distort(camera.k1, camera.k2, camera.p1, camera.p2, 0.0, mx, my)
-    return guarded_pixel(camera, camera.fx * dx + camera.cx, camera.fy * dy + camera.cy, in_domain)
+    in_domain = in_front & (mx * mx + my * my < camera.max_radius2)
+    dx, dy = distort(camera.k1, camera.k2, camera.p1, camera.p2, zero, mx, my)
+    return camera.fx * dx + camera.cx, camera.fy * dy + camera.cy, in_domain
 
 
 def unproject_point(camera: Mei, u: float, v: float) -> tuple[float, float, float, bool]:

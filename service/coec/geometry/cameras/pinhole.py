@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from coec.geometry.cameras.intrinsics import sensor
-from coec.geometry.cameras.kernel import MAX_RANGE_M, guarded_pixel, guarded_ray
+from coec.geometry.cameras.kernel import guarded_ray, like
 
 
 class Pinhole(NamedTuple):
@@ -22,13 +22,12 @@ def build(*, width: int, height: int, fx: float, fy: float, cx: float, cy: float
     return Pinhole(*sensor(width, height, fx, fy, cx, cy))
 
 
-def project_point(camera: Pinhole, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Pixel of a point in the camera frame, and whether it has one: z > 0."""
-    in_domain = (z > 0.0) & (z < MAX_RANGE_M)
-    inverse_z = 1.0 / (z if in_domain else 1.0)
-    return guarded_pixel(
-        camera, camera.fx * (x * inverse_z) + camera.cx, camera.fy * (y * inverse_z) + camera.cy, in_domain
-    )
+def image_point(camera: Pinhole, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """Pixel of a point in the camera frame, and whether the point is in the domain: z > 0."""
+    one = like(1.0, z)
+    in_domain = z > like(0.0, z)
+    inverse_z = one / (z if in_domain else one)
+    return camera.fx * (x * inverse_z) + camera.cx, camera.fy * (y * inverse_z) + camera.cy, in_domain
 
 
 def unproject_point(camera: Pinhole, u: float, v: float) -> tuple[float, float, float, bool]:

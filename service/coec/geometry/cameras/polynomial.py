@@ -5,6 +5,8 @@ import math
 import numpy as np
 from numba.extending import register_jitable
 
+from coec.geometry.cameras.kernel import like
+
 # A Newton step that halves its bracket when it fails gains a bit per step at worst: 52 bits of a float64 and the
 # doublings that find the bracket.
 _MAX_STEPS = 100
@@ -27,7 +29,7 @@ def monotonic_limit_squared(coefficients: tuple[float, ...]) -> float:
 def odd_polynomial(c1: float, c2: float, c3: float, c4: float, t: float) -> float:
     """t (1 + c1 t^2 + c2 t^4 + c3 t^6 + c4 t^8)."""
     s = t * t
-    return t * (1.0 + s * (c1 + s * (c2 + s * (c3 + s * c4))))
+    return t * (like(1.0, t) + s * (c1 + s * (c2 + s * (c3 + s * c4))))
 
 
 @register_jitable(error_model="numpy")

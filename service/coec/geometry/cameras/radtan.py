@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from coec.geometry.cameras.brown_conrady import distort, undistort
 from coec.geometry.cameras.intrinsics import finite, sensor
-from coec.geometry.cameras.kernel import MAX_RANGE_M, guarded_pixel, guarded_ray
+from coec.geometry.cameras.kernel import guarded_ray, like
 from coec.geometry.cameras.polynomial import monotonic_limit_squared
 
 
@@ -55,15 +55,16 @@ def build(
     )
 
 
-def project_point(camera: RadTan, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Pixel of a point in the camera frame, and whether it has one."""
-    in_front = (z > 0.0) & (z < MAX_RANGE_M)
-    inverse_z = 1.0 / (z if in_front else 1.0)
+def image_point(camera: RadTan, x: float, y: float, z: float) -> tuple[float, float, bool]:
+    """Pixel of a point in the camera frame, and whether the point is in the domain."""
+    one = like(1.0, z)
+    in_front = z > like(0.0, z)
+    inverse_z = one / (z if in_front else one)
     mx = x * inverse_z
     my = y * inverse_z
     in_domain = in_front & (mx * mx + my * my < camera.max_radius2)
     dx, dy = distort(camera.k1, camera.k2, camera.p1, camera.p2, camera.k3, mx, my)
-    return guarded_pixel(camera, camera.fx * dx + camera.cx, camera.fy * dy + camera.cy, in_domain)
+    return camera.fx * dx + camera.cx, camera.fy * dy + camera.cy, in_domain
 
 
 def unproject_point(camera: RadTan, u: float, v: float) -> tuple[float, float, float, bool]:

@@ -23,7 +23,7 @@ class Model(NamedTuple):
     name: str
     camera_type: type[Camera]
     build: Callable[..., Camera]
-    project_point: Callable[..., tuple[float, float, bool]]
+    image_point: Callable[..., tuple[float, float, bool]]
     unproject_point: Callable[..., tuple[float, float, float, bool]]
 
     @property
@@ -34,7 +34,7 @@ class Model(NamedTuple):
 
 MODELS: Mapping[str, Model] = MappingProxyType(
     {
-        name: Model(name, camera_type, module.build, module.project_point, module.unproject_point)
+        name: Model(name, camera_type, module.build, module.image_point, module.unproject_point)
         for name, camera_type, module in (
             ("pinhole", Pinhole, pinhole),
             ("radtan", RadTan, radtan),

@@ -1,0 +1,209 @@
+"""`coec bench`: how fast this machine is, beside the plain forms in the same run.
+
+Ratios compare runs of one process that alternate, each at its fastest: what else the machine does cancels out as far as
+it can.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from rich.progress import Progress
+
+from coec.adapters.depth import open_depth
+from coec.adapters.images import GreyImages
+from coec.calibration.calibrator import calibrate
+from coec.calibration.objective import MutualInformation, SearchBox
+from coec.calibration.ports import Silence
+from coec.calibration.search import box_of, maximise
+from coec.cli import bench_scene, console, windows
+from coec.cli.calibrate import StageTimes
+from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
+from coec.geometry import se3
+from coec.geometry.mutual_information import mutual_information
+from coec.geometry.plain_forms import by_numpy, by_scalar_loop
+
+FRAMES = 25
+FRAME_COUNTS = (5, 25, 50, 200)
+REPEATS, FEW_REPEATS = 60, 3
+"""Runs of which the fastest counts; of the plain forms, which take a hundred times as long, fewer."""
+
+START_DEG = (6.0, -6.0, 5.3)
+"""10.0° from the truth, about all three axes."""
+
+FAR_START_DEG = (14.0, -16.0, 13.1)
+"""25.0° from the truth."""
+
+STREET = f"synthetic:?frames={FRAMES}&period_s=7"
+"""The recording for the fused solve: it needs images."""
+
+APART = ("load", "prepare", "depth")
+"""Stages that do not belong to a solve."""
+
+
+Runs = Mapping[str, tuple[Callable[[], Any], int]]
+"""What to run, by name, and how often."""
+
+
+def run(*, as_json: bool) -> int:
+    """Measures and prints the table; always 0."""
+    with console.progress(counted=False) as bars:
+        document = measure(bars)
+    if as_json:
+        console.print_json(document)
+    else:
+        _show(document)
+    return 0
+
+
+def measure(bars: Progress) -> dict[str, Any]:
+    """All figures, by the names of the contract. Times are the fastest of several runs."""
+    task = bars.add_task("one evaluation", total=None, note="")
+    search = SearchConfig(dof=3)
+    start = _moved(START_DEG)
+    objective = bench_scene.objective_of(bench_scene.CAMERAS["double_sphere"], FRAMES, start, box_of(search))
+    whole = _nothing_left_out("double_sphere")
+    pose = bench_scene.T_TRUE
+    fastest = _fastest(
+        {
+            "kernel": (lambda: mutual_information(whole.binned, pose), REPEATS),
+            "objective": (lambda: objective.evaluate(pose), REPEATS),
+            "scalar": (lambda: by_scalar_loop(whole.binned, pose), FEW_REPEATS),
+            "numpy": (lambda: by_numpy(whole.binned, pose), FEW_REPEATS),
+        }
+    )
+    bars.update(task, description="camera models, numbers of frames")
+    document: dict[str, Any] = {
+        "machine": _machine(),
+        "points_per_frame": bench_scene.POINTS,
+        "points_visited_per_frame": int(objective.binned.first_point[-1]) // FRAMES,
+        "mi_25_frames_ms": 1e3 * fastest["objective"],
+        "mi_25_frames_nothing_left_out_ms": 1e3 * fastest["kernel"],
+        "ratio_to_numpy": fastest["numpy"] / fastest["objective"],
+        "ratio_to_scalar": fastest["scalar"] / fastest["objective"],
+        "kernel_ratio_to_numpy": fastest["numpy"] / fastest["kernel"],
+        "kernel_ratio_to_scalar": fastest["scalar"] / fastest["kernel"],
+        "mi_25_frames_ms_by_model": _by_model(start, box_of(search)),
+        "mi_ms_by_frames": _by_frames(objective),
+    }
+    bars.update(task, description="solves")
+    times = []
+    for _ in range(FEW_REPEATS):
+        begin = time.perf_counter()
+        found = maximise(objective, start, search, Silence())
+        times.append(time.perf_counter() - begin)
+    document["solve_10deg_3dof_s"] = min(times)
+    document["solve_10deg_3dof_evaluations"] = found.evaluations
+    document["solve_10deg_3dof_error_deg"] = windows.rotation_error_deg(found.T_camera_lidar, pose)
+    return document | _fused(bars)
+
+
+def _by_model(start: Any, box: SearchBox) -> dict[str, float]:
+    objectives = {
+        name: bench_scene.objective_of(camera, FRAMES, start, box) for name, camera in bench_scene.CAMERAS.items()
+    }
+    runs: Runs = {
+        name: (partial(objective.evaluate, bench_scene.T_TRUE), REPEATS) for name, objective in objectives.items()
+    }
+    return {name: 1e3 * seconds for name, seconds in _fastest(runs).items()}
+
+
+def _by_frames(objective: MutualInformation) -> dict[str, float]:
+    five = bench_scene.first(objective.binned, FRAME_COUNTS[0])
+    many = {count: bench_scene.repeated(five, count // FRAME_COUNTS[0]) for count in FRAME_COUNTS}
+    runs: Runs = {
+        str(count): (partial(mutual_information, frames, bench_scene.T_TRUE), REPEATS) for count, frames in many.items()
+    }
+    return {count: 1e3 * seconds for count, seconds in _fastest(runs).items()}
+
+
+def _fused(bars: Progress) -> dict[str, Any]:
+    """The fused objective, six degrees of freedom, without depth inference. The second run finds all compiled."""
+    loaded = windows.load(STREET, None, WindowConfig().pairs, lambda *_: None)
+    xi = np.array([*np.radians(FAR_START_DEG), 0.0, 0.0, 0.0])
+    window = windows.started_at(loaded.window, xi)
+    configuration = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=30.0))
+    depth = open_depth(configuration.depth, LimitsConfig())
+    seconds = []
+    for _ in range(2):
+        times = StageTimes(bars)
+        estimate = calibrate(window, depth, GreyImages(LimitsConfig()), configuration, times)
+        elapsed = times.elapsed_s()
+        seconds.append(elapsed["total"] - sum(elapsed.get(stage, 0.0) for stage in APART))
+    error_deg = windows.rotation_error_deg(estimate.optimum.T_camera_lidar, window.rig.T_camera_lidar_nominal)
+    return {"solve_25deg_6dof_s": min(seconds), "solve_25deg_6dof_error_deg": error_deg}
+
+
+def _nothing_left_out(model: str) -> MutualInformation:
+    """The objective with every point of every sweep, as no pose is out of reach: a box of half a turn."""
+    return bench_scene.objective_of(bench_scene.CAMERAS[model], FRAMES, bench_scene.T_TRUE, SearchBox(np.pi, 0.0))
+
+
+def _moved(degrees: tuple[float, float, float]) -> Any:
+    return se3.perturb(bench_scene.T_TRUE, np.array([*np.radians(degrees), 0.0, 0.0, 0.0]))
+
+
+def _fastest(runs: Runs) -> dict[str, float]:
+    """The least seconds of each, taken in turns; a first run of each, which may compile, does not count."""
+    for call, _ in runs.values():
+        call()
+    least = dict.fromkeys(runs, np.inf)
+    for turn in range(max(repeats for _, repeats in runs.values())):
+        for name, (call, repeats) in runs.items():
+            if turn < repeats:
+                begin = time.perf_counter()
+                call()
+                least[name] = min(least[name], time.perf_counter() - begin)
+    return least
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "threads": numba.get_num_threads(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "numba": numba.__version__,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _show(document: dict[str, Any]) -> None:
+    machine = document["machine"]
+    console.show(
+        f"{machine['processor']}, {machine['threads']} threads, Python {machine['python']}, numba {machine['numba']}"
+    )
+    shown = console.table("work", "figure", right=(1,))
+    shown.add_row(f"one MI, {FRAMES} frames of 114,000 points", f"{document['mi_25_frames_ms']:.2f} ms")
+    shown.add_row(
+        "the same, free to turn anywhere",
+        f"{document['mi_25_frames_nothing_left_out_ms']:.2f} ms",
+    )
+    shown.add_row("times as fast as NumPy", f"{document['ratio_to_numpy']:.0f}")
+    shown.add_row("times as fast as a scalar compiled loop", f"{document['ratio_to_scalar']:.1f}")
+    for name, milliseconds in document["mi_25_frames_ms_by_model"].items():
+        shown.add_row(f"  camera {name}", f"{milliseconds:.2f} ms")
+    for count, milliseconds in document["mi_ms_by_frames"].items():
+        shown.add_row(f"  {count} frames", f"{milliseconds:.2f} ms")
+    evaluations = document["solve_10deg_3dof_evaluations"]
+    shown.add_row(
+        f"MI solve, 3 axes, from 10° ({evaluations} evaluations)", f"{document['solve_10deg_3dof_s'] * 1e3:.0f} ms"
+    )
+    shown.add_row("fused solve, 6 axes, from 25°", f"{document['solve_25deg_6dof_s']:.2f} s")
+    console.out.print(shown)

@@ -1,0 +1,105 @@
+"""The scene of the speed table: a spinning LiDAR and a camera at one point of a room whose walls lie at a known range
+in every direction, so that the depth map of any camera is exact and the true pose is a maximum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.objective import Features, MutualInformation, SearchBox, build_mutual_information
+from coec.calibration.values import Matrix4, Rig
+from coec.config import ObjectiveConfig
+from coec.geometry.cameras import Camera, build, name_of, scaled
+from coec.geometry.mutual_information import BinnedFrames
+from coec.geometry.projection import unproject
+
+POINTS, BEAMS = 114_000, 64
+"""Of a sweep of the LiDAR of KITTI and KITTI-360."""
+
+IMAGE_PX, MAP_PX = 1400, 512
+"""Side of the image (KITTI-360's fisheye), and of the depth map as a network returns it."""
+
+LOWEST_RAD, HIGHEST_RAD = np.deg2rad([-24.8, 2.0])
+"""Elevations of that LiDAR's beams."""
+
+T_TRUE: Matrix4 = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""The camera looks ahead: its axes x right, y down, z forward in the LiDAR's x forward, y left, z up."""
+
+_SENSOR = {"width": IMAGE_PX, "height": IMAGE_PX, "cx": 699.5, "cy": 699.5, "fx": 437.5, "fy": 437.5}
+CAMERAS: dict[str, Camera] = {
+    "double_sphere": build("double_sphere", **_SENSOR, xi=-0.2, alpha=0.6),
+    "pinhole": build("pinhole", **_SENSOR),
+    "radtan": build("radtan", **_SENSOR, k1=-0.3, k2=0.1, p1=1e-4, p2=1e-4, k3=0.0),
+    "kannala_brandt": build("kannala_brandt", **_SENSOR, k1=-0.01, k2=0.01, k3=-0.01, k4=0.001),
+    # Near KITTI-360's image_02.
+    "mei": build("mei", **_SENSOR | {"fx": 1336.0, "fy": 1336.0}, xi=2.21, k1=0.0169, k2=1.6548, p1=4e-4, p2=4e-4),
+    "eucm": build("eucm", **_SENSOR, alpha=0.6, beta=1.1),
+}
+
+
+FISHEYES = ("double_sphere", "kannala_brandt", "mei", "eucm")
+"""Cameras whose image is a circle that touches the borders; the corners are masked."""
+
+
+def objective_of(camera: Camera, frames: int, start: Matrix4, box: SearchBox) -> MutualInformation:
+    """The objective of a window of so many frames of `POINTS` points, as the service builds it."""
+    across = np.arange(IMAGE_PX) - camera.cx
+    circle = across**2 + across[:, None] ** 2 <= (IMAGE_PX / 2) ** 2
+    rig = Rig("bench", camera, "camera", "lidar", T_TRUE, np.eye(4), circle if name_of(camera) in FISHEYES else None)
+    seen = [_features(scaled(camera, MAP_PX / IMAGE_PX, MAP_PX / IMAGE_PX), seed) for seed in range(frames)]
+    return build_mutual_information(seen, rig, start, box, ObjectiveConfig())
+
+
+def first(frames: BinnedFrames, count: int) -> BinnedFrames:
+    """The first so many frames of a window."""
+    points = frames.first_point[count]
+    return replace(
+        frames,
+        xyz_m=np.ascontiguousarray(frames.xyz_m[:, :points]),
+        range_bin=frames.range_bin[:points],
+        depth_bin=frames.depth_bin[:count],
+        first_point=frames.first_point[: count + 1],
+        bundles=None,
+    )
+
+
+def repeated(frames: BinnedFrames, times: int) -> BinnedFrames:
+    """A window of so many times the frames, each at a place of its own in memory."""
+    shifts = np.arange(times)[:, None] * frames.first_point[-1]
+    return replace(
+        frames,
+        xyz_m=np.tile(frames.xyz_m, (1, times)),
+        range_bin=np.tile(frames.range_bin, times),
+        depth_bin=np.tile(frames.depth_bin, (times, 1)),
+        first_point=np.append((shifts + frames.first_point[:-1]).ravel(), times * frames.first_point[-1]),
+    )
+
+
+def _features(camera: Camera, seed: int) -> Features:
+    rng = np.random.default_rng(seed)
+    phases = rng.uniform(0.0, 2.0 * np.pi, 4)
+    steps = -(-POINTS // BEAMS)
+    azimuth = np.tile(np.linspace(-np.pi, np.pi, steps, endpoint=False), BEAMS)[:POINTS]
+    elevation = np.repeat(np.linspace(HIGHEST_RAD, LOWEST_RAD, BEAMS), steps)[:POINTS]
+    rays = np.column_stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    range_m = _walls_m(rays, phases) * (1.0 + 0.005 * rng.standard_normal(POINTS))
+    u, v = np.meshgrid(np.arange(MAP_PX, dtype=np.float64), np.arange(MAP_PX, dtype=np.float64))
+    of_pixels, valid = unproject(camera, np.column_stack([u.ravel(), v.ravel()]))
+    depth_m = np.where(valid, _walls_m(of_pixels @ T_TRUE[:3, :3], phases), np.nan).reshape(MAP_PX, MAP_PX)
+    return Features(
+        (rays * range_m[:, None]).astype(np.float32), range_m.astype(np.float32), depth_m.astype(np.float32)
+    )
+
+
+def _walls_m(rays: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Range of the wall in each direction (N, 3), LiDAR frame: hills, and pillars that stand out from it."""
+    x, y, z = rays.T
+    azimuth = np.arctan2(y, x)
+    hills = 14.0 + 5.0 * np.sin(2.0 * azimuth + phases[0]) + 8.0 * z + 4.0 * np.sin(7.0 * z + phases[1])
+    pillars = np.sin(9.0 * azimuth + phases[2]) * np.cos(11.0 * z + phases[3]) > 0.3
+    return np.asarray(np.where(pillars, 0.6 * hills, hills))
