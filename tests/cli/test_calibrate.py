@@ -67,6 +67,15 @@ def test_without_motion_compensation(coec: Coec) -> None:
     assert outcome.document["compensation"]["disabled"] == 6
 
 
+def test_time_offset_is_reported_when_asked_for(coec: Coec) -> None:
+    arguments = ("calibrate", SMALL, "--depth", "stereo", "--objective", "mi")
+    asked = coec(*arguments, "--time-offset", "--json").document["time_offset"]
+    assert set(asked) == {"offset_s", "sigma_s", "turn_spread_deg_per_s", "observable", "reason"}
+    assert asked["reason"]
+    assert "camera after its stamp" in coec(*arguments, "--time-offset").out
+    assert "time_offset" not in coec(*arguments, "--json").document
+
+
 def test_needs_a_depth_network(coec: Coec) -> None:
     outcome = coec("calibrate", SMALL)
     assert outcome.status == 2

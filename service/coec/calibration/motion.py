@@ -32,7 +32,7 @@ def compensate(pair: FramePair, rig: Rig, *, enabled: bool) -> CompensatedCloud:
         return CompensatedCloud(pair.lidar.xyz_m, Compensation.NO_EGO_MOTION)
     offset_s, outcome = _point_offsets_s(pair.lidar, rig.sweep)
     dt_s = offset_s + (pair.lidar.stamp_ns - pair.camera.stamp_ns) * 1e-9
-    angular, linear = _sensor_twist(pair.motion, rig.T_lidar_ego)
+    angular, linear = sensor_twist(pair.motion, rig.T_lidar_ego)
     return CompensatedCloud(deskew(pair.lidar.xyz_m, dt_s, angular, linear), outcome)
 
 
@@ -44,18 +44,19 @@ def azimuth_offsets_s(xyz_m: NDArray[np.float32], sweep: SweepTiming) -> NDArray
     return sweep.sign * sweep.period_s * revolutions
 
 
+def sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Angular (3,) rad/s and linear velocity (3,) m/s of the LiDAR in its own frame; the lever arm turns rotation into
+    velocity."""
+    rotation = T_lidar_ego[:3, :3]
+    lidar_in_ego_m = se3.inverse(T_lidar_ego)[:3, 3]
+    angular = np.asarray(motion.angular_radps)
+    linear = np.asarray(motion.linear_mps) + np.cross(angular, lidar_in_ego_m)
+    return rotation @ angular, rotation @ linear
+
+
 def _point_offsets_s(lidar: LidarFrame, sweep: SweepTiming | None) -> tuple[NDArray[np.float64], Compensation]:
     if lidar.time_offset_s is not None:
         return lidar.time_offset_s.astype(np.float64), Compensation.DONE
     if sweep is not None:
         return azimuth_offsets_s(lidar.xyz_m, sweep), Compensation.DONE
     return np.zeros(len(lidar.xyz_m)), Compensation.NO_POINT_TIME
-
-
-def _sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Angular and linear velocity of the LiDAR in its own frame; the lever arm turns rotation into velocity."""
-    rotation = T_lidar_ego[:3, :3]
-    lidar_in_ego_m = se3.inverse(T_lidar_ego)[:3, 3]
-    angular = np.asarray(motion.angular_radps)
-    linear = np.asarray(motion.linear_mps) + np.cross(angular, lidar_in_ego_m)
-    return rotation @ angular, rotation @ linear

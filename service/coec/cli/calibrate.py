@@ -15,6 +15,7 @@ from coec.adapters.depth import open_depth
 from coec.adapters.images import GreyImages
 from coec.adapters.wire import result_of
 from coec.calibration.calibrator import calibrate
+from coec.calibration.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.values import Rig, Window
 from coec.cli import console, files, pictures, windows
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
@@ -41,6 +42,7 @@ class Options:
     camera_model: str | None = None
     frames: int | None = None
     no_motion_compensation: bool = False
+    time_offset: bool = False
     output: Path | None = None
     as_json: bool = False
 
@@ -98,15 +100,20 @@ def run(options: Options) -> int:
         window, fit = (window, None) if options.camera_model is None else refitted(window, options.camera_model)
         depth = open_depth(configuration.depth, LimitsConfig())
         times.step("prepare", 1, 1)
-        estimate = calibrate(window, depth, GreyImages(LimitsConfig()), configuration, times)
+        images = GreyImages(LimitsConfig())
+        estimate = calibrate(window, depth, images, configuration, times)
+        offset = None
+        if options.time_offset:
+            offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
+            times.step("time offset", 1, 1)
     result = result_of(estimate, window.rig, loaded.vehicle)
-    document = _document(result, times.elapsed_s(), fit)
+    document = _document(result, times.elapsed_s(), fit, offset)
     if options.output is not None:
         _write(options.output, window, result, configuration, document)
     if options.as_json:
         console.print_json(document)
     else:
-        _show(window, result, document, fit)
+        _show(window, result, document, fit, offset)
     if loaded.unpaired:
         causes = ", ".join(f"{count} {cause}" for cause, count in sorted(loaded.unpaired.items()))
         console.say(f"coec: frames without a partner: {causes}")
@@ -146,7 +153,9 @@ def refitted(window: Window, model: str) -> tuple[Window, CameraFit]:
     return replace(window, rig=replace(rig, camera=fit.camera)), quality
 
 
-def _document(result: CalibrationResult, elapsed_s: dict[str, float], fit: CameraFit | None) -> dict[str, Any]:
+def _document(
+    result: CalibrationResult, elapsed_s: dict[str, float], fit: CameraFit | None, offset: TimeOffset | None
+) -> dict[str, Any]:
     report = CalibrationReport(**dict(result), elapsed_s=elapsed_s)
     document: dict[str, Any] = report.model_dump(mode="json")
     if fit is not None:
@@ -157,7 +166,20 @@ def _document(result: CalibrationResult, elapsed_s: dict[str, float], fit: Camer
             "residual_max_px": fit.residual_max_px,
             "coverage": fit.coverage,
         }
+    if offset is not None:
+        document["time_offset"] = {
+            "offset_s": _finite(offset.offset_s),
+            "sigma_s": _finite(offset.sigma_s),
+            "turn_spread_deg_per_s": _finite(np.degrees(offset.turn_spread_radps)),
+            "observable": offset.observable,
+            "reason": offset.reason,
+        }
     return document
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no word for what is not a number."""
+    return float(value) if np.isfinite(value) else None
 
 
 def _write(
@@ -174,13 +196,20 @@ def _write(
     files.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
 
 
-def _show(window: Window, result: CalibrationResult, document: dict[str, Any], fit: CameraFit | None) -> None:
+def _show(
+    window: Window,
+    result: CalibrationResult,
+    document: dict[str, Any],
+    fit: CameraFit | None,
+    offset: TimeOffset | None,
+) -> None:
     start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
     start[:3] = np.degrees(start[:3])
     console.show(f"{window.window_id}: {result.pairs} pairs, {result.points_in_view} points in view")
     axes = console.table("axis", "start", "correction", "± σ", "unit", right=(1, 2, 3))
     for axis, name in enumerate(console.AXIS_NAMES):
-        found = console.figure(result.correction[axis], sign=True) if result.solved[axis] else "not searched"
+        unsolved = "not observable" if result.unobservable[axis] else "not searched"
+        found = console.figure(result.correction[axis], sign=True) if result.solved[axis] else unsolved
         spread = console.figure(result.sigma[axis]) if result.solved[axis] else ""
         axes.add_row(name, console.figure(start[axis], sign=True), found, spread, console.UNITS[axis])
     console.out.print(axes)
@@ -189,5 +218,12 @@ def _show(window: Window, result: CalibrationResult, document: dict[str, Any], f
         console.show(
             f"{fit.model} fitted to {fit.of}: {fit.residual_rms_px:.4f} px rms, {fit.residual_max_px:.4f} px at most"
         )
+    if offset is not None:
+        console.show(f"camera after its stamp: {_offset_text(offset)}")
     stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in document["elapsed_s"].items())
     console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")
+
+
+def _offset_text(offset: TimeOffset) -> str:
+    fitted = f"{1e3 * offset.offset_s:+.1f} ± {1e3 * offset.sigma_s:.1f} ms"
+    return f"{fitted}, {offset.reason}" if offset.observable else f"not observable, {offset.reason}"
