@@ -6,14 +6,10 @@ from math import radians
 
 import cv2
 import numpy as np
-import pytest
 
 from coec.adapters import plots
-from coec.calibration.evaluation import FramesPoint, Outcome, Spread, Trial
-from coec.calibration.landscape import Scan
+from coec.calibration.evaluation import Outcome, Trial
 from coec.calibration.starts import directions
-
-FLAT = Spread(0.01, 0.02, 0.03)
 
 
 def _outcome(angle_deg: float, accepted: bool) -> Outcome:
@@ -49,18 +45,8 @@ def test_bullseye_of_one_start() -> None:
     )
 
 
-@pytest.mark.parametrize("names", [("score",), ("mi", "edges")])
-def test_landscape_draws_every_curve(names: tuple[str, ...]) -> None:
-    offsets = np.linspace(-0.1, 0.1, 11)
-    scans = tuple(Scan(axis, offsets, np.exp(-(offsets**2))) for axis in range(6))
-    _size(plots.landscape(dict.fromkeys(names, scans), "title"))
-
-
-@pytest.mark.parametrize("with_translation", [False, True])
-def test_error_against_frames(with_translation: bool) -> None:
-    points = [FramesPoint(frames, 5, 0.8, FLAT, FLAT) for frames in (1, 2, 5)]
-    _size(plots.error_against_frames(points, with_translation, "title"))
-
-
-def test_error_against_frames_of_one_frame() -> None:
-    _size(plots.error_against_frames([FramesPoint(1, 1, 1.0, FLAT, FLAT)], False, "title"))
+def test_methods_stand_side_by_side() -> None:
+    sphere = directions(len(MIXED))
+    two = plots.compared({"mi": MIXED, "fused": MIXED[::-1]}, sphere, "title")
+    three = plots.compared({"mi": MIXED, "fused": MIXED[::-1], "intensity": MIXED}, sphere, "title")
+    assert _size(three)[0] > 1.2 * _size(two)[0]

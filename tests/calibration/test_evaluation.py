@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.evaluation import NOT_SOLVED, Outcome, Trial, frames_point, judge, spread, summarise, worst
-from coec.calibration.landscape import POINTS, REACH_M, REACH_RAD, scan
-from coec.calibration.values import Decision, Estimate, Matrix4, Optimum, StopReason, Verdict
+from coec.calibration.evaluation import (
+    NOT_SOLVED,
+    Outcome,
+    Trial,
+    frames_point,
+    judge,
+    slice_point,
+    spread,
+    summarise,
+    worst,
+)
+from coec.calibration.values import Decision, Estimate, Optimum, StopReason, Verdict
 from coec.geometry import se3
 
 REFERENCE = se3.exp(np.array([1.2, -1.2, 1.2, 0.1, -0.3, 0.8]))
@@ -40,7 +49,18 @@ def _estimate(error: NDArray[np.float64], accepted: bool, sigma: float = np.nan)
         second_derivative=nan,
     )
     return Estimate(
-        "w", 0, 1, optimum, Verdict(decision, (), ()), nan, np.full(6, sigma), np.ones(6, np.bool_), {}, "", ""
+        "w",
+        0,
+        1,
+        optimum,
+        Verdict(decision, (), ()),
+        nan,
+        np.full(6, sigma),
+        np.ones(6, np.bool_),
+        np.zeros(6, np.bool_),
+        {},
+        "",
+        "",
     )
 
 
@@ -146,25 +166,14 @@ def test_frames_point_counts_hits_and_misses() -> None:
     assert point.rotation_rad.max == pytest.approx(radians(2.0))
 
 
-class _Hill:
-    """Highest where the perturbation from the reference is `summit`."""
-
-    def __init__(self, summit: NDArray[np.float64]) -> None:
-        self._summit = summit
-
-    def score(self, T_camera_lidar: Matrix4) -> float:
-        return -float(np.sum((se3.difference(T_camera_lidar, REFERENCE) - self._summit) ** 2))
+def test_claims_about_the_rotation_are_the_root_of_the_sum_of_variances() -> None:
+    point = frames_point(5, [_outcome(0.1, sigma=0.01), _outcome(0.1, sigma=0.03), _outcome(0.1, sigma=np.nan)])
+    assert point.sigma_rad == pytest.approx(np.sqrt(3.0) * 0.02)
+    assert np.isnan(frames_point(1, [_outcome(0.1, sigma=np.nan)]).sigma_rad)
 
 
-def test_scan_finds_the_summit_on_every_axis() -> None:
-    heard: list[tuple[int, int]] = []
-    summit = _xi(2.0, -1.0, 0.4, 0.1, -0.2, 0.3)
-    scans = scan(_Hill(summit), REFERENCE, lambda done, total: heard.append((done, total)))
-    assert [one.axis for one in scans] == list(range(6))
-    assert heard[-1] == (6, 6)
-    for one in scans:
-        reach = REACH_RAD if one.axis < 3 else REACH_M
-        assert one.offsets[[0, -1]] == pytest.approx([-reach, reach])
-        assert 0.0 in one.offsets
-        assert len(one.offsets) == len(one.scores) == POINTS
-        assert abs(one.best_offset - summit[one.axis]) <= reach / (POINTS - 1)
+def test_slice_point_takes_the_slices_together() -> None:
+    point = slice_point(7.5, [(3, [_outcome(0.1), _outcome(2.0)]), (5, [_outcome(0.3)]), (9, [_outcome(0.2)])])
+    assert (point.length_s, point.slices, point.frames, point.solves) == (7.5, 3, 5.0, 4)
+    assert point.hit_rate == 0.75
+    assert point.rotation_rad.max == pytest.approx(radians(2.0))

@@ -14,7 +14,7 @@ from coec.calibration.starts import perturbations
 from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, Options, configuration_of
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
-from coec.schemas.replies import EvaluationReport
+from coec.schemas.evaluation import ComparisonReport, EvaluationReport
 
 CONTRACT = {
     "starts", "hits", "hit_rate", "rotation_deg", "translation_m", "bias", "std", "solve_s", "classified_correctly",
@@ -46,7 +46,8 @@ def test_report_has_the_figures_of_the_contract(coec: Coec) -> None:
     assert report["translation_m"]["max"] == pytest.approx(0.0, abs=1e-9)
     assert report["hit_translation_m"] is None
     assert max(map(abs, report["bias"])) < 0.5
-    assert report["frames"] == []
+    assert report["frames"] == report["slices"] == []
+    assert report["halves"] is None
 
 
 def test_starts_that_cannot_be_solved_are_counted_and_the_exit_is_0(coec: Coec) -> None:
@@ -78,6 +79,57 @@ def test_output_folder_holds_table_report_and_pictures(coec: Coec, tmp_path: Pat
     errors = [float(row["rotation_deg"]) for row in rows]
     assert max(errors) == outcome.document["rotation_deg"]["max"]
     assert sum(int(row["hit"]) for row in rows) == outcome.document["hits"]
+
+
+def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
+    arguments = (
+        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "2", "--frames", "3",
+        "--objective", "all",
+    )  # fmt: skip
+    outcome = coec(*arguments, "--output", tmp_path / "out", "--json")
+    report = outcome.document
+    assert outcome.status == 0
+    assert ComparisonReport.model_validate(report).model_dump(mode="json") == report
+    assert set(report["methods"]) | set(report["not_evaluated"]) == {"fused", "mi", "intensity"}
+    assert {"fused", "mi"} <= set(report["methods"])
+    for name, method in report["methods"].items():
+        assert method["objective"] == name
+        assert set(method) >= CONTRACT
+        assert json.loads((tmp_path / "out" / name / "report.json").read_text()) == method
+        assert (tmp_path / "out" / name / "landscape.png").is_file()
+    assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
+    assert (tmp_path / "out" / "bullseye.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_methods_side_by_side_in_words(coec: Coec) -> None:
+    outcome = coec(
+        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--frames", "2",
+        "--objective", "all", "--halves", "1",
+    )  # fmt: skip
+    header = next(line for line in outcome.out.splitlines() if "fused" in line)
+    assert header.split() == ["fused", "mi", "unit"]
+    assert "intensity was not evaluated: " in outcome.out
+    assert "1 splits into halves of 1 frames" in outcome.out
+    assert not outcome.err
+
+
+def test_slices_and_halves(coec: Coec, tmp_path: Path) -> None:
+    report = coec(
+        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "2", "--objective", "mi",
+        "--against-slice", "--halves", "3", "--output", tmp_path / "out", "--json",
+    ).document  # fmt: skip
+    slices = report["slices"]
+    lengths_s = [point["length_s"] for point in slices]
+    assert lengths_s == pytest.approx([10.0 / 16, 10.0 / 8, 10.0 / 4, 10.0 / 2, 10.0])
+    assert all(point["solves"] == 20 for point in slices)
+    assert [point["pairs"] for point in slices] == [1, 1, 1.5, 3, 6]
+    assert slices[-1]["slices"] == 1
+    assert slices[-1]["hit_rate"] == 1.0
+    halves = report["halves"]
+    assert (halves["splits"], halves["pairs"], halves["solved"]) == (3, 3, 3)
+    assert all(0 < difference < 0.5 for difference in halves["rms"][:3])
+    assert halves["rms"][3:] == [None] * 3
+    assert (tmp_path / "out" / "slices.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_six_degrees_of_freedom_are_searched_and_judged(coec: Coec) -> None:

@@ -16,6 +16,7 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import Silence
 from coec.cli import windows
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig
+from coec.errors import SourceError
 from coec.geometry import se3
 
 LIMITS = LimitsConfig()
@@ -102,3 +103,22 @@ def test_replay_of_a_damaged_window(coec: Coec, recorded: Path, tmp_path: Path) 
     outcome = coec("replay", path, "--json")
     assert outcome.status == 1
     assert outcome.document["error"]["code"] == "bad_window"
+
+
+def test_slices_of_a_recorded_window_are_counted_from_its_first_pair(recorded: Path) -> None:
+    whole = windows.load(str(recorded), None, 25, lambda *_: None).window.pairs
+    span_s = (whole[-1].stamp_ns - whole[0].stamp_ns) * 1e-9
+    half = windows.load(str(recorded), None, 25, lambda *_: None, (0.0, span_s / 2)).window.pairs
+    assert [pair.stamp_ns for pair in half] == [
+        pair.stamp_ns for pair in whole if (pair.stamp_ns - whole[0].stamp_ns) * 1e-9 <= span_s / 2
+    ]
+    assert 0 < len(half) < len(whole)
+    with pytest.raises(SourceError, match="no pair was recorded"):
+        windows.load(str(recorded), None, 25, lambda *_: None, (span_s + 1.0, span_s + 2.0))
+
+
+def test_slices_of_a_recording_choose_among_their_own_frames() -> None:
+    whole = windows.load(SMALL, None, 25, lambda *_: None).window.pairs
+    # A frame every two seconds.
+    later = windows.load(SMALL, 2, 25, lambda *_: None, (3.0, 9.0)).window.pairs
+    assert [pair.stamp_ns for pair in later] == [whole[2].stamp_ns, whole[4].stamp_ns]

@@ -17,12 +17,9 @@ from matplotlib.lines import Line2D
 from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 
-from coec.calibration.evaluation import HIT_M, HIT_RAD, FramesPoint, Outcome, Spread
-from coec.calibration.landscape import Scan
+from coec.calibration.evaluation import HIT_RAD, Outcome
 
 DPI = 110
-
-AXIS_TITLES = ("rx pitch", "ry yaw", "rz roll", "tx right", "ty down", "tz forward")
 
 ERROR_RANGE_DEG = (0.02, 20.0)
 """Ends of the colours: what a good search scatters by, and what is lost altogether."""
@@ -50,76 +47,32 @@ def bullseye(outcomes: Sequence[Outcome], directions: Mapping[str, NDArray[np.fl
     figure.suptitle(title)
     colours = LogNorm(*ERROR_RANGE_DEG, clip=True)
     for column, (name, unit) in enumerate(directions.items()):
-        _draw_starts(_polar(figure, len(directions) + 1, column), name, unit, outcomes, colours)
-    axes = _polar(figure, len(directions) + 1, len(directions))
-    _draw_target(axes, outcomes, colours)
-    scale = figure.colorbar(
-        ScalarMappable(colours, COLOURS), ax=axes, shrink=0.7, pad=0.1, label="final rotation error, deg"
-    )
-    ticks = [tick for tick in TICKS if ERROR_RANGE_DEG[0] <= tick <= ERROR_RANGE_DEG[1]]
-    scale.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+        _draw_starts(_polar(figure, 1, len(directions) + 1, column), name, unit, outcomes, colours)
+    axes = _polar(figure, 1, len(directions) + 1, len(directions))
+    _draw_target(axes, outcomes, colours, _rim_deg(outcomes))
+    _scale(figure, [axes], colours)
     figure.legend(handles=_legend(outcomes), loc="outside lower center", ncols=4, frameon=False)
-    return _png(figure)
+    return png(figure)
 
 
-def landscape(curves: Mapping[str, Sequence[Scan]], title: str) -> bytes:
-    """Each named objective along the six axes about the reference. Several are drawn between their lowest (0) and
-    highest value (1) over all axes, so that units do not matter; one is drawn as it is."""
-    figure = Figure(figsize=(13.0, 7.0), layout="constrained")
+def compared(methods: Mapping[str, Sequence[Outcome]], directions: NDArray[np.float64], title: str) -> bytes:
+    """A column per method: above, the start directions ((n, 3) unit vectors in camera axes) coloured by where their
+    solves ended; below, where they ended. The targets have one radius, that of the worst method."""
+    figure = Figure(figsize=(5.6 * len(methods) + 1.0, 11.5), layout="constrained")
     figure.suptitle(title)
-    panels = figure.subplots(2, 3, sharey=True)
-    shared = len(curves) > 1
-    for name, scans in curves.items():
-        every = np.concatenate([scan.scores for scan in scans])
-        lowest, height = every.min(), np.ptp(every) or 1.0
-        for scan in scans:
-            axes = panels[divmod(scan.axis, 3)]
-            scale, unit = (degrees(1.0), "deg") if scan.axis < 3 else (1.0, "m")
-            scores = (scan.scores - lowest) / height if shared else scan.scores
-            best = scan.best_offset * scale
-            (line,) = axes.plot(scan.offsets * scale, scores, label=f"{name}, best at {best:+.2f} {unit}")
-            axes.plot(best, scores.max(), "o", color=line.get_color(), markersize=5)
-            axes.set_xlabel(f"{AXIS_TITLES[scan.axis]}, {unit}")
-    for axes in panels.flat:
-        axes.axvline(0.0, color="grey", linewidth=0.8, linestyle="--")
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize="small", loc="lower center")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("score, from its lowest to its highest" if shared else "score")
-    return _png(figure)
-
-
-def error_against_frames(points: Sequence[FramesPoint], with_translation: bool, title: str) -> bytes:
-    """Median and 95th percentile of the error over subsets, by the number of frames; the share of hits below."""
-    figure = Figure(figsize=(8.0 * (2 if with_translation else 1), 6.5), layout="constrained")
-    figure.suptitle(title)
-    panels = figure.subplots(2, 2 if with_translation else 1, sharex=True, squeeze=False, height_ratios=(3, 1))
-    frames = [point.frames for point in points]
-    limits = [("rotation error, deg", HIT_DEG, [_in_degrees(point.rotation_rad) for point in points])]
-    if with_translation:
-        limits.append(("translation error, m", HIT_M, [point.translation_m for point in points]))
-    for column, (label, limit, spreads) in enumerate(limits):
-        upper, lower = panels[0, column], panels[1, column]
-        upper.plot(frames, [errors.p95 for errors in spreads], "s--", label="95th percentile")
-        upper.plot(frames, [errors.median for errors in spreads], "o-", label="median")
-        upper.axhline(limit, color="grey", linewidth=0.8, linestyle=":", label=f"limit of a hit, {limit:g}")
-        upper.set_yscale("log")
-        low, high = upper.get_ylim()
-        ticks = [tick for tick in TICKS if low <= tick <= high]
-        upper.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-        upper.minorticks_off()
-        upper.set_ylabel(label)
-        upper.legend()
-        lower.plot(frames, [100.0 * point.hit_rate for point in points], "o-", color="tab:green")
-        lower.set_ylabel("hits, %")
-        lower.set_ylim(-5.0, 105.0)
-        lower.set_xscale("log")
-        lower.set_xticks(frames, [str(count) for count in frames])
-        lower.minorticks_off()
-        lower.set_xlabel("frames in the window")
-        for axes in (upper, lower):
-            axes.grid(alpha=0.3, which="both")
-    return _png(figure)
+    colours = LogNorm(*ERROR_RANGE_DEG, clip=True)
+    rim_deg = max(_rim_deg(outcomes) for outcomes in methods.values())
+    panels = []
+    for column, (name, outcomes) in enumerate(methods.items()):
+        hits = sum(outcome.hit for outcome in outcomes)
+        above, below = _polar(figure, 2, len(methods), column), _polar(figure, 2, len(methods), len(methods) + column)
+        _draw_starts(above, f"{name}: {hits} of {len(outcomes)} hit", directions, outcomes, colours)
+        _draw_target(below, outcomes, colours, rim_deg)
+        panels += [above, below]
+    _scale(figure, panels, colours)
+    every = [outcome for outcomes in methods.values() for outcome in outcomes]
+    figure.legend(handles=_legend(every), loc="outside lower center", ncols=4, frameon=False)
+    return png(figure)
 
 
 def _draw_starts(
@@ -134,10 +87,23 @@ def _draw_starts(
     axes.set_title(f"{name}\ncentre +z, rim -z", fontsize="medium")
 
 
-def _draw_target(axes: PolarAxes, outcomes: Sequence[Outcome], colours: LogNorm) -> None:
+def _rim_deg(outcomes: Sequence[Outcome]) -> float:
+    """See `TARGET_RIMS_DEG`."""
+    p95_deg = np.quantile(np.degrees([outcome.rotation_rad for outcome in outcomes]), 0.95)
+    return next(rim for rim in TARGET_RIMS_DEG if p95_deg <= rim)
+
+
+def _scale(figure: Figure, panels: Sequence[PolarAxes], colours: LogNorm) -> None:
+    scale = figure.colorbar(
+        ScalarMappable(colours, COLOURS), ax=panels, shrink=0.7, pad=0.1, label="final rotation error, deg"
+    )
+    ticks = [tick for tick in TICKS if ERROR_RANGE_DEG[0] <= tick <= ERROR_RANGE_DEG[1]]
+    scale.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+
+
+def _draw_target(axes: PolarAxes, outcomes: Sequence[Outcome], colours: LogNorm, rim_deg: float) -> None:
     errors = np.degrees(np.array([outcome.error[:3] for outcome in outcomes]))
     angle_deg = np.linalg.norm(errors, axis=1)
-    rim_deg = next(rim for rim in TARGET_RIMS_DEG if np.quantile(angle_deg, 0.95) <= rim)
     # Yaw to the right and pitch upwards, as the picture moves.
     _marks(axes, np.arctan2(errors[:, 0], errors[:, 1]), np.minimum(angle_deg, rim_deg), outcomes, colours)
     axes.plot(np.linspace(0.0, 2.0 * pi, 181), np.full(181, HIT_DEG), color="tab:green", linewidth=1.2)
@@ -190,19 +156,16 @@ def _edge(accepted: bool) -> str:
     return "black" if accepted else "red"
 
 
-def _polar(figure: Figure, columns: int, column: int) -> PolarAxes:
-    axes = figure.add_subplot(1, columns, column + 1, projection="polar")
+def _polar(figure: Figure, rows: int, columns: int, index: int) -> PolarAxes:
+    axes = figure.add_subplot(rows, columns, index + 1, projection="polar")
     if not isinstance(axes, PolarAxes):
         raise TypeError(f"matplotlib made {type(axes).__name__} of a polar projection")
     return axes
 
 
-def _in_degrees(errors: Spread) -> Spread:
-    return Spread(degrees(errors.median), degrees(errors.p95), degrees(errors.max))
-
-
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """The figure as a file; equal figures give equal bytes."""
     stream = io.BytesIO()
-    # Without the name of the software and its version: equal figures give equal bytes.
+    # Without the name of the software and its version.
     figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
     return stream.getvalue()

@@ -126,13 +126,32 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class FramesPoint:
-    """Errors over several subsets of one number of frames: all of them, hits and misses."""
+    """Errors over several subsets of one number of frames: all of them, hits and misses.
+
+    `sigma_rad` is the rotation's standard deviation as the solves claim it (median; NaN where none does): the root of
+    the sum of the variances about the three axes, to be held against the errors.
+    """
 
     frames: int
     subsets: int
     hit_rate: float
     rotation_rad: Spread
     translation_m: Spread
+    sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class SlicePoint:
+    """Errors over several slices of one length, seconds, with so many frames (median): hits and misses."""
+
+    length_s: float
+    slices: int
+    frames: float
+    solves: int
+    hit_rate: float
+    rotation_rad: Spread
+    translation_m: Spread
+    sigma_rad: float
 
 
 def judge(trial: Trial, reference: Matrix4, dof: int) -> Outcome:
@@ -194,6 +213,22 @@ def frames_point(frames: int, outcomes: Sequence[Outcome]) -> FramesPoint:
         hit_rate=sum(outcome.hit for outcome in outcomes) / len(outcomes),
         rotation_rad=spread(outcome.rotation_rad for outcome in outcomes),
         translation_m=spread(outcome.translation_m for outcome in outcomes),
+        sigma_rad=_claimed_rotation_rad(outcomes),
+    )
+
+
+def slice_point(length_s: float, slices: Sequence[tuple[int, Sequence[Outcome]]]) -> SlicePoint:
+    """What the outcomes say of slices of one length: the frames of each, and its outcomes; at least one in all."""
+    outcomes = [outcome for _, of_slice in slices for outcome in of_slice]
+    return SlicePoint(
+        length_s=length_s,
+        slices=len(slices),
+        frames=float(np.median([frames for frames, _ in slices])),
+        solves=len(outcomes),
+        hit_rate=sum(outcome.hit for outcome in outcomes) / len(outcomes),
+        rotation_rad=spread(outcome.rotation_rad for outcome in outcomes),
+        translation_m=spread(outcome.translation_m for outcome in outcomes),
+        sigma_rad=_claimed_rotation_rad(outcomes),
     )
 
 
@@ -222,6 +257,13 @@ def _claimed(hits: Sequence[Outcome]) -> NDArray[np.float64]:
     claims = np.array([hit.trial.estimate.sigma for hit in hits if hit.trial.estimate is not None]).reshape(-1, 6)
     known = [column[np.isfinite(column)] for column in claims.T]
     return np.array([np.median(column) if len(column) else np.nan for column in known])
+
+
+def _claimed_rotation_rad(outcomes: Sequence[Outcome]) -> float:
+    """Median of the claims that there are."""
+    sigmas = [outcome.trial.estimate.sigma[:3] for outcome in outcomes if outcome.trial.estimate is not None]
+    claims = [float(np.linalg.norm(sigma)) for sigma in sigmas if np.isfinite(sigma).all()]
+    return float(np.median(claims)) if claims else float("nan")
 
 
 def _unknown() -> NDArray[np.float64]:

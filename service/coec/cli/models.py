@@ -8,20 +8,15 @@ from coec.adapters.depth import models_folder
 from coec.adapters.model_cards import find_card, list_models
 from coec.adapters.onnx_depth import file_identity
 from coec.cli import console
-from coec.errors import ModelError, UsageError
+from coec.errors import ModelError
 
 
-def run(action: str | None, file: Path | None, *, as_json: bool) -> int:
-    """Lists the built-in cards, or shows the card of a file.
+def show(file: Path, *, as_json: bool) -> int:
+    """The card of a file.
 
     Raises:
-        UsageError: another action, or no file.
         ModelError: the file is absent or has no card.
     """
-    if action is None:
-        return _list(as_json)
-    if action != "show" or file is None:
-        raise UsageError("write `coec models`, or `coec models show FILE.onnx`")
     if not file.is_file():
         raise ModelError(f"there is no file {file}")
     digest, identity = file_identity(file)
@@ -34,7 +29,8 @@ def run(action: str | None, file: Path | None, *, as_json: bool) -> int:
     return 0
 
 
-def _list(as_json: bool) -> int:
+def run(*, as_json: bool) -> int:
+    """Lists the built-in cards."""
     cards = list_models()
     if as_json:
         folder = str(models_folder())

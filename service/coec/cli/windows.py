@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from coec.errors import SourceError, UsageError
 from coec.geometry import se3
 from coec.sources import open_source
 from coec.sources.spec import parse_spec
+
+WHOLE = (0.0, math.inf)
+"""Seconds after the first camera frame that hold all of a recording."""
 
 RECORDED_GAP_S = 1e9
 """Frames that were chosen from a recording may be any time apart; its order is already certain."""
@@ -38,9 +42,16 @@ class Loaded:
     unpaired: dict[str, int]
 
 
-def load(source: str, frames: int | None, default_frames: int, heard: Callable[[int, int], None]) -> Loaded:
+def load(
+    source: str,
+    frames: int | None,
+    default_frames: int,
+    heard: Callable[[int, int], None],
+    between_s: tuple[float, float] = WHOLE,
+) -> Loaded:
     """The window of a recorded window's file as it is, of any other recording by choosing `frames` (at most
-    `default_frames` if None) camera frames evenly and pairing them. `heard(done, total)` counts camera frames.
+    `default_frames` if None) camera frames evenly and pairing them. `heard(done, total)` counts camera frames. Only
+    camera frames that were taken `between_s` seconds after the first one are looked at.
 
     Raises:
         UsageError, SourceError, WindowError: see `open_source`; no camera frame found a sweep.
@@ -53,9 +64,10 @@ def load(source: str, frames: int | None, default_frames: int, heard: Callable[[
         and spec.path.is_file()
         and is_window(spec.path)
     ):
-        return _recorded(spec.path, frames)
+        return _recorded(spec.path, frames, between_s)
     recording = open_source(source)
-    chosen = evenly(len(recording.camera_stamps_ns), frames or default_frames)
+    within = _within(recording.camera_stamps_ns, between_s)
+    chosen = [within[index] for index in evenly(len(within), frames or default_frames)]
     pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
     pairs: list[FramePair] = []
     for message in recording.messages(chosen):
@@ -110,8 +122,18 @@ def rotation_error_deg(T_a: Matrix4, T_b: Matrix4) -> float:
     return float(np.degrees(se3.rotation_angle_rad(T_a @ se3.inverse(T_b))))
 
 
-def _recorded(path: Path, frames: int | None) -> Loaded:
+def _within(stamps_ns: Sequence[int], between_s: tuple[float, float]) -> list[int]:
+    """Indices of the stamps, ascending nanoseconds, so many seconds after the first of them."""
+    first_s, last_s = between_s
+    return [index for index, stamp in enumerate(stamps_ns) if first_s <= (stamp - stamps_ns[0]) * 1e-9 <= last_s]
+
+
+def _recorded(path: Path, frames: int | None, between_s: tuple[float, float]) -> Loaded:
     window, configuration = read_window(path)
+    within = _within([pair.stamp_ns for pair in window.pairs], between_s)
+    if not within:
+        raise SourceError(f"{path}: no pair was recorded {between_s[0]:g} to {between_s[1]:g} s after the first")
+    window = replace(window, pairs=tuple(window.pairs[index] for index in within))
     if frames is not None:
         window = replace(window, pairs=tuple(window.pairs[index] for index in evenly(len(window.pairs), frames)))
     result = read_result(path)

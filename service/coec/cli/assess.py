@@ -1,0 +1,184 @@
+"""`coec models assess`: how good a depth network is for this purpose, before it goes on a vehicle."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from coec.adapters.depth import STEREO, CachedDepth, open_depth
+from coec.adapters.evaluation_report import number
+from coec.adapters.images import GreyImages, decode_bgr
+from coec.calibration import depth_quality
+from coec.calibration.depth_quality import DepthQuality
+from coec.calibration.estimators import Sight, look
+from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.values import Window
+from coec.cli import calibrate as calibrate_command
+from coec.cli import console, files, windows
+from coec.cli.evaluation_bench import Stages
+from coec.config import LimitsConfig, WindowConfig
+from coec.errors import CalibrationError, DecodeError
+from coec.schemas.base import to_json
+from coec.schemas.evaluation import DepthFrame, Maybe3, ModelAssessment
+from coec.schemas.replies import Vector3
+
+STAGES = 3
+"""Steps of which an assessment tells."""
+
+STYLES = {"good": "bold green", "usable_in_fused": "bold yellow", "do_not_use": "bold red"}
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    model: str
+    source: str
+    frames: int | None = None
+    output: Path | None = None
+    as_json: bool = False
+
+
+def run(options: Options) -> int:
+    """Prints the assessment; 1 if the network is of no use on this recording.
+
+    Raises:
+        CoecError: no such network or source, or nothing to compare.
+    """
+    with console.progress() as bars:
+        stages = Stages(bars)
+        load = stages.begin("load", None)
+        loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        window = loaded.window
+        asked = calibrate_command.Options(source=options.source, depth=options.model, objective="mi", dof=3)
+        configuration = calibrate_command.configuration_of(asked, loaded.configuration)
+        depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
+        took_ms = _infer(window, depth, stages)
+        sight = look(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
+        quality = depth_quality.assess(sight, configuration, stages.begin("compare", STAGES))
+        if options.output is not None:
+            draw = stages.begin("draw", None)
+            _write_pictures(options.output, options, sight, quality)
+            draw(1, "")
+        elapsed_s = stages.elapsed_s()
+    timed_ms: list[float | None] = took_ms if options.model != STEREO else [None] * len(took_ms)
+    report = _report(options, window, depth.identity, quality, timed_ms, elapsed_s)
+    if options.output is not None:
+        files.write(options.output / "report.json", to_json(report))
+    if options.as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        _show(report)
+    return 1 if report.suitability == "do_not_use" else 0
+
+
+def _infer(window: Window, depth: DepthModel, stages: Stages) -> list[float | None]:
+    """Milliseconds of every frame, decoding included.
+
+    Raises:
+        CalibrationError: a frame has no depth.
+    """
+    heard = stages.begin("depth", len(window.pairs))
+    took_ms: list[float | None] = []
+    for done, pair in enumerate(window.pairs, start=1):
+        began_s = time.perf_counter()
+        try:
+            depth.infer(pair.camera)
+        except DecodeError as error:
+            raise CalibrationError(f"no depth for the camera frame at {pair.stamp_ns} ns: {error}") from error
+        took_ms.append(1e3 * (time.perf_counter() - began_s))
+        heard(done, "")
+    return took_ms
+
+
+def _write_pictures(folder: Path, options: Options, sight: Sight, quality: DepthQuality) -> None:
+    # matplotlib takes a second to import.
+    from coec.adapters import depth_plots
+
+    name = f"{Path(options.model).name} on {sight.window.window_id}"
+    _, sentence = depth_quality.suitability(quality)
+    files.write(folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames"))
+    files.write(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
+    index = len(sight.window.pairs) // 2
+    frame, pairing = sight.window.pairs[index].camera, quality.pairings[index]
+    title = f"{name}, frame at {frame.stamp_ns} ns: rank correlation {pairing.rank_correlation:+.2f}"
+    picture = depth_plots.frame(
+        decode_bgr(frame.image, LimitsConfig()), sight.depth.infer(frame).values, pairing, title
+    )
+    files.write(folder / "frame.png", picture)
+
+
+def _report(
+    options: Options,
+    window: Window,
+    identity: str,
+    quality: DepthQuality,
+    took_ms: list[float | None],
+    elapsed_s: dict[str, float],
+) -> ModelAssessment:
+    judged, sentence = depth_quality.suitability(quality)
+    timed = [value for value in took_ms if value is not None]
+    return ModelAssessment(
+        model=options.model,
+        source=options.source,
+        window_id=window.window_id,
+        pairs=len(window.pairs),
+        depth_identity=identity,
+        suitability=judged.value,
+        verdict=sentence,
+        rank_correlation=number(quality.rank_correlation),
+        covered=quality.covered,
+        inference_ms=float(np.median(timed)) if timed else None,
+        mi=quality.mi,
+        mi_of_unrelated=quality.mi_of_unrelated,
+        mi_over_unrelated=quality.mi_over_unrelated,
+        bias_deg=cast("Vector3", tuple(np.degrees(quality.bias).tolist())),
+        half_width_deg=cast("Maybe3", tuple(number(degrees(width)) for width in quality.half_width)),
+        # Per square degree.
+        peakedness_per_deg2=cast("Vector3", tuple((quality.peakedness / degrees(1.0) ** 2).tolist())),
+        search_deg=depth_quality.SEARCH_DEG,
+        frames=tuple(
+            DepthFrame(
+                stamp_ns=pair.stamp_ns,
+                points=len(pairing.value),
+                covered=pairing.covered,
+                rank_correlation=number(pairing.rank_correlation),
+                inference_ms=took,
+            )
+            for pair, pairing, took in zip(window.pairs, quality.pairings, took_ms, strict=True)
+        ),
+        elapsed_s=elapsed_s,
+    )
+
+
+def _show(report: ModelAssessment) -> None:
+    console.show(f"{Path(report.model).name} on {report.window_id}: {report.pairs} pairs")
+    console.show(report.verdict, STYLES[report.suitability])
+    figures = console.table("figure", "value", "unit", right=(1,))
+    figures.add_row("rank correlation with inverse range", console.figure(report.rank_correlation, 2, sign=True), "")
+    figures.add_row("points in view with a value", console.figure(100 * report.covered, 1), "%")
+    figures.add_row("MI at the calibration", console.figure(report.mi), "nats")
+    figures.add_row("MI with other frames' maps", console.figure(report.mi_of_unrelated), "nats")
+    figures.add_row("ratio of the two", console.figure(report.mi_over_unrelated, 2), "")
+    figures.add_row("inference of one frame", console.figure(report.inference_ms, 1), "ms")
+    console.out.print(figures)
+    axes = console.table("MI about", "optimum", "half-width of the peak", "f''/f per deg²", "unit", right=(1, 2, 3))
+    for axis in range(3):
+        axes.add_row(
+            console.AXIS_NAMES[axis],
+            console.figure(report.bias_deg[axis], 2, sign=True),
+            console.figure(report.half_width_deg[axis], 1),
+            console.figure(report.peakedness_per_deg2[axis], 4),
+            "deg",
+        )
+    console.out.print(axes)
+    worst = min(report.frames, key=lambda frame: abs(frame.rank_correlation or 0.0))
+    console.show(
+        f"worst frame: {worst.stamp_ns} ns, rank correlation {console.figure(worst.rank_correlation, 2, sign=True)}"
+    )
+    console.show("  ".join(f"{stage} {seconds:.1f} s" for stage, seconds in report.elapsed_s.items()))

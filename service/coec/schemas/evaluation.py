@@ -1,0 +1,164 @@
+"""Documents of `coec evaluate --json` and `coec models assess --json`.
+
+Angles in degrees, lengths in metres, axes rx ry rz tx ty tz about and along the camera axes. A number that could not be
+computed is null.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from coec.schemas.base import Message, Part
+from coec.schemas.replies import Count, Counts, Maybe6, Vector3, Vector6
+
+
+class Spread(Part):
+    """Of a figure over the starts; null when it could not be computed."""
+
+    median: float | None
+    p95: float | None = Field(description="95th percentile, interpolated linearly")
+    max: float | None
+
+
+class VerdictCounts(Part):
+    """Starts by decision of the self-diagnosis and by truth."""
+
+    accepted_hits: Count
+    accepted_misses: Count = Field(description="the dangerous ones: wrong, and would be served")
+    failed_hits: Count
+    failed_misses: Count
+
+
+class FramesPoint(Part):
+    """Errors over several subsets of one number of frames, hits and misses."""
+
+    frames: Count
+    subsets: Count
+    hit_rate: float
+    rotation_deg: Spread
+    translation_m: Spread
+    sigma_deg: float | None = Field(description="standard deviation of the rotation that the solves claim, median")
+
+
+class SlicePoint(Part):
+    """Errors over several slices of one length, hits and misses."""
+
+    length_s: float = Field(ge=0, description="seconds of recording that the frames were taken from")
+    slices: Count = Field(description="of this length, at different places of the recording")
+    pairs: float = Field(ge=0, description="camera-LiDAR pairs in a slice, median")
+    solves: Count
+    hit_rate: float = Field(ge=0, le=1)
+    rotation_deg: Spread
+    translation_m: Spread
+    sigma_deg: float | None = Field(description="standard deviation of the rotation that the solves claim, median")
+
+
+Counts6 = tuple[Count, Count, Count, Count, Count, Count]
+
+
+class HalvesReport(Part):
+    """Solves on disjoint halves of the frames against each other: rx ry rz (deg), tx ty tz (m)."""
+
+    splits: Count
+    pairs: Count = Field(description="camera-LiDAR pairs in each half")
+    solved: Count = Field(description="splits with a result from both halves; the figures are those of these")
+    accepted: Count = Field(description="splits of which both results were accepted")
+    hits: Count = Field(description="splits of which both results hit the source's calibration")
+    rms: Maybe6 = Field(description="root mean square difference; null on axes that were not searched")
+    largest: Maybe6 = Field(description="largest absolute difference")
+    sigma: Maybe6 = Field(description="standard deviation of the difference that the halves claim, median")
+    claimed: Counts6 = Field(description="splits in which both halves claim a standard deviation")
+    covered: Maybe6 = Field(description="share of these whose difference lies within 3 of them")
+
+
+class EvaluationReport(Message):
+    """What `coec evaluate --json` prints: solves from starts all around the source's calibration, on one window."""
+
+    source: str
+    vehicle: str
+    pair: str
+    window_id: str
+    pairs: Count = Field(description="camera-LiDAR pairs in the window")
+    camera_model: str
+    objective: str
+    dof: Literal[3, 6]
+    start_rotation_deg: float = Field(description="radius of the sphere of starts")
+    start_translation_m: float = Field(description="radius of the sphere of starts")
+    search_rotation_deg: float = Field(description="half-width of the search box; widened to hold the starts")
+    search_translation_m: float = Field(description="likewise; 0 with 3 dof")
+    hit_rotation_deg: float = Field(description="a hit ends nearer to the source's calibration than this")
+    hit_translation_m: float | None = Field(description="and, with 6 dof, than this; null with 3 dof")
+    starts: Count
+    hits: Count
+    hit_rate: float = Field(ge=0, le=1)
+    rotation_deg: Spread = Field(description="error against the source's calibration, all starts")
+    translation_m: Spread = Field(description="error against the source's calibration, all starts")
+    median: Vector6 = Field(description="median error of all starts: rx ry rz (deg), tx ty tz (m)")
+    bias: Maybe6 = Field(description="mean error of the hits: rx ry rz (deg), tx ty tz (m); null without a hit")
+    std: Maybe6 = Field(description="standard deviation of the hits about it; null below two hits")
+    rms: Maybe6 = Field(description="root mean square error of the hits; null without a hit")
+    sigma: Maybe6 = Field(description="median of the standard deviations that the hits claim; null where none")
+    from_reference: Vector6 = Field(description="error of a solve that starts at the source's calibration (deg, m)")
+    solve_s: Spread = Field(description="one solve, without reading the source and inferring depth, s")
+    evaluations: Spread = Field(description="of the objective, per solve")
+    classified_correctly: float = Field(ge=0, le=1, description="share of starts whose verdict agrees with hit or miss")
+    verdicts: VerdictCounts
+    stop_reasons: Counts = Field(description="starts by the reason for which their search ended")
+    worst_start: Count = Field(description="index of the start that ended furthest from a hit")
+    frames: tuple[FramesPoint, ...] = Field(description="error against the number of frames; empty if not asked for")
+    slices: tuple[SlicePoint, ...] = Field(description="error against the length of the slice; empty if not asked for")
+    halves: HalvesReport | None = Field(description="agreement of disjoint halves; null if not asked for")
+    depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
+    config_hash: str = Field(description="of everything that decides the results, but for the start")
+    elapsed_s: dict[str, float] = Field(description="by stage, s")
+
+
+class ComparisonReport(Message):
+    """What `coec evaluate --objective all --json` prints: every method on the same window and from the same starts."""
+
+    source: str
+    methods: dict[str, EvaluationReport] = Field(description="by the name of the objective")
+    not_evaluated: dict[str, str] = Field(description="objectives that this source does not allow, and why")
+    elapsed_s: dict[str, float] = Field(description="by stage, s")
+
+
+Maybe3 = tuple[float | None, float | None, float | None]
+
+Suitability = Literal["good", "usable_in_fused", "do_not_use"]
+
+
+class DepthFrame(Part):
+    """A depth map against the sweep of its frame."""
+
+    stamp_ns: int
+    points: Count = Field(description="LiDAR points in view that fall on a value of the map")
+    covered: float = Field(ge=0, le=1, description="share of the points in view that do")
+    rank_correlation: float | None = Field(description="Spearman's, of the map with inverse range; null below 2 points")
+    inference_ms: float | None = Field(description="null where the map came with the frame")
+
+
+class ModelAssessment(Message):
+    """What `coec models assess --json` prints: how good a depth network is for this purpose, on one window at the
+    source's calibration. Signs of rank correlations: + for networks that give inverse depth, - for depth."""
+
+    model: str
+    source: str
+    window_id: str
+    pairs: Count = Field(description="camera-LiDAR pairs in the window")
+    depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
+    suitability: Suitability
+    verdict: str = Field(description="one sentence for people")
+    rank_correlation: float | None = Field(description="median over the frames")
+    covered: float = Field(ge=0, le=1, description="median over the frames")
+    inference_ms: float | None = Field(description="median over the frames")
+    mi: float = Field(description="mutual information at the source's calibration, nats")
+    mi_of_unrelated: float = Field(description="the same with the maps of other frames, nats")
+    mi_over_unrelated: float
+    bias_deg: Vector3 = Field(description="optimum of the mutual information from the source's calibration, rx ry rz")
+    half_width_deg: Maybe3 = Field(description="of its peak, half-way down to the unrelated, rx ry rz; null: no peak")
+    peakedness_per_deg2: Vector3 = Field(description="-f''/f at the optimum, rx ry rz")
+    search_deg: float = Field(description="half-width of the box in which the optimum was searched")
+    frames: tuple[DepthFrame, ...]
+    elapsed_s: dict[str, float] = Field(description="by stage, s")
