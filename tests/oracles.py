@@ -173,3 +173,49 @@ def alignment_sums(
             strength += weighs * e
             square += weighs**2
     return strength, square
+
+
+def doubled(values: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.float64]:
+    """An image of half the resolution, interpolated at the pixels of the whole; outside, its border is repeated."""
+    out = np.empty(shape)
+    last = np.array(values.shape) - 1
+    for pixel in np.ndindex(shape):
+        # Pixel j of the half covers the pixels 2j and 2j + 1, so its centre lies at 2j + 0.5.
+        at = np.clip((np.array(pixel) - 0.5) / 2.0, 0.0, last)
+        low = np.minimum(at.astype(int), np.maximum(last - 1, 0))
+        high, (a, b) = np.minimum(low + 1, last), at - low
+        out[pixel] = (1 - a) * ((1 - b) * values[low[0], low[1]] + b * values[low[0], high[1]])
+        out[pixel] += a * ((1 - b) * values[high[0], low[1]] + b * values[high[0], high[1]])
+    return out
+
+
+def stereographic_ray(x: float, y: float) -> NDArray[np.float64]:
+    """Unit direction of a point of the stereographic plane, tan(θ/2) from its middle at the angle θ off the axis."""
+    theta, phi = 2.0 * np.arctan(np.hypot(x, y)), np.arctan2(y, x)
+    return np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+
+
+def charted_sums(
+    p_camera: NDArray[np.float32],
+    weight_steps: NDArray[np.integer],
+    cells: NDArray[np.integer],
+    cells_per_unit: np.float32,
+    centre: NDArray[np.float32],
+) -> tuple[int, int]:
+    """Σ w·e and Σ w², in whole steps, of one frame on its chart, point by point.
+
+    p_camera (N, 3); cells (h, w): 2e + 1 where a strength of e steps is known, else 0. In single precision, as is what
+    it checks: which cell a point falls on is decided there.
+    """
+    strength, square = 0, 0
+    for (x, y, z), w in zip(p_camera, weight_steps.tolist(), strict=True):
+        with np.errstate(all="ignore"):
+            scale = cells_per_unit / (np.sqrt(x * x + y * y + z * z) + z)
+            column, row = x * scale + (centre[0] + np.float32(0.5)), y * scale + (centre[1] + np.float32(0.5))
+        if not (0.0 <= column < cells.shape[1] and 0.0 <= row < cells.shape[0]):
+            continue
+        packed = int(cells[int(row), int(column)])
+        if packed:
+            strength += w * ((packed - 1) // 2)
+            square += w * w
+    return strength, square

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.basins import ROUNDS, find_basins, sample_reach
+from coec.calibration.basins import AT_RIM, FINE, ROUNDS, at_rim, find_basins, sample_reach
 from coec.calibration.edges import EdgeWitness
 from coec.calibration.estimators import SAME_BASIN_RAD
 from coec.calibration.objective import SearchBox
 from coec.calibration.values import Matrix4, Window
 from coec.geometry import se3
-from coec.geometry.alignment import significances
+from coec.geometry.edge_charts import significances
 
 START = se3.perturbation(np.array([0.4, -0.3, 1.2, 0.5, -1.0, 2.0]))
 TURN = SearchBox(np.radians(28.0), 0.0)
@@ -87,7 +87,7 @@ def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, shar
     z = [basin.significance for basin in basins]
     assert z == sorted(z, reverse=True)
     poses = np.stack([basin.T_camera_lidar for basin in basins])
-    assert z == pytest.approx(significances(sharp_edges.levels[0], poses).tolist())
+    assert z == significances(sharp_edges.charts[FINE], poses).tolist()
     for index, a in enumerate(basins):
         for b in basins[:index]:
             assert angle_deg(a.T_camera_lidar, b.T_camera_lidar) >= np.degrees(ROUNDS[-1].apart_rad) - 1e-6
@@ -105,3 +105,21 @@ def test_basins_lie_within_the_reach(sharp_street: Window, sharp_edges: EdgeWitn
     turns, shifts = moves(np.stack([b.T_camera_lidar for b in find_basins(sharp_edges, start, BOTH)]), start)
     assert np.linalg.norm(turns, axis=1).max() <= BOTH.rotation_rad + 1e-6
     assert np.linalg.norm(shifts, axis=1).max() <= BOTH.translation_m + 2e-6
+
+
+@pytest.mark.parametrize("share", [0.5, AT_RIM - 0.01, AT_RIM + 0.01, 1.5])
+@pytest.mark.parametrize("axis", [1, 4])
+def test_a_pose_near_the_bound_of_either_reach_lies_on_the_rim(axis: int, share: float) -> None:
+    bound = BOTH.rotation_rad if axis < 3 else BOTH.translation_m
+    assert at_rim(se3.perturb(START, share * bound * np.eye(6)[axis]), START, BOTH) == (share > AT_RIM)
+
+
+def test_rotation_only_has_no_rim_of_translation() -> None:
+    assert not at_rim(se3.perturb(START, np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])), START, TURN)
+
+
+def test_same_input_same_basins_to_the_bit(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    start = away_from(sharp_street.rig.T_camera_lidar_nominal, 12.0, 3)
+    first, second = (find_basins(sharp_edges, start, BOTH) for _ in range(2))
+    assert [b.T_camera_lidar.tobytes() for b in first] == [b.T_camera_lidar.tobytes() for b in second]
+    assert [b.significance for b in first] == [b.significance for b in second]

@@ -11,15 +11,16 @@ from coec.calibration.basins import sample_reach
 from coec.calibration.calibrator import calibrate
 from coec.calibration.edges import EdgeWitness
 from coec.calibration.estimators import SAME_BASIN_RAD
-from coec.calibration.fused import OTHER_POSES, FusedObjective
+from coec.calibration.fused import OTHER_POSES, FusedObjective, Fusion, Scale
 from coec.calibration.motion import compensate
 from coec.calibration.objective import MutualInformation, SearchBox, build_mutual_information, range_and_depth
 from coec.calibration.ports import DepthModel, Silence
-from coec.calibration.values import CameraFrame, Decision, DepthMap, Estimate, FramePair, Window
+from coec.calibration.values import CameraFrame, Decision, DepthMap, Estimate, FramePair, Matrix4, Window
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
-from coec.geometry.alignment import frame_alignment, significances
+from coec.geometry.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edge_charts import significances as charted_significances
 
 FUSED = CalibrationConfig(objective=ObjectiveConfig(kind="fused"))
 SIX = CalibrationConfig(objective=ObjectiveConfig(kind="fused"), search=SearchConfig(dof=6))
@@ -57,8 +58,13 @@ def depth_witness(sharp_street: Window, stereo: DepthModel) -> MutualInformation
 
 
 @pytest.fixture(scope="module")
-def fused(sharp_street: Window, sharp_edges: EdgeWitness, depth_witness: MutualInformation) -> FusedObjective:
-    return FusedObjective(sharp_edges, depth_witness, sharp_street.T_camera_lidar_start, REACH)
+def fusion(sharp_street: Window, sharp_edges: EdgeWitness, depth_witness: MutualInformation) -> Fusion:
+    return Fusion(sharp_edges, depth_witness, sharp_street.T_camera_lidar_start, REACH)
+
+
+@pytest.fixture(scope="module")
+def fused(fusion: Fusion) -> FusedObjective:
+    return fusion.settling[0]
 
 
 def solve(window: Window, depth: DepthModel, config: CalibrationConfig = FUSED) -> Estimate:
@@ -85,23 +91,44 @@ def is_accounted_for(estimate: Estimate) -> bool:
 
 
 # ------------------------------------------------------------------------------------------------- the objective
+def z_of(edges: EdgeFrames, pose: Matrix4) -> float:
+    strength, square = frame_alignment(edges, pose)
+    return float(strength.sum() / np.sqrt(square.sum()))
+
+
 @pytest.mark.parametrize("turn_deg", [0.0, 0.4, 3.0, 20.0])
 def test_the_score_is_the_sum_of_both_witnesses_in_their_own_standard_deviations(
     sharp_street: Window,
     sharp_edges: EdgeWitness,
     depth_witness: MutualInformation,
-    fused: FusedObjective,
+    fusion: Fusion,
     turn_deg: float,
 ) -> None:
     pose = from_start(sharp_street, 1, turn_deg).T_camera_lidar_start
     others = sample_reach(sharp_street.T_camera_lidar_start, REACH, OTHER_POSES)
-    other_z = significances(sharp_edges.levels[0], others)
     other_mi = np.array([depth_witness.evaluate(other).score for other in others])
-    strength, square = frame_alignment(sharp_edges.levels[0], pose)
-    z = strength.sum() / np.sqrt(square.sum())
-    expected = (z - other_z.mean()) / other_z.std()
-    expected += (depth_witness.evaluate(pose).score - other_mi.mean()) / other_mi.std()
-    assert fused.evaluate(pose).score == pytest.approx(expected, abs=1e-6)
+    of_depth = (depth_witness.evaluate(pose).score - other_mi.mean()) / other_mi.std()
+    for objective, edges in zip(fusion.settling, (sharp_edges.whole, sharp_edges.sharp), strict=True):
+        z = significances(edges, others)
+        expected = (z_of(edges, pose) - z.mean()) / z.std() + of_depth
+        assert objective.evaluate(pose).score == pytest.approx(expected, abs=1e-6)
+    band_z = np.mean([charted_significances(chart, others) for chart in sharp_edges.charts], axis=0)
+    for objective, band in zip(fusion.ranking, (sharp_edges.bands[1], sharp_edges.bands[0]), strict=True):
+        expected = (z_of(band, pose) - band_z.mean()) / band_z.std() + of_depth
+        assert objective.evaluate(pose).score == pytest.approx(expected, abs=1e-6)
+
+
+def test_basins_are_ranked_from_coarse_to_fine_and_settled_on_the_sharpest_edges(
+    sharp_edges: EdgeWitness, fusion: Fusion
+) -> None:
+    assert [objective.step_rad for objective in fusion.ranking] == [*reversed(sharp_edges.band_blur_rad[:-1])]
+    whole, sharp = fusion.settling
+    assert sharp.step_rad < whole.step_rad == sharp_edges.whole_blur_rad <= fusion.ranking[-1].step_rad
+
+
+def test_a_score_that_does_not_vary_is_no_division_by_zero() -> None:
+    assert Scale.of(np.full(5, 3.0)).standard(3.0) == 0.0
+    assert Scale.of(np.array([1.0, 3.0])).standard(4.0) == pytest.approx(2.0)
 
 
 def test_the_frames_average_to_the_score(sharp_street: Window, fused: FusedObjective) -> None:
@@ -119,12 +146,18 @@ def test_what_is_said_about_depth_is_what_the_depth_witness_says(
     assert (both.mi, both.overlap, both.points_in_view) == (alone.mi, alone.overlap, alone.points_in_view)
 
 
-def test_the_truth_stands_out_and_other_poses_are_spread_around_nought(
-    sharp_street: Window, fused: FusedObjective
-) -> None:
-    others = [fused.rank(pose) for pose in sample_reach(sharp_street.T_camera_lidar_start, REACH, OTHER_POSES)]
-    assert np.mean(others) == pytest.approx(0.0, abs=1e-6)
-    assert fused.rank(sharp_street.T_camera_lidar_start) > max(others)
+def test_the_truth_stands_out_and_other_poses_are_spread_around_nought(sharp_street: Window, fusion: Fusion) -> None:
+    truth, others = sharp_street.T_camera_lidar_start, sample_reach(sharp_street.T_camera_lidar_start, REACH, 64)
+    depth = [fusion.depth_contrast(pose) for pose in others]
+    assert np.mean(depth) == pytest.approx(0.0, abs=1e-6)
+    assert np.std(depth) == pytest.approx(1.0, abs=1e-6)
+    # Counted in deviations of the charts, of which there are two to three bands.
+    edges = [fusion.edge_contrast(pose) for pose in others]
+    assert abs(np.mean(edges)) < 0.2
+    assert 0.7 < np.std(edges) < 1.3
+    assert fusion.edge_contrast(truth) > max(edges)
+    assert fusion.rank(truth) == fusion.edge_contrast(truth) + fusion.depth_contrast(truth)
+    assert fusion.rank(truth) > max(fusion.rank(pose) for pose in others)
 
 
 def test_depth_that_does_not_vary_with_the_pose_leaves_the_edges_to_decide(
@@ -139,9 +172,8 @@ def test_depth_that_does_not_vary_with_the_pose_leaves_the_edges_to_decide(
             del frame
             return DepthMap(np.ones((40, 40), np.float32))
 
-    alone = FusedObjective(
-        sharp_edges, mutual_information_of(sharp_street, Blank()), sharp_street.T_camera_lidar_start, REACH
-    )
+    blank, start = mutual_information_of(sharp_street, Blank()), sharp_street.T_camera_lidar_start
+    alone = Fusion(sharp_edges, blank, start, REACH).settling[0]
     score = alone.evaluate(sharp_street.T_camera_lidar_start).score
     assert np.isfinite(score)
     assert score > alone.evaluate(from_start(sharp_street, 4, 3.0).T_camera_lidar_start).score

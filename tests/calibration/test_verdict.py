@@ -23,7 +23,7 @@ PLAIN = replace(PEAK, first_derivative=PEAK.first_derivative / 100, second_deriv
 VAGUE = replace(PEAK, sigma=PEAK.sigma * 100)
 UNKNOWN = replace(PEAK, sigma=np.full(6, np.nan))
 OUTSTANDING = (
-    Metric("contrast", 9.0, LIMITS.min_contrast, at_least=True),
+    Metric("edge_contrast", 9.0, LIMITS.min_edge_contrast, at_least=True),
     Metric("runner_up", 0.5, LIMITS.max_runner_up, at_least=False),
 )
 
@@ -55,7 +55,7 @@ def test_a_peak_with_everything_in_view_is_accepted() -> None:
         (verdict_on(stop=StopReason.EVALUATIONS), "evaluations_exhausted"),
         (verdict_on(curvature=VAGUE), "sigma_deg"),
         (verdict_on(curvature=UNKNOWN), "sigma_deg"),
-        (verdict_on(of_objective=(replace(OUTSTANDING[0], value=3.0),)), "contrast"),
+        (verdict_on(of_objective=(replace(OUTSTANDING[0], value=3.0),)), "edge_contrast"),
         (verdict_on(of_objective=(replace(OUTSTANDING[1], value=0.95),)), "runner_up"),
         (verdict_on(of_objective=(Metric("mi_over_unrelated", 1.1, 1.2, at_least=True),)), "mi_over_unrelated"),
     ],

@@ -1,14 +1,14 @@
-"""The significance of range edges on edge maps against its plain form, and the climb on it."""
+"""The significance of range edges on edge maps against its plain form."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from coec.geometry import se3
-from coec.geometry.alignment import EdgeFrames, climb, frame_alignment, significances
+from coec.geometry.alignment import EdgeFrames, frame_alignment, significances
 from coec.geometry.cameras import Camera, build
 from coec.geometry.projection import project
-from oracles import alignment_sums, gaussian_blur
+from oracles import alignment_sums
 
 WIDTH, HEIGHT = 96, 64
 SENSOR = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 61.0, "cx": 47.2, "cy": 30.9}
@@ -87,70 +87,3 @@ def test_edges_laid_at_random_have_a_significance_of_about_one_however_many_are_
         assert np.mean(z) == pytest.approx(0.0, abs=4.0 / np.sqrt(60))
         # Points share pixels when there are more of them than pixels: the deviation of many is above one.
         assert 0.7 < np.std(z) < 2.5
-
-
-def aimed(seed: int = 3) -> EdgeFrames:
-    """Two frames whose maps are brightest where their points fall at `POSE`."""
-    rng = np.random.default_rng(seed)
-    camera, counts = CAMERAS["pinhole"], (60, 80)
-    uv = rng.uniform([8, 8], [WIDTH - 8, HEIGHT - 8], (sum(counts), 2))
-    depth = rng.uniform(4.0, 30.0, sum(counts))
-    rays = np.column_stack([(uv[:, 0] - 47.2) / 60.0, (uv[:, 1] - 30.9) / 61.0, np.ones(len(uv))])
-    back = se3.inverse(POSE)
-    xyz_m = (rays * depth[:, None]) @ back[:3, :3].T + back[:3, 3]
-    maps = np.zeros((2, HEIGHT, WIDTH))
-    for index, (u, v) in enumerate(np.rint(uv).astype(int)):
-        maps[int(index >= counts[0]), v, u] = 1.0
-    blurred = np.stack([gaussian_blur(frame, 2.0, 7) for frame in maps])
-    blurred = (blurred - blurred.mean(axis=(1, 2), keepdims=True)) / blurred.std(axis=(1, 2), keepdims=True)
-    return EdgeFrames(
-        camera,
-        np.ascontiguousarray(xyz_m.T.astype(np.float32)),
-        np.ones(sum(counts), np.float32),
-        np.array([0, counts[0], sum(counts)]),
-        blurred.astype(np.float32),
-    )
-
-
-def climbed(
-    frames: EdgeFrames, starts: NDArray[np.float64], steps: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return climb(frames, starts, steps, 4, np.eye(4), np.array([np.pi, 1e6]))
-
-
-def around(pose: NDArray[np.float64], angle_rad: float, count: int) -> NDArray[np.float64]:
-    axes = np.random.default_rng(5).normal(size=(count, 3))
-    axes *= angle_rad / np.linalg.norm(axes, axis=1, keepdims=True)
-    return np.stack([se3.perturb(pose, np.array([*axis, 0.0, 0.0, 0.0])) for axis in axes])
-
-
-TURNS = np.radians([0.5, 0.5, 0.5, 0.0, 0.0, 0.0])
-
-
-def test_a_climb_returns_to_the_pose_that_the_maps_were_made_for() -> None:
-    frames = aimed()
-    # Two degrees are two pixels of this camera, the width of the blur.
-    ends, _ = climbed(frames, around(POSE, np.radians(2.0), 12), TURNS)
-    errors_deg = [np.degrees(se3.rotation_angle_rad(end @ se3.inverse(POSE))) for end in ends]
-    # Half a pixel, to which the maps were rounded.
-    assert max(errors_deg) < 0.5
-
-
-def test_a_climb_never_ends_below_its_start_and_says_where_it_is() -> None:
-    frames = aimed()
-    starts = np.concatenate([around(POSE, angle, 20) for angle in (0.0, 0.05, 0.2, 0.6)])
-    before = starts.copy()
-    ends, z = climbed(frames, starts, np.array([0.01] * 3 + [0.1] * 3))
-    assert (starts == before).all()
-    assert (z >= significances(frames, starts)).all()
-    np.testing.assert_allclose(z, significances(frames, ends), atol=1e-9)
-    assert all(se3.is_rigid(end) for end in ends)
-
-
-def test_a_climb_without_steps_of_translation_turns_about_the_camera_axes_only() -> None:
-    frames = aimed()
-    starts = around(POSE, np.radians(2.0), 12)
-    ends, _ = climbed(frames, starts, TURNS)
-    moved = [end @ se3.inverse(start) for start, end in zip(starts, ends, strict=True)]
-    assert np.abs(np.array(moved)[:, :3, 3]).max() < 1e-12
-    assert np.abs(np.array(moved)[:, :3, :3] - np.eye(3)).max() > 1e-3

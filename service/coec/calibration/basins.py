@@ -7,7 +7,7 @@ finer levels with ever more edges. Nothing is drawn at random: same input, same 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import pi, radians
+from math import cos, pi, radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,36 +16,36 @@ from coec.calibration.edges import EdgeWitness
 from coec.calibration.objective import SearchBox
 from coec.calibration.values import Matrix4
 from coec.geometry import se3
-from coec.geometry.alignment import EdgeFrames, climb, significances
+from coec.geometry.edge_charts import EdgeCharts, climb, keep_apart, significances
 
-COVER_RAD = radians(1.3)
+COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
 
-MIN_COVER, MAX_COVER = 4_000, 60_000
+MIN_COVER, MAX_COVER = 10_000, 150_000
 """Poses of the cover, whatever the reach: enough for the translations of a small one, bounded time for a large one."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Round:
-    """One round of climbing: how many poses begin it, how far apart (rad), on which level, thinned or not, first step
-    (rad) and halvings of it."""
+    """One round of climbing: how many poses begin it, how far apart (rad), on the coarse or the fine chart, thinned or
+    not, first step (rad) and halvings of it."""
 
     poses: int
     apart_rad: float
-    level: int
+    chart: int
     thinned: bool
     step_rad: float
     halvings: int
 
 
+COARSE, FINE = 0, 1
+
 ROUNDS = (
-    _Round(300, radians(1.5), level=2, thinned=True, step_rad=radians(0.8), halvings=2),
-    _Round(60, radians(0.7), level=1, thinned=True, step_rad=radians(0.4), halvings=2),
-    _Round(12, radians(0.4), level=1, thinned=False, step_rad=radians(0.2), halvings=2),
-    _Round(6, radians(0.4), level=0, thinned=False, step_rad=radians(0.1), halvings=2),
+    _Round(1500, radians(0.9), COARSE, thinned=True, step_rad=radians(0.45), halvings=1),
+    _Round(300, radians(0.7), FINE, thinned=True, step_rad=radians(0.3), halvings=1),
+    _Round(24, radians(0.4), FINE, thinned=False, step_rad=radians(0.15), halvings=1),
 )
-"""Each round's steps begin at the width of its blur and end at the next one's. Measured on real recordings: with 400
-first poses the true basin was among them from every start 25° away; 300 leave a margin over the 100 that it took."""
+"""Each round's steps begin at the width of its blur and end at the next one's."""
 
 METRES_PER_RADIAN = 7.0
 """Translation step per rotation step: what moves a point 7 m away as far."""
@@ -53,7 +53,7 @@ METRES_PER_RADIAN = 7.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basin:
-    """A local maximum of the edge witness: its pose (4, 4) and its significance on the finest level."""
+    """A local maximum of the edge witness: its pose (4, 4) and its significance on the fine chart."""
 
     T_camera_lidar: Matrix4
     significance: float
@@ -78,11 +78,11 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
     The reach is a ball: so many radians about any axis, and so many metres in any direction (0: rotation only).
     """
     poses = _cover(start, reach)
-    z = significances(edges.thinned[-1], poses)
+    z = significances(edges.thinned[COARSE], poses)
     for number in ROUNDS:
         poses = poses[_apart(poses, z, number.poses, number.apart_rad)]
-        level = (edges.thinned if number.thinned else edges.levels)[number.level]
-        poses, z = _climbed(level, poses, number, start, reach)
+        charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
+        poses, z = _climbed(charts, poses, number, start, reach)
     return [Basin(poses[k], float(z[k])) for k in _apart(poses, z, len(poses), ROUNDS[-1].apart_rad)]
 
 
@@ -105,28 +105,17 @@ def _cover(start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
 
 
 def _climbed(
-    level: EdgeFrames, poses: NDArray[np.float64], number: _Round, start: Matrix4, reach: SearchBox
+    charts: EdgeCharts, poses: NDArray[np.float64], number: _Round, start: Matrix4, reach: SearchBox
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     shift_m = number.step_rad * METRES_PER_RADIAN if reach.translation_m > 0.0 else 0.0
     steps = np.array([number.step_rad] * 3 + [shift_m] * 3)
-    return climb(level, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m]))
+    return climb(charts, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m]))
 
 
-def _apart(poses: NDArray[np.float64], z: NDArray[np.float64], count: int, apart_rad: float) -> list[int]:
+def _apart(poses: NDArray[np.float64], z: NDArray[np.float64], count: int, apart_rad: float) -> NDArray[np.int64]:
     """Indices of the best poses, best first, no two closer in rotation than `apart_rad`."""
-    rotations = poses[:, :3, :3].reshape(-1, 9)
-    # The trace of R_a·R_bᵀ is the sum of the products of the entries: 1 + 2 cos(angle).
-    limit = 1.0 + 2.0 * np.cos(apart_rad)
-    free = np.ones(len(poses), np.bool_)
-    kept: list[int] = []
-    for index in np.argsort(-z, kind="stable"):
-        if not free[index]:
-            continue
-        kept.append(int(index))
-        if len(kept) == count:
-            break
-        free &= np.einsum("ni,i->n", rotations, rotations[index]) <= limit
-    return kept
+    rotations = np.ascontiguousarray(poses[:, :3, :3].reshape(-1, 9))
+    return np.asarray(keep_apart(rotations, np.argsort(-z, kind="stable"), count, 1.0 + 2.0 * cos(apart_rad)))
 
 
 def _ball(count: int) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from coec.calibration.confidence import measure_curvature
 from coec.calibration.estimators import ESTIMATORS, look
+from coec.calibration.observability import unobservable, without
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.values import Compensation, Estimate, Optimum, Window
 from coec.calibration.verdict import judge, shape_metrics
@@ -33,12 +34,16 @@ def calibrate(
     # P_i and D_i, the objective and its maximum.
     sight = look(window, depth, images, config, progress)
     found = ESTIMATORS[config.objective.kind](sight, config)
-    pose = found.search.T_camera_lidar
+    search, curvature = found.search, measure_curvature(found.objective, found.search.T_camera_lidar, dof)
+    blind = unobservable(curvature, dof, config.verdict)
+    if blind:
+        search = without(blind, search, found.objective, window.T_camera_lidar_start, config.search, progress)
+        curvature = measure_curvature(found.objective, search.T_camera_lidar, dof, blind)
+    pose = search.T_camera_lidar
     # Self-diagnosis, equation (2).
     at_optimum = found.objective.evaluate(pose)
-    curvature = measure_curvature(found.objective, pose, dof)
     metrics = (*found.metrics, *shape_metrics(at_optimum, curvature, config.verdict))
-    verdict = judge(metrics, found.search.stop_reason)
+    verdict = judge(metrics, search.stop_reason)
     progress.step("diagnosis", 1, 1)
 
     outcomes = Counter(cloud.outcome for cloud in sight.clouds)
@@ -53,15 +58,16 @@ def calibrate(
             mi=at_optimum.mi,
             overlap=at_optimum.overlap,
             points_in_view=at_optimum.points_in_view,
-            evaluations=found.search.evaluations,
-            stop_reason=found.search.stop_reason,
+            evaluations=search.evaluations,
+            stop_reason=search.stop_reason,
             first_derivative=curvature.first_derivative,
             second_derivative=curvature.second_derivative,
         ),
         verdict=verdict,
         correction=se3.difference(pose, window.rig.T_camera_lidar_nominal),
         sigma=curvature.sigma,
-        solved=np.arange(6) < dof,
+        solved=(np.arange(6) < dof) & ~np.isin(np.arange(6), blind),
+        unobservable=np.isin(np.arange(6), blind),
         compensation={outcome.value: outcomes[outcome] for outcome in Compensation},
         depth_identity=depth.identity,
         config_hash=config_hash(

@@ -7,6 +7,7 @@ sum (the sandwich estimator of maximum-likelihood theory, Huber 1967: J⁻¹·V�
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import combinations
 from math import fsum, sqrt
@@ -37,29 +38,30 @@ class Curvature:
     sigma: NDArray[np.float64]
 
 
-def measure_curvature(objective: Objective, pose: Matrix4, dof: int) -> Curvature:
-    """Central differences per frame about `pose` (4, 4) on the first `dof` axes."""
-    steps = objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)[:dof]
+def measure_curvature(objective: Objective, pose: Matrix4, dof: int, kept: Collection[int] = ()) -> Curvature:
+    """Central differences per frame about `pose` (4, 4) on the first `dof` axes, less those in `kept`."""
+    moved = [axis for axis in range(dof) if axis not in kept]
+    steps = objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)[moved]
 
     def at(offset: NDArray[np.float64]) -> NDArray[np.float64]:
         perturbation = np.zeros(6)
-        perturbation[:dof] = offset
+        perturbation[moved] = offset
         return objective.evaluate(se3.perturb(pose, perturbation)).frame_scores
 
     axes = np.diag(steps)
-    centre = at(np.zeros(dof))
+    centre = at(np.zeros(len(moved)))
     plus = np.array([at(axis) for axis in axes])
     minus = np.array([at(-axis) for axis in axes])
     gradients = (plus - minus) / (2.0 * steps[:, None])  # (dof, F)
     hessian = np.diag((plus + minus - 2.0 * centre).mean(axis=1) / steps**2)
-    for i, j in combinations(range(dof), 2):
+    for i, j in combinations(range(len(moved)), 2):
         both, against = axes[i] + axes[j], axes[i] - axes[j]
         mixed = (at(both) + at(-both) - at(against) - at(-against)).mean()
         hessian[i, j] = hessian[j, i] = mixed / (4.0 * steps[i] * steps[j])
     return Curvature(
-        first_derivative=_padded(gradients.mean(axis=1)),
-        second_derivative=_padded(-np.diag(hessian)),
-        sigma=_padded(_sandwich(gradients, -hessian)),
+        first_derivative=_padded(gradients.mean(axis=1), moved),
+        second_derivative=_padded(-np.diag(hessian), moved),
+        sigma=_padded(_sandwich(gradients, -hessian), moved),
     )
 
 
@@ -75,9 +77,10 @@ def _sandwich(gradients: NDArray[np.float64], information: NDArray[np.float64]) 
     if frames <= dof or inverse is None:
         return np.full(dof, np.nan)
     centred = [[g - fsum(row) / frames for g in row] for row in gradients.tolist()]
-    # J⁻¹·g of every frame: its own Newton step. Their spread over the root of F is that of the mean.
+    # J⁻¹·g of every frame: its own Newton step. Their spread over the root of F is that of the mean. The optimum has
+    # used up as many degrees of freedom as there are axes (MacKinnon, White 1985, "HC1").
     steps = [[fsum(inverse[i][j] * centred[j][f] for j in range(dof)) for f in range(frames)] for i in range(dof)]
-    return np.array([sqrt(fsum(s * s for s in row) / (frames - 1) / frames) for row in steps])
+    return np.array([sqrt(fsum(s * s for s in row) / (frames - dof) / frames) for row in steps])
 
 
 def _inverse(matrix: list[list[float]]) -> list[list[float]] | None:
@@ -99,5 +102,7 @@ def _inverse(matrix: list[list[float]]) -> list[list[float]] | None:
     return [[fsum(lower[k][i] * lower[k][j] for k in range(n)) for j in range(n)] for i in range(n)]
 
 
-def _padded(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.concatenate([values, np.full(6 - len(values), np.nan)])
+def _padded(values: NDArray[np.float64], axes: list[int]) -> NDArray[np.float64]:
+    padded = np.full(6, np.nan)
+    padded[axes] = values
+    return padded

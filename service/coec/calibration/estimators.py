@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import radians
 from types import MappingProxyType
@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.basins import at_rim, find_basins
+from coec.calibration.dead_regions import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.edges import build_edges
-from coec.calibration.fused import FusedObjective
+from coec.calibration.fused import FusedObjective, Fusion
 from coec.calibration.motion import CompensatedCloud, compensate
 from coec.calibration.objective import (
     Features,
@@ -26,14 +27,14 @@ from coec.calibration.objective import (
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.search import SearchResult, box_of, maximise, polish
 from coec.calibration.values import DepthMap, Matrix4, Metric, StopReason, Window
-from coec.config import CalibrationConfig
+from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
 from coec.geometry.image_edges import halved
 
 Seen = TypeVar("Seen")
 
-POLISHED_BASINS = 3
+POLISHED_BASINS = 6
 """Basins that are polished on the fused objective: the true one was never below the second place."""
 
 DEPTH_THINNING = 4
@@ -49,13 +50,14 @@ MAX_GREY_WIDTH_PX = 800
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
     """A window as an estimator sees it: its pairs, P_i as the clouds at the instants of the exposures, and how to look
-    at the images. Depth is inferred, and images are decoded, only when an estimator asks."""
+    at the images. Depth is inferred only when an estimator asks, and images are decoded once: `greys_seen`."""
 
     window: Window
     clouds: tuple[CompensatedCloud, ...]
     depth: DepthModel
     images: ImageReader
     progress: Progress
+    greys_seen: tuple[NDArray[np.uint8], ...] | None = None
 
     def depths(self) -> list[DepthMap]:
         """D_i of every pair.
@@ -71,6 +73,8 @@ class Sight:
         Raises:
             CalibrationError: an image cannot be decoded.
         """
+        if self.greys_seen is not None:
+            return list(self.greys_seen)
         return self._each("images", lambda index: self.images.grey(self.window.pairs[index].camera))
 
     def _each(self, stage: str, look: Callable[[int], Seen]) -> list[Seen]:
@@ -87,9 +91,26 @@ class Sight:
 def look(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, progress: Progress
 ) -> Sight:
-    """The window with its sweeps motion-compensated."""
+    """The window with its sweeps motion-compensated; without a mask of the rig's, with the one its frames tell."""
     clouds = tuple(compensate(pair, window.rig, enabled=config.motion_compensation) for pair in window.pairs)
-    return Sight(window, clouds, depth, images, progress)
+    sight = Sight(window, clouds, depth, images, progress)
+    return sight if window.rig.mask is not None or len(window.pairs) < MIN_FRAMES else _masked(sight)
+
+
+def _masked(sight: Sight) -> Sight:
+    try:
+        greys = tuple(sight.greys())
+    except CalibrationError:
+        return sight  # an estimator that needs the images will say so
+    moving = (
+        grey
+        for grey, pair in zip(greys, sight.window.pairs, strict=True)
+        if pair.motion is None or pair.motion.speed_mps >= MIN_SPEED_MPS
+    )
+    rig, mask = sight.window.rig, lit_pixels(moving)
+    if mask is None or mask.shape != (rig.camera.height, rig.camera.width):
+        return replace(sight, greys_seen=greys)
+    return replace(sight, window=replace(sight.window, rig=replace(rig, mask=mask)), greys_seen=greys)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,28 +157,37 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     edges = build_edges(window.pairs, [cloud.xyz_m for cloud in sight.clouds], sight.greys(), window.rig)
     basins = find_basins(edges, start, reach)
     progress.step("basins", 1, 1)
-    fused = FusedObjective(edges, depth, start, reach)
-    ranked = sorted(((fused.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
-    ends = [
-        polish(fused, basin, config.search, lambda count: progress.step("search", count, config.search.max_evaluations))
-        for _, basin in ranked[:POLISHED_BASINS]
-    ]
-    polished = [(fused.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
+    fusion = Fusion(edges, depth, start, reach)
+    ranked = sorted(((fusion.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
+    ends = [_polished(fusion.ranking, basin, config.search, progress) for _, basin in ranked[:POLISHED_BASINS]]
+    polished = [(fusion.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
     best = max(range(len(ends)), key=lambda k: polished[k][0])
-    contrast, pose = polished[best]
-    rivals = [rank for rank, other in (*polished, *ranked[POLISHED_BASINS:]) if _differ(other, pose)]
-    related = fused.edges_over_unrelated(pose)
+    found, pose = ends[best], polished[best][1]
+    contrast = fusion.edge_contrast(pose)
+    rivals = [
+        fusion.edge_contrast(other) for _, other in (*polished, *ranked[POLISHED_BASINS:]) if _differ(other, pose)
+    ]
+    limits = config.verdict
     metrics = (
-        Metric("edges_over_unrelated", related, config.verdict.min_edges_over_unrelated, at_least=True),
-        Metric("contrast", contrast, config.verdict.min_contrast, at_least=True),
-        Metric(
-            "runner_up", max(rivals, default=0.0) / max(contrast, 1e-9), config.verdict.max_runner_up, at_least=False
-        ),
+        Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
+        Metric("runner_up", max(rivals, default=0.0) / max(contrast, 1e-9), limits.max_runner_up, at_least=False),
     )
-    found = ends[best]
-    if at_rim(pose, start, reach):
+    settled = _polished(fusion.settling, pose, config.search, progress)
+    found = replace(settled, evaluations=found.evaluations + settled.evaluations)
+    if at_rim(found.T_camera_lidar, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
-    return Found(fused, found, metrics)
+    return Found(fusion.settling[-1], found, metrics)
+
+
+def _polished(
+    objectives: Sequence[FusedObjective], basin: Matrix4, config: SearchConfig, progress: Progress
+) -> SearchResult:
+    """The maximum next to a basin, from level to finer level."""
+    first, *finer = objectives
+    found = polish(first, basin, config, progress)
+    for objective in finer:
+        found = polish(objective, found.T_camera_lidar, config, progress, found.evaluations)
+    return found
 
 
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
@@ -176,9 +206,7 @@ def _by_mutual_information(frames: list[Features], sight: Sight, config: Calibra
     objective: MutualInformation = build_mutual_information(
         frames, sight.window.rig, start, box_of(config.search), config.objective
     )
-    search = maximise(
-        objective, start, config.search, lambda count: progress.step("search", count, config.search.max_evaluations)
-    )
+    search = maximise(objective, start, config.search, progress)
     mi, unrelated = objective.evaluate(search.T_camera_lidar).mi, objective.mi_of_unrelated(search.T_camera_lidar)
     ratio = Metric("mi_over_unrelated", mi / max(unrelated, 1e-12), config.verdict.min_mi_over_unrelated, at_least=True)
     return Found(objective, search, (ratio,))

@@ -6,8 +6,7 @@ network that tells nothing adds noise of one unit, a scene without edges likewis
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from math import radians
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,27 +15,23 @@ from coec.calibration.basins import sample_reach
 from coec.calibration.edges import EdgeWitness
 from coec.calibration.objective import Evaluation, MutualInformation, SearchBox
 from coec.calibration.values import Matrix4
-from coec.geometry.alignment import frame_alignment, significances
+from coec.geometry.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edge_charts import significances as charted_significances
+from coec.geometry.image_edges import BLUR_SIGMA_PX
 
 OTHER_POSES = 64
 """Poses within reach from which the mean and the standard deviation of a score are taken: known to an eighth."""
 
-UNRELATED_ROLLS = 4
-"""Other frames that each sweep is laid on to find what unrelated images give."""
-
-RANKED_LEVELS = 3
-"""Levels of the edge witness that rank basins: a pose that is right is right at every blur."""
-
 
 @dataclass(frozen=True, slots=True)
-class _Scale:
+class Scale:
     """Mean and standard deviation of a score over other poses."""
 
     mean: float
     deviation: float
 
     @classmethod
-    def of(cls, scores: NDArray[np.float64]) -> _Scale:
+    def of(cls, scores: NDArray[np.float64]) -> Scale:
         # A score that does not vary at all tells nothing; it must not divide by zero either.
         return cls(float(scores.mean()), max(float(scores.std()), 1e-9))
 
@@ -45,28 +40,26 @@ class _Scale:
 
 
 class FusedObjective:
-    """Standardised edge significance plus standardised mutual information, both per frame and in sum."""
+    """Standardised edge significance at one blur plus standardised mutual information, per frame and in sum."""
 
-    step_rad = radians(0.2)
-    """The blur of the finest level, two pixels of a camera of 600 px focal length."""
+    def __init__(self, edges: EdgeFrames, step_rad: float, depth: MutualInformation, of_edges: Scale, of_depth: Scale):
+        self._edges, self._depth = edges, depth
+        self._of_edges, self._of_depth = of_edges, of_depth
+        self._step_rad = step_rad
 
-    def __init__(self, edges: EdgeWitness, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
-        """Freezes the scales from poses within `reach` of `start`."""
-        self._edges = edges
-        self._depth = depth
-        poses = sample_reach(start, reach, OTHER_POSES)
-        self._edge_scales = [_Scale.of(significances(level, poses)) for level in edges.levels[:RANKED_LEVELS]]
-        self._depth_scale = _Scale.of(np.array([depth.evaluate(pose).score for pose in poses]))
+    @property
+    def step_rad(self) -> float:
+        """The blur of the edges, or a pixel where that is more."""
+        return self._step_rad
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
-        """The objective at `T_camera_lidar` (4, 4), on the finest level; in standard deviations."""
+        """The objective at `T_camera_lidar` (4, 4), in standard deviations."""
         depth = self._depth.evaluate(T_camera_lidar)
-        strength, square = frame_alignment(self._edges.levels[0], T_camera_lidar)
+        strength, square = frame_alignment(self._edges, T_camera_lidar)
         # Σ w·e of a frame over the root of all frames' Σ w²: the sum over the frames is the significance of the window.
         of_frames = len(strength) * strength / np.sqrt(max(float(square.sum()), 1e-9))
-        edge_scale, depth_scale = self._edge_scales[0], self._depth_scale
-        frame_scores = (of_frames - edge_scale.mean) / edge_scale.deviation
-        frame_scores = frame_scores + (depth.frame_scores - depth_scale.mean) / depth_scale.deviation
+        frame_scores = (of_frames - self._of_edges.mean) / self._of_edges.deviation
+        frame_scores = frame_scores + (depth.frame_scores - self._of_depth.mean) / self._of_depth.deviation
         return Evaluation(
             score=float(frame_scores.mean()),
             frame_scores=frame_scores,
@@ -75,22 +68,50 @@ class FusedObjective:
             points_in_view=depth.points_in_view,
         )
 
-    def rank(self, T_camera_lidar: Matrix4) -> float:
-        """How outstanding a pose is: the edge witness averaged over its levels, plus depth, in standard deviations."""
-        pose = T_camera_lidar[None]
-        edges = [
-            scale.standard(float(significances(level, pose)[0]))
-            for scale, level in zip(self._edge_scales, self._edges.levels, strict=False)
-        ]
-        return float(np.mean(edges)) + self._depth_scale.standard(self._depth.evaluate(T_camera_lidar).score)
 
-    def edges_over_unrelated(self, T_camera_lidar: Matrix4) -> float:
-        """Significance of the edges on the finest level over that of the same sweeps on the images of other frames:
-        what the layout of a road scene alone gives. Not a number for a single frame."""
-        level, pose = self._edges.levels[0], T_camera_lidar[None]
-        rolls = range(1, min(len(level.maps), UNRELATED_ROLLS + 1))
-        if not rolls:
-            return float("nan")
-        others = [replace(level, maps=np.ascontiguousarray(np.roll(level.maps, k, axis=0))) for k in rolls]
-        unrelated = float(np.mean([significances(other, pose)[0] for other in others]))
-        return float(significances(level, pose)[0]) / max(unrelated, 1.0)
+class Fusion:
+    """Both witnesses of a window, with their scales frozen from poses within reach.
+
+    Attributes:
+        ranking: what a basin is polished on before it is ranked, one after the other; the coarsest band the charts have
+            settled.
+        settling: what the best basin is polished on in the end, one after the other.
+    """
+
+    ranking: tuple[FusedObjective, ...]
+    settling: tuple[FusedObjective, FusedObjective]
+
+    def __init__(self, edges: EdgeWitness, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
+        self._edges, self._depth = edges, depth
+        poses = sample_reach(start, reach, OTHER_POSES)
+        self._of_bands = Scale.of(np.mean([charted_significances(chart, poses) for chart in edges.charts], axis=0))
+        self._of_depth = Scale.of(np.array([depth.evaluate(pose).score for pose in poses]))
+        self.ranking = tuple(
+            FusedObjective(band, blur_rad, depth, self._of_bands, self._of_depth)
+            for band, blur_rad in reversed(list(zip(edges.bands[:-1], edges.band_blur_rad[:-1], strict=True)))
+        )
+        blur_rad = edges.whole_blur_rad
+        self.settling = (
+            FusedObjective(edges.whole, blur_rad, depth, Scale.of(significances(edges.whole, poses)), self._of_depth),
+            # One pixel: the sharpest edges are narrower, but their hill has ripples of that width.
+            FusedObjective(
+                edges.sharp,
+                blur_rad / BLUR_SIGMA_PX,
+                depth,
+                Scale.of(significances(edges.sharp, poses)),
+                self._of_depth,
+            ),
+        )
+
+    def edge_contrast(self, T_camera_lidar: Matrix4) -> float:
+        """How far the edge witness, averaged over its bands, stands above other poses; standard deviations."""
+        z = [float(significances(band, T_camera_lidar[None])[0]) for band in self._edges.bands]
+        return self._of_bands.standard(float(np.mean(z)))
+
+    def depth_contrast(self, T_camera_lidar: Matrix4) -> float:
+        """How far the depth witness stands above other poses; standard deviations."""
+        return self._of_depth.standard(self._depth.evaluate(T_camera_lidar).score)
+
+    def rank(self, T_camera_lidar: Matrix4) -> float:
+        """How outstanding a pose is to both witnesses, standard deviations."""
+        return self.edge_contrast(T_camera_lidar) + self.depth_contrast(T_camera_lidar)

@@ -6,7 +6,7 @@ with a fresh quadratic model of its size. Deterministic: same objective, same ev
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from math import radians
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective import Objective, SearchBox
+from coec.calibration.ports import Progress
 from coec.calibration.values import Matrix4, StopReason
 from coec.config import SearchConfig
 from coec.geometry import se3
@@ -48,8 +49,8 @@ def box_of(config: SearchConfig) -> SearchBox:
     return SearchBox(radians(config.rotation_deg), config.translation_m if config.dof == 6 else 0.0)
 
 
-def maximise(objective: Objective, start: Matrix4, config: SearchConfig, heard: Callable[[int], None]) -> SearchResult:
-    """The pose of the highest score in the box about `start` (4, 4); `heard` is told the number of evaluations so far.
+def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progress: Progress) -> SearchResult:
+    """The pose of the highest score in the box about `start` (4, 4).
 
     Coordinates are the perturbation ξ = [rx ry rz tx ty tz] on the left of the start, about the camera axes; with three
     degrees of freedom the translation is not searched.
@@ -59,7 +60,7 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, heard: 
     def score(coordinates: NDArray[np.float64]) -> float:
         nonlocal evaluations
         evaluations += 1
-        heard(evaluations)
+        progress.step("search", evaluations, config.max_evaluations)
         return objective.evaluate(_pose(start, coordinates)).score
 
     half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
@@ -79,20 +80,34 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, heard: 
     return SearchResult(_pose(start, found), evaluations, stop_reason)
 
 
-def polish(objective: Objective, basin: Matrix4, config: SearchConfig, heard: Callable[[int], None]) -> SearchResult:
-    """The maximum next to `basin` (4, 4), which lies within a few of the objective's difference steps of it."""
-    evaluations = 0
+def polish(
+    objective: Objective,
+    basin: Matrix4,
+    config: SearchConfig,
+    progress: Progress,
+    evaluations: int = 0,
+    kept: Collection[int] = (),
+) -> SearchResult:
+    """The maximum next to `basin` (4, 4), which lies within a few of the objective's difference steps of it;
+    `evaluations` were made before. The axes in `kept` stay as they are."""
 
     def score(coordinates: NDArray[np.float64]) -> float:
         nonlocal evaluations
         evaluations += 1
-        heard(evaluations)
-        return objective.evaluate(_pose(basin, coordinates)).score
+        progress.step("search", evaluations, config.max_evaluations)
+        return objective.evaluate(_pose(basin, placed(coordinates))).score
 
-    step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)
-    found, exhausted = _bobyqa(score, np.zeros(config.dof), 4.0 * step, 4.0 * step, 0.5 * step, config)
+    moved = [axis for axis in range(config.dof) if axis not in kept]
+
+    def placed(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+        perturbation = np.zeros(6)
+        perturbation[moved] = coordinates
+        return perturbation
+
+    step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)[moved]
+    found, exhausted = _bobyqa(score, np.zeros(len(moved)), 4.0 * step, 4.0 * step, 0.5 * step, config)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
-    return SearchResult(_pose(basin, found), evaluations, stop_reason)
+    return SearchResult(_pose(basin, placed(found)), evaluations, stop_reason)
 
 
 def _bobyqa(
@@ -104,7 +119,7 @@ def _bobyqa(
     config: SearchConfig,
 ) -> tuple[NDArray[np.float64], bool]:
     """The best coordinates within `reach` of `centre` and inside the box, and whether the evaluations ran out."""
-    optimiser = nlopt.opt(nlopt.LN_BOBYQA, config.dof)
+    optimiser = nlopt.opt(nlopt.LN_BOBYQA, len(centre))
     lower, upper = np.maximum(centre - reach, -half_width), np.minimum(centre + reach, half_width)
     # The first quadratic model needs two steps of room between the bounds.
     step = np.minimum(step, (upper - lower) / 2.0)

@@ -284,7 +284,8 @@ class Estimate:
     Attributes:
         correction: (6,) rotation vector (rad) and translation (m) from the nominal calibration, about the camera axes.
         sigma: (6,) standard deviation per axis (rad, m); NaN where it was not estimated.
-        solved: (6,) bool, the axes that were searched.
+        solved: (6,) bool, the axes that were searched and found.
+        unobservable: (6,) bool, the axes that were searched but that the window does not tell: kept as before.
         compensation: how many pairs ended with which `Compensation`, by name.
         depth_identity: sha256 of the network, or `precomputed`.
         config_hash: of everything that decides the result.
@@ -298,6 +299,7 @@ class Estimate:
     correction: NDArray[np.float64]
     sigma: NDArray[np.float64]
     solved: NDArray[np.bool_]
+    unobservable: NDArray[np.bool_]
     compensation: dict[str, int]
     depth_identity: str
     config_hash: str

@@ -22,8 +22,7 @@ ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 
 _MEANING = {
     "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",
-    "edges_over_unrelated": "the sweeps fit their own images no better than those of other frames",
-    "contrast": "no pose stands out from the others",
+    "edge_contrast": "no pose stands out from the others",
     "runner_up": "ambiguous: another pose explains the window nearly as well",
     "newton_step_deg": "the objective is not at a maximum on every rotation axis",
     "newton_step_m": "the objective is not at a maximum on every translation axis",
@@ -45,17 +44,19 @@ def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictC
         Metric("sigma_deg", degrees(float(np.max(curvature.sigma[ROTATION]))), limits.max_sigma_deg, at_least=False),
         Metric("overlap", evaluation.overlap, limits.min_overlap, at_least=True),
     ]
-    if np.isfinite(curvature.first_derivative[TRANSLATION]).all():
+    if np.isfinite(curvature.first_derivative[TRANSLATION]).any():
         step_m = _newton_step(curvature, TRANSLATION)
-        sigma_m = float(np.max(curvature.sigma[TRANSLATION]))
+        sigma_m = float(np.max(curvature.sigma[TRANSLATION][np.isfinite(curvature.first_derivative[TRANSLATION])]))
         metrics.append(Metric("newton_step_m", step_m, limits.max_newton_step_m, at_least=False))
         metrics.append(Metric("sigma_m", sigma_m, limits.max_sigma_m, at_least=False))
     return tuple(metrics)
 
 
 def _newton_step(curvature: Curvature, axes: slice) -> float:
-    """Largest |f'| / f'' over some axes: how far away each axis alone puts its maximum; infinite without one."""
+    """Largest |f'| / f'' over some axes, those not searched apart: how far away each axis alone puts its maximum;
+    infinite without one."""
     first, second = curvature.first_derivative[axes], curvature.second_derivative[axes]
+    first, second = first[np.isfinite(first)], second[np.isfinite(first)]
     return float(np.max(np.abs(first) / second)) if (second > 0.0).all() else float("inf")
 
 

@@ -1,13 +1,18 @@
 """How much of an edge there is at every pixel, at several scales: what range edges are laid onto.
 
-Gradient magnitude, clipped, divided by its local mean (so that a hedge does not outshine a house), blurred with a
-Gaussian of two pixels at every level of a pyramid whose levels halve the resolution.
+Gradient magnitude, clipped, divided by its local mean (so that a hedge does not outshine a house), and of that the
+bands of a Laplacian pyramid (Burt, Adelson 1983): each level blurred by two pixels, less the next level. What is wider
+than a level's blur is the layout of the scene, rich in edges below the horizon and poor above, which fits many wrong
+poses: without it the true pose stands twice as far from the others (measured: 12 against 4.3 standard deviations on a
+suburban street, 7.5 against 3.9 in a garage, 4.9 against 1.8 on one raw fisheye frame, where the layout preferred a
+wrong pose).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit, prange
@@ -29,34 +34,89 @@ edges."""
 BLUR_SIGMA_PX = 2.0
 """Blur of each level, in pixels of that level: 2, 4, 8 ... pixels of the image."""
 
-_TAPS = 7
-_KERNEL = np.exp(-0.5 * (np.arange(-_TAPS, _TAPS + 1) / BLUR_SIGMA_PX) ** 2)
-_KERNEL /= _KERNEL.sum()
-_KERNEL = _KERNEL.astype(np.float32)
+SHARP_SIGMA_PX = 0.6
+"""Blur of the sharpest map. What lies beside an edge draws a blurred one to itself, above all the road below a kerb:
+in simulated drives through a fisheye of 4.4 px per degree the optimum is 0.3 degrees off in pitch at 2 px, 0.08 at
+0.6 px. Halves of a real window agree twice as well in roll. Narrower only aliases."""
+
+
+def _gaussian(sigma_px: float) -> NDArray[np.float32]:
+    taps = math.ceil(3.5 * sigma_px)
+    kernel = np.exp(-0.5 * (np.arange(-taps, taps + 1) / sigma_px) ** 2)
+    normalised: NDArray[np.float32] = (kernel / kernel.sum()).astype(np.float32)
+    return normalised
+
+
+_BLUR, _SHARP = _gaussian(BLUR_SIGMA_PX), _gaussian(SHARP_SIGMA_PX)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgePyramid:
-    """Level k is at 1/2^k of the resolution: (h_k, w_k) float32, zero mean and unit standard deviation over the pixels
-    that count, NaN at masked ones."""
+    """Edge maps of an image, float32: zero mean and unit deviation over the pixels that count, NaN at masked ones.
 
-    levels: tuple[NDArray[np.float32], ...]
+    Attributes:
+        bands: level k at 1/2^(finest + k) of the resolution: what is as wide as its blur.
+        whole: at the resolution of `bands[0]`: all that is as wide as its blur or wider.
+        sharp: the same, blurred by `SHARP_SIGMA_PX` only.
+    """
+
+    bands: tuple[NDArray[np.float32], ...]
+    whole: NDArray[np.float32]
+    sharp: NDArray[np.float32]
 
 
-def edge_pyramid(grey: NDArray[np.uint8], lit: NDArray[np.bool_], levels: int) -> EdgePyramid:
+def edge_pyramid(grey: NDArray[np.uint8], lit: NDArray[np.bool_], finest: int, coarsest: int) -> EdgePyramid:
     """Standardised edge maps of an image.
 
     Args:
         grey: (h, w) uint8.
         lit: (h, w) bool; False = ignore this pixel.
-        levels: number of levels.
+        finest: halvings of the resolution of the first level.
+        coarsest: halvings of the resolution of the last level.
     """
     edges = _normalised_gradient(grey, lit)
-    out = []
-    for _ in range(levels):
-        out.append(_standardised(_blurred(edges), lit))
+    for _ in range(finest):
         edges, lit = halved(edges), _halved_mask(lit)
-    return EdgePyramid(tuple(out))
+    sharp = _smooth(edges, lit, _SHARP)
+    smooth, masks = [], []
+    for _ in range(finest, coarsest + 2):
+        smooth.append(_smooth(edges, lit, _BLUR))
+        masks.append(lit)
+        edges, lit = halved(edges), _halved_mask(lit)
+    bands = [fine - _doubled(coarse, fine.shape[0], fine.shape[1]) for fine, coarse in pairwise(smooth)]
+    return EdgePyramid(
+        bands=tuple(_standardised(band, mask) for band, mask in zip(bands, masks, strict=False)),
+        whole=_standardised(smooth[0], masks[0]),
+        sharp=_standardised(sharp, masks[0]),
+    )
+
+
+def _smooth(edges: NDArray[np.float32], lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Blurred over the pixels that count only: a mask is no valley."""
+    if lit.all():
+        return _blurred(edges, kernel)
+    share: NDArray[np.float32] = np.maximum(_blurred(lit.astype(np.float32), kernel), np.float32(1e-3))
+    smooth: NDArray[np.float32] = _blurred(np.where(lit, edges, np.float32(0.0)), kernel) / share
+    return smooth
+
+
+@njit(cache=True, parallel=True)
+def _doubled(values: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """(height, width): interpolated between the pixels of an image that `halved` made; its border is repeated."""
+    h, w = values.shape
+    out = np.empty((height, width), np.float32)
+    near, far = np.float32(0.75), np.float32(0.25)
+    for y in prange(height):
+        # Pixel j of the half lies between the pixels 2·j and 2·j + 1 of the whole; a last odd pixel has none.
+        a = min(y // 2, h - 1)
+        b = min(max(y // 2 - 1 if y % 2 == 0 else a + 1, 0), h - 1)
+        for x in range(width):
+            c = min(x // 2, w - 1)
+            d = min(max(x // 2 - 1 if x % 2 == 0 else c + 1, 0), w - 1)
+            out[y, x] = near * (near * values[a, c] + far * values[a, d]) + far * (
+                near * values[b, c] + far * values[b, d]
+            )
+    return out
 
 
 def _normalised_gradient(grey: NDArray[np.uint8], lit: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -110,23 +170,24 @@ def _local_mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return values
 
 
-def _blurred(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    return _blurred_along_rows(_blurred_along_rows(values).T.copy()).T.copy()
+def _blurred(values: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    return _blurred_along_rows(_blurred_along_rows(values, kernel).T.copy(), kernel).T.copy()
 
 
 @njit(cache=True, parallel=True)
-def _blurred_along_rows(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _blurred_along_rows(values: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
     """Gaussian along the second axis; the border pixel is repeated outside."""
     h, w = values.shape
+    taps = kernel.shape[0] // 2
     out = np.empty((h, w), np.float32)
     for y in prange(h):
-        row = np.empty(w + 2 * _TAPS, np.float32)
-        row[:_TAPS] = values[y, 0]
-        row[_TAPS : _TAPS + w] = values[y]
-        row[_TAPS + w :] = values[y, w - 1]
+        row = np.empty(w + 2 * taps, np.float32)
+        row[:taps] = values[y, 0]
+        row[taps : taps + w] = values[y]
+        row[taps + w :] = values[y, w - 1]
         total = np.zeros(w, np.float32)
-        for k in range(2 * _TAPS + 1):
-            tap, shifted = _KERNEL[k], row[k : k + w]
+        for k in range(2 * taps + 1):
+            tap, shifted = kernel[k], row[k : k + w]
             for x in range(w):
                 total[x] += tap * shifted[x]
         out[y] = total
