@@ -25,7 +25,8 @@ def fake_worker_command(fault: str, marker: Path) -> list[str]:
     """Command of a worker that answers every job with its window's name, except for one fault.
 
     `fault` is `none`, or one of crash, hang, grow, half (half a message), refuse: done at every solve; with the suffix
-    `-once`, only at the first (the file `marker` remembers over processes); `unusable` or `stillborn`: at the start.
+    `-once`, only at the first (the file `marker` remembers over processes); `unusable` or `stillborn`: at the start;
+    `sick` (dies) or `sick-refuse`: at whatever is no solve.
     """
     return [sys.executable, __file__, fault, str(marker)]
 
@@ -41,8 +42,11 @@ def _serve(fault: str, marker: Path, link: Link) -> None:
     hoard: list[bytearray] = []
     while True:
         message = link.receive()
-        if message["kind"] == "prefetch":
-            link.send({"kind": "done"})
+        if message["kind"] != "solve":
+            if fault == "sick":
+                os.kill(os.getpid(), signal.SIGKILL)
+            refusal = {"kind": "refused", "code": "bad_window", "text": "empty"}
+            link.send(refusal if fault == "sick-refuse" else {"kind": "done", "echo": message})
             continue
         kind, _, once = fault.partition("-")
         if once and marker.exists():

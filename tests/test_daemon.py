@@ -274,11 +274,18 @@ def test_every_wrong_question_gets_an_answer(tmp_path: Path, endpoint: str) -> N
             (KEYS.window("front", "front-12"), "", "not_found"),
             (KEYS.window("front", "..-12"), "", "not_found"),
             (KEYS.command("front", "dance"), "", "bad_request"),
-            (KEYS.command("front", "apply"), "", "not_supported"),
-            (KEYS.overlay("front"), "", "not_supported"),
+            (KEYS.command("front", "apply"), "", "nothing_pending"),
+            (KEYS.command("front", "rollback"), "", "not_found"),
+            (KEYS.command("front", "commission"), "", "too_few_windows"),
+            (KEYS.overlay("front"), "", "not_found"),
+            (KEYS.overlay("front"), ";at=somewhere", "bad_request"),
+            (KEYS.evidence_of("front", "front-12"), "", "not_found"),
+            (KEYS.evidence_of("front", "front-12"), ";overlay=both", "bad_request"),
         ]:
             assert served.get(key, parameters).get("code") == code, key
-        assert served.get(KEYS.command("front", "calibrate"), payload=b"x")["code"] == "bad_request"
+        assert served.get(KEYS.evidence("front"))["events"] == []
+        for name, payload in (("calibrate", b"x"), ("reset", b'{"all":true}'), ("hold", b'{"release":1}')):
+            assert served.get(KEYS.command("front", name), payload=payload)["code"] == "bad_request"
         few = served.get(KEYS.command("front", "calibrate"))
         assert (few["accepted"], few["text"]) == (False, "3 more pairs needed.")
         keys = {str(reply.ok.key_expr) for reply in served.client.get(f"{root}/*/health") if reply.ok}

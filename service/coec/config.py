@@ -215,15 +215,29 @@ class VerdictConfig(Stage):
     min_overlap: float = Field(
         default=0.5, ge=0, le=1, description="points in view over the most any pose of the box sees"
     )
-    min_edges_over_unrelated: float = Field(
-        default=1.5, gt=0, description="significance of the edges over that with other frames' images (fused)"
-    )
-    min_contrast: float = Field(
-        default=4.0, gt=0, description="fused score, in standard deviations of the scores of other poses within reach"
+    min_edge_contrast: float = Field(
+        default=6.0, gt=0, description="edge significance, in standard deviations of that of other poses (fused)"
     )
     max_runner_up: float = Field(
-        default=0.9, gt=0, le=1, description="fused score of the next best basin over the best one's; above: ambiguous"
+        default=0.85,
+        gt=0,
+        le=1,
+        description="edge contrast of the next best basin over the best one's; above: ambiguous",
     )
+
+
+class TimeOffsetConfig(Stage):
+    """When the offset between the clocks of camera and LiDAR counts as observed."""
+
+    reach_s: float = Field(default=0.1, gt=0, le=0.5, description="largest offset looked for, s")
+    min_turn_spread_deg_per_s: float = Field(
+        default=2.5, gt=0, description="least spread of the turn rate over the frames; less is a straight drive"
+    )
+    translation_sigma_m: float = Field(
+        default=0.05, ge=0, description="how well the mount's position is known: driving on, 5 cm look like 5 ms"
+    )
+    floor_s: float = Field(default=0.001, ge=0, description="time of exposure, trigger and ego-motion are off by, s")
+    max_sigma_s: float = Field(default=0.008, gt=0, description="largest standard deviation of an offset observed, s")
 
 
 class CalibrationConfig(Stage):
@@ -233,7 +247,65 @@ class CalibrationConfig(Stage):
     objective: ObjectiveConfig = ObjectiveConfig()
     search: SearchConfig = SearchConfig()
     verdict: VerdictConfig = VerdictConfig()
+    time_offset: TimeOffsetConfig = TimeOffsetConfig()
     motion_compensation: bool = True
+
+
+class FusionConfig(Stage):
+    """How accepted windows combine into the extrinsic that is served. Rotations per axis in degrees, translations in
+    metres."""
+
+    prior_deg: float = Field(default=10.0, gt=0, le=180, description="how far the first extrinsic may be off")
+    prior_m: float = Field(default=0.3, gt=0, le=10, description="how far the first extrinsic may be off")
+    floor_deg: float = Field(
+        default=0.1, ge=0, description="error that all windows of a scene share; averaging does not lower sigma below"
+    )
+    floor_m: float = Field(default=0.03, ge=0, description="the same for translations")
+    drift_deg_per_sqrt_h: float = Field(
+        default=0.01, ge=0, description="creep of the mount, a random walk; 0 = every window counts for ever"
+    )
+    drift_m_per_sqrt_h: float = Field(default=0.001, ge=0, description="the same for translations")
+    step_false_alarm: float = Field(
+        default=1e-4, gt=0, lt=1, description="a window less probable than this without a step raises suspicion"
+    )
+    overwhelming_false_alarm: float = Field(
+        default=0.0, ge=0, lt=1, description="one less probable than this is taken without a second; 0 = never"
+    )
+
+
+# --- what is done about it ------------------------------------------------------------------------------------------
+
+
+class MonitorConfig(Stage):
+    """When the latest pairs are judged at the current extrinsic, between two windows."""
+
+    period_s: float = Field(default=5.0, gt=0, le=86_400, description="one look per so much sensor time, s")
+    pairs: int = Field(default=6, ge=4, le=10, description="pairs of one look, evenly over the period")
+    min_pairs: int = Field(default=4, ge=4, le=10, description="with fewer the look waits for the next period")
+    urgent_slice_s: float = Field(
+        default=30.0, gt=0, le=3600, description="slice of the window that is taken as soon as the monitor suspects, s"
+    )
+
+    @model_validator(mode="after")
+    def _counts_agree(self) -> MonitorConfig:
+        if self.min_pairs > self.pairs:
+            raise ValueError("min_pairs must not exceed pairs")
+        return self
+
+
+class PolicyConfig(Stage):
+    """What may become current without a person: an estimate is one thing, applying it another. What is not applied
+    waits for `command/apply`. Limits are per axis; those of a day count every step of the last 24 h of sensor time."""
+
+    apply: Literal["never", "within_limits", "always"] = "within_limits"
+    max_step_deg: float = Field(default=10.0, gt=0, description="largest step of a rotation, degrees (within_limits)")
+    max_step_m: float = Field(default=0.3, gt=0, description="largest step of a translation, m (within_limits)")
+    max_per_day_deg: float = Field(default=20.0, gt=0, description="sum of all steps of a day, degrees (within_limits)")
+    max_per_day_m: float = Field(default=0.6, gt=0, description="sum of all steps of a day, m (within_limits)")
+    agree_deg: float = Field(
+        default=0.3, gt=0, description="an accepted estimate nearer than this confirms what is served, degrees"
+    )
+    agree_m: float = Field(default=0.1, gt=0, description="an accepted estimate nearer than this confirms it, m")
 
 
 # --- the daemon -----------------------------------------------------------------------------------------------------
@@ -250,6 +322,9 @@ class PairConfig(Stage):
     pairing: PairingConfig = PairingConfig()
     window: WindowConfig = WindowConfig()
     calibration: CalibrationConfig = CalibrationConfig()
+    monitor: MonitorConfig = MonitorConfig()
+    policy: PolicyConfig = PolicyConfig()
+    fusion: FusionConfig = FusionConfig()
 
 
 class LimitsConfig(Stage):
@@ -269,7 +344,8 @@ class StateConfig(Stage):
     min_free_bytes: int = Field(
         default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
     )
-    history: int = Field(default=500, ge=1, le=10_000, description="results kept per pair")
+    history: int = Field(default=500, ge=1, le=10_000, description="entries kept per pair")
+    evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
 
 
 class WorkerConfig(Stage):

@@ -126,7 +126,11 @@ class Daemon:
     def _start(self) -> None:
         for pair in self._pairs.values():
             pair.refresh()
-        for thread in (self._bus.thread, *(pair.recorder.thread for pair in self._pairs.values())):
+        for thread in (
+            self._bus.thread,
+            self._bus.drawing_thread,
+            *(pair.recorder.thread for pair in self._pairs.values()),
+        ):
             thread.start()
         self._worker.start()
         config = Snapshot.of_document(
@@ -190,8 +194,10 @@ class Daemon:
         _joined([pair.recorder.thread for pair in pairs], RECORDER_STOP_S)
         for pair in pairs:
             pair.save()
-        self._bus.thread.request_stop()
-        _joined([self._bus.thread], QUERIES_STOP_S)
+        answering = (self._bus.thread, self._bus.drawing_thread)
+        for thread in answering:
+            thread.request_stop()
+        _joined(answering, QUERIES_STOP_S)
         self._bus.undeclare_queryables()
         closed = self._bus.close(SESSION_STOP_S)
         _joined([self._worker.thread], WORKER_STOP_S)
@@ -235,7 +241,7 @@ class Daemon:
     def _threads(self) -> list[ServiceThread]:
         pairs = self._pairs.values()
         own = [thread for pair in pairs for thread in (pair.ingest, pair.recorder.thread)]
-        return [self._bus.thread, self._worker.thread, *own]
+        return [self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
 
     def _renew(self) -> None:
         for pair in self._pairs.values():

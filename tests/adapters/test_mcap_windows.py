@@ -124,6 +124,7 @@ def a_result(window_id: str = "front-1", reasons: tuple[Reason, ...] = ()) -> Ca
         correction_rad_m=six,
         sigma_rad_m=(*six[:3], None, None, None),
         solved=(True, True, True, False, False, False),
+        unobservable=(False, False, False, False, False, False),
         status="failed" if reasons else "accepted",
         verdict=Verdict(decision="failed" if reasons else "accepted", reasons=reasons),
         metrics={"overlap": MetricReply(value=0.97, limit=0.5, at_least=True, passed=True)},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import queue
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -242,3 +243,22 @@ def test_only_the_pairs_own_windows_are_read(tmp_path: Path, window_id: str) -> 
         folder.read("front", window_id, 0, 1)
     with pytest.raises(UsageError, match="offset"):
         folder.read("front", "front-1", 6, 1)
+
+
+def test_evidence_is_the_last_to_go_and_never_for_its_age(tmp_path: Path) -> None:
+    path = tmp_path / "windows"
+    path.mkdir()
+    for name, age_days in (("front-1", 200), ("front-2", 200), ("front-3", 0)):
+        (path / f"{name}.mcap").write_bytes(bytes(100_000))
+        when = time.time() - 86_400 * age_days
+        os.utime(path / f"{name}.mcap", (when, when))
+    folder = folder_of(tmp_path, max_age_days=90.0)
+    folder.protect("front", frozenset({"front-1"}))
+    folder.make_room()
+    assert sorted(file.stem for file in path.iterdir()) == ["front-1", "front-3"]
+    (path / "front-4.mcap").write_bytes(bytes(700_000))
+    full = folder_of(tmp_path, max_bytes=2**20)
+    full.protect("front", frozenset({"front-1"}))
+    full.make_room()
+    assert sorted(file.stem for file in path.iterdir()) == ["front-1"]
+    full.protect("front", frozenset())

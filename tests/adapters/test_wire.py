@@ -62,6 +62,7 @@ def estimate(seed: int = 0, **changes: Any) -> Estimate:
         correction=rng.normal(size=6) * 0.05,
         sigma=np.array([*rng.random(3) * 1e-3, NAN, NAN, NAN]),
         solved=np.array([True, True, True, False, False, False]),
+        unobservable=np.array([False, False, False, False, True, False]),
         compensation={"done": 24, "no_ego_motion": 1},
         depth_identity="precomputed",
         config_hash="0123456789abcdef",

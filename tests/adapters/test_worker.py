@@ -13,7 +13,17 @@ from pathlib import Path
 import pytest
 
 from coec.adapters import worker_link
-from coec.adapters.worker import PREFETCHES_WAITING, Solved, SolveJob, Worker, WorkerState
+from coec.adapters.worker import (
+    BUSY,
+    ERRANDS_WAITING,
+    PREFETCHES_WAITING,
+    SUPERSEDED,
+    Errand,
+    Solved,
+    SolveJob,
+    Worker,
+    WorkerState,
+)
 from coec.calibration.values import Reason
 from coec.config import WorkerConfig
 from fakes import fake_worker_command, wait_until
@@ -146,6 +156,55 @@ def test_prefetches_are_bounded_and_give_way_to_windows(tmp_path: Path) -> None:
     finally:
         worker.request_stop()
         assert worker.thread.join(DEADLINE_S)
+
+
+def errand(kind: str, told: queue.SimpleQueue[object], number: int = 0, pair: str = "front") -> Errand:
+    return Errand(kind, pair, {"number": number}, told.put, timeout_s=1.0)
+
+
+def test_an_errand_comes_back_with_its_answer(tmp_path: Path) -> None:
+    told: queue.SimpleQueue[object] = queue.SimpleQueue()
+    with running("none", tmp_path) as (worker, _):
+        worker.run_errand(errand("overlay", told, 7))
+        answer = told.get(timeout=DEADLINE_S)
+    assert isinstance(answer, dict)
+    assert answer["echo"] == {"kind": "overlay", "pair": "front", "number": 7}
+
+
+def test_of_the_looks_of_a_pair_the_newest_is_taken_and_errands_are_bounded(tmp_path: Path) -> None:
+    told: queue.SimpleQueue[object] = queue.SimpleQueue()
+    outcomes = Outcomes()
+    worker = Worker(LIMITS, "{}", outcomes.events.put, outcomes.on_failed, fake_worker_command("none", tmp_path / "m"))
+    worker.look(errand("observe", told, 0, "rear"))
+    worker.look(errand("observe", told, 1))
+    worker.look(errand("observe", told, 2))
+    assert told.get_nowait() is SUPERSEDED
+    for number in range(ERRANDS_WAITING):
+        worker.run_errand(errand("overlay", told, 100 + number))
+    worker.run_errand(errand("overlay", told, 999))
+    assert told.get_nowait() is BUSY
+    worker.solve(job("a"))
+    worker.start()
+    try:
+        answers = [told.get(timeout=DEADLINE_S) for _ in range(2 + ERRANDS_WAITING)]
+        assert outcomes.solved().job == job("a")
+    finally:
+        worker.request_stop()
+        assert worker.thread.join(DEADLINE_S)
+    numbers = [answer["echo"]["number"] for answer in answers if isinstance(answer, dict)]
+    assert numbers == [0, 2, *range(100, 100 + ERRANDS_WAITING)]
+
+
+@pytest.mark.parametrize("fault", ["sick", "sick-refuse"])
+def test_an_errand_that_fails_is_answered_and_not_tried_again(tmp_path: Path, fault: str) -> None:
+    told: queue.SimpleQueue[object] = queue.SimpleQueue()
+    with running(fault, tmp_path) as (worker, outcomes):
+        worker.run_errand(errand("overlay", told))
+        answer = told.get(timeout=DEADLINE_S)
+        assert isinstance(answer, Reason)
+        assert answer.code == ("bad_window" if fault == "sick-refuse" else "worker_failed")
+        worker.solve(job("a"))
+        assert outcomes.solved().job == job("a")
 
 
 def test_a_configuration_that_cannot_work_is_told(tmp_path: Path) -> None:

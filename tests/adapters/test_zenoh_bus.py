@@ -32,11 +32,14 @@ def endpoint() -> str:
 def bus(endpoint: str) -> Iterator[Bus]:
     session = open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
     bus = Bus(session)
-    bus.thread.start()
+    answering = (bus.thread, bus.drawing_thread)
+    for thread in answering:
+        thread.start()
     yield bus
     bus.undeclare_inputs()
-    bus.thread.request_stop()
-    assert bus.thread.join(DEADLINE_S)
+    for thread in answering:
+        thread.request_stop()
+    assert all(thread.join(DEADLINE_S) for thread in answering)
     bus.undeclare_queryables()
     assert bus.close(DEADLINE_S)
 
@@ -185,3 +188,35 @@ def test_a_port_in_use_is_a_clear_error(bus: Bus, endpoint: str) -> None:
 
 def test_no_router_is_no_error(endpoint: str) -> None:
     open_session(ZenohConfig(connect=(endpoint,)), LimitsConfig()).close()
+
+
+def test_the_attachment_of_a_query_is_handed_on(bus: Bus, client: zenoh.Session) -> None:
+    seen: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+
+    def answer(request: Request) -> Answer:
+        seen.put(request.attachment)
+        return Answer(b"", MSGPACK)
+
+    bus.serve("test/who", lambda _: [Route("test/who", answer, quick=False)])
+    ask_ok(client, "test/who")
+    assert seen.get(timeout=DEADLINE_S) is None
+    list(client.get("test/who", attachment=b"me", timeout=DEADLINE_S))
+    assert seen.get(timeout=DEADLINE_S) == b"me"
+
+
+def test_a_picture_that_takes_long_keeps_no_other_query_waiting(bus: Bus, client: zenoh.Session) -> None:
+    drawn = threading.Event()
+
+    def draw(_: Request) -> Answer:
+        drawn.wait(DEADLINE_S)
+        return Answer(b"jpeg", "image/jpeg")
+
+    bus.serve("test/overlay", lambda _: [Route("test/overlay", draw, quick=False, draws=True)])
+    bus.serve("test/list", lambda _: [Route("test/list", lambda _: Answer(b"list", MSGPACK), quick=False)])
+    assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
+    waiting = client.get("test/overlay", timeout=DEADLINE_S)
+    assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
+    drawn.set()
+    (reply,) = waiting
+    assert reply.ok is not None
+    assert reply.ok.payload.to_bytes() == b"jpeg"

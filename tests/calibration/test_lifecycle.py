@@ -1,84 +1,373 @@
 """What is served: never an estimate that was not accepted, never health that was not looked at."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial, reduce
 
 import numpy as np
 import pytest
 
-from coec.adapters.images import GreyImages
-from coec.calibration.calibrator import calibrate
+from coec.calibration.causes import CAUSES
 from coec.calibration.lifecycle import (
+    CommandRefusedError,
     HealthState,
+    PairState,
     Provenance,
+    Rules,
     Status,
+    after_commissioning,
     after_estimate,
     after_failure,
-    assess,
+    after_observation,
+    aged,
+    apply_pending,
+    held,
     initial_state,
+    released,
+    reset,
     restored,
+    rolled_back,
 )
-from coec.calibration.ports import DepthModel, Silence
-from coec.calibration.values import Decision, Estimate, Reason, Window
-from coec.config import CalibrationConfig, LimitsConfig
+from coec.calibration.monitor import Observation, Outcome
+from coec.calibration.values import Decision, Estimate, Optimum, Reason, Rig, StopReason, Verdict
+from coec.config import FusionConfig, PolicyConfig
+from coec.geometry import se3
+from coec.geometry.cameras import build
 
+S = 1_000_000_000
 DAY_S = 86_400.0
+LATE_NS = 10_000 * S
 CRASH = Reason("worker_failed", "The worker crashed twice.")
+OVERLAP = Reason("overlap", "too little")
+
+RULES = Rules(PolicyConfig(), FusionConfig())
+NEVER = Rules(PolicyConfig(apply="never"), FusionConfig())
+
+RIG = Rig(
+    "front",
+    build("pinhole", width=4, height=3, fx=2.0, fy=2.0, cx=1.5, cy=1.0),
+    "camera",
+    "lidar",
+    se3.perturbation(np.array([0.1, -0.2, 0.3, 0.5, 0.0, 1.0])),
+    np.eye(4),
+)
 
 
-@pytest.fixture(scope="module")
-def accepted(street: Window, stereo: DepthModel) -> Estimate:
-    return calibrate(street, stereo, GreyImages(LimitsConfig()), CalibrationConfig(), Silence())
+def estimate(turned_deg: float, stamp_s: int = 100, decision: Decision = Decision.ACCEPTED) -> Estimate:
+    """Of a window that ends at `stamp_s`: the camera is turned by so much in yaw from nominal."""
+    xi = np.array([0.0, np.radians(turned_deg), 0.0, 0.0, 0.0, 0.0])
+    reasons = () if decision is Decision.ACCEPTED else (OVERLAP,)
+    return Estimate(
+        window_id=f"front-{(stamp_s - 50) * S}",
+        data_stamp_ns=stamp_s * S,
+        pairs=20,
+        optimum=Optimum(
+            T_camera_lidar=se3.perturb(RIG.T_camera_lidar_nominal, xi),
+            score=1.0,
+            score_at_start=0.5,
+            mi=0.5,
+            overlap=0.9,
+            points_in_view=1000,
+            evaluations=50,
+            stop_reason=StopReason.TOLERANCE,
+            first_derivative=np.zeros(6),
+            second_derivative=np.ones(6),
+        ),
+        verdict=Verdict(decision, (), reasons),
+        correction=xi,
+        sigma=np.array([5e-4] * 3 + [np.nan] * 3),
+        solved=np.arange(6) < 3,
+        unobservable=np.zeros(6, np.bool_),
+        compensation={},
+        depth_identity="precomputed",
+        config_hash="0",
+    )
 
 
-@pytest.fixture(scope="module")
-def failed(accepted: Estimate) -> Estimate:
-    verdict = replace(accepted.verdict, decision=Decision.FAILED, reasons=(Reason("overlap", "too little"),))
-    moved = accepted.optimum.T_camera_lidar @ np.diag([-1.0, -1.0, 1.0, 1.0])
-    return replace(accepted, verdict=verdict, optimum=replace(accepted.optimum, T_camera_lidar=moved))
+def solved(state: PairState, value: Estimate, rules: Rules = RULES) -> PairState:
+    return after_estimate(state, value, value.data_stamp_ns - 50 * S, rules)
 
 
-def test_before_anything_the_nominal_extrinsic_is_served_and_health_is_unknown(street: Window) -> None:
-    state = initial_state(street.rig)
-    assert state.provenance is Provenance.NOMINAL
-    assert state.status is Status.NOT_ACCEPTED
-    np.testing.assert_array_equal(state.T_camera_lidar, street.rig.T_camera_lidar_nominal)
-    assert assess(state, None, DAY_S).state is HealthState.UNKNOWN
+def look(stamp_s: int, flagged: bool = False, cause: str | None = None) -> Observation:
+    return Observation(
+        stamp_ns=stamp_s * S,
+        pair_stamps_ns=tuple((stamp_s - i) * S for i in range(4, -1, -1)),
+        metrics=(),
+        offset=np.zeros(6),
+        sigma=np.full(6, 1e-3),
+        distance2=9.0 if flagged else 0.1,
+        flagged=flagged,
+        weak=False,
+        flagged_by_paper=None,
+        causes=() if cause is None else (CAUSES[cause],),
+    )
 
 
-def test_an_accepted_estimate_is_served(street: Window, accepted: Estimate) -> None:
-    state = after_estimate(initial_state(street.rig), accepted)
-    np.testing.assert_array_equal(state.T_camera_lidar, accepted.optimum.T_camera_lidar)
-    assert (state.provenance, state.status) == (Provenance.ESTIMATED, Status.ACCEPTED)
-    assert state.valid_from_ns == accepted.data_stamp_ns
-    assert assess(state, 1.0, DAY_S).state is HealthState.HEALTHY
+def watched(state: PairState, *looks: Observation) -> PairState:
+    return reduce(after_observation, looks, state)
 
 
-def test_a_failed_estimate_is_never_served(street: Window, accepted: Estimate, failed: Estimate) -> None:
-    for before in (initial_state(street.rig), after_estimate(initial_state(street.rig), accepted)):
-        state = after_estimate(before, failed)
-        np.testing.assert_array_equal(state.T_camera_lidar, before.T_camera_lidar)
-        assert state.provenance is before.provenance
-        assert state.status is Status.FAILED
-        health = assess(state, 1.0, DAY_S)
-        assert health.state is HealthState.SUSPECT
-        assert health.reasons == failed.verdict.reasons
+def flagged_from(stamp_s: int, count: int) -> list[Observation]:
+    return [look(stamp_s + 5 * i, flagged=True) for i in range(count)]
 
 
-def test_a_window_that_gave_no_estimate_degrades_and_serves_what_was(street: Window, accepted: Estimate) -> None:
-    before = after_estimate(initial_state(street.rig), accepted)
-    state = after_failure(before, CRASH)
+def clear_from(stamp_s: int, count: int) -> list[Observation]:
+    return [look(stamp_s + 5 * i) for i in range(count)]
+
+
+HEALTHY = solved(initial_state(RIG), estimate(0.5))
+
+
+def pose_of(value: Estimate) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    return value.optimum.T_camera_lidar
+
+
+# --- windows ----------------------------------------------------------------------------------------------------
+
+
+def test_before_anything_the_nominal_extrinsic_is_served_and_health_is_unknown() -> None:
+    state = initial_state(RIG)
+    assert (state.provenance, state.status, state.health) == (
+        Provenance.NOMINAL,
+        Status.NOT_ACCEPTED,
+        HealthState.UNKNOWN,
+    )
+    assert [reason.code for reason in state.reasons] == ["not_evaluated"]
+    np.testing.assert_array_equal(state.T_camera_lidar, RIG.T_camera_lidar_nominal)
+
+
+def test_the_first_accepted_estimate_is_served_to_the_last_bit() -> None:
+    np.testing.assert_array_equal(HEALTHY.T_camera_lidar, pose_of(estimate(0.5)))
+    assert (HEALTHY.provenance, HEALTHY.status, HEALTHY.health) == (
+        Provenance.ESTIMATED,
+        Status.ACCEPTED,
+        HealthState.HEALTHY,
+    )
+    assert HEALTHY.valid_from_ns == 100 * S
+    assert HEALTHY.reasons == ()
+
+
+@pytest.mark.parametrize("before", [initial_state(RIG), HEALTHY])
+def test_a_failed_estimate_is_never_served(before: PairState) -> None:
+    state = solved(before, estimate(3.0, 300, Decision.FAILED))
     np.testing.assert_array_equal(state.T_camera_lidar, before.T_camera_lidar)
-    assert assess(state, 1.0, DAY_S) == replace(assess(state, 1.0, DAY_S), state=HealthState.DEGRADED, reasons=(CRASH,))
-    assert assess(after_estimate(state, accepted), 1.0, DAY_S).state is HealthState.HEALTHY
+    assert (state.provenance, state.status) == (before.provenance, Status.FAILED)
+    assert (state.health, state.reasons) == (HealthState.SUSPECT, (OVERLAP,))
+    assert state.pending is None
 
 
-def test_an_old_result_is_stale_not_healthy(street: Window, accepted: Estimate) -> None:
-    state = after_estimate(initial_state(street.rig), accepted)
-    assert assess(state, DAY_S + 1.0, DAY_S).state is HealthState.STALE
+def test_a_window_that_gave_no_estimate_degrades_and_serves_what_was() -> None:
+    state = after_failure(HEALTHY, CRASH)
+    np.testing.assert_array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
+    assert (state.health, state.reasons, state.failures) == (HealthState.DEGRADED, (CRASH,), (CRASH,))
+    assert solved(state, estimate(0.5, 300)).health is HealthState.HEALTHY
 
 
-def test_an_estimate_read_back_from_disk_says_so_and_its_age_is_unknown(street: Window, accepted: Estimate) -> None:
-    state = restored(after_estimate(initial_state(street.rig), accepted))
-    assert state.provenance is Provenance.RESTORED
-    assert assess(state, None, DAY_S).state is HealthState.UNKNOWN
-    assert restored(initial_state(street.rig)).provenance is Provenance.NOMINAL
+def test_windows_that_agree_are_averaged() -> None:
+    state = solved(HEALTHY, estimate(0.54, 300))
+    turned = np.degrees(se3.difference(state.T_camera_lidar, RIG.T_camera_lidar_nominal)[1])
+    assert 0.5 < turned < 0.54
+    assert state.track is not None
+    assert state.track.windows == 2
+    assert state.health is HealthState.HEALTHY
+
+
+def test_a_single_window_that_differs_moves_nothing_and_a_second_one_decides() -> None:
+    one = solved(HEALTHY, estimate(2.0, 300))
+    np.testing.assert_array_equal(one.T_camera_lidar, HEALTHY.T_camera_lidar)
+    assert one.health is HealthState.SUSPECT
+    assert [reason.code for reason in one.reasons] == ["step_suspected"]
+    assert one.pending is not None
+    assert watched(one, *clear_from(310, 3)).health is HealthState.SUSPECT, "against a window a look does not count"
+    back = solved(one, estimate(0.5, 500))
+    assert back.health is HealthState.HEALTHY
+    assert back.pending is None
+    two = solved(one, estimate(2.02, 500))
+    assert two.health is HealthState.HEALTHY
+    assert 1.9 < np.degrees(se3.difference(two.T_camera_lidar, RIG.T_camera_lidar_nominal)[1]) < 2.1
+
+
+# --- the monitor ------------------------------------------------------------------------------------------------
+
+
+def test_one_bad_look_decides_nothing() -> None:
+    state = watched(HEALTHY, *clear_from(110, 3), look(125, flagged=True), *clear_from(130, 2))
+    assert state.health is HealthState.HEALTHY
+    assert state.flagged_since_ns is None
+
+
+def test_a_moved_mount_becomes_suspect_then_red_and_the_next_window_corrects_it() -> None:
+    states = [watched(HEALTHY, *clear_from(190, 2), *flagged_from(200, count)) for count in range(1, 4)]
+    assert [state.health for state in states] == [
+        HealthState.HEALTHY,
+        HealthState.SUSPECT,
+        HealthState.MISCALIBRATED,
+    ]
+    red = states[-1]
+    assert red.flagged_since_ns == 196 * S
+    np.testing.assert_array_equal(red.T_camera_lidar, HEALTHY.T_camera_lidar)
+    mixed = after_estimate(red, estimate(1.0, 230), 150 * S, RULES)
+    assert mixed.health is HealthState.MISCALIBRATED
+    np.testing.assert_array_equal(mixed.T_camera_lidar, HEALTHY.T_camera_lidar)
+    fresh = after_estimate(mixed, estimate(1.5, 260), 220 * S, RULES)
+    assert fresh.health is HealthState.HEALTHY
+    np.testing.assert_array_equal(fresh.T_camera_lidar, pose_of(estimate(1.5)))
+    assert fresh.monitor.outcome is Outcome.UNKNOWN
+    assert fresh.flagged_since_ns is None
+
+
+def test_where_no_look_was_ever_clear_the_first_window_counts_in_full() -> None:
+    red = watched(initial_state(RIG), *flagged_from(200, 3))
+    assert red.flagged_since_ns == 0
+    assert after_estimate(red, estimate(1.5, 260), 150 * S, RULES).health is HealthState.HEALTHY
+
+
+def test_a_window_that_agrees_acquits() -> None:
+    suspect = watched(HEALTHY, *flagged_from(200, 2))
+    state = after_estimate(suspect, estimate(0.5, 260), 220 * S, RULES)
+    assert state.health is HealthState.HEALTHY
+
+
+def test_with_never_the_candidate_waits_and_nothing_else_changes() -> None:
+    red = watched(solved(initial_state(RIG), estimate(0.0), NEVER), *flagged_from(200, 3))
+    state = after_estimate(red, estimate(1.0, 260), 220 * S, NEVER)
+    np.testing.assert_array_equal(state.T_camera_lidar, RIG.T_camera_lidar_nominal)
+    assert (state.provenance, state.valid_from_ns) == (red.provenance, red.valid_from_ns)
+    assert state.health is HealthState.MISCALIBRATED
+    assert [reason.code for reason in state.reasons] == ["candidate_waits", "apply_never"]
+    assert state.pending is not None
+    np.testing.assert_array_equal(state.pending.T_camera_lidar, pose_of(estimate(1.0)))
+    assert watched(state, *clear_from(270, 9)).health is HealthState.MISCALIBRATED
+    applied = apply_pending(state, NEVER)
+    np.testing.assert_array_equal(applied.T_camera_lidar, pose_of(estimate(1.0)))
+    assert (applied.health, applied.provenance, applied.pending) == (HealthState.HEALTHY, Provenance.ESTIMATED, None)
+
+
+def test_red_fades_by_staying_clear_through_yellow_only() -> None:
+    red = watched(HEALTHY, *flagged_from(200, 4))
+    clears = [watched(red, *clear_from(300, count)).health for count in range(1, 6)]
+    assert clears[-1] is HealthState.HEALTHY
+    first = clears.index(HealthState.SUSPECT)
+    assert set(clears[:first]) <= {HealthState.MISCALIBRATED}
+    assert HealthState.MISCALIBRATED not in clears[first:]
+
+
+@pytest.mark.parametrize("code", sorted(set(CAUSES) - {"bent_mount"}))
+def test_a_cause_in_the_data_degrades_with_its_own_reason_and_passes(code: str) -> None:
+    state = watched(HEALTHY, *[look(200 + 5 * i, flagged=True, cause=code) for i in range(4)])
+    assert state.health is HealthState.DEGRADED
+    assert [reason.code for reason in state.reasons] == [code]
+    assert watched(state, *clear_from(300, 6)).health is HealthState.HEALTHY
+
+
+def test_bad_data_do_not_hide_a_red_state() -> None:
+    red = watched(HEALTHY, *flagged_from(200, 3))
+    dirty = watched(red, *[look(300 + 5 * i, cause="lens_dirty") for i in range(4)])
+    assert dirty.health is HealthState.MISCALIBRATED
+    assert [reason.code for reason in dirty.reasons] == ["bent_mount", "lens_dirty"]
+
+
+def test_a_monitor_that_sees_nothing_wrong_makes_no_unproven_extrinsic_healthy() -> None:
+    state = watched(initial_state(RIG), *clear_from(100, 5))
+    assert state.health is HealthState.UNKNOWN
+    assert watched(after_failure(initial_state(RIG), CRASH), *clear_from(100, 5)).health is HealthState.UNKNOWN
+    assert watched(initial_state(RIG), *flagged_from(100, 3)).health is HealthState.MISCALIBRATED
+
+
+# --- policy -----------------------------------------------------------------------------------------------------
+
+
+def test_a_step_beyond_the_limits_waits_for_a_person() -> None:
+    state = solved(initial_state(RIG), estimate(11.0))
+    assert state.health is HealthState.MISCALIBRATED
+    assert [reason.code for reason in state.reasons] == ["candidate_waits", "step_too_large"]
+    np.testing.assert_array_equal(state.T_camera_lidar, RIG.T_camera_lidar_nominal)
+    applied = apply_pending(state, RULES)
+    np.testing.assert_array_equal(applied.T_camera_lidar, pose_of(estimate(11.0)))
+    assert applied.changes == ()
+
+
+def test_the_steps_of_a_day_add_up() -> None:
+    rules = Rules(PolicyConfig(max_step_deg=2.0, max_per_day_deg=3.0), FusionConfig())
+    state = solved(initial_state(RIG), estimate(1.9, 100), rules)
+    state = reduce(lambda s, e: solved(s, e, rules), [estimate(0.2, 300), estimate(0.2, 500)], state)
+    assert [reason.code for reason in state.reasons] == ["candidate_waits", "day_exhausted"]
+    next_day = 100 + 86_401
+    tomorrow = reduce(lambda s, e: solved(s, e, rules), [estimate(0.2, next_day), estimate(0.2, next_day + 200)], state)
+    assert tomorrow.health is HealthState.HEALTHY
+    assert tomorrow.pending is None
+
+
+# --- commands ---------------------------------------------------------------------------------------------------
+
+
+def test_hold_freezes_everything_but_the_estimates() -> None:
+    frozen = held(HEALTHY)
+    state = solved(frozen, estimate(0.55, 300))
+    np.testing.assert_array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
+    assert state.health is HealthState.HEALTHY, "it agrees with what is served"
+    assert state.pending is not None
+    assert state.pending.waits.code == "held"
+    commands: tuple[Callable[[PairState], PairState], ...] = (
+        partial(apply_pending, rules=RULES),
+        partial(reset, rig=RIG),
+        partial(rolled_back, pose=pose_of(estimate(0.1)), estimate=estimate(0.1), rules=RULES),
+    )
+    for command in commands:
+        with pytest.raises(CommandRefusedError, match="held"):
+            command(state)
+    moved = apply_pending(released(state), RULES)
+    assert not np.array_equal(moved.T_camera_lidar, HEALTHY.T_camera_lidar)
+
+
+def test_nothing_pending_is_refused() -> None:
+    with pytest.raises(CommandRefusedError, match="No candidate"):
+        apply_pending(HEALTHY, RULES)
+
+
+def test_a_reset_serves_nominal_and_knows_nothing() -> None:
+    state = reset(watched(HEALTHY, *flagged_from(200, 3)), RIG)
+    np.testing.assert_array_equal(state.T_camera_lidar, RIG.T_camera_lidar_nominal)
+    assert (state.provenance, state.health, state.valid_from_ns) == (Provenance.NOMINAL, HealthState.UNKNOWN, 0)
+    assert (state.track, state.accepted, state.pending) == (None, None, None)
+    assert watched(state, *clear_from(300, 5)).health is HealthState.UNKNOWN
+
+
+def test_a_roll_back_is_looked_at_before_it_is_called_healthy() -> None:
+    state = rolled_back(HEALTHY, pose_of(estimate(0.2)), estimate(0.2), RULES)
+    np.testing.assert_array_equal(state.T_camera_lidar, pose_of(estimate(0.2)))
+    assert (state.provenance, state.health) == (Provenance.RESTORED, HealthState.UNKNOWN)
+    assert watched(state, *clear_from(300, 3)).health is HealthState.HEALTHY
+
+
+def test_commissioning_confirms_what_is_served_and_nothing_else() -> None:
+    state = after_commissioning(HEALTHY, HEALTHY.T_camera_lidar)
+    assert (state.provenance, state.health) == (Provenance.COMMISSIONED, HealthState.HEALTHY)
+    assert after_commissioning(HEALTHY, RIG.T_camera_lidar_nominal) is HEALTHY
+
+
+# --- time -------------------------------------------------------------------------------------------------------
+
+
+def test_what_was_not_looked_at_for_long_is_stale_not_healthy() -> None:
+    assert aged(HEALTHY, DAY_S, DAY_S) is HEALTHY
+    state = aged(HEALTHY, DAY_S + 1.0, DAY_S)
+    assert (state.health, [reason.code for reason in state.reasons]) == (HealthState.STALE, ["stale"])
+    assert aged(state, DAY_S + 2.0, DAY_S) is state
+    assert solved(state, estimate(0.5, LATE_NS // S)).health is HealthState.HEALTHY
+    red = watched(HEALTHY, *flagged_from(200, 3))
+    assert aged(red, DAY_S + 1.0, DAY_S) is red
+    nothing = initial_state(RIG)
+    assert aged(nothing, DAY_S + 1.0, DAY_S) is nothing
+
+
+def test_an_age_that_nobody_knows_is_not_healthy() -> None:
+    assert aged(HEALTHY, None, DAY_S).health is HealthState.UNKNOWN
+
+
+def test_an_estimate_read_back_from_disk_says_so_and_keeps_its_health() -> None:
+    state = restored(HEALTHY)
+    assert (state.provenance, state.health) == (Provenance.RESTORED, HealthState.HEALTHY)
+    assert restored(initial_state(RIG)).provenance is Provenance.NOMINAL
+    red = restored(replace(watched(HEALTHY, *flagged_from(200, 3))))
+    assert red.health is HealthState.MISCALIBRATED

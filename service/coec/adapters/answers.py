@@ -7,26 +7,24 @@ from collections.abc import Callable, Mapping, Sequence
 import zenoh
 from pydantic import BaseModel
 
+from coec.adapters import commands
 from coec.adapters import metrics as metrics_text
 from coec.adapters.pair_service import PairService
 from coec.adapters.snapshots import Snapshot, answer_of
 from coec.adapters.zenoh_bus import Answer, Bus, Request, Route
-from coec.errors import CoecError, UsageError
-from coec.schemas.keys import Format, Keys, parse_history_selector, parse_range_selector, parse_selector
+from coec.errors import UsageError
+from coec.schemas.keys import (
+    Format,
+    Keys,
+    parse_evidence_selector,
+    parse_history_selector,
+    parse_overlay_selector,
+    parse_range_selector,
+    parse_selector,
+)
 
 OCTETS = "application/octet-stream"
-
-LATER_COMMANDS = ("apply", "rollback", "reset", "commission", "hold")
-"""Commands of CONTRACT that this version does not carry out."""
-
-EMPTY_PAYLOADS = (b"", b"\x80", b"{}")
-"""What a command without arguments may carry: nothing, or an empty map in either encoding."""
-
-
-class NotSupportedError(CoecError):
-    """The contract knows this, this version does not do it."""
-
-    reply_code = "not_supported"
+JPEG = "image/jpeg"
 
 
 class VehicleAnswers:
@@ -66,22 +64,24 @@ class VehicleAnswers:
         """Who answers a key, or a key expression, of the pair.
 
         Raises:
-            UsageError, NotSupportedError: nobody.
+            UsageError: nobody.
         """
         readable = self._pair_routes[pair]
         if key in readable:
             return [readable[key]]
         if _has_wildcard(key):
             asked = zenoh.KeyExpr(key)
-            return [route for known, route in readable.items() if asked.intersects(zenoh.KeyExpr(known))]
+            matching = [route for known, route in readable.items() if asked.intersects(zenoh.KeyExpr(known))]
+            # A picture is drawn for whoever asks for one, not for everything at once.
+            return matching if key.endswith("/overlay") else [route for route in matching if not route.draws]
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
             return [Route(key, self._window(self._pairs[pair], address.argument), quick=False)]
         if address.resource == "command":
             return [Route(key, self._command(self._pairs[pair], str(address.argument)), quick=False)]
-        if address.resource == "alive":
-            raise UsageError("`alive` is a liveliness token: ask for liveliness")
-        raise NotSupportedError(f"`{address.resource}` is not served by this version")
+        if address.resource == "evidence" and address.argument is not None:
+            return [Route(key, self._evidence(self._pairs[pair], address.argument), quick=False)]
+        raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_unknown(self, key: str) -> Sequence[Route]:
         """Nobody, in silence where another queryable answers: a session hands a query to all that match.
@@ -101,6 +101,8 @@ class VehicleAnswers:
             Route(keys.health(name), lambda request: pair.health(_format(request)), quick=True),
             Route(keys.history(name), lambda request: _history(pair, request), quick=False),
             Route(keys.windows(name), lambda request: _in_format(request, pair.windows), quick=False),
+            Route(keys.evidence(name), lambda request: _in_format(request, pair.evidence), quick=False),
+            Route(keys.overlay(name), lambda request: _overlay(pair, request), quick=False, draws=True),
         )
         return {route.key: route for route in routes}
 
@@ -111,18 +113,27 @@ class VehicleAnswers:
 
         return answer
 
+    def _evidence(self, pair: PairService, event_id: str) -> Callable[[Request], Answer]:
+        def answer(request: Request) -> Answer:
+            chosen = parse_evidence_selector(request.parameters)
+            if chosen.overlay is not None:
+                return Answer(pair.ledger.evidence.overlay(event_id, chosen.overlay), JPEG)
+            return answer_of(pair.ledger.evidence.event(event_id), chosen.format)
+
+        return answer
+
     def _command(self, pair: PairService, name: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
             form = _format(request)
-            if name in LATER_COMMANDS:
-                raise NotSupportedError(f"the command `{name}` is not carried out by this version")
-            if name != "calibrate":
-                raise UsageError(f"no such command; known: calibrate, {', '.join(LATER_COMMANDS)}")
-            if request.payload not in EMPTY_PAYLOADS:
-                raise UsageError("`calibrate` takes no arguments")
-            return answer_of(pair.calibrate(), form)
+            arguments = commands.parse(name, request.payload)
+            return answer_of(pair.command(name, arguments, commands.sender_of(request.attachment)), form)
 
         return answer
+
+
+def _overlay(pair: PairService, request: Request) -> Answer:
+    chosen = parse_overlay_selector(request.parameters)
+    return Answer(pair.overlay(chosen.window_id, nominal=chosen.at == "nominal"), JPEG)
 
 
 def _history(pair: PairService, request: Request) -> Answer:

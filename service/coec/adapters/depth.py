@@ -9,7 +9,7 @@ from pathlib import Path
 
 from coec.adapters.images import decode_depth
 from coec.adapters.incoming import Refusal
-from coec.adapters.model_cards import ModelCard, built_in_cards, find_card
+from coec.adapters.model_cards import CARDS, ModelCard, built_in_cards, find_card
 from coec.adapters.onnx_depth import OnnxDepth, file_identity
 from coec.calibration.ports import DepthModel
 from coec.calibration.values import CameraFrame, DepthMap
@@ -85,7 +85,7 @@ class CachedDepth:
 def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
     """The depth model that a configuration names: `stereo`, an ONNX file, or the name of a built-in card.
 
-    The file of a built-in card is looked for in `models_folder()`.
+    The file of a built-in card is looked for in `models_folder()`, then among those that come with the package.
 
     Raises:
         ModelError: no such file or name, no card for it, a damaged network, or one that does not match its
@@ -112,10 +112,11 @@ def models_folder() -> Path:
 
 
 def _file_of(card: ModelCard) -> Path:
-    """`<name>.onnx` in the folder of networks, or the card's customary file name if only that is there."""
-    path = models_folder() / f"{card.name}.onnx"
-    customary = models_folder() / (card.file or path.name)
-    return customary if customary.is_file() and not path.is_file() else path
+    """`<name>.onnx` in the folder of networks, else the card's customary file name there, else the file that comes
+    with the package; the first where there is none."""
+    name = f"{card.name}.onnx"
+    places = [models_folder() / name, models_folder() / (card.file or name), CARDS / name]
+    return next((path for path in places if path.is_file()), places[0])
 
 
 def _content_key(frame: CameraFrame) -> bytes:

@@ -54,6 +54,9 @@ def render(status: StatusReply, health: Mapping[str, HealthState], worker_rss_by
         _Family("coec_window_pairs", "gauge", "Pairs in the open window.", _per_pair(pairs, "selected")),
         _Family("coec_windows_recorded", "counter", "Windows recorded.", _per_pair(pairs, "windows")),
         _Family("coec_windows_evaluated", "counter", "Windows evaluated.", _per_pair(pairs, "solved")),
+        _Family("coec_looks", "counter", "Looks of the monitor.", _per_pair(pairs, "looks")),
+        _Family("coec_health_changes", "counter", "States entered.", tuple(_counts(pairs, "transitions", "to"))),
+        _Family("coec_commands", "counter", "Commands, by outcome.", tuple(_counts(pairs, "commands", "command"))),
         _Family("coec_worker_restarts", "counter", "Workers replaced.", (({}, status.worker.restarts),)),
         _Family("coec_worker_memory_bytes", "gauge", "Resident memory.", (({}, float(worker_rss_bytes)),)),
         _Family("coec_storage_used_bytes", "gauge", "Bytes of all windows.", (({}, status.storage.bytes_used),)),
@@ -65,6 +68,12 @@ def render(status: StatusReply, health: Mapping[str, HealthState], worker_rss_by
 
 def _per_pair(pairs: Iterable[PairStatus], name: str) -> tuple[Sample, ...]:
     return tuple(({"pair": pair.name}, float(getattr(pair, name))) for pair in pairs)
+
+
+def _counts(pairs: Iterable[PairStatus], name: str, label: str) -> Iterable[Sample]:
+    for pair in pairs:
+        for key, count in getattr(pair, name).items():
+            yield {"pair": pair.name, label: key}, float(count)
 
 
 def _streams(pairs: Iterable[PairStatus], name: str) -> Iterable[Sample]:

@@ -2,7 +2,7 @@
 
 A card is a YAML file beside the network (`midas.onnx` -> `midas.yaml`): either a whole card, or one line that
 points to a built-in one, `card: dpt_beit_large_512`. Networks whose file is known are recognised by sha256
-and need no YAML. The built-in cards lie in the folder `cards`.
+and need no YAML. The built-in cards lie in the folder `cards`, and with one of them, `street`, its network.
 """
 
 from __future__ import annotations
@@ -111,6 +111,10 @@ class ModelCard(_Part):
     licence: str = Field(min_length=1, description="of the weights: SPDX identifier, or what the authors wrote")
     sha256: Sha256 | None = None
     source: str = Field(min_length=1, description="where the network and these numbers come from")
+    rank_correlation: dict[str, Annotated[float, Field(ge=-1, le=1)]] = Field(
+        default_factory=dict,
+        description="Spearman's, of the output with inverse LiDAR range, median of the frames, by recording",
+    )
 
 
 class _Reference(_Part):

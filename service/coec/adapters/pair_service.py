@@ -1,54 +1,64 @@
-"""The flow of one camera-LiDAR pair: samples to windows, windows to the worker, results to what is served.
+"""The flow of one camera-LiDAR pair: samples to windows and looks, both to the worker, results to what is served.
 
-Three threads meet here, and each owns its part: the ingest thread the streams (pairing, window), the recorder thread
-the files, the worker's supervisor the results. What they share is immutable and replaced as a whole under one lock.
+Three threads meet here, and each owns its part: the ingest thread the streams (pairing, window, looks), the recorder
+thread the files, the worker's supervisor the results. What they share is the ledger, which has a lock of its own.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
 
 from coec.adapters import snapshots
+from coec.adapters.baseline_file import load_baseline
 from coec.adapters.depth import STEREO
+from coec.adapters.evidence import Side
 from coec.adapters.images import Inspector
 from coec.adapters.inbox import Call, Inbox
 from coec.adapters.intake import CAMERA, EGO, LIDAR, Intake, StreamCounts
+from coec.adapters.ledger import Ledger
 from coec.adapters.logs import LossCounter
+from coec.adapters.looks import pack_pairs, pack_pose, unpack_observation
 from coec.adapters.msgpack_frames import encode_camera
+from coec.adapters.overlays import Overlays
 from coec.adapters.recorder import Recorder, RecordingPlan
 from coec.adapters.rig import rig_of
 from coec.adapters.sensor_clock import NS_PER_S, SensorClock
 from coec.adapters.snapshots import Snapshot
-from coec.adapters.state_store import History, StateStore
+from coec.adapters.state_store import BASELINES, StateStore
+from coec.adapters.stream_report import StreamReport
 from coec.adapters.threads import ServiceThread
-from coec.adapters.window_folder import WindowFolder
-from coec.adapters.wire import estimate_of, result_of
-from coec.adapters.worker import SUPERSEDED, Solved, SolveJob, Worker
+from coec.adapters.window_folder import WindowFolder, start_ns_of
+from coec.adapters.wire import estimate_of, metric_of, result_of
+from coec.adapters.worker import SUPERSEDED, Errand, Solved, SolveJob, Worker
 from coec.adapters.zenoh_bus import Answer
-from coec.calibration.lifecycle import (
-    Health,
-    HealthState,
-    PairState,
-    after_estimate,
-    after_failure,
-    assess,
-    initial_state,
-)
+from coec.calibration import lifecycle
+from coec.calibration.baseline import Baseline, drift, mismatch
+from coec.calibration.commissioning import learned_hash
+from coec.calibration.lifecycle import Health, HealthState, PairState, Rules
+from coec.calibration.monitor import Observation, Outcome
 from coec.calibration.pairing import Pairer
-from coec.calibration.values import FramePair, ImageQuality, Matrix4, Reason
+from coec.calibration.sampler import LookSampler
+from coec.calibration.urgency import Urgency
+from coec.calibration.values import Estimate, FramePair, Matrix4, Metric, Reason
 from coec.calibration.window import PairSelected, SliceEnded, WindowCutter
-from coec.config import Config, PairConfig, config_hash
-from coec.errors import StateError
+from coec.config import CalibrationConfig, Config, PairConfig, config_hash
+from coec.errors import NotFoundError, StateError
+from coec.geometry import se3
 from coec.schemas import replies
 from coec.schemas.base import from_msgpack
 from coec.schemas.keys import Format, Keys
-from coec.schemas.replies import CalibrationResult
+from coec.schemas.replies import CalibrationResult, EvidenceEvent, MetricsPoint
 
 _log = logging.getLogger(__name__)
 
@@ -64,20 +74,11 @@ GRACE_NS = NS_PER_S
 IDLE_S = 0.25
 COMMAND_TIMEOUT_S = 10.0
 
+COMMISSIONING_WINDOWS = 8
+"""Windows that a rig is commissioned from, the newest: 200 pairs."""
 
-@dataclass(frozen=True, slots=True)
-class StreamReport:
-    """What the ingest thread last said of itself."""
-
-    streams: dict[str, StreamCounts] = field(default_factory=dict)
-    unpaired: dict[str, int] = field(default_factory=dict)
-    rejections: dict[str, int] = field(default_factory=dict)
-    pairs: int = 0
-    selected: int = 0
-    quality: ImageQuality | None = None
-    frozen: bool = False
-    rate_hz: float | None = None
-    sync_error_s: float | None = None
+COMMISSIONING_TIMEOUT_S = 900.0
+"""A commissioning calibrates its windows many times over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,8 @@ class Outside:
 
 
 class PairService:
-    """Serves one pair. Attributes `ingest` and `recorder.thread` are its threads; `inbox` takes its samples."""
+    """Serves one pair. Attributes `ingest` and `recorder.thread` are its threads; `inbox` takes its samples, `ledger`
+    keeps its state."""
 
     def __init__(self, pair: PairConfig, config: Config, outside: Outside) -> None:
         """Build the pair and recall its state; `refresh` must be called before anything is asked.
@@ -106,11 +108,14 @@ class PairService:
         self._config = config
         self._outside = outside
         self._rig = rig_of(pair)
+        self._rules = Rules(pair.policy, pair.fusion)
         self.losses = LossCounter(_log, pair.name)
         depths = {CAMERA: FRAMES_WAITING, LIDAR: FRAMES_WAITING, EGO: MOTIONS_WAITING}
         self.inbox = Inbox(depths, lambda stream: self.losses.add(stream, "overrun"))
+        self._baseline_trouble: Reason | None = None
+        self._baseline = self._load_baseline()
         plan = RecordingPlan(
-            self._rig, pair.calibration, pair.window.min_pairs, {"vehicle": config.vehicle, "pair": pair.name}
+            self._rig, self._calibration(), pair.window.min_pairs, {"vehicle": config.vehicle, "pair": pair.name}
         )
         self.recorder = Recorder(plan, outside.folder, self.losses, self._on_recorded)
         self.ingest = ServiceThread(f"ingest-{pair.name}", self._run)
@@ -118,24 +123,24 @@ class PairService:
         self._intake = Intake(pair, config.limits, self.losses)
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._cutter = WindowCutter(pair.window, self._rig, Inspector(config.limits))
+        self._sampler = LookSampler(pair.monitor, pair.window)
+        self._urgency = Urgency(pair.monitor, pair.window)
         self._clock = SensorClock()
         self._pairs = 0
         self._sync_error_s: float | None = None
         self._frozen = False
         self._report = StreamReport()
         # Shared.
+        self.ledger = Ledger(self._rig, config.vehicle, config.state, outside.store, outside.folder, self.losses)
+        self._overlays = Overlays(pair.name, outside.worker)
         self._lock = threading.RLock()
-        self._damage: Reason | None = None
-        self._evaluated_s: float | None = None
-        self._state = self._recall()
-        self._history = History(config.state.directory / f"history-{pair.name}.jsonl", config.state.history)
-        if self._history.damaged:
-            self.losses.add("storage", "history_damaged", self._history.damaged)
+        self._look_metrics: tuple[Metric, ...] = ()
+        self._looks = 0
         self._solved = 0
         self._health = Health(HealthState.UNKNOWN, ())
-        self._since_ns = time.time_ns()
         self._served: dict[str, Snapshot] = {}
         self._published: dict[str, object] = {}
+        self._commands: dict[str, int] = {}
 
     # --- asked from outside -----------------------------------------------------------------------------------------
 
@@ -158,16 +163,31 @@ class PairService:
         return self._served["health"].answer(form)
 
     def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
-        """Past results with `data_stamp_ns` in the bounds, the newest `limit` of them."""
-        results = self._history.results()
-        chosen = tuple(result for result in results if since_ns <= result.data_stamp_ns <= until_ns)[-limit:]
-        return replies.HistoryReply(vehicle=self._config.vehicle, pair=self.name, total=len(results), results=chosen)
+        """Past results and other entries with a sensor stamp in the bounds, the newest `limit` of each; entries that
+        have none are dated by the wall clock."""
+        entries = self.ledger.history.entries()
+        results = self.ledger.history.results()
+
+        def inside(kept: replies.HistoryEntry) -> bool:
+            return since_ns <= (kept.wall_ns if kept.stamp_ns is None else kept.stamp_ns) <= until_ns
+
+        return replies.HistoryReply(
+            vehicle=self._config.vehicle,
+            pair=self.name,
+            total=len(results),
+            results=tuple(result for result in results if since_ns <= result.data_stamp_ns <= until_ns)[-limit:],
+            entries=tuple(kept.chained for kept in entries if inside(kept.entry))[-limit:],
+        )
 
     def windows(self) -> replies.WindowsReply:
         """The recorded windows."""
         return replies.WindowsReply(
             vehicle=self._config.vehicle, pair=self.name, windows=self._outside.folder.listing(self.name)
         )
+
+    def evidence(self) -> replies.EvidenceReply:
+        """Red events that are kept."""
+        return self.ledger.evidence.listing(self._config.vehicle)
 
     def read_window(self, window_id: str, offset: int, length: int) -> bytes:
         """Bytes of one window's file.
@@ -177,6 +197,20 @@ class PairService:
             UsageError: the offset lies behind its end.
         """
         return self._outside.folder.read(self.name, window_id, offset, length)
+
+    def overlay(self, window_id: str | None, *, nominal: bool) -> bytes:
+        """JPEG of a window's (None: the latest one's) points at the current, or the nominal, extrinsic.
+
+        Raises:
+            NotFoundError: no such window.
+            NotDrawnError: the worker has no time, or cannot.
+        """
+        latest = self.recorder.latest
+        if window_id is None and (latest is None or not latest.exists()):
+            raise NotFoundError(f"pair {self.name} has no window yet")
+        path = latest if window_id is None and latest else self._outside.folder.existing(self.name, str(window_id))
+        pose = self._rig.T_camera_lidar_nominal if nominal else self.ledger.state.T_camera_lidar
+        return self._overlays.jpeg(path, pose, f"{path.stem}  {'nominal' if nominal else 'current'}")
 
     def status(self) -> replies.PairStatus:
         """Counters since the start."""
@@ -195,19 +229,13 @@ class PairService:
             pairs=report.pairs,
             selected=report.selected,
             rejections=report.rejections,
-            losses={**drops.get("window", {}), **drops.get("storage", {})},
+            losses={**drops.get("window", {}), **drops.get("storage", {}), **drops.get("monitor", {})},
             windows=self.recorder.recorded,
             solved=self._solved,
+            looks=self._looks,
+            transitions=dict(self.ledger.transitions),
+            commands=dict(self._commands),
         )
-
-    def calibrate(self) -> replies.Acknowledgement:
-        """Finish the open window now if it has enough pairs, and solve it; else solve the latest window again."""
-        done: Future[replies.Acknowledgement] = Future()
-        self.inbox.call(lambda: done.set_result(self._calibrate_now()))
-        try:
-            return done.result(COMMAND_TIMEOUT_S)
-        except TimeoutError:
-            return self._acknowledge("busy", "The streams keep the service busy; ask again.", accepted=False)
 
     def take_sample(self, stream: str, payload: bytes, encoding: str) -> None:
         """A sample came: microseconds, on the network's thread."""
@@ -215,13 +243,21 @@ class PairService:
 
     def refresh(self) -> None:
         """Serialise what is served anew, and publish what changed. The daemon calls it every second."""
+        self.ledger.age(self._config.stale_after_s)
         with self._lock:
-            state = self._state
+            state = self.ledger.state
             rig, vehicle = self._rig, self._config.vehicle
             accepted = result_of(state.accepted, rig, vehicle) if state.accepted else None
             latest = result_of(state.latest, rig, vehicle) if state.latest else None
-            fallback_hash = config_hash(self._pair.calibration)
-            extrinsic = snapshots.extrinsic_of(vehicle, rig, state, accepted, self.percent_complete, fallback_hash)
+            extrinsic = snapshots.extrinsic_of(
+                vehicle,
+                rig,
+                state,
+                accepted,
+                self.percent_complete,
+                config_hash(self._pair.calibration),
+                self._pair.fusion,
+            )
             health = self._health_reply(state, latest)
             self._served = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
             changed = {
@@ -233,6 +269,106 @@ class PairService:
                     self._published[name] = essence
                     key = f"{self._outside.keys.root}/{self.name}/{name}"
                     self._outside.publish(key, self._served[name].answer("msgpack"))
+
+    # --- commands ---------------------------------------------------------------------------------------------------
+
+    def command(self, name: str, arguments: dict[str, Any], sender: str) -> replies.Acknowledgement:
+        """Carry out a command of `commands.NAMES`, or say why not; either is logged and written down."""
+        carry_out: dict[str, Callable[[], replies.Acknowledgement]] = {
+            "calibrate": self._calibrate,
+            "apply": self._apply,
+            "rollback": partial(self._roll_back, arguments.get("to")),
+            "reset": self._reset,
+            "commission": self._commission,
+            "hold": partial(self._hold, release=bool(arguments.get("release", False))),
+        }
+        try:
+            acknowledged = carry_out[name]()
+        except lifecycle.CommandRefusedError as error:
+            acknowledged = self._acknowledge(name, error.code, str(error), accepted=False)
+        except NotFoundError as error:
+            acknowledged = self._acknowledge(name, error.reply_code, str(error), accepted=False)
+        accepted, code = acknowledged.accepted, acknowledged.code
+        outcome = f"{name}_{'accepted' if accepted else 'refused'}"
+        self._commands[outcome] = self._commands.get(outcome, 0) + 1
+        fields = {"pair": self.name, "command": name, "sender": sender, "accepted": accepted, "code": code}
+        _log.info("a command came", extra={"fields": fields})
+        self.ledger.note_command(name, code, acknowledged.text, sender, accepted=accepted)
+        self.ledger.save()
+        self.refresh()
+        return acknowledged
+
+    def _calibrate(self) -> replies.Acknowledgement:
+        """Finish the open window now if it has enough pairs, and solve it; else solve the latest window again."""
+        done: Future[replies.Acknowledgement] = Future()
+        self.inbox.call(lambda: done.set_result(self._calibrate_now()))
+        try:
+            return done.result(COMMAND_TIMEOUT_S)
+        except TimeoutError:
+            text = "The streams keep the service busy; ask again."
+            return self._acknowledge("calibrate", "busy", text, accepted=False)
+
+    def _apply(self) -> replies.Acknowledgement:
+        self.ledger.update(partial(lifecycle.apply_pending, rules=self._rules), None, looked=False)
+        return self._replaced("apply", "applied", "The candidate is served from now on.")
+
+    def _roll_back(self, to: str | None) -> replies.Acknowledgement:
+        kept, result = self.ledger.accepted_calibration(to)
+        told = kept.entry.camera_from_lidar or result.camera_from_lidar
+        pose, estimate = np.array(told.matrix, dtype=np.float64), estimate_of(result)
+        self.ledger.update(lambda state: lifecycle.rolled_back(state, pose, estimate, self._rules), None, looked=False)
+        text = f"The calibration {kept.sha256[:16]} is served again; the next accepted window may move it: see `hold`."
+        return self._replaced("rollback", "rolled_back", text, result.window_id)
+
+    def _reset(self) -> replies.Acknowledgement:
+        self.ledger.update(lambda state: lifecycle.reset(state, self._rig), None, looked=False)
+        text = "The workshop calibration is served; the next accepted window may move it: see `hold`."
+        return self._replaced("reset", "reset", text)
+
+    def _hold(self, *, release: bool) -> replies.Acknowledgement:
+        self.ledger.update(lifecycle.released if release else lifecycle.held, None, looked=False)
+        if release:
+            return self._acknowledge("hold", "released", "Accepted estimates may be applied again.")
+        return self._acknowledge("hold", "held", "The extrinsic stays as it is until it is released.")
+
+    def _replaced(self, name: str, code: str, text: str, window_id: str | None = None) -> replies.Acknowledgement:
+        self._look_metrics = ()
+        self.inbox.call(self._urgency.calm)
+        return self._acknowledge(name, code, text, window_id=window_id)
+
+    def _commission(self) -> replies.Acknowledgement:
+        """Have the worker learn the baseline from the windows that agree with what is served."""
+        state, folder = self.ledger.state, self._outside.folder
+        agreeing = [
+            folder.path(result.window_id)
+            for result in self.ledger.history.results()
+            if result.status == "accepted"
+            and folder.path(result.window_id).exists()
+            and lifecycle.agrees(state.T_camera_lidar, estimate_of(result).optimum.T_camera_lidar, self._pair.policy)
+        ]
+        paths = list(dict.fromkeys(agreeing))[-COMMISSIONING_WINDOWS:]
+        if not paths:
+            text = "No recorded window agrees with what is served: calibrate first."
+            return self._acknowledge("commission", "too_few_windows", text, accepted=False)
+        body = {"paths": [str(path) for path in paths], "pose": pack_pose(state.T_camera_lidar)}
+        self._outside.worker.run_errand(
+            Errand("commission", self.name, body, self._on_commissioned, COMMISSIONING_TIMEOUT_S)
+        )
+        text = f"The rig is being commissioned from {len(paths)} windows; `history` will say how it went."
+        return self._acknowledge("commission", "commissioning", text, window_id=paths[-1].stem)
+
+    def _acknowledge(
+        self, name: str, code: str, text: str, *, accepted: bool = True, window_id: str | None = None
+    ) -> replies.Acknowledgement:
+        return replies.Acknowledgement(
+            vehicle=self._config.vehicle,
+            pair=self.name,
+            command=name,
+            accepted=accepted,
+            code=code,
+            text=text,
+            window_id=window_id,
+        )
 
     # --- on the ingest thread ---------------------------------------------------------------------------------------
 
@@ -265,7 +401,9 @@ class PairService:
             self._pairs += 1
             self._clock.observe(pair.stamp_ns, time.monotonic())
             self._sync_error_s = (pair.camera.stamp_ns - pair.lidar.stamp_ns) / NS_PER_S
-            T_camera_lidar = self._state.T_camera_lidar
+            T_camera_lidar = self.ledger.state.T_camera_lidar
+            for ended in self._urgency.heed(pair.stamp_ns, self._cutter, self._clock.rate_hz):
+                self._end(ended)
             frozen_before = self._cutter.rejections["frozen"]
             for event in self._cutter.offer(pair, T_camera_lidar):
                 if isinstance(event, PairSelected):
@@ -273,7 +411,11 @@ class PairService:
                     self._select(event, T_camera_lidar)
                 else:
                     self._end(event)
+                    self._urgency.ended(event, self._cutter, self._clock.rate_hz)
             self._frozen |= self._cutter.rejections["frozen"] > frozen_before
+            look = self._sampler.offer(pair)
+            if look is not None:
+                self._look(look)
 
     def _select(self, event: PairSelected, T_camera_lidar: Matrix4) -> None:
         self.recorder.add(event.window_id, event.pair, T_camera_lidar)
@@ -284,6 +426,12 @@ class PairService:
         fields = {"window": event.window_id, "pairs": event.pairs, "complete": event.complete}
         _log.info("a slice ended", extra={"fields": fields})
         self.recorder.end(event)
+
+    def _look(self, pairs: tuple[FramePair, ...]) -> None:
+        """Have the worker judge the latest pairs at what is served."""
+        epoch, pose = self.ledger.epoch, self.ledger.state.T_camera_lidar
+        body = {"pose": pack_pose(pose), "frames": pack_pairs(pairs)}
+        self._outside.worker.look(Errand("observe", self.name, body, partial(self._on_observed, epoch)))
 
     def _end_in_silence(self) -> None:
         """Let the slice end by extrapolated time when the streams have stopped."""
@@ -303,31 +451,14 @@ class PairService:
         if lacking <= 0:
             (ended,) = self._cutter.finish()
             self._end(ended)
-            return self._acknowledge(
-                "window_finished", f"The window of {ended.pairs} pairs is being solved.", window_id=ended.window_id
-            )
+            text = f"The window of {ended.pairs} pairs is being solved."
+            return self._acknowledge("calibrate", "window_finished", text, window_id=ended.window_id)
         latest = self.recorder.latest
         if latest is not None and latest.exists():
             self._outside.worker.solve(SolveJob(self.name, latest.stem, latest))
-            return self._acknowledge(
-                "window_again",
-                f"The latest window is being solved again; {lacking} more pairs are needed for a new one.",
-                window_id=latest.stem,
-            )
-        return self._acknowledge("too_few_pairs", f"{lacking} more pairs needed.", accepted=False)
-
-    def _acknowledge(
-        self, code: str, text: str, *, accepted: bool = True, window_id: str | None = None
-    ) -> replies.Acknowledgement:
-        return replies.Acknowledgement(
-            vehicle=self._config.vehicle,
-            pair=self.name,
-            command="calibrate",
-            accepted=accepted,
-            code=code,
-            text=text,
-            window_id=window_id,
-        )
+            text = f"The latest window is being solved again; {lacking} more pairs are needed for a new one."
+            return self._acknowledge("calibrate", "window_again", text, window_id=latest.stem)
+        return self._acknowledge("calibrate", "too_few_pairs", f"{lacking} more pairs needed.", accepted=False)
 
     def _tell(self) -> None:
         silent = self._clock.is_silent(time.monotonic())
@@ -347,6 +478,13 @@ class PairService:
     # --- on the recorder's and the supervisor's threads -------------------------------------------------------------
 
     def _on_recorded(self, window_id: str, path: Path, live: bool) -> None:
+        waiting, since_ns = self.ledger.evidence.awaiting, self.ledger.state.flagged_since_ns
+        if waiting is not None and live:
+            begun_ns = waiting.stamp_ns if since_ns is None else since_ns
+            if start_ns_of(window_id) >= begun_ns:
+                self.ledger.evidence.add_window_after(window_id)
+                self.ledger.protect()
+                self._draw(waiting, window_id, "after")
         self._outside.worker.solve(SolveJob(self.name, window_id, path, live))
 
     def on_solved(self, solved: Solved) -> None:
@@ -356,16 +494,18 @@ class PairService:
         _log.info("a window was solved", extra={"fields": fields})
         if solved.note is not None:
             self.losses.add("window", "result_not_written", detail=solved.note.text)
-        with self._lock:
-            try:
-                self._history.append(result)
-            except StateError as error:
-                self.losses.add("storage", "history_not_saved", detail=str(error))
-            self._solved += 1
-            latest = self._state.latest
-            # A window of an earlier run is old news when a newer one has been evaluated.
-            if solved.job.live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
-                self._become(after_estimate(self._state, estimate_of(result)))
+        self._check_baseline(result)
+        self.ledger.note_result(result)
+        self._solved += 1
+        latest = self.ledger.state.latest
+        # A window of an earlier run is old news when a newer one has been evaluated.
+        if solved.job.live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
+            estimate, start_ns = self._unbiased(estimate_of(result)), start_ns_of(result.window_id)
+            self._step(
+                lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules), result.data_stamp_ns
+            )
+        else:
+            self.ledger.save()
         self.refresh()
 
     def on_failed(self, job: SolveJob, reason: Reason) -> None:
@@ -373,104 +513,189 @@ class PairService:
         self.losses.add("window", reason.code, detail=reason.text)
         if reason is SUPERSEDED or not job.live:
             return
-        with self._lock:
-            self._become(after_failure(self._state, reason))
+        self._step(lambda state: lifecycle.after_failure(state, reason), None)
         self.refresh()
 
-    def save(self) -> None:
-        """Put the state on the disk; a failure is counted."""
-        with self._lock:
-            age_s = self._age_s()
-            evaluated_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
-            try:
-                self._outside.store.remember(self._rig, self._state, evaluated_ns)
-            except StateError as error:
-                self.losses.add("storage", "state_not_saved", detail=str(error))
+    def _on_observed(self, epoch: int, answer: dict[str, Any] | Reason) -> None:
+        if isinstance(answer, Reason):
+            self.losses.add("monitor", f"look_{answer.code}", detail=answer.text)
+            return
+        observation = unpack_observation(answer)
+        if not self._step(
+            lambda state: lifecycle.after_observation(state, observation), observation.stamp_ns, observation, epoch
+        ):
+            self.losses.add("monitor", "look_overtaken")
+            return
+        self._looks += 1
+        self._look_metrics = observation.metrics
+        self.ledger.evidence.note(
+            MetricsPoint(
+                stamp_ns=observation.stamp_ns,
+                state=self.ledger.state.health.value,
+                metrics={metric.name: metric_of(metric).value for metric in observation.metrics},
+            )
+        )
+        self.refresh()
 
-    def _become(self, state: PairState) -> None:
-        self._state = state
-        self._damage = None
-        self._evaluated_s = time.monotonic()
-        self.save()
+    def _step(
+        self,
+        step: Callable[[PairState], PairState],
+        stamp_ns: int | None,
+        observation: Observation | None = None,
+        epoch: int | None = None,
+    ) -> bool:
+        """Data were judged: take the step, raise or end the alarm, draw what a red event needs. False when the step
+        was meant for another extrinsic."""
+        taken = self.ledger.update(step, stamp_ns, looked=True, epoch=epoch)
+        if taken is None:
+            return False
+        before, after = taken
+        if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
+            self._look_metrics = ()
+        self._hurry(before, after, observation)
+        red = HealthState.MISCALIBRATED
+        if after.health is red and before.health is not red:
+            self._draw_new_event()
+        return True
+
+    def _hurry(self, before: PairState, after: PairState, observation: Observation | None) -> None:
+        """A window is wanted when the monitor's word has become worse, or a window did not settle it."""
+        if after.monitor.outcome not in (Outcome.SUSPECT, Outcome.CONFIRMED) or after.flagged_since_ns is None:
+            self.inbox.call(self._urgency.calm)
+            return
+        waiting = after.pending is not None and after.pending.contradicts
+        if waiting or (observation is not None and before.monitor.outcome is after.monitor.outcome):
+            return
+        since_ns, from_ns = after.flagged_since_ns, 0
+        if observation is not None:
+            from_ns = observation.stamp_ns + round(self._pair.monitor.period_s * NS_PER_S)
+        self.inbox.call(lambda: self._urgency.alarm(since_ns, from_ns))
+
+    def _draw_new_event(self) -> None:
+        event = self.ledger.evidence.newest
+        if event is None:
+            return
+        sides: tuple[tuple[Side, str | None], ...] = (("before", event.window_before), ("after", event.window_after))
+        for side, window_id in sides:
+            if window_id is not None:
+                self._draw(event, window_id, side)
+
+    def _draw(self, event: EvidenceEvent, window_id: str, side: Side) -> None:
+        """A picture for the evidence, at what was served when the event began."""
+
+        def drawn(picture: bytes | Reason) -> None:
+            if isinstance(picture, Reason):
+                self.losses.add("storage", "overlay_not_drawn", detail=picture.text)
+            else:
+                self.ledger.evidence.add_overlay(event.event_id, side, picture)
+
+        pose = np.array(event.camera_from_lidar.matrix, dtype=np.float64)
+        path = self._outside.folder.path(window_id)
+        self._overlays.request(path, pose, f"{window_id}  {side} {event.event_id}", drawn)
+
+    def save(self) -> None:
+        """Put the state on the disk."""
+        self.ledger.save()
+
+    # --- the commissioned rig ---------------------------------------------------------------------------------------
+
+    def _calibration(self) -> CalibrationConfig:
+        """How windows are calibrated: with the limits that were learned on this rig, if they were."""
+        configured = self._pair.calibration
+        if self._baseline is None:
+            return configured
+        return configured.model_copy(update={"verdict": self._baseline.verdict(configured.verdict)})
+
+    def _load_baseline(self) -> Baseline | None:
+        try:
+            baseline = load_baseline(self._config.state.directory / BASELINES, self.name)
+        except StateError as error:
+            self._baseline_trouble = Reason("baseline_damaged", f"The baseline of the rig cannot be used: {error}")
+            return None
+        if baseline is None:
+            return None
+        learned = learned_hash(self._pair.calibration)
+        wrong = mismatch(baseline, self._rig, baseline.depth_identity, learned)
+        self._baseline_trouble = None if wrong is None else _mismatched(wrong)
+        return baseline if wrong is None else None
+
+    def _check_baseline(self, result: CalibrationResult) -> None:
+        """Only a result tells which network the worker has opened."""
+        baseline = self._baseline
+        if baseline is not None and baseline.depth_identity != result.depth_identity:
+            self._baseline = None
+            self._baseline_trouble = _mismatched("It was made with another depth network.")
+            self.recorder.use(self._calibration())
+
+    def _unbiased(self, estimate: Estimate) -> Estimate:
+        """What an estimate says once the estimator's bias on this rig is taken out."""
+        if self._baseline is None:
+            return estimate
+        return lifecycle.moved(estimate, self._baseline.unbiased(estimate.optimum.T_camera_lidar), self._rig)
+
+    def _on_commissioned(self, answer: dict[str, Any] | Reason) -> None:
+        if isinstance(answer, Reason):
+            self.losses.add("window", "commissioning_failed", detail=answer.text)
+            self.ledger.note_command("commission", answer.code, f"failed: {answer.text}", "service", accepted=False)
+            self.ledger.save()
+            return
+        self._baseline = self._load_baseline()
+        self.recorder.use(self._calibration())
+        text = f"Commissioned from {answer['windows']} windows, {answer['pairs']} pairs; baseline {answer['hash']}."
+        self.ledger.note_commissioned(text)
+        pose = np.array(answer["pose"], dtype=np.float64)
+        self._step(lambda state: lifecycle.after_commissioning(state, pose), self.ledger.evaluated_stamp_ns)
+        self.refresh()
 
     # --- health -----------------------------------------------------------------------------------------------------
 
-    def _recall(self) -> PairState:
-        damage = self._outside.store.damage
-        try:
-            remembered = self._outside.store.recall(self._rig)
-        except StateError as error:
-            damage, remembered = (*damage, str(error)), None
-        if damage:
-            source = "the previous copy" if remembered else "the nominal calibration"
-            self._damage = Reason("state_damaged", f"The state on the disk was damaged; {source} is served.")
-            self.losses.add("storage", "state_damaged", len(damage), detail="; ".join(damage))
-        if remembered is None:
-            return initial_state(self._rig)
-        if remembered.evaluated_wall_ns is not None:
-            age_s = max(time.time_ns() - remembered.evaluated_wall_ns, 0) / NS_PER_S
-            self._evaluated_s = time.monotonic() - age_s
-        return remembered.state
-
-    def _age_s(self) -> float | None:
-        return None if self._evaluated_s is None else time.monotonic() - self._evaluated_s
-
     def _health_reply(self, state: PairState, latest: CalibrationResult | None) -> replies.HealthReply:
-        age_s = self._age_s()
-        health = self._with_troubles(assess(state, age_s, self._config.stale_after_s))
-        if health.state is not self._health.state:
-            self._since_ns = time.time_ns()
+        health = self._with_troubles(Health(state.health, state.reasons))
         self._health = health
+        value, sigma = self._drift(state)
+        metrics = dict(latest.metrics) if latest else {}
         return replies.HealthReply(
             vehicle=self._config.vehicle,
             pair=self.name,
             state=health.state.value,
             level=replies.ROS_LEVELS[health.state.value],
             reasons=snapshots.reasons_of(health.reasons),
-            metrics=latest.metrics if latest else {},
+            metrics={**metrics, **{metric.name: metric_of(metric) for metric in self._look_metrics}},
             axes=snapshots.axes_of(latest, state.status),
-            needs=self._needs(state),
-            data_quality=self._data_quality(),
-            since_ns=self._since_ns,
-            evaluated_ns=latest.data_stamp_ns if latest else None,
-            age_s=age_s,
+            drift=value,
+            drift_sigma=sigma,
+            needs=self._report.needs(self._pair, state.latest),
+            data_quality=self._report.data_quality(self.losses.snapshot()),
+            since_ns=self.ledger.since_ns,
+            evaluated_ns=self.ledger.evaluated_stamp_ns,
+            age_s=self.ledger.age_s,
         )
+
+    def _drift(self, state: PairState) -> tuple[replies.Maybe6 | None, replies.Maybe6 | None]:
+        """From the commissioned calibration, with its standard deviations; None before commissioning."""
+        if self._baseline is None:
+            return None, None
+        sigma = np.full(6, np.nan) if state.accepted is None else state.accepted.sigma
+        drifted = drift(se3.perturb(state.T_camera_lidar, self._baseline.bias), sigma, self._baseline)
+        return _maybe(drifted.value), _maybe(drifted.sigma)
 
     def _with_troubles(self, health: Health) -> Health:
         """What ails the service itself makes a healthy pair degraded, and is said in every state."""
-        own = tuple(reason for reason in (self._damage, self.recorder.trouble) if reason is not None)
-        troubles = (*own, *self._outside.vehicle_troubles())
+        own = (self.ledger.damage, self._baseline_trouble, self.recorder.trouble)
+        troubles = (*(reason for reason in own if reason is not None), *self._outside.vehicle_troubles())
+        if self.ledger.state.frozen:
+            troubles = (*troubles, Reason("held", "The extrinsic is held by command."))
         if not troubles:
             return health
-        state = HealthState.DEGRADED if health.state is HealthState.HEALTHY else health.state
-        return Health(state, (*health.reasons, *troubles))
+        worse = health.state is HealthState.HEALTHY and any(reason.code != "held" for reason in troubles)
+        return Health(HealthState.DEGRADED if worse else health.state, (*health.reasons, *troubles))
 
-    def _needs(self, state: PairState) -> tuple[str, ...]:
-        report, needs = self._report, []
-        lacking = self._pair.window.min_pairs - report.selected
-        if lacking > 0:
-            needs.append(f"{lacking} more pairs")
-        if self._pair.calibration.motion_compensation:
-            compensation = state.latest.compensation if state.latest else {}
-            ego = report.streams.get(EGO)
-            if self._pair.ego is None or (report.pairs and (ego is None or not ego.accepted)):
-                needs.append("motion compensation has no ego-motion")
-            elif compensation.get("no_point_time", 0):
-                needs.append("motion compensation has no point times")
-        return tuple(needs)
 
-    def _data_quality(self) -> replies.DataQuality:
-        report = self._report
-        drops = snapshots.drops_of(self.losses.snapshot(), report.unpaired)
-        if report.rejections:
-            drops["pairs"] = report.rejections
-        quality = report.quality
-        return replies.DataQuality(
-            pair_rate_hz=report.rate_hz,
-            sync_error_s=report.sync_error_s,
-            drops=drops,
-            sharpness=quality.sharpness if quality else None,
-            mean_level=quality.mean_level if quality else None,
-            clipped=quality.clipped if quality else None,
-            frozen_image=report.frozen,
-        )
+def _mismatched(text: str) -> Reason:
+    return Reason("baseline_mismatch", f"The baseline of the rig is not used: {text}")
+
+
+def _maybe(rad_m: np.ndarray[Any, np.dtype[np.float64]]) -> replies.Maybe6:
+    """(6,) in degrees and metres; NaN becomes null."""
+    told = snapshots.degrees_and_metres(rad_m)
+    return cast("replies.Maybe6", tuple(None if math.isnan(value) else value for value in told))

@@ -69,6 +69,7 @@ class Recorder:
         """`on_recorded(window_id, path, live)` is called on the recorder's thread for each finished window, and with
         `live` False for unsolved ones of earlier runs."""
         self._plan = plan
+        self._configuration = plan.configuration
         self._folder = folder
         self._losses = losses
         self._on_recorded = on_recorded
@@ -86,6 +87,10 @@ class Recorder:
     def latest(self) -> Path | None:
         """The latest finished window; None when there is none on the disk."""
         return self._latest
+
+    def use(self, configuration: CalibrationConfig) -> None:
+        """The next window is to be calibrated with this: the limits of the rig were learned anew."""
+        self._configuration = configuration
 
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
         """Queue a chosen pair; never waits for the disk. `T_camera_lidar` (4, 4) is where a search will start if this
@@ -182,7 +187,7 @@ class Recorder:
             self._plan.rig,
             item.T_camera_lidar,
             item.window_id,
-            self._plan.configuration,
+            self._configuration,
             self._plan.metadata,
         )
         return _Open(item.window_id, writer, 0)

@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from coec.adapters.baseline_file import load_baseline, save_baseline
 from coec.adapters.depth import CachedDepth, open_depth
-from coec.adapters.images import GreyImages
+from coec.adapters.images import GreyImages, decode_bgr, encode_jpeg
+from coec.adapters.looks import pack_observation, unpack_pairs
 from coec.adapters.mcap_windows import read_window, write_result
 from coec.adapters.msgpack_frames import decode_camera
+from coec.adapters.overlay import draw
 from coec.adapters.rig import rig_of
+from coec.adapters.state_store import BASELINES
 from coec.adapters.wire import result_of
+from coec.calibration.baseline import Baseline, mismatch
 from coec.calibration.calibrator import calibrate
+from coec.calibration.commissioning import commission, learned_hash
+from coec.calibration.monitor import observe
+from coec.calibration.motion import compensate
 from coec.calibration.ports import Silence
 from coec.calibration.values import (
     CameraFrame,
@@ -36,6 +46,8 @@ _log = logging.getLogger(__name__)
 
 WARM_UP_POINTS = 4000
 WARM_UP_DEPTH_PX = (48, 64)
+
+OVERLAY_JPEG_QUALITY = 88
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +72,10 @@ class Solver:
         self._depth_maps_kept = depth_maps_kept
         self._images = GreyImages(config.limits)
         self._networks: dict[DepthConfig, CachedDepth] = {}
-        self._depth_of_pair = {pair.name: pair.calibration.depth for pair in config.pairs}
-        for depth in self._depth_of_pair.values():
-            self._network(depth)
+        self._pairs = {pair.name: pair for pair in config.pairs}
+        self._rigs = {pair.name: rig_of(pair) for pair in config.pairs}
+        for pair in config.pairs:
+            self._network(pair.calibration.depth)
 
     def warm_up(self) -> None:
         """Run every kernel once on a few invented points, so that no window waits for a compiler."""
@@ -71,7 +84,10 @@ class Solver:
             configuration = pair.calibration.model_copy(update={"search": search})
             # An invented window need not lead to a calibration; that it ran is enough.
             with contextlib.suppress(CalibrationError, DecodeError):
-                calibrate(_invented_window(rig_of(pair)), _Ramp(), self._images, configuration, Silence())
+                calibrate(_invented_window(self._rigs[pair.name], 2), _Ramp(), self._images, configuration, Silence())
+            with contextlib.suppress(CalibrationError, DecodeError):
+                look = _invented_window(self._rigs[pair.name], pair.monitor.pairs)
+                observe(look, _Ramp(), self._images, configuration, None)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
@@ -79,7 +95,7 @@ class Solver:
         Raises:
             DecodeError: the frame cannot be decoded.
         """
-        self._network(self._depth_of_pair[pair]).infer(decode_camera(frame, self._config.limits))
+        self._network(self._pairs[pair].calibration.depth).infer(decode_camera(frame, self._config.limits))
 
     def solve(self, path: Path) -> Solution:
         """Calibrate a finished window by the configuration it carries, and write the result into its file.
@@ -97,6 +113,68 @@ class Solver:
             code = error.reply_code if isinstance(error, CoecError) else "recording_failed"
             return Solution(result, Reason(code, f"The window file does not hold the result: {error}"))
         return Solution(result, None)
+
+    def observe(
+        self, pair: str, pose: Sequence[Sequence[float]], frames: Sequence[Sequence[bytes | None]]
+    ) -> dict[str, Any]:
+        """A look of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `looks` packs them.
+
+        Raises:
+            CalibrationError, DecodeError, ModelError, StateError: there is no answer.
+        """
+        configuration = self._pairs[pair].calibration
+        window = Window(
+            f"{pair}-look",
+            self._rigs[pair],
+            np.array(pose, dtype=np.float64),
+            unpack_pairs(frames, self._config.limits),
+        )
+        network = self._network(configuration.depth)
+        return pack_observation(
+            observe(window, network, self._images, configuration, self._baseline(pair, network.identity))
+        )
+
+    def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> bytes:
+        """JPEG of the points of a window's last pair on its image, at an extrinsic (rows of the (4, 4) matrix).
+
+        Raises:
+            WindowError, DecodeError: the window or its image cannot be read.
+        """
+        window, configuration = read_window(path)
+        pair, rig = window.pairs[-1], window.rig
+        cloud = compensate(pair, rig, enabled=configuration.motion_compensation)
+        image = decode_bgr(pair.camera.image, self._config.limits)
+        T_camera_lidar = np.array(pose, dtype=np.float64)
+        return encode_jpeg(draw(image, rig.camera, T_camera_lidar, cloud.xyz_m, rig.mask, title), OVERLAY_JPEG_QUALITY)
+
+    def commission(self, pair: str, pose: Sequence[Sequence[float]], paths: Sequence[Path]) -> dict[str, Any]:
+        """Learn the baseline of a rig at an extrinsic (rows of the (4, 4) matrix) from recorded windows; write it.
+
+        Raises:
+            WindowError, CalibrationError, DecodeError, ModelError, StateError: there is no baseline.
+        """
+        configuration = self._pairs[pair].calibration
+        start = np.array(pose, dtype=np.float64)
+        windows = [replace(read_window(path)[0], T_camera_lidar_start=start) for path in paths]
+        baseline = commission(
+            windows,
+            self._network(configuration.depth),
+            self._images,
+            configuration,
+            sensors={},
+            reference=start,
+        )
+        saved = save_baseline(self._config.state.directory / BASELINES, baseline)
+        told = {"windows": baseline.windows, "pairs": baseline.pairs, "hash": saved}
+        return {**told, "pose": baseline.T_camera_lidar.tolist()}
+
+    def _baseline(self, pair: str, depth_identity: str) -> Baseline | None:
+        """What was learned of the rig, if it holds for this configuration and network."""
+        learned = load_baseline(self._config.state.directory / BASELINES, pair)
+        configured = learned_hash(self._pairs[pair].calibration)
+        if learned is None or mismatch(learned, self._rigs[pair], depth_identity, configured) is not None:
+            return None
+        return learned
 
     def _network(self, config: DepthConfig) -> CachedDepth:
         if config not in self._networks:
@@ -117,8 +195,8 @@ class _Ramp:
         return DepthMap(np.tile(np.linspace(1.0, 2.0, width, dtype=np.float32), (height, 1)))
 
 
-def _invented_window(rig: Rig) -> Window:
-    """Two pairs with points all around the LiDAR, seeded."""
+def _invented_window(rig: Rig, count: int) -> Window:
+    """Pairs with points all around the LiDAR, seeded."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(WARM_UP_POINTS, 3))
     range_m = rng.uniform(5.0, 30.0, size=(WARM_UP_POINTS, 1))
@@ -127,6 +205,6 @@ def _invented_window(rig: Rig) -> Window:
     image = EncodedImage(ImageFormat.MONO8, width, height, rng.bytes(width * height))
     pairs = tuple(
         FramePair(CameraFrame(stamp, rig.camera_frame, image), LidarFrame(stamp, rig.lidar_frame, xyz_m))
-        for stamp in (0, 100_000_000)
+        for stamp in range(0, count * 100_000_000, 100_000_000)
     )
     return Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)

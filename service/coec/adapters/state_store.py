@@ -1,4 +1,4 @@
-"""The state of every pair in the one state file, and its past results in a file of lines per pair."""
+"""The state of every pair in the one state file."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import hashlib
 import json
 import logging
 import threading
-from collections import deque
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,21 +16,47 @@ from pydantic import ValidationError
 from coec.adapters.rig import rig_to_json
 from coec.adapters.state_file import StateFile
 from coec.adapters.wire import estimate_of, result_of
-from coec.calibration.lifecycle import PairState, Provenance, Status, restored
+from coec.calibration.fusion import track_from_dict, track_to_dict
+from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState, Provenance, Status, restored
+from coec.calibration.monitor import MonitorState, Outcome
 from coec.calibration.values import Reason, Rig
-from coec.errors import CoecError, DecodeError, StateError
+from coec.errors import CoecError, StateError
 from coec.schemas import replies
-from coec.schemas.base import Part, from_json, to_json
+from coec.schemas.base import Part
 from coec.schemas.replies import CalibrationResult
 
 _log = logging.getLogger(__name__)
 
 
+Rows = tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]
+
+
+BASELINES = "rig.json"
+"""In the state directory: what was learned when the pairs were commissioned."""
+
+
+class StoredCandidate(Part):
+    """`Candidate` on the disk."""
+
+    T_camera_lidar: Rows
+    result: CalibrationResult
+    waits: replies.Reason
+    contradicts: bool
+
+
+class StoredChange(Part):
+    """`Change` on the disk."""
+
+    stamp_ns: int
+    step: tuple[float, ...]
+
+
 class StoredPair(Part):
-    """`PairState` on the disk, and when (wall clock) its latest window was evaluated."""
+    """`PairState` on the disk; when (wall clock) it was looked at and since when it is in its state of health; and the
+    last hash of its history. What is not in a file of an earlier version is as at the first start."""
 
     rig_sha256: str
-    T_camera_lidar: tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]
+    T_camera_lidar: Rows
     provenance: Literal["nominal", "commissioned", "estimated", "restored"]
     status: Literal["not_accepted", "accepted", "failed"]
     valid_from_ns: int
@@ -39,6 +64,27 @@ class StoredPair(Part):
     accepted: CalibrationResult | None
     failures: tuple[replies.Reason, ...]
     evaluated_wall_ns: int | None
+    health: replies.HealthState = "unknown"
+    reasons: tuple[replies.Reason, ...] = ()
+    pending: StoredCandidate | None = None
+    frozen: bool = False
+    proven: bool = False
+    track: dict[str, Any] | None = None
+    monitor: dict[str, Any] | None = None
+    flagged_since_ns: int | None = None
+    changes: tuple[StoredChange, ...] = ()
+    since_wall_ns: int | None = None
+    evaluated_stamp_ns: int | None = None
+    history_head: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """When the pair was last looked at (wall clock and sensor time), and since when (wall clock) it is in its state."""
+
+    evaluated_wall_ns: int | None
+    evaluated_stamp_ns: int | None
+    since_wall_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +92,8 @@ class Remembered:
     """A pair's state as it was before the restart."""
 
     state: PairState
-    evaluated_wall_ns: int | None
+    clocks: Clocks
+    history_head: str | None
 
 
 class StateStore:
@@ -82,11 +129,12 @@ class StateStore:
                     extra={"fields": {"pair": rig.pair}},
                 )
                 return None
-            return Remembered(restored(_state_of(stored)), stored.evaluated_wall_ns)
-        except (ValidationError, CoecError, ValueError) as error:
+            clocks = Clocks(stored.evaluated_wall_ns, stored.evaluated_stamp_ns, stored.since_wall_ns)
+            return Remembered(restored(_state_of(stored)), clocks, stored.history_head)
+        except (ValidationError, CoecError, ValueError, TypeError) as error:
             raise StateError(f"the state of pair {rig.pair} cannot be used: it has another form") from error
 
-    def remember(self, rig: Rig, state: PairState, evaluated_wall_ns: int | None) -> None:
+    def remember(self, rig: Rig, state: PairState, clocks: Clocks, history_head: str | None = None) -> None:
         """Put the pair's state on the disk.
 
         Raises:
@@ -100,93 +148,53 @@ class StateStore:
             valid_from_ns=state.valid_from_ns,
             latest=result_of(state.latest, rig, self._vehicle) if state.latest else None,
             accepted=result_of(state.accepted, rig, self._vehicle) if state.accepted else None,
-            failures=tuple(replies.Reason(code=reason.code, text=reason.text) for reason in state.failures),
-            evaluated_wall_ns=evaluated_wall_ns,
+            failures=_told(state.failures),
+            evaluated_wall_ns=clocks.evaluated_wall_ns,
+            health=state.health.value,
+            reasons=_told(state.reasons),
+            pending=self._candidate(state.pending, rig) if state.pending else None,
+            frozen=state.frozen,
+            proven=state.proven,
+            track=track_to_dict(state.track) if state.track else None,
+            monitor=asdict(state.monitor),
+            flagged_since_ns=state.flagged_since_ns,
+            changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
+            since_wall_ns=clocks.since_wall_ns,
+            evaluated_stamp_ns=clocks.evaluated_stamp_ns,
+            history_head=history_head,
         )
         with self._lock:
             self._pairs[rig.pair] = stored.model_dump(mode="json")
             self._file.save({"pairs": self._pairs})
 
-
-class History:
-    """Past results of one pair, oldest first: a line each, `<sha256 of the JSON> <JSON>`; the newest `limit` are kept.
-
-    A damaged line costs its result only. Safe to use from several threads.
-    """
-
-    def __init__(self, path: Path, limit: int) -> None:
-        self._path = path
-        self._lock = threading.Lock()
-        self._results: deque[CalibrationResult] = deque(maxlen=limit)
-        self._lines = 0
-        self.damaged = 0
-        self._load()
-
-    def results(self) -> tuple[CalibrationResult, ...]:
-        """All that are kept."""
-        with self._lock:
-            return tuple(self._results)
-
-    def append(self, result: CalibrationResult) -> None:
-        """Keep one more.
-
-        Raises:
-            StateError: it is kept in memory, but not on the disk.
-        """
-        with self._lock:
-            self._results.append(result)
-            try:
-                if self._lines >= 2 * (self._results.maxlen or 1):
-                    self._rewrite()
-                    return
-                with self._path.open("ab") as stream:
-                    stream.write(_line(result))
-                self._lines += 1
-            except OSError as error:
-                raise StateError(f"cannot write {self._path}: {error.strerror}") from error
-
-    def _load(self) -> None:
-        try:
-            lines = self._path.read_bytes().splitlines()
-        except OSError:
-            return
-        self._lines = len(lines)
-        for line in lines[-(self._results.maxlen or 0) :]:
-            checksum, _, document = line.partition(b" ")
-            if checksum != _checksum(document):
-                self.damaged += 1
-                continue
-            try:
-                self._results.append(from_json(CalibrationResult, document))
-            except DecodeError:
-                self.damaged += 1
-
-    def _rewrite(self) -> None:
-        fresh = self._path.with_name(self._path.name + ".new")
-        fresh.write_bytes(b"".join(_line(result) for result in self._results))
-        fresh.replace(self._path)
-        self._lines = len(self._results)
-
-
-def _line(result: CalibrationResult) -> bytes:
-    document = to_json(result)
-    return _checksum(document) + b" " + document + b"\n"
-
-
-def _checksum(document: bytes) -> bytes:
-    return hashlib.sha256(document).hexdigest().encode()
+    def _candidate(self, pending: Candidate, rig: Rig) -> StoredCandidate:
+        return StoredCandidate(
+            T_camera_lidar=_rows(pending.T_camera_lidar.tolist()),
+            result=result_of(pending.estimate, rig, self._vehicle),
+            waits=replies.Reason(code=pending.waits.code, text=pending.waits.text),
+            contradicts=pending.contradicts,
+        )
 
 
 def _rig_sha256(rig: Rig) -> str:
     return hashlib.sha256(json.dumps(rig_to_json(rig), sort_keys=True).encode()).hexdigest()
 
 
-def _rows(rows: list[list[float]]) -> tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]:
+def _rows(rows: list[list[float]]) -> Rows:
     a, b, c, d = ((row[0], row[1], row[2], row[3]) for row in rows)
     return a, b, c, d
 
 
+def _told(reasons: tuple[Reason, ...]) -> tuple[replies.Reason, ...]:
+    return tuple(replies.Reason(code=reason.code, text=reason.text) for reason in reasons)
+
+
+def _reasons(stored: tuple[replies.Reason, ...]) -> tuple[Reason, ...]:
+    return tuple(Reason(reason.code, reason.text) for reason in stored)
+
+
 def _state_of(stored: StoredPair) -> PairState:
+    pending = stored.pending
     return PairState(
         T_camera_lidar=np.array(stored.T_camera_lidar, dtype=np.float64),
         provenance=Provenance(stored.provenance),
@@ -194,5 +202,28 @@ def _state_of(stored: StoredPair) -> PairState:
         valid_from_ns=stored.valid_from_ns,
         latest=estimate_of(stored.latest) if stored.latest else None,
         accepted=estimate_of(stored.accepted) if stored.accepted else None,
-        failures=tuple(Reason(reason.code, reason.text) for reason in stored.failures),
+        failures=_reasons(stored.failures),
+        health=HealthState(stored.health),
+        reasons=_reasons(stored.reasons),
+        pending=None
+        if pending is None
+        else Candidate(
+            np.array(pending.T_camera_lidar, dtype=np.float64),
+            estimate_of(pending.result),
+            Reason(pending.waits.code, pending.waits.text),
+            pending.contradicts,
+        ),
+        frozen=stored.frozen,
+        proven=stored.proven,
+        track=track_from_dict(stored.track) if stored.track else None,
+        monitor=_monitor_of(stored.monitor) if stored.monitor else MonitorState(),
+        flagged_since_ns=stored.flagged_since_ns,
+        changes=tuple(Change(change.stamp_ns, change.step) for change in stored.changes),
     )
+
+
+def _monitor_of(document: dict[str, Any]) -> MonitorState:
+    """JSON knows lists only, the state is made of tuples."""
+    values: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in document.items()}
+    values["outcome"] = Outcome(values["outcome"])
+    return MonitorState(**values)

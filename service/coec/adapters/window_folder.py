@@ -45,6 +45,7 @@ class WindowFolder:
         self._lock = threading.Lock()
         self._known: dict[tuple[str, int, int], WindowInfo] = {}
         self._pairs_in: dict[str, int] = {}
+        self._protected: dict[str, frozenset[str]] = {}
         self.removed = 0
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -57,6 +58,17 @@ class WindowFolder:
         """Where a window is, or will be."""
         return self._folder / f"{window_id}.mcap"
 
+    def existing(self, pair: str, window_id: str) -> Path:
+        """The file of a window of the pair.
+
+        Raises:
+            NotFoundError: no such window.
+        """
+        match = _WINDOW_ID.fullmatch(window_id)
+        if match is None or match[1] != pair or not self.path(window_id).exists():
+            raise NotFoundError(f"pair {pair} has no window of this id; the list is in `windows`")
+        return self.path(window_id)
+
     def windows(self, pair: str) -> list[Path]:
         """Files of the pair's windows, by the sensor time of their beginning."""
         return [path for _, path in sorted(self._stamped(pair, ".mcap"))]
@@ -68,6 +80,12 @@ class WindowFolder:
     def note(self, window_id: str, pairs: int) -> None:
         """Remember how many pairs a fresh window holds, for the list."""
         self._pairs_in[window_id] = pairs
+
+    def protect(self, pair: str, window_ids: frozenset[str]) -> None:
+        """These windows of the pair (and no others any more) are evidence: age does not remove them, and lack of room
+        only when no other window is left."""
+        with self._lock:
+            self._protected[pair] = window_ids
 
     def usage(self) -> Usage:
         """How full it is."""
@@ -82,13 +100,16 @@ class WindowFolder:
         """
         with self._lock:
             entries = sorted(self._entries())
+            newest = entries[-1][2] if entries else None
+            evidence = frozenset().union(*self._protected.values())
             used = sum(size for _, size, _ in entries)
             reserve = max((size for _, size, _ in entries), default=0)
             oldest_kept_ns = time.time_ns() - round(self._config.max_age_days * SECONDS_PER_DAY * 1e9)
-            for modified_ns, size, path in entries:
+            for modified_ns, size, path in sorted(entries, key=lambda entry: entry[2].stem in evidence):
                 too_much = used + reserve > self._config.max_bytes
                 too_full = _free_bytes(self._folder) < self._config.min_free_bytes + reserve
-                if not too_much and not (too_full and path != entries[-1][2]) and modified_ns >= oldest_kept_ns:
+                too_old = modified_ns < oldest_kept_ns and path.stem not in evidence
+                if not too_much and not (too_full and path != newest) and not too_old:
                     continue
                 path.unlink(missing_ok=True)
                 self.removed += 1
@@ -113,11 +134,8 @@ class WindowFolder:
             NotFoundError: no such window.
             UsageError: the offset lies behind the end.
         """
-        match = _WINDOW_ID.fullmatch(window_id)
-        if match is None or match[1] != pair:
-            raise NotFoundError(f"pair {pair} has no window of this id; the list is in `windows`")
         try:
-            with self.path(window_id).open("rb") as stream:
+            with self.existing(pair, window_id).open("rb") as stream:
                 size = os.fstat(stream.fileno()).st_size
                 if offset > size:
                     raise UsageError(f"`offset` lies behind the end of the file ({size} bytes)")
@@ -164,6 +182,11 @@ class WindowFolder:
         except (CoecError, OSError):
             _log.exception("a window could not be listed", extra={"fields": {"window": path.stem}})
             return None
+
+
+def start_ns_of(window_id: str) -> int:
+    """Stamp of the pair that opened the window of this id."""
+    return int(window_id.rpartition("-")[2])
 
 
 def _free_bytes(folder: Path) -> int:

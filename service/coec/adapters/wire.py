@@ -58,6 +58,7 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         correction_rad_m=cast("replies.Vector6", tuple(float(v) for v in estimate.correction)),
         sigma_rad_m=_maybe6(estimate.sigma),
         solved=cast("replies.Flags6", tuple(bool(v) for v in estimate.solved)),
+        unobservable=cast("replies.Flags6", tuple(bool(v) for v in estimate.unobservable)),
         status="accepted" if estimate.verdict.decision is Decision.ACCEPTED else "failed",
         verdict=replies.Verdict(
             decision=estimate.verdict.decision.value,
@@ -108,6 +109,7 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
         correction=_array(result.correction_rad_m),
         sigma=_array(result.sigma_rad_m),
         solved=np.array(result.solved, dtype=np.bool_),
+        unobservable=np.array(result.unobservable, dtype=np.bool_),
         compensation=dict(result.compensation),
         depth_identity=result.depth_identity,
         config_hash=result.config_hash,
@@ -118,7 +120,7 @@ def metric_of(metric: Metric) -> replies.MetricReply:
     """A figure with its limit."""
     return replies.MetricReply(
         value=_number(metric.value),
-        limit=_number(metric.limit),
+        limit=None if math.isinf(metric.limit) else _number(metric.limit),
         at_least=metric.at_least,
         passed=bool(metric.passed),
     )

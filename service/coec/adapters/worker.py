@@ -40,6 +40,9 @@ PREFETCHES_WAITING = 8
 BACKLOG = 64
 """Unsolved windows of earlier runs that may wait."""
 
+ERRANDS_WAITING = 8
+"""Pictures and commissionings that may wait."""
+
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.5, 30.0
 """Pause before a worker that could not start is started again; doubles from the first to the last."""
 
@@ -89,6 +92,29 @@ class WorkerStatus:
 
 
 SUPERSEDED = Reason("superseded", "A newer window of the pair came before the worker was free.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errand:
+    """Work that is done once or not at all.
+
+    Attributes:
+        kind: `observe`, `overlay` or `commission`, as `worker_main` knows them.
+        pair: whose.
+        body: what the work needs, in values that msgpack knows.
+        done: called once, on the supervisor's thread or on the one that asked, with the worker's answer, or why there
+            is none.
+        timeout_s: after which the worker is replaced; None for that of a solve.
+    """
+
+    kind: str
+    pair: str
+    body: dict[str, Any]
+    done: Callable[[dict[str, Any] | Reason], None]
+    timeout_s: float | None = None
+
+
+BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +192,8 @@ class Worker:
         self._live: dict[str, SolveJob] = {}
         self._backlog: deque[SolveJob] = deque()
         self._prefetches: deque[_Prefetch] = deque(maxlen=PREFETCHES_WAITING)
+        self._looks: dict[str, Errand] = {}
+        self._errands: deque[Errand] = deque()
         self._attempts: dict[SolveJob, int] = {}
         self._state = WorkerState.STARTING
         self._starts = 0
@@ -207,6 +235,25 @@ class Worker:
                 self._prefetches_dropped += 1
             self._prefetches.append(_Prefetch(pair, frame))
             self._condition.notify_all()
+
+    def look(self, errand: Errand) -> None:
+        """Queue a look of the monitor, in front of everything: it is short. Per pair only the newest waits."""
+        with self._condition:
+            superseded = self._looks.pop(errand.pair, None)
+            self._looks[errand.pair] = errand
+            self._condition.notify_all()
+        if superseded is not None:
+            superseded.done(SUPERSEDED)
+
+    def run_errand(self, errand: Errand) -> None:
+        """Queue other work, behind the windows; when too much waits it is answered with `BUSY` at once."""
+        with self._condition:
+            full = len(self._errands) >= ERRANDS_WAITING
+            if not full:
+                self._errands.append(errand)
+            self._condition.notify_all()
+        if full:
+            errand.done(BUSY)
 
     @property
     def unusable(self) -> Reason | None:
@@ -276,6 +323,8 @@ class Worker:
             self._state = WorkerState.BUSY
             if isinstance(job, SolveJob):
                 self._solve(child, job)
+            elif isinstance(job, Errand):
+                self._run_errand(child, job)
             else:
                 child.link.send({"kind": "prefetch", "pair": job.pair, "frame": job.frame})
                 self._reply(child, self._config.timeout_s)
@@ -301,6 +350,20 @@ class Worker:
         else:
             self._on_failed(job, Reason(str(reply["code"]), str(reply["text"])))
 
+    def _run_errand(self, child: _Child, errand: Errand) -> None:
+        try:
+            child.link.send({**errand.body, "kind": errand.kind, "pair": errand.pair})
+            reply = self._reply(child, errand.timeout_s or self._config.timeout_s)
+        except (_ChildError, OSError, EOFError) as error:
+            errand.done(Reason("worker_failed", f"The worker {_cause(child, error)}."))
+            raise
+        if reply is None:
+            errand.done(Reason("stopping", "The service is stopping."))
+        elif reply["kind"] == "refused":
+            errand.done(Reason(str(reply["code"]), str(reply["text"])))
+        else:
+            errand.done(reply)
+
     def _after_death(self, job: SolveJob, child: _Child, error: Exception) -> None:
         """Put the window back in front, unless it has had its attempts or a newer one of its pair has come."""
         attempts = self._attempts[job]
@@ -319,7 +382,7 @@ class Worker:
             del self._attempts[job]
             self._on_failed(job, given_up)
 
-    def _next_job(self, child: _Child) -> SolveJob | _Prefetch | None:
+    def _next_job(self, child: _Child) -> SolveJob | Errand | _Prefetch | None:
         """The next job, or None when there was none for a moment.
 
         Raises:
@@ -333,9 +396,13 @@ class Worker:
         self._check(child)
         return job
 
-    def _take(self) -> SolveJob | _Prefetch | None:
+    def _take(self) -> SolveJob | Errand | _Prefetch | None:
+        if self._looks:
+            return self._looks.pop(next(iter(self._looks)))
         if self._live:
             return self._live.pop(next(iter(self._live)))
+        if self._errands:
+            return self._errands.popleft()
         if self._prefetches:
             return self._prefetches.popleft()
         return self._backlog.popleft() if self._backlog else None

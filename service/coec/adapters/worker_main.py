@@ -60,9 +60,18 @@ def _serve(link: Link, config: Config) -> None:
 def _answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
     """The answer to one job. What is not a `CoecError` ends the process: the service replaces it and tries again."""
     try:
-        if message["kind"] == "prefetch":
-            solver.prefetch(message["pair"], message["frame"])
-            return {"kind": "done"}
+        match message["kind"]:
+            case "prefetch":
+                solver.prefetch(message["pair"], message["frame"])
+                return {"kind": "done"}
+            case "observe":
+                return {"kind": "observed", **solver.observe(message["pair"], message["pose"], message["frames"])}
+            case "overlay":
+                path, pose = Path(message["path"]), message["pose"]
+                return {"kind": "drawn", "jpeg": solver.overlay(path, pose, message["title"])}
+            case "commission":
+                paths = [Path(path) for path in message["paths"]]
+                return {"kind": "commissioned", **solver.commission(message["pair"], message["pose"], paths)}
         solution = solver.solve(Path(message["path"]))
     except CoecError as error:
         return {"kind": "refused", "code": error.reply_code, "text": str(error)}

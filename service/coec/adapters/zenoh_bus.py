@@ -13,6 +13,7 @@ import queue
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import zenoh
 
@@ -30,6 +31,9 @@ JSON = "application/json"
 SLOW_QUERIES_WAITING = 32
 """Queries that may wait for the slow thread; the next is told `busy`."""
 
+DRAWING_QUERIES_WAITING = 8
+"""Queries for pictures that may wait."""
+
 MAX_COMMAND_BYTES = 65_536
 """Largest payload of a query; commands are a few numbers."""
 
@@ -38,11 +42,12 @@ POLL_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A query, as far as an answer depends on it. `key` is concrete."""
+    """A query, as far as an answer depends on it. `key` is concrete; `attachment` tells who asks, in whatever form."""
 
     key: str
     parameters: str
     payload: bytes
+    attachment: bytes | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +60,13 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """Who answers a key. `quick` answers take microseconds and are given on Zenoh's thread."""
+    """Who answers a key. `quick` answers take microseconds and are given on Zenoh's thread. Those that `draws` may wait
+    for the worker, and keep nobody waiting but each other."""
 
     key: str
     answer: Callable[[Request], Answer]
     quick: bool
+    draws: bool = False
 
 
 def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
@@ -89,6 +96,9 @@ def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
         raise ConfigError(f"cannot open the Zenoh session ({where}): {error}") from error
 
 
+_Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route]]]
+
+
 class Bus:
     """Everything the service declares in a session. Calls come from the daemon's threads."""
 
@@ -97,8 +107,10 @@ class Bus:
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._queryables: list[zenoh.Queryable[None]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
-        self._slow: queue.Queue[tuple[zenoh.Query, Sequence[Route]]] = queue.Queue(SLOW_QUERIES_WAITING)
-        self.thread = ServiceThread("slow-queries", self._answer_slowly)
+        self._slow: _Waiting = queue.Queue(SLOW_QUERIES_WAITING)
+        self._drawing: _Waiting = queue.Queue(DRAWING_QUERIES_WAITING)
+        self.thread = ServiceThread("slow-queries", partial(_answer_from, self._slow, self._answer))
+        self.drawing_thread = ServiceThread("drawing-queries", partial(_answer_from, self._drawing, self._answer))
 
     def subscribe(self, key: str, on_sample: Callable[[bytes, str], None]) -> None:
         """Call `on_sample(payload, encoding)` for every put on `key`, on Zenoh's thread."""
@@ -151,10 +163,11 @@ class Bus:
         for queryable in self._queryables:
             queryable.undeclare()
         self._queryables.clear()
-        while not self._slow.empty():
-            waiting, _ = self._slow.get_nowait()
-            with waiting:
-                _reply_error(waiting, "stopping", "the service is stopping; ask again when it is back")
+        for waiting in (self._slow, self._drawing):
+            while not waiting.empty():
+                query, _ = waiting.get_nowait()
+                with query:
+                    _reply_error(query, "stopping", "the service is stopping; ask again when it is back")
 
     def close(self, deadline_s: float) -> bool:
         """Close the session; False when it did not close within `deadline_s` (under loss it can take 10 s)."""
@@ -176,7 +189,7 @@ class Bus:
             self._answer(query, routes)
             return
         try:
-            self._slow.put_nowait((query, routes))
+            (self._drawing if any(route.draws for route in routes) else self._slow).put_nowait((query, routes))
         except queue.Full:
             with query:
                 _reply_error(query, "busy", "too many queries wait; ask again in a moment")
@@ -184,9 +197,10 @@ class Bus:
     def _answer(self, query: zenoh.Query, routes: Sequence[Route]) -> None:
         with query:
             payload = query.payload.to_bytes() if query.payload is not None else b""
+            attachment = query.attachment.to_bytes() if query.attachment is not None else None
             for route in routes:
                 try:
-                    answer = route.answer(Request(route.key, str(query.parameters), payload))
+                    answer = route.answer(Request(route.key, str(query.parameters), payload, attachment))
                 except CoecError as error:
                     _reply_error(query, error.reply_code, str(error))
                 except Exception:
@@ -196,17 +210,20 @@ class Bus:
                     timestamp = self._session.new_timestamp()
                     query.reply(route.key, answer.payload, encoding=answer.encoding, timestamp=timestamp)
 
-    def _answer_slowly(self, thread: ServiceThread) -> None:
-        while not thread.stopping:
-            thread.beat()
-            try:
-                query, routes = self._slow.get(timeout=POLL_S)
-            except queue.Empty:
-                continue
-            try:
-                self._answer(query, routes)
-            except zenoh.ZError:  # the client is gone
-                _log.debug("a reply found no receiver")
+
+def _answer_from(
+    waiting: _Waiting, answer: Callable[[zenoh.Query, Sequence[Route]], None], thread: ServiceThread
+) -> None:
+    while not thread.stopping:
+        thread.beat()
+        try:
+            query, routes = waiting.get(timeout=POLL_S)
+        except queue.Empty:
+            continue
+        try:
+            answer(query, routes)
+        except zenoh.ZError:  # the client is gone
+            _log.debug("a reply found no receiver")
 
 
 def _direct(callback: Callable[..., None]) -> zenoh.handlers.Callback[object]:

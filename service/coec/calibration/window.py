@@ -46,6 +46,7 @@ class SliceEnded:
 class _Slice:
     window_id: str
     start_ns: int
+    length_ns: int
     filled: set[int]
     next_look_ns: int
 
@@ -62,7 +63,7 @@ class WindowCutter:
         self._config = config
         self._rig = rig
         self._inspector = inspector
-        self._slice_ns = round(config.slice_s * NS_PER_S)
+        self._next_length_ns = round(config.slice_s * NS_PER_S)
         self._open: _Slice | None = None
         self.rejections: Counter[str] = Counter()
         self.last_quality: ImageQuality | None = None
@@ -75,14 +76,20 @@ class WindowCutter:
     @property
     def slice_end_ns(self) -> int | None:
         """Sensor time at which the open slice ends; None when none is open."""
-        return self._open.start_ns + self._slice_ns if self._open else None
+        return self._open.start_ns + self._open.length_ns if self._open else None
+
+    @property
+    def slice_start_ns(self) -> int | None:
+        """Stamp of the pair that opened the slice; None when none is open."""
+        return self._open.start_ns if self._open else None
 
     def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[PairSelected | SliceEnded]:
         """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, by which it must be in view."""
         events: list[PairSelected | SliceEnded] = [*self._end_before(pair.stamp_ns)]
         if self._open is None:
             window_id = f"{self._rig.pair}-{pair.stamp_ns}"
-            self._open = _Slice(window_id, pair.stamp_ns, set(), pair.stamp_ns)
+            self._open = _Slice(window_id, pair.stamp_ns, self._next_length_ns, set(), pair.stamp_ns)
+            self._next_length_ns = round(self._config.slice_s * NS_PER_S)
         if self._select(self._open, pair, T_camera_lidar):
             events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
         return events
@@ -90,6 +97,10 @@ class WindowCutter:
     def advance(self, stamp_ns: int) -> list[SliceEnded]:
         """Sensor time has passed `stamp_ns` though no pair came."""
         return self._end_before(stamp_ns) if self.slice_end_ns and stamp_ns >= self.slice_end_ns else []
+
+    def hurry(self, slice_s: float) -> None:
+        """The next slice is to be `slice_s` long: a window is wanted soon. The one after it is an ordinary one."""
+        self._next_length_ns = round(slice_s * NS_PER_S)
 
     def finish(self) -> list[SliceEnded]:
         """Ends the open slice here and now."""
@@ -100,12 +111,12 @@ class WindowCutter:
 
     def _end_before(self, stamp_ns: int) -> list[SliceEnded]:
         """Ends the open slice if the stamp lies outside it; sensor time that stepped back is outside, too."""
-        if self._open is None or 0 <= stamp_ns - self._open.start_ns < self._slice_ns:
+        if self._open is None or 0 <= stamp_ns - self._open.start_ns < self._open.length_ns:
             return []
         return self.finish()
 
     def _select(self, current: _Slice, pair: FramePair, T_camera_lidar: Matrix4) -> bool:
-        bin_ns = self._slice_ns // self._config.pairs
+        bin_ns = current.length_ns // self._config.pairs
         index = min((pair.stamp_ns - current.start_ns) // bin_ns, self._config.pairs - 1)
         if index in current.filled or pair.stamp_ns < current.next_look_ns:
             return False

@@ -23,7 +23,7 @@ EXIT_BROKEN_PIPE = 141
 
 SOURCE_HELP = (
     "a recorded window or ROS 2 bag (.mcap), kitti360:ROOT?camera=image_00, kitti-raw:ROOT?..., a folder or "
-    "dataset.yaml, synthetic:?seed=0"
+    "dataset.yaml, synthetic:?seed=0, sim:seed=1&seconds=60"
 )
 
 app = typer.Typer(
@@ -98,6 +98,9 @@ def _calibrate(
     camera_model: CameraModel = None,
     frames: Frames = None,
     no_motion_compensation: NoMotionCompensation = False,
+    time_offset: Annotated[
+        bool, typer.Option("--time-offset", help="Also estimate the offset of the camera's clock, if turns show it.")
+    ] = False,
     output: Annotated[
         Path | None, typer.Option(help="Write overlay_before.png, overlay_after.png and result.json.", metavar="DIR")
     ] = None,
@@ -115,6 +118,7 @@ def _calibrate(
         camera_model=camera_model,
         frames=frames,
         no_motion_compensation=no_motion_compensation,
+        time_offset=time_offset,
         output=output,
         as_json=as_json,
     )
@@ -134,7 +138,13 @@ def _evaluate(
     depth: Annotated[
         str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
     ] = None,
-    objective: Objective = None,
+    objective: Annotated[
+        str | None,
+        typer.Option(
+            help="What is maximised: fused, mi, intensity as for calibrate, or all: the three side by side.",
+            metavar="NAME",
+        ),
+    ] = None,
     dof: Annotated[
         DegreesOfFreedom | None,
         typer.Option(help="Rotation only, or translation too; 6 if --translation-m is given.", show_default=False),
@@ -145,6 +155,17 @@ def _evaluate(
     against_frames: Annotated[
         bool, typer.Option("--against-frames", help="Also solve windows of 1, 2, 3, 5, ... frames: frames.png.")
     ] = False,
+    against_slice: Annotated[
+        bool, typer.Option("--against-slice", help="Also solve slices of 1/16 to all of the recording: slices.png.")
+    ] = False,
+    halves: Annotated[
+        int,
+        typer.Option(
+            help="Also split the frames N times at random into disjoint halves and compare their results.",
+            metavar="N",
+            min=0,
+        ),
+    ] = 0,
     output: Annotated[
         Path | None, typer.Option(help="Write plots, overlays, starts.csv and report.json.", metavar="DIR")
     ] = None,
@@ -165,7 +186,117 @@ def _evaluate(
         frames=frames,
         no_motion_compensation=no_motion_compensation,
         against_frames=against_frames,
+        against_slice=against_slice,
+        halves=halves,
         output=output,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("commission")
+def _commission(
+    sources: Annotated[list[str], typer.Argument(metavar="SOURCE...", help=SOURCE_HELP, show_default=False)],
+    output: Annotated[Path, typer.Option(help="Baseline to write, or to add the pair to.", metavar="FILE")] = Path(
+        "rig.json"
+    ),
+    depth: Annotated[
+        str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
+    ] = None,
+    objective: Objective = None,
+    dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None,
+    frames: Frames = None,
+    false_alarm_rate: Annotated[
+        float, typer.Option(help="Share of looks at a right extrinsic that may be flagged.", min=1e-4, max=0.2)
+    ] = 0.01,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(help="camera=SERIAL or lidar=SERIAL; repeatable.", metavar="STREAM=SERIAL", show_default=False),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Learn the baseline of a rig from windows in which its calibration is right: bias, spread, every limit."""
+    from coec.cli import commission as command
+
+    options = command.Options(
+        sources=tuple(sources),
+        output=output,
+        depth=depth,
+        objective=objective,
+        dof=None if dof is None else int(dof.value),
+        frames=frames,
+        false_alarm_rate=false_alarm_rate,
+        sensors=tuple(sensor or ()),
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("diagnose")
+def _diagnose(
+    source: Source,
+    depth: Annotated[
+        str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Baseline from `coec commission`.", metavar="FILE", show_default=False)
+    ] = None,
+    perturb: Annotated[
+        str | None,
+        typer.Option(help="Move the extrinsic: degrees and metres.", metavar="RX,RY,RZ[,TX,TY,TZ]"),
+    ] = None,
+    detection: Annotated[
+        int,
+        typer.Option(
+            help="Instead, print how well moved extrinsics are seen, over N splits of the pairs.", metavar="N", min=0
+        ),
+    ] = 0,
+    looks: Annotated[int, typer.Option(help="Looks per split and move, with --detection.", min=1)] = 10,
+    frames: Frames = None,
+    as_json: Json = False,
+) -> None:
+    """Take one look at the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong."""
+    from coec.cli import diagnose as command
+
+    options = command.Options(
+        source=source,
+        depth=depth,
+        rig=rig,
+        perturb=perturb,
+        detection=detection,
+        looks=looks,
+        frames=frames,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("paper")
+def _paper(
+    source: Source,
+    output: Annotated[Path, typer.Option(help="Folder for the figures and report.json.", metavar="DIR")] = Path(
+        "coec-paper"
+    ),
+    depth: Annotated[
+        str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
+    ] = None,
+    objective: Annotated[str, typer.Option(help="mi (the paper's) or fused.", metavar="NAME")] = "mi",
+    runs: Annotated[int, typer.Option(help="Solves per experiment.", min=1)] = 100,
+    samples: Annotated[int, typer.Option(help="Samples of pairs for the failure metrics.", min=3)] = 100,
+    frames: Frames = None,
+    as_json: Json = False,
+) -> None:
+    """Repeat the published experiments on a recording: metrics.png, bullseye.png, drive.png."""
+    from coec.cli import paper as command
+
+    options = command.Options(
+        source=source,
+        output=output,
+        depth=depth,
+        objective=objective,
+        runs=runs,
+        samples=samples,
+        frames=frames,
         as_json=as_json,
     )
     raise typer.Exit(command.run(options))
@@ -309,18 +440,121 @@ def _convert(
     raise typer.Exit(command.run(source, out, as_json=as_json))
 
 
-@app.command("models")
-def _models(
-    action: Annotated[
-        str | None, typer.Argument(help="`show`, then a file.", metavar="[show", show_default=False)
-    ] = None,
-    file: Annotated[Path | None, typer.Argument(help="An ONNX file.", metavar="FILE]", show_default=False)] = None,
+network_models = typer.Typer(
+    help="Depth networks: list the built-in model cards, show which card a file gets, assess one."
+)
+app.add_typer(network_models, name="models")
+
+
+@network_models.callback(invoke_without_command=True)
+def _models(context: typer.Context, as_json: Json = False) -> None:
+    if context.invoked_subcommand is None:
+        from coec.cli import models as command
+
+        raise typer.Exit(command.run(as_json=as_json))
+
+
+@network_models.command("show")
+def _models_show(
+    file: Annotated[Path, typer.Argument(help="An ONNX file.", metavar="FILE", show_default=False)],
     as_json: Json = False,
 ) -> None:
-    """List the built-in model cards, or show which card a network file gets."""
+    """Show the model card that a network file is run by."""
     from coec.cli import models as command
 
-    raise typer.Exit(command.run(action, file, as_json=as_json))
+    raise typer.Exit(command.show(file, as_json=as_json))
+
+
+@network_models.command("assess")
+def _models_assess(
+    model: Annotated[
+        str,
+        typer.Argument(help="An ONNX file, a built-in name, or `stereo`.", metavar="MODEL", show_default=False),
+    ],
+    source: Source,
+    frames: Frames = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Write curves.png, joint.png, frame.png and report.json.", metavar="DIR")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Hold a depth network against the LiDAR of a calibrated recording: exit 1 if it is of no use there."""
+    from coec.cli import assess as command
+
+    options = command.Options(model=model, source=source, frames=frames, output=output, as_json=as_json)
+    raise typer.Exit(command.run(options))
+
+
+sim_app = typer.Typer(no_args_is_help=True, help="A vehicle that does not exist (optional extra `sim`).")
+app.add_typer(sim_app, name="sim")
+
+Seed = Annotated[int, typer.Option(help="Same seed, same bytes.", min=0)]
+SimCamera = Annotated[str, typer.Option(help="fisheyeW (185°, W×W pixels) or pinholeWxH (90° wide).", metavar="CAMERA")]
+Faults = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--fault",
+        help="KIND:BEGIN[-END][:KEY=VALUE,...], repeatable: step:30:rx=3, drift:30-90:ry=2, dirt, dark, frozen, beams, "
+        "no-ego, offset, loss.",
+        metavar="FAULT",
+    ),
+]
+
+
+@sim_app.command("drive")
+def _sim_drive(
+    output: Annotated[Path, typer.Option(help="ROS 2 MCAP to write.", metavar="FILE.mcap", show_default=False)],
+    seed: Seed = 0,
+    seconds: Annotated[float, typer.Option(help="Length of the drive.", min=0.1)] = 60.0,
+    camera: SimCamera = "fisheye700",
+    lidar: Annotated[int, typer.Option(help="Beams: 64, 32 or 16.")] = 64,
+    camera_hz: Annotated[float, typer.Option(help="Pictures per second.", min=0.01)] = 10.0,
+    lidar_hz: Annotated[float, typer.Option(help="Sweeps per second.", min=0.01, max=10)] = 10.0,
+    fault: Faults = None,
+    workshop: Annotated[
+        str | None,
+        typer.Option(help="Error of the nominal calibration, degrees and metres.", metavar="RX,RY,RZ[,TX,TY,TZ]"),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a drive as a ROS 2 bag; the truth lies beside the sensors on /ground_truth/tf."""
+    from coec.cli import sim as command
+
+    options = command.Options(
+        seed=seed,
+        seconds=seconds,
+        camera=camera,
+        lidar=lidar,
+        camera_hz=camera_hz,
+        lidar_hz=lidar_hz,
+        faults=tuple(fault or ()),
+        workshop=workshop,
+    )
+    raise typer.Exit(command.drive(options, output, as_json=as_json))
+
+
+@sim_app.command("view")
+def _sim_view(
+    output: Annotated[Path, typer.Option(help="Picture to write.", metavar="FILE.jpg", show_default=False)],
+    seed: Seed = 0,
+    at_s: Annotated[float, typer.Option(help="Seconds into the drive.", min=0)] = 0.0,
+    camera: SimCamera = "fisheye700",
+    fault: Faults = None,
+    as_json: Json = False,
+) -> None:
+    """Write one picture of a drive."""
+    from coec.cli import sim as command
+
+    options = command.Options(seed=seed, seconds=at_s + 1.0, camera=camera, faults=tuple(fault or ()))
+    raise typer.Exit(command.view(options, at_s, output, as_json=as_json))
+
+
+@app.command("bench")
+def _bench(as_json: Json = False) -> None:
+    """Measure the speed of the kernels and of a solve on this machine, beside plain forms in the same run."""
+    from coec.cli import bench as command
+
+    raise typer.Exit(command.run(as_json=as_json))
 
 
 @app.command("demo")

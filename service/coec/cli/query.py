@@ -20,7 +20,10 @@ from coec.schemas.keys import MAX_LENGTH, VERSION_CHUNK, Keys
 from coec.schemas.replies import StatusReply, WindowInfo, WindowsReply
 
 VEHICLE_KEYS = ("status", "config", "metrics")
-PAIR_KEYS = ("extrinsic", "health", "history", "windows")
+PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
+JPEG = "image/jpeg"
+PICTURE_KEYS = ("overlay", "evidence")
+"""Keys whose answer may be a picture, for `--output`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,7 @@ def run(options: Options) -> int:
     if not whole and head == "windows" and argument:
         return _download(options, keys, argument)
     if options.output is not None:
-        raise UsageError("--output belongs to windows/ID")
+        return _save_picture(options, keys, head, argument)
     with connected([options.connect], options.timeout_s) as session:
         key, kind = _resolve(session, options, keys)
         replies = ask(session, _selector(key, options.params), options.timeout_s, _payload(options.payload))
@@ -73,7 +76,11 @@ def _resolve(session: zenoh.Session, options: Options, keys: Keys) -> tuple[str,
         return f"{keys.root}/{options.pair or '*'}/{options.key}", options.key
     if head == "command" and argument:
         return keys.command(options.pair or _only_pair(session, options, keys), argument), "command"
-    known = ", ".join((*PAIR_KEYS, "windows/ID", *VEHICLE_KEYS, "command/NAME"))
+    if head == "evidence" and argument:
+        return keys.evidence_of(options.pair or argument.rpartition("-")[0], argument), "event"
+    if head == "overlay":
+        raise UsageError("say where to with --output FILE.jpg")
+    known = ", ".join((*PAIR_KEYS, "windows/ID", "evidence/ID", "overlay", *VEHICLE_KEYS, "command/NAME"))
     raise UsageError(f"unknown key {options.key}; known: {known}, or a whole key expression with {VERSION_CHUNK}")
 
 
@@ -138,6 +145,29 @@ def _render(reply: Reply, kind: str | None) -> None:
 
 def _succeeded(reply: Reply, kind: str | None) -> bool:
     return kind != "command" or bool(json.loads(reply.payload).get("accepted", True))
+
+
+def _save_picture(options: Options, keys: Keys, head: str, argument: str) -> int:
+    """`overlay`, or `evidence/ID` with `--param overlay=before`, as a JPEG file."""
+    if head not in PICTURE_KEYS or (head == "evidence") != bool(argument):
+        raise UsageError(
+            "--output belongs to windows/ID, overlay, and evidence/ID with --param overlay=before or after"
+        )
+    with connected([options.connect], options.timeout_s) as session:
+        if head == "overlay":
+            key = keys.overlay(options.pair or _only_pair(session, options, keys))
+        else:
+            key = keys.evidence_of(options.pair or argument.rpartition("-")[0], argument)
+        reply = ask_one(session, _selector(key, options.params), options.timeout_s)
+    if reply.encoding != JPEG:
+        raise UsageError("the answer is no picture: give --param overlay=before or overlay=after")
+    path = Path(str(options.output))
+    _save(path, reply.payload)
+    if options.as_json:
+        console.print_json({"path": str(path), "size_bytes": len(reply.payload)})
+    else:
+        console.show(f"{path}  {len(reply.payload)} bytes")
+    return 0
 
 
 # --- windows/ID -----------------------------------------------------------------------------------------------

@@ -28,6 +28,16 @@ def extrinsic(payload: bytes) -> None:
     _axes(reply.axes)
     for row in reply.camera_from_lidar.matrix:
         console.show("  " + "  ".join(f"{value:+.6f}" for value in row))
+    if reply.held:
+        console.show("held by command: nothing is applied", "bold yellow")
+    if reply.pending is not None:
+        waits = f": {reply.pending.waits.text}" if reply.pending.waits else ""
+        console.show(f"a candidate from window {reply.pending.window_id} waits for `command/apply`{waits}", "yellow")
+        if reply.pending.step is not None:
+            console.show(
+                "  step "
+                + "  ".join(f"{name} {v:+.3f}" for name, v in zip(console.AXES, reply.pending.step, strict=True))
+            )
     if reply.data_stamp_ns is not None:
         console.show(f"from window {reply.window_id}, data until {_instant(reply.data_stamp_ns)}")
 
@@ -47,6 +57,11 @@ def health(payload: bytes) -> None:
     for need in reply.needs:
         console.show(f"  needs: {need}")
     console.show_metrics(reply.metrics)
+    if reply.drift is not None:
+        drift = "  ".join(
+            f"{name} {console.figure(value, sign=True)}" for name, value in zip(console.AXES, reply.drift, strict=True)
+        )
+        console.show(f"drift from commissioned (deg, m): {drift}")
     quality = reply.data_quality
     known = {
         "pairs per second": quality.pair_rate_hz,
@@ -73,6 +88,14 @@ def history(payload: bytes) -> None:
         verdict = console.styled(result.verdict.decision)
         table.add_row(_instant(result.data_stamp_ns), verdict, str(result.pairs), *moved, result.window_id)
     console.out.print(table)
+    table = console.table("#", "service time", "what", "outcome", "why", "sender", "sha256", right=(0,))
+    for item in reply.entries:
+        entry = item.entry
+        if entry.kind != "estimate":
+            outcome = console.styled(entry.code)
+            row = (str(entry.sequence), _instant(entry.wall_ns), entry.kind, outcome, entry.text)
+            table.add_row(*row, entry.sender or "", item.sha256[:12])
+    console.out.print(table)
 
 
 def windows(payload: bytes) -> None:
@@ -84,6 +107,33 @@ def windows(payload: bytes) -> None:
         size = f"{window.size_bytes / 1e6:.1f}"
         verdict = console.styled(window.decision or "not evaluated")
         table.add_row(window.window_id, str(window.pairs), size, verdict, window.sha256[:16])
+    console.out.print(table)
+
+
+def evidence(payload: bytes) -> None:
+    """Red events of a pair."""
+    reply = from_json(replies.EvidenceReply, payload)
+    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.events)} red events")
+    table = console.table("event", "began", "why", "window before", "window after", "now")
+    for event in reply.events:
+        why = "; ".join(reason.code for reason in event.reasons)
+        windows_of = (event.window_before or "-", event.window_after or "-")
+        table.add_row(event.event_id, _instant(event.wall_ns), why, *windows_of, event.resolution or "still red")
+    console.out.print(table)
+
+
+def event(payload: bytes) -> None:
+    """One red event."""
+    reply = from_json(replies.EvidenceEvent, payload)
+    console.show(f"{reply.event_id}  began {_instant(reply.wall_ns)}, {reply.resolution or 'still red'}")
+    for reason in reply.reasons:
+        console.show(f"  {reason.code}: {reason.text}")
+    console.show(f"windows: before {reply.window_before or '-'}, after {reply.window_after or '-'}")
+    names = sorted({name for point in reply.metrics for name in point.metrics})
+    table = console.table("look", "state", *names, right=range(2, 2 + len(names)))
+    for point in reply.metrics:
+        figures = [console.figure(point.metrics.get(name)) for name in names]
+        table.add_row(_instant(point.stamp_ns), console.styled(point.state), *figures)
     console.out.print(table)
 
 
@@ -131,6 +181,8 @@ BY_KIND: Final[Mapping[str, Callable[[bytes], None]]] = {
     "health": health,
     "history": history,
     "windows": windows,
+    "evidence": evidence,
+    "event": event,
     "status": status,
     "command": command,
 }

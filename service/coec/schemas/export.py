@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import frames, replies
+from coec.schemas import evaluation, frames, replies
 from coec.schemas.base import Message
 
 FRAMES: tuple[type[Message], ...] = (frames.CameraFrame, frames.LidarFrame, frames.EgoMotion)
@@ -18,13 +18,18 @@ MESSAGES: tuple[type[Message], ...] = (
     replies.ExtrinsicReply,
     replies.HealthReply,
     replies.HistoryReply,
+    replies.HistoryEntry,
+    replies.EvidenceReply,
+    replies.EvidenceEvent,
     replies.WindowsReply,
     replies.StatusReply,
     replies.Acknowledgement,
     replies.ErrorReply,
     replies.CalibrationResult,
     replies.CalibrationReport,
-    replies.EvaluationReport,
+    evaluation.EvaluationReport,
+    evaluation.ComparisonReport,
+    evaluation.ModelAssessment,
 )
 
 

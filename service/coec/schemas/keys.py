@@ -81,6 +81,14 @@ class Keys:
         """Queryable: JPEG of the latest window's points on the image."""
         return f"{self.root}/{pair}/overlay"
 
+    def evidence(self, pair: str) -> str:
+        """Queryable: list of red events that are kept."""
+        return f"{self.root}/{pair}/evidence"
+
+    def evidence_of(self, pair: str, event_id: str) -> str:
+        """Queryable: one red event with its figures, or a picture of it (`?overlay=before`, `?overlay=after`)."""
+        return f"{self.root}/{pair}/evidence/{event_id}"
+
     def command(self, pair: str, name: str) -> str:
         """Queryable with payload; `name` may be `*`."""
         return f"{self.root}/{pair}/command/{name}"
@@ -102,9 +110,12 @@ class Keys:
         match chunks:
             case [("status" | "metrics" | "config") as resource]:
                 return Address(None, resource)
-            case [pair, ("extrinsic" | "health" | "history" | "windows" | "overlay" | "alive") as resource]:
+            case [
+                pair,
+                ("extrinsic" | "health" | "history" | "windows" | "overlay" | "evidence" | "alive") as resource,
+            ]:
                 return Address(pair, resource)
-            case [pair, ("windows" | "command") as resource, argument]:
+            case [pair, ("windows" | "evidence" | "command") as resource, argument]:
                 return Address(pair, resource, argument)
             case _:
                 raise UsageError(f"no such resource below {self.root}; see `{self.status}` for what is served")
@@ -133,6 +144,22 @@ class RangeSelector:
 
     offset: int = 0
     length: int = MAX_LENGTH
+    format: Format = "msgpack"
+
+
+@dataclass(frozen=True, slots=True)
+class OverlaySelector:
+    """Which window (None: the latest), and at which extrinsic its points are drawn."""
+
+    at: Literal["current", "nominal"] = "current"
+    window_id: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceSelector:
+    """A picture of the event, or (None) the event itself."""
+
+    overlay: Literal["before", "after"] | None = None
     format: Format = "msgpack"
 
 
@@ -172,6 +199,34 @@ def parse_range_selector(parameters: str) -> RangeSelector:
         _integer(given, "length", MAX_LENGTH, 1, MAX_LENGTH),
         _format(given),
     )
+
+
+def parse_overlay_selector(parameters: str) -> OverlaySelector:
+    """`at=nominal;window=<id>`, each optional.
+
+    Raises:
+        UsageError: unknown, doubled or malformed parameter; names it.
+    """
+    given = _split(parameters, ("at", "window", "format"))
+    match given.get("at", "current"):
+        case ("current" | "nominal") as at:
+            return OverlaySelector(at, given.get("window"))
+        case _:
+            raise UsageError("parameter `at` must be current or nominal")
+
+
+def parse_evidence_selector(parameters: str) -> EvidenceSelector:
+    """`overlay=before` or `overlay=after`, `format=json`, each optional.
+
+    Raises:
+        UsageError: unknown, doubled or malformed parameter; names it.
+    """
+    given = _split(parameters, ("overlay", "format"))
+    match given.get("overlay"):
+        case (None | "before" | "after") as overlay:
+            return EvidenceSelector(overlay, _format(given))
+        case _:
+            raise UsageError("parameter `overlay` must be before or after")
 
 
 def _split(parameters: str, allowed: tuple[str, ...]) -> dict[str, str]:

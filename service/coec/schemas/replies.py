@@ -23,7 +23,7 @@ Counts = dict[str, Count]
 
 Provenance = Literal["nominal", "commissioned", "estimated", "restored"]
 Status = Literal["not_accepted", "accepted", "failed"]
-AxisStatus = Literal["not_solved", "not_accepted", "accepted", "failed"]
+AxisStatus = Literal["not_solved", "not_observable", "not_accepted", "accepted", "failed"]
 Decision = Literal["accepted", "failed"]
 HealthState = Literal["unknown", "healthy", "suspect", "miscalibrated", "degraded", "stale"]
 
@@ -68,7 +68,9 @@ class MetricReply(Part):
 class AxisReply(Part):
     """One degree of freedom, about or along an axis of the camera."""
 
-    status: AxisStatus = Field(description="`not_solved`: the search did not move this axis")
+    status: AxisStatus = Field(
+        description="`not_solved`: not searched; `not_observable`: searched, but the window does not tell it"
+    )
     sigma: float | None = Field(description="standard deviation in `unit`; null when not estimated")
     correction: float = Field(description="from the nominal calibration, in `unit`")
     unit: Literal["deg", "m"]
@@ -111,7 +113,10 @@ class CalibrationResult(Message):
     sigma: Maybe6 = Field(description="standard deviations (deg, m); null where not estimated")
     correction_rad_m: Vector6 = Field(description="`correction` in rad and m, exact")
     sigma_rad_m: Maybe6 = Field(description="`sigma` in rad and m, exact")
-    solved: Flags6 = Field(description="axes that the search moved")
+    solved: Flags6 = Field(description="axes that the search found")
+    unobservable: Flags6 = Field(
+        description="axes that were searched but that the window does not tell: kept as before"
+    )
     status: Status
     verdict: Verdict
     metrics: dict[str, MetricReply] = Field(description="self-diagnosis by name")
@@ -145,6 +150,8 @@ class Candidate(Part):
     window_id: str
     data_stamp_ns: int
     camera_from_lidar: Transform
+    step: Vector6 | None = Field(default=None, description="from what is served: rx ry rz (deg), tx ty tz (m)")
+    waits: Reason | None = Field(default=None, description="why it was not applied")
 
 
 class ExtrinsicReply(Message):
@@ -164,6 +171,7 @@ class ExtrinsicReply(Message):
     window_id: str | None = Field(description="the window it came from; null for nominal")
     config_hash: str
     pending: Candidate | None = None
+    held: bool = Field(default=False, description="frozen by `command/hold`")
 
 
 class DataQuality(Part):
@@ -189,6 +197,7 @@ class HealthReply(Message):
     metrics: dict[str, MetricReply] = Field(description="of the latest result, by name")
     axes: Axes
     drift: Maybe6 | None = Field(default=None, description="from commissioned (deg, m); null before commissioning")
+    drift_sigma: Maybe6 | None = Field(default=None, description="standard deviations of `drift` (deg, m)")
     needs: tuple[str, ...] = Field(description="what is still missing, one sentence each")
     data_quality: DataQuality
     since_ns: int = Field(description="wall clock when this state began, ns since 1970")
@@ -196,13 +205,72 @@ class HealthReply(Message):
     age_s: float | None = Field(description="of the last evaluated window; null before the first")
 
 
+class HistoryEntry(Message):
+    """A line of the append-only history. Its sha256 is that of its own canonical JSON; the next entry holds it as
+    `previous_sha256`, so that no entry can be changed, taken out or put in unseen."""
+
+    sequence: Count = Field(description="counts the entries of a pair from 0")
+    previous_sha256: str = Field(description="of the entry before, hexadecimal; 64 zeros for the first")
+    kind: Literal["estimate", "extrinsic", "state", "command", "commissioned", "chain"]
+    code: str = Field(description="machine-readable: decision, provenance, state, outcome of the command")
+    text: str = Field(description="one sentence")
+    wall_ns: int = Field(description="wall clock of the service, ns since 1970")
+    stamp_ns: int | None = Field(default=None, description="sensor time of the data behind it, ns")
+    window_id: str | None = None
+    sender: str | None = Field(default=None, description="attachment of a command, made harmless")
+    camera_from_lidar: Transform | None = Field(default=None, description="what is served from here on (`extrinsic`)")
+    result_sha256: str | None = Field(default=None, description="of the canonical JSON of the result (`estimate`)")
+
+
+class ChainedEntry(Part):
+    """An entry of the history, and its own sha256, by which `command/rollback` can name it."""
+
+    sha256: str
+    entry: HistoryEntry
+
+
 class HistoryReply(Message):
-    """Past results, oldest first."""
+    """Past results and what else happened, oldest first."""
 
     vehicle: str
     pair: str
     total: Count = Field(description="results kept, before the selector")
     results: tuple[CalibrationResult, ...]
+    entries: tuple[ChainedEntry, ...] = Field(default=(), description="of the hash chain, results without their bodies")
+
+
+class MetricsPoint(Part):
+    """The figures of the monitor at one look."""
+
+    stamp_ns: int
+    state: HealthState
+    metrics: dict[str, float | None]
+
+
+class EvidenceEvent(Message):
+    """What is kept of a red event: windows before and after, pictures, the figures around it, the decision."""
+
+    event_id: str
+    vehicle: str
+    pair: str
+    stamp_ns: int = Field(description="sensor time of the data that decided, ns")
+    wall_ns: int = Field(description="wall clock, ns since 1970")
+    reasons: tuple[Reason, ...]
+    camera_from_lidar: Transform = Field(description="what was served then")
+    window_before: str | None = Field(description="the last window before the event; null when there is none")
+    window_after: str | None = Field(default=None, description="the first window after it; null until there is one")
+    overlays: tuple[Literal["before", "after"], ...] = Field(default=(), description="pictures that are kept")
+    metrics: tuple[MetricsPoint, ...] = Field(description="around the event, oldest first")
+    resolved_stamp_ns: int | None = Field(default=None, description="sensor time of the end of the red state, ns")
+    resolution: str | None = Field(default=None, description="one sentence; null while it is red")
+
+
+class EvidenceReply(Message):
+    """Red events that are kept, oldest first, without their figures."""
+
+    vehicle: str
+    pair: str
+    events: tuple[EvidenceEvent, ...]
 
 
 class WindowInfo(Part):
@@ -244,6 +312,9 @@ class PairStatus(Part):
     losses: Counts = Field(default_factory=dict, description="frames that found no partner, and windows lost, by cause")
     windows: Count = Field(default=0, description="windows recorded")
     solved: Count = Field(default=0, description="windows evaluated")
+    looks: Count = Field(default=0, description="looks of the monitor at the served extrinsic")
+    transitions: Counts = Field(default_factory=dict, description="changes of health, by the state that was entered")
+    commands: Counts = Field(default_factory=dict, description="commands, by name and outcome")
 
 
 class WorkerStatus(Part):
@@ -296,73 +367,3 @@ class ErrorReply(Message):
 
     code: str
     message: str
-
-
-# --- evaluation ---------------------------------------------------------------------------------------------
-
-
-class Spread(Part):
-    """Of a figure over the starts; null when it could not be computed."""
-
-    median: float | None
-    p95: float | None = Field(description="95th percentile, interpolated linearly")
-    max: float | None
-
-
-class VerdictCounts(Part):
-    """Starts by decision of the self-diagnosis and by truth."""
-
-    accepted_hits: Count
-    accepted_misses: Count = Field(description="the dangerous ones: wrong, and would be served")
-    failed_hits: Count
-    failed_misses: Count
-
-
-class FramesPoint(Part):
-    """Errors over several subsets of one number of frames, hits and misses."""
-
-    frames: Count
-    subsets: Count
-    hit_rate: float
-    rotation_deg: Spread
-    translation_m: Spread
-
-
-class EvaluationReport(Message):
-    """What `coec evaluate --json` prints: solves from starts all around the source's calibration, on one window."""
-
-    source: str
-    vehicle: str
-    pair: str
-    window_id: str
-    pairs: Count = Field(description="camera-LiDAR pairs in the window")
-    camera_model: str
-    objective: str
-    dof: Literal[3, 6]
-    start_rotation_deg: float = Field(description="radius of the sphere of starts")
-    start_translation_m: float = Field(description="radius of the sphere of starts")
-    search_rotation_deg: float = Field(description="half-width of the search box; widened to hold the starts")
-    search_translation_m: float = Field(description="likewise; 0 with 3 dof")
-    hit_rotation_deg: float = Field(description="a hit ends nearer to the source's calibration than this")
-    hit_translation_m: float | None = Field(description="and, with 6 dof, than this; null with 3 dof")
-    starts: Count
-    hits: Count
-    hit_rate: float = Field(ge=0, le=1)
-    rotation_deg: Spread = Field(description="error against the source's calibration, all starts")
-    translation_m: Spread = Field(description="error against the source's calibration, all starts")
-    median: Vector6 = Field(description="median error of all starts: rx ry rz (deg), tx ty tz (m)")
-    bias: Maybe6 = Field(description="mean error of the hits: rx ry rz (deg), tx ty tz (m); null without a hit")
-    std: Maybe6 = Field(description="standard deviation of the hits about it; null below two hits")
-    rms: Maybe6 = Field(description="root mean square error of the hits; null without a hit")
-    sigma: Maybe6 = Field(description="median of the standard deviations that the hits claim; null where none")
-    from_reference: Vector6 = Field(description="error of a solve that starts at the source's calibration (deg, m)")
-    solve_s: Spread = Field(description="one solve, without reading the source and inferring depth, s")
-    evaluations: Spread = Field(description="of the objective, per solve")
-    classified_correctly: float = Field(ge=0, le=1, description="share of starts whose verdict agrees with hit or miss")
-    verdicts: VerdictCounts
-    stop_reasons: Counts = Field(description="starts by the reason for which their search ended")
-    worst_start: Count = Field(description="index of the start that ended furthest from a hit")
-    frames: tuple[FramesPoint, ...] = Field(description="error against the number of frames; empty if not asked for")
-    depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
-    config_hash: str = Field(description="of everything that decides the results, but for the start")
-    elapsed_s: dict[str, float] = Field(description="by stage, s")

@@ -1,0 +1,168 @@
+"""What is kept of every red event: the windows before and after it, pictures, the figures around it, the decision.
+
+One folder per event: `event.json` and the pictures. The windows themselves stay in the window folder, which is told not
+to remove them. Bounded: the oldest event goes when there are too many, and its windows are ordinary ones again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import shutil
+import threading
+from collections import deque
+from pathlib import Path
+from typing import Literal
+
+from coec.errors import DecodeError, NotFoundError
+from coec.schemas.base import from_json, to_json
+from coec.schemas.replies import EvidenceEvent, EvidenceReply, MetricsPoint
+
+_log = logging.getLogger(__name__)
+
+POINTS_KEPT = 240
+"""Looks of the monitor whose figures are remembered: 20 minutes at one in 5 s."""
+
+POINTS_AFTER = 60
+"""Looks after the beginning of an event that are added to it: five minutes."""
+
+Side = Literal["before", "after"]
+
+
+class Evidence:
+    """Red events of one pair. Safe to use from several threads; a fault of the disk costs evidence, never the service.
+
+    Attributes:
+        lost: writes that failed.
+    """
+
+    def __init__(self, folder: Path, pair: str, limit: int) -> None:
+        self._folder = folder
+        self._pair = pair
+        self._limit = limit
+        self._lock = threading.RLock()
+        self._points: deque[MetricsPoint] = deque(maxlen=POINTS_KEPT)
+        self._events: dict[str, EvidenceEvent] = {}
+        self._after = 0
+        self.lost = 0
+        for path in sorted(folder.glob(f"{pair}-*/event.json"), key=lambda path: _stamp(path.parent.name)):
+            with contextlib.suppress(OSError, DecodeError):
+                event = from_json(EvidenceEvent, path.read_bytes())
+                if event.pair == pair and event.event_id == path.parent.name:
+                    self._events[event.event_id] = event
+
+    @property
+    def window_ids(self) -> frozenset[str]:
+        """Windows that must stay."""
+        with self._lock:
+            both = ((event.window_before, event.window_after) for event in self._events.values())
+            return frozenset(window_id for pair in both for window_id in pair if window_id is not None)
+
+    @property
+    def newest(self) -> EvidenceEvent | None:
+        """The newest event; None when there is none."""
+        with self._lock:
+            return next(reversed(self._events.values()), None)
+
+    @property
+    def awaiting(self) -> EvidenceEvent | None:
+        """The event that has no window after it yet."""
+        with self._lock:
+            newest = self.newest
+            return newest if newest is not None and newest.window_after is None else None
+
+    def note(self, point: MetricsPoint) -> None:
+        """Figures of one look."""
+        with self._lock:
+            self._points.append(point)
+            newest = self.newest
+            if newest is not None and self._after > 0:
+                self._after -= 1
+                self._keep(newest.model_copy(update={"metrics": (*newest.metrics, point)}))
+
+    def begin(self, event: EvidenceEvent) -> EvidenceEvent:
+        """A red event begins; the figures so far are added to it."""
+        with self._lock:
+            begun = event.model_copy(update={"metrics": tuple(self._points)})
+            self._after = POINTS_AFTER
+            self._keep(begun)
+            while len(self._events) > self._limit:
+                oldest = next(iter(self._events))
+                del self._events[oldest]
+                shutil.rmtree(self._folder / oldest, ignore_errors=True)
+            return begun
+
+    def add_window_after(self, window_id: str) -> EvidenceEvent | None:
+        """The first window after the newest event; None when no event waits for one."""
+        with self._lock:
+            event = self.awaiting
+            if event is None:
+                return None
+            return self._keep(event.model_copy(update={"window_after": window_id}))
+
+    def add_overlay(self, event_id: str, side: Side, jpeg: bytes) -> None:
+        """A picture of one of the windows, at the extrinsic that was served when the event began."""
+        with self._lock:
+            event = self._events.get(event_id)
+            if event is None or not self._write(self._folder / event_id / f"{side}.jpg", jpeg):
+                return
+            sides = tuple(s for s in ("before", "after") if s == side or s in event.overlays)
+            self._keep(event.model_copy(update={"overlays": sides}))
+
+    def resolve(self, stamp_ns: int | None, text: str) -> None:
+        """The pair is not red any more."""
+        with self._lock:
+            newest = self.newest
+            if newest is not None and newest.resolution is None:
+                self._keep(newest.model_copy(update={"resolved_stamp_ns": stamp_ns, "resolution": text}))
+
+    def listing(self, vehicle: str) -> EvidenceReply:
+        """All events, without their figures."""
+        with self._lock:
+            bare = tuple(event.model_copy(update={"metrics": ()}) for event in self._events.values())
+            return EvidenceReply(vehicle=vehicle, pair=self._pair, events=bare)
+
+    def event(self, event_id: str) -> EvidenceEvent:
+        """One event with its figures.
+
+        Raises:
+            NotFoundError: no such event.
+        """
+        with self._lock:
+            if event_id not in self._events:
+                raise NotFoundError("no such event is kept; the list is in `evidence`")
+            return self._events[event_id]
+
+    def overlay(self, event_id: str, side: Side) -> bytes:
+        """JPEG of the window before or after an event.
+
+        Raises:
+            NotFoundError: no such event, or it has no such picture.
+        """
+        event = self.event(event_id)
+        try:
+            return (self._folder / event.event_id / f"{side}.jpg").read_bytes()
+        except OSError as error:
+            raise NotFoundError(f"the event has no picture of the window {side} it") from error
+
+    def _keep(self, event: EvidenceEvent) -> EvidenceEvent:
+        self._events[event.event_id] = event
+        self._write(self._folder / event.event_id / "event.json", to_json(event))
+        return event
+
+    def _write(self, path: Path, data: bytes) -> bool:
+        fresh = path.with_name(path.name + ".new")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fresh.write_bytes(data)
+            fresh.replace(path)
+        except OSError as error:
+            self.lost += 1
+            _log.error(f"evidence could not be written: {error.strerror}", extra={"fields": {"pair": self._pair}})
+            return False
+        return True
+
+
+def _stamp(event_id: str) -> int:
+    text = event_id.rpartition("-")[2]
+    return int(text) if text.isdigit() else 0

@@ -1,0 +1,374 @@
+"""The state of a pair and every step it can take: windows, looks of the monitor, age, commands of people.
+
+An estimate that was not accepted is never served as current; a pair that was not looked at is never healthy; what a
+person froze does not move. Each function returns the next state whole; `PairState` is all that survives a restart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from math import degrees, fsum, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.fusion import Measurement, StepState, Track, absorb, prior_sigma
+from coec.calibration.lifecycle import policy
+from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
+from coec.calibration.monitor import MonitorState, Observation, Outcome, diagnose
+from coec.calibration.monitor import after_observation as look_taken
+from coec.calibration.values import Decision, Estimate, Matrix4, Reason, Rig
+from coec.config import FusionConfig, PolicyConfig
+from coec.errors import CoecError
+from coec.geometry import se3
+
+BENT_MOUNT = "bent_mount"
+"""The one cause of `diagnose` that is the calibration's; every other is the data's."""
+
+NOT_EVALUATED = Reason("not_evaluated", "No window has been evaluated yet.")
+
+
+class Provenance(StrEnum):
+    """Where the served extrinsic comes from."""
+
+    NOMINAL = "nominal"
+    COMMISSIONED = "commissioned"
+    ESTIMATED = "estimated"
+    RESTORED = "restored"
+
+
+class Status(StrEnum):
+    """How the latest calibration ended; `not_accepted` before the first."""
+
+    NOT_ACCEPTED = "not_accepted"
+    ACCEPTED = "accepted"
+    FAILED = "failed"
+
+
+class CommandRefusedError(CoecError):
+    """A command that cannot be carried out now.
+
+    Attributes:
+        code: machine-readable outcome.
+    """
+
+    reply_code = "refused"
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A pose (4, 4) that an accepted estimate asks for and that waits for `apply`; why it waits, and whether it is too
+    far from what is served for both to be right."""
+
+    T_camera_lidar: Matrix4
+    estimate: Estimate
+    waits: Reason
+    contradicts: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """A state with its reasons."""
+
+    state: HealthState
+    reasons: tuple[Reason, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What the owner of the vehicle has laid down."""
+
+    policy: PolicyConfig
+    fusion: FusionConfig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairState:
+    """Everything that survives a restart.
+
+    Attributes:
+        T_camera_lidar: (4, 4) the extrinsic that is served.
+        valid_from_ns: sensor time of the data it rests on; 0 for the nominal one.
+        latest: the last estimate, accepted or not.
+        accepted: the accepted estimate on which the served extrinsic rests; None for a nominal one.
+        failures: why the last attempt produced no estimate; empty when it produced one.
+        health, reasons: the state of the machine, and why it is in it.
+        pending: what waits for `apply`.
+        frozen: whether a person holds the extrinsic.
+        proven: whether a window, or commissioning, has confirmed what is served.
+        track: the fusion of accepted windows since the extrinsic last jumped; None before the first.
+        monitor: what the looks since then add up to.
+        flagged_since_ns: sensor time since which the monitor has something against the pairs, None while it has not. A
+            window that began earlier mixes two mounts: it neither corrects nor acquits.
+        changes: steps of the last day that nobody ordered.
+    """
+
+    T_camera_lidar: Matrix4
+    provenance: Provenance
+    status: Status
+    valid_from_ns: int
+    latest: Estimate | None = None
+    accepted: Estimate | None = None
+    failures: tuple[Reason, ...] = ()
+    health: HealthState = HealthState.UNKNOWN
+    reasons: tuple[Reason, ...] = (NOT_EVALUATED,)
+    pending: Candidate | None = None
+    frozen: bool = False
+    proven: bool = False
+    track: Track | None = None
+    monitor: MonitorState = field(default_factory=MonitorState)
+    flagged_since_ns: int | None = None
+    changes: tuple[policy.Change, ...] = ()
+
+
+def initial_state(rig: Rig) -> PairState:
+    """Nominal, not accepted, nothing looked at."""
+    return PairState(rig.T_camera_lidar_nominal, Provenance.NOMINAL, Status.NOT_ACCEPTED, 0)
+
+
+def restored(state: PairState) -> PairState:
+    """The state after a restart: an estimate that was read back from disk says so."""
+    if state.provenance is Provenance.ESTIMATED:
+        return replace(state, provenance=Provenance.RESTORED)
+    return state
+
+
+def moved(estimate: Estimate, pose: Matrix4, rig: Rig) -> Estimate:
+    """An estimate that says another pose (4, 4): the estimator's known bias was taken out of it."""
+    optimum = replace(estimate.optimum, T_camera_lidar=pose)
+    return replace(estimate, optimum=optimum, correction=se3.difference(pose, rig.T_camera_lidar_nominal))
+
+
+def agrees(T_one: Matrix4, T_other: Matrix4, rules: PolicyConfig) -> bool:
+    """Whether two extrinsics are too near each other to speak of a contradiction."""
+    return policy.agrees(policy.step_between(T_one, T_other), rules)
+
+
+def happened(state: PairState, event: Event, *reasons: Reason) -> PairState:
+    """The state after an event: the table decides, and the reasons are the newest ones for being there."""
+    return replace(state, health=TRANSITIONS[state.health, event], reasons=reasons)
+
+
+# --- windows --------------------------------------------------------------------------------------------------------
+
+
+def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules) -> PairState:
+    """A window was solved. `window_start_ns` is the stamp of its first pair."""
+    state = replace(state, latest=estimate, failures=())
+    if estimate.verdict.decision is Decision.FAILED:
+        state = replace(state, status=Status.FAILED)
+        return _unless_red(state, Event.FAILED, *estimate.verdict.reasons)
+    state = replace(state, status=Status.ACCEPTED)
+    if state.flagged_since_ns is not None and window_start_ns < state.flagged_since_ns:
+        return state
+    track = _fused(state, estimate, rules)
+    state = replace(state, track=track)
+    if track.step is StepState.SUSPECTED and track.candidate is not None:
+        step = policy.step_between(state.T_camera_lidar, track.candidate.T_camera_lidar)
+        why = Reason("step_suspected", f"The latest window differs by {_told(step)}; the next one decides.")
+        pending = Candidate(track.candidate.T_camera_lidar, estimate, why, contradicts=True)
+        return _unless_red(replace(state, pending=pending), Event.STEP_SUSPECTED, why)
+    # A track of one window is that window, to the last bit.
+    pose = estimate.optimum.T_camera_lidar if track.windows <= 1 else track.T_camera_lidar
+    return _applied_or_waiting(state, pose, estimate, rules.policy)
+
+
+def after_failure(state: PairState, reason: Reason) -> PairState:
+    """A window from which no estimate could be made: the served extrinsic stays."""
+    return _unless_red(replace(state, status=Status.FAILED, failures=(reason,)), Event.NO_RESULT, reason)
+
+
+def _fused(state: PairState, estimate: Estimate, rules: Rules) -> Track:
+    """The track with the estimate in it. It starts again from the estimate when there is none yet, and when the monitor
+    already speaks against what is served: then two witnesses agree that the mount has moved."""
+    measurement = Measurement.of(estimate)
+    pose = estimate.optimum.T_camera_lidar
+    accused = state.monitor.outcome in (Outcome.SUSPECT, Outcome.CONFIRMED)
+    elsewhere = not agrees(state.T_camera_lidar, pose, rules.policy)
+    track = state.track
+    if track is None or (accused and elsewhere):
+        track = Track.initial(pose, prior_sigma(rules.fusion), estimate.data_stamp_ns)
+    return absorb(track, measurement, rules.fusion)
+
+
+def _applied_or_waiting(state: PairState, pose: Matrix4, estimate: Estimate, rules: PolicyConfig) -> PairState:
+    step = policy.step_between(state.T_camera_lidar, pose)
+    if not step.any():
+        return _served(state, pose, estimate)
+    past = policy.remembered(state.changes, estimate.data_stamp_ns)
+    waits = policy.objection(step, past, estimate.data_stamp_ns, rules)
+    if state.frozen:
+        waits = Reason("held", "The extrinsic is held by command: the candidate waits for its release.")
+    if waits is None:
+        change = policy.Change(estimate.data_stamp_ns, tuple(abs(float(value)) for value in step))
+        return replace(_served(state, pose, estimate), changes=(*past, change))
+    close = policy.agrees(step, rules)
+    state = replace(state, pending=Candidate(pose, estimate, waits, contradicts=not close))
+    if close:
+        return _confirmed(state)
+    why = Reason("candidate_waits", f"An accepted window differs by {_told(step)} from what is served.")
+    return happened(state, Event.CONTRADICTED, why, waits)
+
+
+def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
+    state = replace(
+        state,
+        T_camera_lidar=pose,
+        provenance=Provenance.ESTIMATED,
+        valid_from_ns=estimate.data_stamp_ns,
+        accepted=estimate,
+        pending=None,
+    )
+    return _confirmed(state)
+
+
+def _confirmed(state: PairState) -> PairState:
+    """A window vouches for what is served: whatever the monitor had against it is settled. What is wrong with the data
+    is not."""
+    fresh = MonitorState(blind=state.monitor.blind)
+    cause = diagnose(fresh)
+    state = happened(replace(state, proven=True, monitor=fresh, flagged_since_ns=None), Event.CONFIRMED_BY_WINDOW)
+    return state if cause is None else happened(state, Event.DATA_CAUSE, cause.as_reason())
+
+
+# --- the monitor, and time ------------------------------------------------------------------------------------------
+
+
+def after_observation(state: PairState, observation: Observation) -> PairState:
+    """The monitor had a look at the served extrinsic. One look decides nothing: `MonitorState` adds them up."""
+    monitor = look_taken(state.monitor, observation)
+    since_ns = state.flagged_since_ns
+    if observation.flagged and not observation.causes:
+        if since_ns is None:
+            # Without a clear look before, nothing says that earlier pairs were any better.
+            was_clear = state.monitor.outcome is Outcome.CLEAR
+            since_ns = observation.pair_stamps_ns[0] if was_clear else state.valid_from_ns
+    elif monitor.outcome in (Outcome.CLEAR, Outcome.UNKNOWN):
+        since_ns = None
+    state = replace(state, monitor=monitor, flagged_since_ns=since_ns)
+    cause = diagnose(monitor)
+    if cause is not None and cause.code != BENT_MOUNT:
+        return _unless_red(state, Event.DATA_CAUSE, cause.as_reason())
+    if monitor.outcome is Outcome.CONFIRMED:
+        why = () if cause is None else (cause.as_reason(),)
+        return happened(state, Event.MOUNT_MOVED, *(why or (Reason(BENT_MOUNT, "The mount has moved."),)))
+    if monitor.outcome is Outcome.SUSPECT:
+        text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to tell."
+        return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
+    # Against an accepted window that contradicts what is served the word of the monitor is not enough.
+    if monitor.outcome is Outcome.CLEAR and (state.pending is None or not state.pending.contradicts):
+        if state.proven:
+            return happened(state, Event.CLEAR)
+        after = happened(state, Event.NO_OBJECTION, NOT_EVALUATED)
+        return state if after.health is state.health else after
+    return state
+
+
+def aged(state: PairState, age_s: float | None, stale_after_s: float) -> PairState:
+    """Time has passed since the last look (None: nobody knows when that was)."""
+    if age_s is None:
+        return state if state.health is HealthState.UNKNOWN else happened(state, Event.REPLACED, NOT_EVALUATED)
+    if age_s <= stale_after_s or TRANSITIONS[state.health, Event.AGED] is state.health:
+        return state
+    text = f"The last evaluation is {age_s:.0f} s old, more than {stale_after_s:.0f} s."
+    return happened(state, Event.AGED, Reason("stale", text))
+
+
+# --- commands -------------------------------------------------------------------------------------------------------
+
+
+def apply_pending(state: PairState, rules: Rules) -> PairState:
+    """A person accepts the candidate; limits of policy do not bind people.
+
+    Raises:
+        CommandRefusedError: nothing waits, or the extrinsic is held.
+    """
+    _refuse_if_held(state)
+    if state.pending is None:
+        raise CommandRefusedError("nothing_pending", "No candidate waits.")
+    pose, estimate, track = state.pending.T_camera_lidar, state.pending.estimate, state.track
+    if track is None or not np.array_equal(track.T_camera_lidar, pose):
+        track = Track.initial(pose, prior_sigma(rules.fusion), estimate.data_stamp_ns)
+    return replace(_served(state, pose, estimate), track=track)
+
+
+def rolled_back(state: PairState, pose: Matrix4, estimate: Estimate, rules: Rules) -> PairState:
+    """A person returns to an earlier accepted calibration; it has to be looked at again before it is called healthy.
+
+    Raises:
+        CommandRefusedError: the extrinsic is held.
+    """
+    _refuse_if_held(state)
+    state = _replaced(state, pose, "Rolled back by command; not looked at since.")
+    return replace(
+        state,
+        provenance=Provenance.RESTORED,
+        valid_from_ns=estimate.data_stamp_ns,
+        accepted=estimate,
+        proven=True,
+        track=Track.initial(pose, prior_sigma(rules.fusion), estimate.data_stamp_ns),
+    )
+
+
+def reset(state: PairState, rig: Rig) -> PairState:
+    """A person returns to the workshop calibration.
+
+    Raises:
+        CommandRefusedError: the extrinsic is held.
+    """
+    _refuse_if_held(state)
+    state = _replaced(state, rig.T_camera_lidar_nominal, "Reset to nominal by command; not looked at since.")
+    return replace(state, provenance=Provenance.NOMINAL, valid_from_ns=0, accepted=None, proven=False, track=None)
+
+
+def held(state: PairState) -> PairState:
+    """A person freezes the extrinsic: estimates go on, nothing is applied."""
+    return replace(state, frozen=True)
+
+
+def released(state: PairState) -> PairState:
+    """The extrinsic may move again; what waits goes on waiting for `apply` or for the next window."""
+    return replace(state, frozen=False)
+
+
+def after_commissioning(state: PairState, T_commissioned: Matrix4) -> PairState:
+    """The rig was commissioned: if that is what is served, it is the baseline of this rig, and confirmed."""
+    if not np.array_equal(T_commissioned, state.T_camera_lidar):
+        return state
+    state = replace(state, provenance=Provenance.COMMISSIONED, proven=True, monitor=MonitorState())
+    return happened(state, Event.CONFIRMED_BY_WINDOW)
+
+
+def _replaced(state: PairState, pose: Matrix4, text: str) -> PairState:
+    state = replace(state, T_camera_lidar=pose, pending=None, monitor=MonitorState(), flagged_since_ns=None, changes=())
+    return happened(state, Event.REPLACED, Reason("replaced", text))
+
+
+def _refuse_if_held(state: PairState) -> None:
+    if state.frozen:
+        raise CommandRefusedError("held", 'The extrinsic is held: release it first with `hold` and {"release": true}.')
+
+
+def _unless_red(state: PairState, event: Event, *reasons: Reason) -> PairState:
+    """The event; where the state stays red, the reasons for the red stay, too, in front of the new ones."""
+    after = happened(state, event, *reasons)
+    if state.health is after.health is HealthState.MISCALIBRATED:
+        red = tuple(reason for reason in state.reasons if reason.code in _RED)
+        return replace(after, reasons=(*red, *reasons))
+    return after
+
+
+_RED = (BENT_MOUNT, "candidate_waits")
+"""Codes of the reasons for which a pair is miscalibrated."""
+
+
+def _told(step: NDArray[np.float64]) -> str:
+    """A step (6,) in a few words."""
+    angle_deg = degrees(se3.rotation_angle_rad(se3.perturbation(step)))
+    metres = sqrt(fsum(float(value) ** 2 for value in step[3:]))
+    return f"{angle_deg:.2f}° and {100 * metres:.1f} cm"

@@ -1,0 +1,95 @@
+"""Health as an explicit state machine: six states (CONTRACT), what can happen, and one table that says what follows.
+
+The table is total and the only place where a state changes. `markdown()` renders it for the documentation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from types import MappingProxyType
+
+
+class HealthState(StrEnum):
+    """States of `health` (CONTRACT). `unknown` is the state of not having looked."""
+
+    UNKNOWN = "unknown"
+    HEALTHY = "healthy"
+    SUSPECT = "suspect"
+    MISCALIBRATED = "miscalibrated"
+    DEGRADED = "degraded"
+    STALE = "stale"
+
+
+class Event(StrEnum):
+    """What can happen to the health of a pair."""
+
+    CONFIRMED_BY_WINDOW = "window_agrees"
+    CONTRADICTED = "window_contradicts"
+    STEP_SUSPECTED = "window_differs"
+    FAILED = "window_refused"
+    NO_RESULT = "no_result"
+    CLEAR = "monitor_clear"
+    NO_OBJECTION = "monitor_no_objection"
+    SUSPECTED = "monitor_suspects"
+    MOUNT_MOVED = "monitor_confirms"
+    DATA_CAUSE = "data_cause"
+    AGED = "aged"
+    REPLACED = "replaced"
+
+
+MEANING: Mapping[Event, str] = MappingProxyType(
+    {
+        Event.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
+        Event.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
+        Event.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
+        Event.FAILED: "the verdict on a window was negative",
+        Event.NO_RESULT: "a window came to nothing: the worker failed, or there was too little in it",
+        Event.CLEAR: "the monitor sees nothing wrong with an extrinsic that a window has confirmed",
+        Event.NO_OBJECTION: "the monitor sees nothing wrong with an extrinsic that no window has confirmed",
+        Event.SUSPECTED: "the monitor suspects that the mount has moved",
+        Event.MOUNT_MOVED: "the monitor is certain that the mount has moved",
+        Event.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
+        Event.AGED: "the last look is older than `stale_after_s`",
+        Event.REPLACED: "a person replaced the extrinsic (rollback, reset), or the time of the last look is lost",
+    }
+)
+
+_U, _H, _S, _M, _D, _A = HealthState
+
+# Rows: what happens. Columns: the state it happens in, in the order of `HealthState`.
+#   Green is only ever reached by looking (CONFIRMED_BY_WINDOW, CLEAR). Red is left only by a window that agrees, by a
+#   person, or step by step by a monitor that stays clear; neither silence nor bad data hides it.
+_ROWS: Mapping[Event, tuple[HealthState, ...]] = {
+    #                            unknown healthy suspect miscal. degraded stale
+    Event.CONFIRMED_BY_WINDOW: (_H, _H, _H, _H, _H, _H),
+    Event.CONTRADICTED: (_M, _M, _M, _M, _M, _M),
+    Event.STEP_SUSPECTED: (_S, _S, _S, _M, _S, _S),
+    Event.FAILED: (_S, _S, _S, _M, _S, _S),
+    Event.NO_RESULT: (_D, _D, _D, _M, _D, _D),
+    Event.CLEAR: (_H, _H, _H, _S, _H, _H),
+    Event.NO_OBJECTION: (_U, _H, _S, _S, _U, _U),
+    Event.SUSPECTED: (_S, _S, _S, _M, _S, _S),
+    Event.MOUNT_MOVED: (_M, _M, _M, _M, _M, _M),
+    Event.DATA_CAUSE: (_D, _D, _D, _M, _D, _D),
+    Event.AGED: (_U, _A, _A, _M, _A, _A),
+    Event.REPLACED: (_U, _U, _U, _U, _U, _U),
+}
+
+TRANSITIONS: Mapping[tuple[HealthState, Event], HealthState] = MappingProxyType(
+    {(before, event): after for event, row in _ROWS.items() for before, after in zip(HealthState, row, strict=True)}
+)
+"""The state after an event, for every state and every event."""
+
+
+def markdown() -> str:
+    """The table for the documentation: a line per event, a column per state; · means that nothing changes."""
+    rows = [["", *(state.value for state in HealthState)]]
+    for event in Event:
+        after = [TRANSITIONS[state, event] for state in HealthState]
+        marks = ["·" if new is old else new.value for old, new in zip(HealthState, after, strict=True)]
+        rows.append([event.value, *marks])
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    rows.insert(1, ["-" * width for width in widths])
+    cells = ([text.ljust(width) for text, width in zip(row, widths, strict=True)] for row in rows)
+    return "".join(f"| {' | '.join(row)} |\n" for row in cells)

@@ -1,0 +1,46 @@
+"""A look on its way to the worker and back: nothing is lost, to the bit."""
+
+import msgpack
+import numpy as np
+
+from coec.adapters.looks import pack_observation, pack_pairs, unpack_observation, unpack_pairs
+from coec.calibration.causes import CAUSES
+from coec.calibration.monitor import Observation
+from coec.calibration.pairing import Pairer
+from coec.calibration.values import Metric
+from coec.config import LimitsConfig, PairingConfig
+from coec.sources import open_source
+
+
+def test_pairs_survive() -> None:
+    pairer = Pairer(PairingConfig(), expects_motion=True)
+    pairs = [p for frame in open_source("synthetic:?frames=2&width=64").messages() for p in pairer.push(frame)]
+    pairs += pairer.flush()
+    back = unpack_pairs(msgpack.unpackb(msgpack.packb(pack_pairs(pairs)), max_bin_len=2**30), LimitsConfig())
+    assert len(back) == 2
+    for one, other in zip(pairs, back, strict=True):
+        assert one.camera == other.camera
+        assert one.motion == other.motion
+        np.testing.assert_array_equal(one.lidar.xyz_m, other.lidar.xyz_m)
+
+
+def test_an_observation_survives_with_its_nans() -> None:
+    made = Observation(
+        stamp_ns=7,
+        pair_stamps_ns=(5, 7),
+        metrics=(Metric("mi", 1 / 3, float("nan"), at_least=True),),
+        offset=np.array([1 / 3, np.nan, 0.0, 1.0, 2.0, 3.0]),
+        sigma=np.full(6, np.nan),
+        distance2=1 / 7,
+        flagged=True,
+        weak=False,
+        flagged_by_paper=None,
+        causes=(CAUSES["dark"],),
+    )
+    back = unpack_observation(msgpack.unpackb(msgpack.packb(pack_observation(made))))
+    np.testing.assert_array_equal(back.offset, made.offset)
+    np.testing.assert_array_equal(back.sigma, made.sigma)
+    assert (back.stamp_ns, back.pair_stamps_ns, back.distance2, back.causes) == (7, (5, 7), 1 / 7, made.causes)
+    assert (back.flagged, back.weak, back.flagged_by_paper) == (True, False, None)
+    assert back.metrics[0].value == 1 / 3
+    assert np.isnan(back.metrics[0].limit)

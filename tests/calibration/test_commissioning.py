@@ -1,0 +1,118 @@
+"""From windows to a baseline, on a synthetic street whose truth is known, and from its limits to detection."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coec.adapters.baseline_file import baseline_hash
+from coec.adapters.images import CachedGreys, GreyImages
+from coec.calibration.baseline import Baseline
+from coec.calibration.commissioning import commission, learned_hash
+from coec.calibration.detection import table, try_detection
+from coec.calibration.estimators import look
+from coec.calibration.looks import gather
+from coec.calibration.monitor import observe
+from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.values import Decision, Estimate, Metric, Verdict, Window
+from coec.calibration.verdict_limits import learned
+from coec.config import CalibrationConfig, LimitsConfig, SearchConfig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+from estimates import estimate
+
+CONFIG = CalibrationConfig(search=SearchConfig(reach_deg=8.0))
+"""The starts are 5 degrees away: looking no further keeps the solves short."""
+
+
+@pytest.fixture(scope="module")
+def images() -> ImageReader:
+    return CachedGreys(GreyImages(LimitsConfig()), 16)
+
+
+@pytest.fixture(scope="module")
+def baseline(sharp_street: Window, stereo: DepthModel, images: ImageReader) -> Baseline:
+    return commission([sharp_street], stereo, images, CONFIG, sensors={"camera_serial": "C1"})
+
+
+class TestCommission:
+    def test_learns_that_the_estimator_is_right_on_this_rig(self, baseline: Baseline, sharp_street: Window) -> None:
+        np.testing.assert_array_equal(baseline.T_camera_lidar, sharp_street.rig.T_camera_lidar_nominal)
+        assert np.degrees(np.abs(baseline.bias[:3])).max() < 0.3
+        assert baseline.pairs == len(sharp_street.pairs)
+        assert baseline.sensors["camera_serial"] == "C1"
+        assert baseline.config_hash == learned_hash(CONFIG)
+
+    def test_its_limits_see_what_they_have_to(self, baseline: Baseline) -> None:
+        assert baseline.detected["1 deg"] == 1.0
+        assert baseline.detected["3 deg"] == 1.0
+
+    def test_a_look_at_the_commissioned_pose_is_clear_and_at_a_moved_one_is_not(
+        self, baseline: Baseline, sharp_street: Window, stereo: DepthModel, images: ImageReader
+    ) -> None:
+        right = observe(sharp_street, stereo, images, CONFIG, baseline)
+        assert not right.flagged
+        assert right.flagged_by_paper is not None
+        moved = se3.perturb(sharp_street.T_camera_lidar_start, np.radians([0.6, -0.6, 0.5, 0, 0, 0]))
+        wrong = observe(replace(sharp_street, T_camera_lidar_start=moved), stereo, images, CONFIG, baseline)
+        assert wrong.flagged
+
+    def test_refuses_a_reference_that_the_windows_do_not_show(
+        self, sharp_street: Window, stereo: DepthModel, images: ImageReader
+    ) -> None:
+        wrong = se3.perturb(sharp_street.rig.T_camera_lidar_nominal, np.radians([0, 2.0, 0, 0, 0, 0]))
+        with pytest.raises(CalibrationError, match="away from the reference: calibrate first"):
+            commission([sharp_street], stereo, images, CONFIG, sensors={}, reference=wrong)
+
+    def test_refuses_too_few_pairs(self, sharp_street: Window, stereo: DepthModel, images: ImageReader) -> None:
+        few = replace(sharp_street, pairs=sharp_street.pairs[:4])
+        with pytest.raises(CalibrationError, match="more than 4 pairs"):
+            commission([few], stereo, images, CONFIG, sensors={})
+
+    def test_refuses_windows_of_several_rigs(
+        self, sharp_street: Window, stereo: DepthModel, images: ImageReader
+    ) -> None:
+        other = replace(sharp_street, rig=replace(sharp_street.rig, pair="other"))
+        with pytest.raises(CalibrationError, match="several camera-LiDAR pairs"):
+            commission([sharp_street, other], stereo, images, CONFIG, sensors={})
+
+    @pytest.mark.slow
+    def test_same_windows_same_baseline(
+        self, baseline: Baseline, sharp_street: Window, stereo: DepthModel, images: ImageReader
+    ) -> None:
+        again = commission([sharp_street], stereo, images, CONFIG, sensors={"camera_serial": "C1"})
+        assert baseline_hash(again) == baseline_hash(baseline)
+
+
+def test_detection_learns_on_some_pairs_and_tries_others(
+    sharp_street: Window, stereo: DepthModel, images: ImageReader
+) -> None:
+    evidence = gather(look(sharp_street, stereo, images, CONFIG, Silence()))
+    heard: list[tuple[int, int]] = []
+    tried = try_detection(evidence, sharp_street.T_camera_lidar_start, CONFIG, 1, 3, lambda *step: heard.append(step))
+    rows = {row.name: row for row in table(tried)}
+    assert heard == [(1, 1)]
+    assert {"right", "0.5 deg", "1 deg", "3 deg"} <= set(rows)
+    assert rows["3 deg"].flagged == 1.0
+    assert all(row.looks == 3 for row in rows.values())
+
+
+def with_metrics(contrast: float, runner_up: float, sigma_deg: float) -> Estimate:
+    metrics = (
+        Metric("edge_contrast", contrast, 4.0, at_least=True),
+        Metric("runner_up", runner_up, 0.9, at_least=False),
+        Metric("sigma_deg", sigma_deg, 0.25, at_least=False),
+    )
+    return replace(estimate(0), verdict=Verdict(Decision.ACCEPTED, metrics, ()))
+
+
+class TestVerdictLimits:
+    def test_lie_half_way_between_right_and_wrong(self) -> None:
+        limits = learned([with_metrics(16.0, 0.4, 0.1)], [with_metrics(4.0, 0.9, 0.2)])
+        assert limits == {"min_edge_contrast": pytest.approx(8.0), "max_runner_up": pytest.approx(0.6)}
+
+    def test_a_figure_that_does_not_tell_them_apart_has_none(self) -> None:
+        near = [with_metrics(16.0, 0.4, 0.1), with_metrics(3.0, 0.5, 0.1)]
+        assert set(learned(near, [with_metrics(4.0, 0.9, 0.2)])) == {"max_runner_up"}

@@ -1,0 +1,66 @@
+"""The machine of health: every edge of its table, and what the table as a whole promises."""
+
+import pytest
+
+from coec.calibration import lifecycle
+from coec.calibration.lifecycle import MEANING, TRANSITIONS, Event, HealthState, markdown
+
+U, H, S, M, D, A = HealthState
+
+EDGES: dict[Event, tuple[HealthState, ...]] = {
+    # from:                   unknown, healthy, suspect, miscalibrated, degraded, stale
+    Event.CONFIRMED_BY_WINDOW: (H, H, H, H, H, H),
+    Event.CONTRADICTED: (M, M, M, M, M, M),
+    Event.STEP_SUSPECTED: (S, S, S, M, S, S),
+    Event.FAILED: (S, S, S, M, S, S),
+    Event.NO_RESULT: (D, D, D, M, D, D),
+    Event.CLEAR: (H, H, H, S, H, H),
+    Event.NO_OBJECTION: (U, H, S, S, U, U),
+    Event.SUSPECTED: (S, S, S, M, S, S),
+    Event.MOUNT_MOVED: (M, M, M, M, M, M),
+    Event.DATA_CAUSE: (D, D, D, M, D, D),
+    Event.AGED: (U, A, A, M, A, A),
+    Event.REPLACED: (U, U, U, U, U, U),
+}
+
+
+@pytest.mark.parametrize(
+    ("event", "before", "after"),
+    [
+        pytest.param(event, before, after, id=f"{before.value}-{event.value}")
+        for event, row in EDGES.items()
+        for before, after in zip(HealthState, row, strict=True)
+    ],
+)
+def test_edge(event: Event, before: HealthState, after: HealthState) -> None:
+    assert TRANSITIONS[before, event] is after
+
+
+def test_the_table_is_total_and_every_event_has_a_meaning() -> None:
+    assert set(TRANSITIONS) == {(state, event) for state in HealthState for event in Event}
+    assert set(MEANING) == set(Event)
+
+
+def test_green_is_only_reached_by_looking() -> None:
+    ways = {event for (before, event), after in TRANSITIONS.items() if after is H and before is not H}
+    assert ways == {Event.CONFIRMED_BY_WINDOW, Event.CLEAR}
+
+
+def test_silence_and_bad_data_hide_no_red() -> None:
+    for event in (Event.AGED, Event.DATA_CAUSE, Event.NO_RESULT, Event.FAILED, Event.SUSPECTED):
+        assert TRANSITIONS[M, event] is M
+
+
+def test_only_a_moved_mount_is_red() -> None:
+    ways = {event for (before, event), after in TRANSITIONS.items() if after is M and before is not M}
+    assert ways == {Event.CONTRADICTED, Event.MOUNT_MOVED}
+
+
+def test_every_state_can_be_reached_and_left() -> None:
+    for state in HealthState:
+        assert any(after is state for (before, _), after in TRANSITIONS.items() if before is not state)
+        assert any(after is not state for (before, _), after in TRANSITIONS.items() if before is state)
+
+
+def test_the_documentation_shows_the_table() -> None:
+    assert markdown() in (lifecycle.__doc__ or "")

@@ -1,0 +1,49 @@
+"""`coec commission`, `coec diagnose` and `coec paper`, as they are called."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+Coec = Callable[..., Any]
+
+RIG = "synthetic:?frames=8&width=320&period_s=2"
+"""A street that is cast in a second and has edges enough for a look."""
+
+
+def test_one_look_at_a_right_and_at_a_wrong_extrinsic(coec: Coec) -> None:
+    right = coec("diagnose", RIG, "--depth", "stereo", "--json")
+    assert right.status == 0
+    assert right.document["causes"] == []
+    assert right.document["flagged_by_paper"] is None
+    wrong = coec("diagnose", RIG, "--depth", "stereo", "--perturb", "2,-2,1", "--json")
+    assert wrong.status == 1
+    assert wrong.document["flagged"]
+    assert wrong.document["metrics"]["distance_rotation"]["value"] > 1.0
+
+
+def test_a_baseline_that_is_not_there(coec: Coec, tmp_path: Path) -> None:
+    outcome = coec("diagnose", RIG, "--depth", "stereo", "--rig", tmp_path / "rig.json")
+    assert outcome.status == 2
+    assert "run `coec commission`" in outcome.err
+
+
+def test_serials_have_a_form(coec: Coec) -> None:
+    outcome = coec("commission", RIG, "--depth", "stereo", "--sensor", "radar=7")
+    assert outcome.status == 2
+    assert "camera=SERIAL" in outcome.err
+
+
+def test_the_published_experiments(coec: Coec, tmp_path: Path) -> None:
+    outcome = coec(
+        "paper", RIG, "--depth", "stereo", "--runs", 2, "--samples", 3, "--frames", 6, "--output", tmp_path, "--json"
+    )
+    assert outcome.status == 0
+    assert outcome.document == json.loads((tmp_path / "report.json").read_text())
+    assert [row["start_deg"] for row in outcome.document["drive"]] == [5.0, 10.0]
+    assert outcome.document["bullseye"]["runs"] == 2
+    assert [row["moved_deg"] for row in outcome.document["failure_metrics"]["moves"]] == [0.0, 1.0, 3.0]
+    for name in ("metrics.png", "bullseye.png", "drive.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
