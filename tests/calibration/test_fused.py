@@ -10,7 +10,6 @@ from coec.adapters.images import GreyImages
 from coec.calibration.basins import sample_reach
 from coec.calibration.calibrator import calibrate
 from coec.calibration.edges import EdgeWitness
-from coec.calibration.estimators import SAME_BASIN_RAD
 from coec.calibration.fused import OTHER_POSES, FusedObjective, Fusion, Scale
 from coec.calibration.motion import compensate
 from coec.calibration.objective import MutualInformation, SearchBox, build_mutual_information, range_and_depth
@@ -207,12 +206,12 @@ def test_same_input_same_bits(sharp_street: Window, stereo: DepthModel) -> None:
 
 
 def test_a_network_that_tells_nothing_does_not_lead_out_of_the_basin_of_the_edges(
-    sharp_street: Window, stereo: DepthModel
+    sharp_street: Window, sharp_edges: EdgeWitness, stereo: DepthModel
 ) -> None:
     start = from_start(sharp_street, 8, 5.0)
     informed, uninformed = solve(start, stereo), solve(start, Noise())
     apart = informed.optimum.T_camera_lidar @ se3.inverse(uninformed.optimum.T_camera_lidar)
-    assert se3.rotation_angle_rad(apart) < SAME_BASIN_RAD
+    assert se3.rotation_angle_rad(apart) < 1.5 * sharp_edges.band_blur_rad[1]
     # Walls and poles tell the yaw by their upright edges, which needs no depth.
     assert np.degrees(abs(uninformed.correction[1])) < 0.3
 
@@ -264,3 +263,21 @@ def test_sweeps_without_a_jump_in_range_are_an_error(sharp_street: Window, stere
 
     with pytest.raises(CalibrationError, match="no sweep has a jump in range"):
         solve(replace(sharp_street, pairs=tuple(on_a_sphere(pair) for pair in sharp_street.pairs)), stereo)
+
+
+def test_a_start_beyond_the_reach_of_the_truth_ends_at_the_rim_or_is_refused(
+    sharp_street: Window, stereo: DepthModel
+) -> None:
+    near = FUSED.model_copy(update={"search": SearchConfig(reach_deg=4.0)})
+    estimate = solve(from_start(sharp_street, 3, 8.0), stereo, near)
+    assert estimate.verdict.decision is Decision.FAILED
+    assert is_accounted_for(estimate)
+
+
+def test_the_verdict_tells_how_far_the_answer_stands_out(sharp_street: Window, stereo: DepthModel) -> None:
+    metrics = {metric.name: metric for metric in solve(from_start(sharp_street, 1, 5.0), stereo).verdict.metrics}
+    limits = FUSED.verdict
+    assert (metrics["edge_contrast"].limit, metrics["edge_contrast"].at_least) == (limits.min_edge_contrast, True)
+    assert (metrics["runner_up"].limit, metrics["runner_up"].at_least) == (limits.max_runner_up, False)
+    assert metrics["edge_contrast"].value > 3.0
+    assert metrics["runner_up"].value >= 0.0

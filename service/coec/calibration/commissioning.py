@@ -1,0 +1,292 @@
+"""From good windows to the baseline of a rig: the estimator's bias and spread on it, and every limit.
+
+Nothing is set by hand: the same windows are looked at where they are right and after they were moved by known amounts,
+and each limit is put where it flags no more of the right ones than the stated rate, and as many of the moved ones as
+that leaves. Moves are seeded: the same windows give the same baseline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import radians, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.baseline import (
+    FLOOR,
+    PRIOR_SPREAD_POSE,
+    PRIOR_SPREAD_ROTATION,
+    Accuracy,
+    Baseline,
+    MonitorLimits,
+    chi2_quantile,
+    normal_quantile,
+)
+from coec.calibration.causes import scene_baseline
+from coec.calibration.estimators import look
+from coec.calibration.looks import POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
+from coec.calibration.monitor import FALSE_ALARM_RATE, MIN_PAIRS, edges_per_pair
+from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
+from coec.calibration.values import Matrix4, Window
+from coec.calibration.verdict_limits import verdict_limits
+from coec.config import CalibrationConfig, config_hash
+from coec.errors import CalibrationError
+from coec.geometry import se3
+
+MAX_PAIRS = 48
+"""Pairs that are looked at, evenly chosen from all windows: two windows of the default size."""
+
+BLOCKS = 10
+"""Blocks of neighbouring pairs that are left out in turn (Künsch 1989, the block jackknife): neighbours are not
+independent."""
+
+PRIOR_BLOCKS = 6
+"""Blocks that the spread known from other rigs counts for."""
+
+OUTLIER = 4.0
+"""Times the median deviation beyond which a look that left a block out counts for no more (2.7 standard deviations)."""
+
+LOOK_PAIRS = 6
+"""Pairs of a look from which limits are learned: about as many as the monitor takes."""
+
+LOOKS, FAR_LOOKS = 12, 5
+"""Looks at the right pose and after every move, and far off."""
+
+SMALL_RAD, SMALL_M = radians(0.5), 0.10
+"""The smallest moves that have to be seen."""
+
+FAR_RAD = radians(12.0)
+"""A move beyond the reach of a look: what is found there is no optimum."""
+
+MOVES = (
+    ("0.5 deg", SMALL_RAD, 0.0),
+    ("1 deg", radians(1.0), 0.0),
+    ("3 deg", radians(3.0), 0.0),
+    ("10 cm", 0.0, SMALL_M),
+)
+"""By name: rotations about random axes (rad) and translations in random directions (m)."""
+
+SEED = 20_230_617
+
+AGREEMENT_RAD = radians(0.5)
+"""Least limit of the witnesses' disagreement: a quarter of the hill of the depth witness."""
+
+
+def commission(
+    windows: Sequence[Window],
+    depth: DepthModel,
+    images: ImageReader,
+    config: CalibrationConfig,
+    *,
+    sensors: dict[str, str],
+    reference: Matrix4 | None = None,
+    false_alarm_rate: float = FALSE_ALARM_RATE,
+    progress: Progress | None = None,
+) -> Baseline:
+    """The baseline of the rig of `windows`.
+
+    Args:
+        windows: of one rig, in which the extrinsic is right.
+        sensors: what identifies the sensors, by stream; the frame ids are added.
+        reference: (4, 4) the right extrinsic; None = the workshop calibration of the rig.
+        false_alarm_rate: share of looks at a right pose that may be flagged.
+
+    Raises:
+        CalibrationError: too few pairs, or the windows do not show the reference: nothing is learned from a rig that is
+            not right.
+    """
+    heard = progress or Silence()
+    whole = _merged(windows)
+    rig = whole.rig
+    right = rig.T_camera_lidar_nominal if reference is None else reference
+    evidence = gather(look(replace(whole, T_camera_lidar_start=right), depth, images, config, heard))
+    rotation, pose = _accuracies(evidence, right, config, heard)
+    _check(rotation)
+    looks = _Looks(evidence, right, config, heard)
+    clean = looks.moved(0.0, 0.0, "right")
+    moved = {name: looks.moved(turn_rad, shift_m, name) for name, turn_rad, shift_m in MOVES}
+    far = looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS)
+    monitor = _monitor_limits(clean, moved, far, rotation, pose, false_alarm_rate)
+    accuracy = rotation if config.search.dof == ROTATION_DOF else pose
+    expected = se3.perturb(right, np.nan_to_num(accuracy.bias))
+    limits = verdict_limits(whole, right, expected, depth, images, config, heard)
+    return Baseline(
+        pair=rig.pair,
+        T_camera_lidar=right,
+        rotation=rotation,
+        pose=pose,
+        dof=config.search.dof,
+        limits=limits,
+        monitor=monitor,
+        scene=scene_baseline(evidence.scenes),
+        false_alarm_rate=false_alarm_rate,
+        windows=len(windows),
+        pairs=len(evidence.pairs),
+        detected={
+            name: float(np.mean([is_flagged(seen, rotation, pose, monitor) for seen in seen_after]))
+            for name, seen_after in moved.items()
+        },
+        sensors={**sensors, "camera_frame": rig.camera_frame, "lidar_frame": rig.lidar_frame},
+        depth_identity=depth.identity,
+        config_hash=learned_hash(config),
+    )
+
+
+def learned_hash(config: CalibrationConfig) -> str:
+    """Of the configuration that a baseline holds for: all that moves an optimum; the limits are what it replaces."""
+    return config_hash(config.objective, config.search, str(config.motion_compensation))
+
+
+def is_flagged(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> bool:
+    """Whether a look puts the local optimum too far from where it should be."""
+    return (
+        rotation.distance2(seen.offset_rotation, seen.pairs) > limits.max_distance2_rotation
+        or pose.farthest2(seen.offset_pose, seen.pairs) > limits.max_farthest2_pose
+    )
+
+
+def learn_accuracy(evidence: Evidence, right: Matrix4, config: CalibrationConfig) -> tuple[Accuracy, Accuracy]:
+    """How looks over three and over six degrees of freedom lie about the right pose (4, 4)."""
+    return _accuracies(evidence, right, config, Silence())
+
+
+def learn_limits(
+    evidence: Evidence, right: Matrix4, config: CalibrationConfig, accuracies: tuple[Accuracy, Accuracy], rate: float
+) -> MonitorLimits:
+    """The limits of looks, at a false-alarm rate."""
+    rotation, pose = accuracies
+    looks = _Looks(evidence, right, config, Silence())
+    moved = {name: looks.moved(turn_rad, shift_m, name) for name, turn_rad, shift_m in MOVES[::3]}
+    return _monitor_limits(
+        looks.moved(0.0, 0.0, "right"), moved, looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS), rotation, pose, rate
+    )
+
+
+def _merged(windows: Sequence[Window]) -> Window:
+    pairs = sorted((pair for window in windows for pair in window.pairs), key=lambda pair: pair.stamp_ns)
+    if len(pairs) <= MIN_PAIRS:
+        raise CalibrationError(
+            f"commissioning needs more than {MIN_PAIRS} pairs of a camera frame and a sweep, there are {len(pairs)}"
+        )
+    if any(window.rig.pair != windows[0].rig.pair for window in windows):
+        raise CalibrationError("the windows are of several camera-LiDAR pairs: commission one at a time")
+    if len(pairs) > MAX_PAIRS:
+        pairs = [pairs[round(index)] for index in np.linspace(0, len(pairs) - 1, MAX_PAIRS)]
+    return replace(windows[0], pairs=tuple(pairs))
+
+
+def _accuracies(
+    evidence: Evidence, right: Matrix4, config: CalibrationConfig, heard: Progress
+) -> tuple[Accuracy, Accuracy]:
+    """The bias from all pairs, the spread of one pair from leaving out blocks of them."""
+    count = len(evidence.pairs)
+    whole = look_at(evidence, right, config)
+    blocks = np.array_split(np.arange(count), min(count, BLOCKS))
+    without = []
+    for number, block in enumerate(blocks, start=1):
+        kept = [index for index in range(count) if index not in set(block.tolist())]
+        without.append(look_at(evidence.of(kept), right, config))
+        heard.step("spread", number, len(blocks))
+    at_rotation = np.array([seen.offset_rotation for seen in without])
+    at_pose = np.array([seen.offset_pose for seen in without])
+    not_searched = np.array([0.0] * 3 + [np.nan] * 3)
+    return (
+        _accuracy(whole.offset_rotation + not_searched, at_rotation, PRIOR_SPREAD_ROTATION, count),
+        _accuracy(whole.offset_pose, at_pose, PRIOR_SPREAD_POSE, count),
+    )
+
+
+def _accuracy(
+    bias: NDArray[np.float64], without: NDArray[np.float64], prior: NDArray[np.float64], count: int
+) -> Accuracy:
+    """From the looks that each left a block out, and what is known of other rigs: the variance of few blocks is itself
+    uncertain (the posterior mean under an inverse gamma prior of `PRIOR_BLOCKS` degrees of freedom)."""
+    blocks = len(without)
+    apart = np.abs(without - np.median(without, axis=0))
+    # One look that ended in another basin must not make the rig look blind.
+    apart = np.minimum(apart, OUTLIER * np.median(apart, axis=0) + FLOOR)
+    variance = (blocks - 1) / blocks * (apart**2).sum(axis=0) * count
+    spread = np.sqrt((PRIOR_BLOCKS * prior**2 + (blocks - 1) * variance) / (PRIOR_BLOCKS + blocks - 1))
+    return Accuracy(bias=bias, bias_sigma=spread / sqrt(count), spread=spread)
+
+
+def _check(rotation: Accuracy) -> None:
+    if float(np.max(np.abs(rotation.bias[:3]))) > MAX_BIAS_RAD:
+        turned = ", ".join(f"{value:+.2f}" for value in np.degrees(rotation.bias[:3]))
+        raise CalibrationError(
+            f"the windows put the camera ({turned}) deg about x, y, z away from the reference: "
+            "calibrate first, or give the calibration that is right"
+        )
+
+
+MAX_BIAS_RAD = radians(1.0)
+"""More than this is no bias of the estimator, but a wrong reference."""
+
+
+class _Looks:
+    """Looks at seeded subsets of the pairs, near the right pose moved by a known amount in seeded directions."""
+
+    def __init__(self, evidence: Evidence, right: Matrix4, config: CalibrationConfig, heard: Progress) -> None:
+        self._evidence = evidence
+        self._right = right
+        self._config = config
+        self._heard = heard
+
+    def moved(self, turn_rad: float, shift_m: float, name: str, count: int = LOOKS) -> list[Look]:
+        """`count` looks after a turn and a shift."""
+        rng = np.random.default_rng([SEED, round(turn_rad * 1e6), round(shift_m * 1e6)])
+        pairs = len(self._evidence.pairs)
+        size = min(LOOK_PAIRS, pairs - 1)
+        seen = []
+        for number in range(1, count + 1):
+            # Neighbours, as the monitor sees them.
+            first = int(rng.integers(0, pairs))
+            indices = sorted((first + step) % pairs for step in range(size))
+            xi = np.concatenate([turn_rad * _direction(rng), shift_m * _direction(rng)])
+            seen.append(look_at(self._evidence.of(indices), se3.perturb(self._right, xi), self._config))
+            self._heard.step(name, number, count)
+        return seen
+
+
+def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
+    drawn = rng.normal(size=3)
+    return np.asarray(drawn / np.sqrt((drawn**2).sum()))
+
+
+def _monitor_limits(
+    clean: Sequence[Look],
+    moved: dict[str, list[Look]],
+    far: Sequence[Look],
+    rotation: Accuracy,
+    pose: Accuracy,
+    rate: float,
+) -> MonitorLimits:
+    turned = [rotation.distance2(seen.offset_rotation, seen.pairs) for seen in moved["0.5 deg"]]
+    shifted = [pose.farthest2(seen.offset_pose, seen.pairs) for seen in moved["10 cm"]]
+    edges = float(np.min([edges_per_pair(seen) for seen in clean]))
+    lost = float(np.median([edges_per_pair(seen) for seen in far]))
+    z = normal_quantile(1.0 - rate / 3.0)
+    agreement = _beyond([seen.agreement_rad for seen in clean], z)
+    return MonitorLimits(
+        max_distance2_rotation=_between(chi2_quantile(1.0 - rate / 2.0, ROTATION_DOF), min(turned)),
+        max_farthest2_pose=_between(chi2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1), min(shifted)),
+        min_edges_per_pair=min(sqrt(edges * max(lost, 0.25 * edges)), 0.8 * edges),
+        max_agreement_rad=max(agreement, AGREEMENT_RAD),
+        min_overlap=0.8 * float(np.min([seen.overlap for seen in clean])),
+        min_mi=_beyond([seen.mi for seen in clean], -z),
+        max_f1=_beyond([seen.f1 for seen in clean], z),
+        min_f2=_beyond([seen.f2 for seen in clean], -z),
+    )
+
+
+def _between(right: float, wrong: float) -> float:
+    """Half-way, in ratio, from what right looks do not exceed to the least of the moved ones, and no nearer to these
+    than at a quarter of it; where the two come close the false-alarm rate decides."""
+    return max(right, min(sqrt(right * wrong), 0.25 * wrong))
+
+
+def _beyond(values: Sequence[float], z: float) -> float:
+    """So many standard deviations from the mean."""
+    return float(np.mean(values) + z * np.std(values, ddof=1))

@@ -1,0 +1,238 @@
+"""Is the extrinsic that is served still right? A short look every few seconds, and a sequential decision over them.
+
+One look is the paper's three figures, equation (2), and next to it a sharper question: how many standard deviations lie
+between the pose and the local optimum of both witnesses. The decision adds up the evidence of looks at pairs that were
+not counted yet (Page 1954, "Continuous inspection schemes"): one bad frame decides nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from math import degrees
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.baseline import (
+    UNCOMMISSIONED_ACCURACY_POSE,
+    UNCOMMISSIONED_ACCURACY_ROTATION,
+    Baseline,
+    MonitorLimits,
+    chi2_quantile,
+)
+from coec.calibration.causes import BENT_MOUNT, CAUSES, Cause, data_causes
+from coec.calibration.estimators import look
+from coec.calibration.looks import POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
+from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.timing import explained_by_motion
+from coec.calibration.values import Matrix4, Metric, Window
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+
+FALSE_ALARM_RATE = 0.01
+"""Share of looks at a right pose that may be flagged: the limit of an uncommissioned rig, and what commissioning aims
+at unless told otherwise."""
+
+MIN_PAIRS = 4
+"""With fewer, a lamp post decides."""
+
+SUSPECT_AT, CONFIRMED_AT, CLEAR_BELOW, MOST = 1.5, 2.5, 0.5, 3.5
+"""Evidence in independent looks: to become suspect and confirmed, below which it clears again, and at most, so that a
+repaired mount clears within three looks, too. A bad frame is in at most one look and its overlap with the next."""
+
+WEAK_SHARE = 0.5
+"""A flagged look whose edges are faint counts half, and confirms nothing: a full solve has to."""
+
+BLIND_AT = 1.2
+"""Evidence by which a cause in the data is believed: more than one look."""
+
+UNCOMMISSIONED = MonitorLimits(
+    max_distance2_rotation=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0, ROTATION_DOF),
+    max_farthest2_pose=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0 / POSE_DOF, 1),
+    min_edges_per_pair=4.0,
+)
+"""Of an uncommissioned rig. Edges at the right pose are at 10 to 24 on every recording tried."""
+
+
+class Outcome(StrEnum):
+    """What the looks so far say. `unknown`: nothing was seen that could tell."""
+
+    UNKNOWN = "unknown"
+    CLEAR = "clear"
+    SUSPECT = "suspect"
+    CONFIRMED = "confirmed"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """One look at the current extrinsic, judged.
+
+    Attributes:
+        stamp_ns: of the last pair.
+        pair_stamps_ns: of all of them, ascending.
+        metrics: every figure with its limit.
+        offset: (6,) from the current pose to the local optimum, the estimator's bias removed where known (rad, m).
+        sigma: (6,) its standard deviation.
+        distance2: squared distance in standard deviations over its limit: above 1 is flagged.
+        flagged: the pose is wrong, or the data are.
+        weak: the edges at the local optimum are fainter than they should be.
+        flagged_by_paper: equation (2) with learned limits; None until the rig is commissioned.
+        causes: what is wrong with the data, those that hide others first; such a look says nothing of the pose.
+    """
+
+    stamp_ns: int
+    pair_stamps_ns: tuple[int, ...]
+    metrics: tuple[Metric, ...]
+    offset: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    distance2: float
+    flagged: bool
+    weak: bool
+    flagged_by_paper: bool | None
+    causes: tuple[Cause, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorState:
+    """What the looks so far add up to: plain values that go through JSON as they are.
+
+    Attributes:
+        evidence: in independent looks that say the mount is bent, floor 0.
+        outcome: see there.
+        blind: the same for every cause in the data, by code.
+        offset: running mean of the flagged offsets (rad, m); empty without one.
+        last_stamps_ns: of the pairs of the last look.
+    """
+
+    evidence: float = 0.0
+    outcome: Outcome = Outcome.UNKNOWN
+    blind: Mapping[str, float] = field(default_factory=dict)
+    offset: tuple[float, ...] = ()
+    last_stamps_ns: tuple[int, ...] = ()
+
+
+def observe(
+    window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
+) -> Observation:
+    """A look at the extrinsic at which `window` starts, with all its pairs: five to ten of the latest, in motion.
+
+    Raises:
+        CalibrationError: fewer than `MIN_PAIRS` pairs, or an image or its depth cannot be decoded.
+    """
+    if len(window.pairs) < MIN_PAIRS:
+        raise CalibrationError(f"a look needs {MIN_PAIRS} pairs, there are {len(window.pairs)}")
+    evidence = gather(look(window, depth, images, config, Silence()))
+    return judge_look(
+        evidence, look_at(evidence, window.T_camera_lidar_start, config), window.T_camera_lidar_start, baseline
+    )
+
+
+def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline | None) -> Observation:
+    """A look at `pose` (4, 4) against the limits of the rig, and the causes of what is wrong with it."""
+    limits = UNCOMMISSIONED if baseline is None else baseline.monitor
+    rotation = UNCOMMISSIONED_ACCURACY_ROTATION if baseline is None else baseline.rotation
+    accuracy = UNCOMMISSIONED_ACCURACY_POSE if baseline is None else baseline.pose
+    of_rotation = rotation.distance2(seen.offset_rotation, seen.pairs) / limits.max_distance2_rotation
+    of_pose = accuracy.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose
+    metrics = _metrics(seen, of_rotation, of_pose, limits)
+    flagged, weak = max(of_rotation, of_pose) > 1.0, edges_per_pair(seen) < limits.min_edges_per_pair
+    causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
+    if not causes:
+        explained = explained_by_motion(
+            evidence.pairs,
+            evidence.rig,
+            evidence.edges.whole,
+            se3.perturb(pose, np.nan_to_num(rotation.bias)),
+            seen.T_rotation,
+            limits.min_edges_per_pair * float(np.sqrt(seen.pairs)),
+        )
+        causes = () if explained is None else (explained,)
+    stamps_ns = tuple(pair.stamp_ns for pair in evidence.pairs)
+    return Observation(
+        stamp_ns=stamps_ns[-1],
+        pair_stamps_ns=stamps_ns,
+        metrics=metrics,
+        offset=seen.offset_pose - accuracy.bias,
+        sigma=accuracy.sigma(seen.pairs),
+        distance2=max(of_rotation, of_pose),
+        flagged=flagged,
+        weak=weak,
+        flagged_by_paper=None if baseline is None else by_equation_2(seen, limits),
+        causes=causes,
+    )
+
+
+def by_equation_2(seen: Look, limits: MonitorLimits) -> bool:
+    """Equation (2) of Borer et al. 2023: failed if MI < MI_lim or f' > f'_lim or f'' < f''_lim."""
+    return seen.mi < limits.min_mi or seen.f1 > limits.max_f1 or seen.f2 < limits.min_f2
+
+
+def edges_per_pair(seen: Look) -> float:
+    """Significance of the edges at the local optimum over the root of the number of pairs."""
+    return seen.edges_at_best / float(np.sqrt(max(seen.pairs, 1)))
+
+
+def after_observation(state: MonitorState, observation: Observation) -> MonitorState:
+    """The state after one more look. It counts by the share of its pairs that the last one did not hold."""
+    counted = set(state.last_stamps_ns)
+    fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
+    codes = {cause.code for cause in observation.causes}
+    blind = {
+        code: min(max(state.blind.get(code, 0.0) + (fresh if code in codes else -fresh), 0.0), MOST)
+        for code in {*state.blind, *codes}
+    }
+    blind = {code: blind[code] for code in sorted(blind) if blind[code] > 0.0}
+    after = replace(state, blind=blind, last_stamps_ns=observation.pair_stamps_ns)
+    if codes:
+        # Neither for nor against: the data cannot tell.
+        return after
+    if not observation.flagged and observation.weak:
+        return after
+    step = fresh * (WEAK_SHARE if observation.weak else 1.0)
+    most = max(state.evidence, SUSPECT_AT) if observation.weak else MOST
+    evidence = min(max(state.evidence + (step if observation.flagged else -step), 0.0), most)
+    offset = (
+        _mean(state.offset, observation.offset, step / max(evidence, step)) if observation.flagged else state.offset
+    )
+    return replace(after, evidence=evidence, outcome=_outcome(state.outcome, evidence), offset=offset)
+
+
+def diagnose(state: MonitorState) -> Cause | None:
+    """What is wrong, if anything is certain enough: a cause in the data first; a bent mount only once confirmed."""
+    for code, cause in CAUSES.items():
+        if state.blind.get(code, 0.0) >= BLIND_AT:
+            return cause
+    return BENT_MOUNT if state.outcome is Outcome.CONFIRMED else None
+
+
+def _outcome(before: Outcome, evidence: float) -> Outcome:
+    """With hysteresis: what was suspected stays so until little speaks for it."""
+    if evidence >= CONFIRMED_AT:
+        return Outcome.CONFIRMED
+    if before is Outcome.CONFIRMED and evidence >= CLEAR_BELOW:
+        return before
+    if evidence >= SUSPECT_AT or (before is Outcome.SUSPECT and evidence >= CLEAR_BELOW):
+        return Outcome.SUSPECT
+    return Outcome.CLEAR
+
+
+def _mean(before: tuple[float, ...], offset: NDArray[np.float64], share: float) -> tuple[float, ...]:
+    if not before:
+        return tuple(float(value) for value in offset)
+    return tuple((1.0 - share) * old + share * float(new) for old, new in zip(before, offset, strict=True))
+
+
+def _metrics(seen: Look, of_rotation: float, of_pose: float, limits: MonitorLimits) -> tuple[Metric, ...]:
+    return (
+        Metric("mi", seen.mi, limits.min_mi, at_least=True),
+        Metric("f1", seen.f1, limits.max_f1, at_least=False),
+        Metric("f2", seen.f2, limits.min_f2, at_least=True),
+        Metric("distance_rotation", of_rotation, 1.0, at_least=False),
+        Metric("distance_pose", of_pose, 1.0, at_least=False),
+        Metric("edges_per_pair", edges_per_pair(seen), limits.min_edges_per_pair, at_least=True),
+        Metric("agreement_deg", degrees(seen.agreement_rad), degrees(limits.max_agreement_rad), at_least=False),
+        Metric("overlap", seen.overlap, limits.min_overlap, at_least=True),
+    )

@@ -1,0 +1,172 @@
+"""`coec commission`: good windows of a rig in, its baseline out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coec.adapters.baseline_file import baseline_hash, baseline_to_json, save_baseline
+from coec.adapters.depth import CachedDepth, open_depth
+from coec.adapters.images import CachedGreys, GreyImages
+from coec.calibration.baseline import Baseline
+from coec.calibration.commissioning import MAX_PAIRS, commission
+from coec.calibration.ports import DepthModel, ImageReader
+from coec.calibration.values import Window
+from coec.cli import calibrate as calibrate_command
+from coec.cli import console, windows
+from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
+from coec.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    sources: tuple[str, ...]
+    output: Path
+    depth: str | None = None
+    objective: str | None = None
+    dof: int | None = None
+    frames: int | None = None
+    false_alarm_rate: float = 0.01
+    sensors: tuple[str, ...] = ()
+    as_json: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rigged:
+    """Windows of one rig, and what looks at them need."""
+
+    windows: tuple[Window, ...]
+    configuration: CalibrationConfig
+    depth: DepthModel
+    images: ImageReader
+
+
+def run(options: Options) -> int:
+    """Prints and writes the baseline.
+
+    Raises:
+        CoecError: there is none.
+    """
+    sensors = sensors_of(options.sensors)
+    with console.progress() as bars:
+        times = calibrate_command.StageTimes(bars)
+        rigged = load(options.sources, options, times)
+        baseline = commission(
+            rigged.windows,
+            rigged.depth,
+            rigged.images,
+            rigged.configuration,
+            sensors=sensors,
+            false_alarm_rate=options.false_alarm_rate,
+            progress=times,
+        )
+    save_baseline(options.output, baseline)
+    if options.as_json:
+        console.print_json(document_of(baseline))
+    else:
+        show(baseline)
+        console.show(f"written to {options.output}")
+    return 0
+
+
+def load(sources: tuple[str, ...], options: Options, times: calibrate_command.StageTimes) -> Rigged:
+    """The windows of all sources, with the configuration of the first.
+
+    Raises:
+        UsageError: no source, no depth, or a value that does not exist.
+    """
+    if not sources:
+        raise UsageError("name at least one recording of a rig whose calibration is right")
+    loaded = [
+        windows.load(source, options.frames, WindowConfig().pairs, lambda done, total: times.step("load", done, total))
+        for source in sources
+    ]
+    configuration = calibrate_command.configuration_of(
+        calibrate_command.Options(source=sources[0], depth=options.depth, objective=options.objective, dof=options.dof),
+        loaded[0].configuration,
+    )
+    depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), MAX_PAIRS)
+    images = CachedGreys(GreyImages(LimitsConfig()), MAX_PAIRS)
+    found = tuple(replace(one.window, T_camera_lidar_start=one.window.rig.T_camera_lidar_nominal) for one in loaded)
+    return Rigged(found, configuration, depth, images)
+
+
+def sensors_of(named: tuple[str, ...]) -> dict[str, str]:
+    """Serial numbers by stream, from `camera=SERIAL` and the like.
+
+    Raises:
+        UsageError: not of this form.
+    """
+    sensors = {}
+    for text in named:
+        stream, _, serial = text.partition("=")
+        if stream not in ("camera", "lidar") or not serial:
+            raise UsageError(f"--sensor {text}: give camera=SERIAL or lidar=SERIAL")
+        sensors[f"{stream}_serial"] = serial
+    return sensors
+
+
+def document_of(baseline: Baseline) -> dict[str, Any]:
+    """What `--json` prints: the baseline as it is written, its hash, and bias and spread in degrees and metres."""
+    sigma = baseline.accuracy.sigma(baseline.pairs)
+    return {
+        "baseline": baseline_to_json(baseline),
+        "hash": baseline_hash(baseline),
+        "bias": _in_degrees(baseline.bias),
+        "bias_sigma": _in_degrees(np.nan_to_num(baseline.bias_sigma)),
+        "sigma_of_a_window": _in_degrees(np.nan_to_num(sigma)),
+    }
+
+
+def show(baseline: Baseline) -> None:
+    """The baseline for people."""
+    console.show(
+        f"{baseline.pair}: commissioned from {baseline.pairs} pairs of {baseline.windows} "
+        f"window{'s' if baseline.windows > 1 else ''}, hash {baseline_hash(baseline)}"
+    )
+    table = console.table("axis", "bias", "± σ", "σ of a look at 6 pairs", "unit", right=(1, 2, 3))
+    bias, known = _in_degrees(baseline.pose.bias), _in_degrees(baseline.pose.bias_sigma)
+    of_look = _in_degrees(baseline.pose.sigma(6))
+    for axis, name in enumerate(console.AXIS_NAMES):
+        table.add_row(
+            name,
+            console.figure(bias[axis], sign=True),
+            console.figure(known[axis]),
+            console.figure(of_look[axis]),
+            console.UNITS[axis],
+        )
+    console.out.print(table)
+    limits = console.table("limit of a look", "value", right=(1,))
+    monitor = baseline.monitor
+    for name, value in (
+        ("mi, nats, at least", monitor.min_mi),
+        ("f', nats per rad, at most", monitor.max_f1),
+        ("f'', nats per rad², at least", monitor.min_f2),
+        ("distance² over rotations, σ², at most", monitor.max_distance2_rotation),
+        ("distance² of the farthest axis, σ², at most", monitor.max_farthest2_pose),
+        ("edges per pair, at least", monitor.min_edges_per_pair),
+        ("agreement of the witnesses, deg, at most", float(np.degrees(monitor.max_agreement_rad))),
+        ("overlap, at least", monitor.min_overlap),
+    ):
+        limits.add_row(name, console.figure(value))
+    console.out.print(limits)
+    if baseline.limits:
+        verdicts = console.table("limit of a calibration", "value", right=(1,))
+        for name, value in sorted(baseline.limits.items()):
+            verdicts.add_row(name, console.figure(value))
+        console.out.print(verdicts)
+    caught = ", ".join(f"{name} {100 * share:.0f} %" for name, share in baseline.detected.items())
+    console.show(
+        f"at {100 * baseline.false_alarm_rate:g} % false alarms, looks at the moved extrinsic flagged: {caught}"
+    )
+
+
+def _in_degrees(rad_m: Any) -> list[float]:
+    values = np.array(rad_m, dtype=np.float64)
+    values[:3] = np.degrees(values[:3])
+    return [float(value) for value in values]

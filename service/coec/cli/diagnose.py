@@ -1,0 +1,123 @@
+"""`coec diagnose`: how well a wrong extrinsic is seen on a recording, or whether its extrinsic is right."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coec.adapters.baseline_file import load_baseline
+from coec.adapters.wire import metric_of
+from coec.calibration.baseline import mismatch
+from coec.calibration.commissioning import learned_hash
+from coec.calibration.detection import table, try_detection
+from coec.calibration.estimators import look
+from coec.calibration.looks import gather
+from coec.calibration.monitor import observe
+from coec.cli import calibrate as calibrate_command
+from coec.cli import commission, console, windows
+from coec.errors import UsageError
+from coec.geometry import se3
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    source: str
+    depth: str | None = None
+    rig: Path | None = None
+    perturb: str | None = None
+    detection: int = 0
+    looks: int = 10
+    frames: int | None = None
+    as_json: bool = False
+
+
+def run(options: Options) -> int:
+    """One look at the recording's extrinsic, 1 if it is flagged; with `detection`, the table instead.
+
+    Raises:
+        CoecError: nothing can be seen.
+    """
+    with console.progress() as bars:
+        times = calibrate_command.StageTimes(bars)
+        of_source = commission.Options(
+            sources=(options.source,), output=Path(), depth=options.depth, frames=options.frames
+        )
+        rigged = commission.load((options.source,), of_source, times)
+        if options.detection > 0:
+            return _tabulate(rigged, options, times)
+        return _look(rigged, options)
+
+
+def _tabulate(rigged: commission.Rigged, options: Options, times: calibrate_command.StageTimes) -> int:
+    window = rigged.windows[0]
+    evidence = gather(look(window, rigged.depth, rigged.images, rigged.configuration, times))
+    tried = try_detection(
+        evidence,
+        window.T_camera_lidar_start,
+        rigged.configuration,
+        options.detection,
+        options.looks,
+        lambda done, total: times.step("splits", done, total),
+    )
+    rows = table(tried)
+    if options.as_json:
+        console.print_json({"source": options.source, "splits": options.detection, "moves": [asdict(r) for r in rows]})
+        return 0
+    shown = console.table("extrinsic", "looks", "flagged", "by equation (2)", right=(1, 2, 3))
+    for row in rows:
+        shown.add_row(row.name, str(row.looks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
+    console.out.print(shown)
+    console.show(
+        f"{options.detection} splits of {len(evidence.pairs)} pairs: limits learned on one half, tried on the other"
+    )
+    return 0
+
+
+def _look(rigged: commission.Rigged, options: Options) -> int:
+    window = rigged.windows[0]
+    if options.perturb is not None:
+        moved = se3.perturb(window.T_camera_lidar_start, windows.perturbation_of(options.perturb))
+        window = replace(window, T_camera_lidar_start=moved)
+    baseline = None
+    if options.rig is not None:
+        baseline = load_baseline(options.rig, window.rig.pair)
+        if baseline is None:
+            raise UsageError(f"{options.rig} holds no baseline of the pair {window.rig.pair}: run `coec commission`")
+        against = mismatch(baseline, window.rig, rigged.depth.identity, learned_hash(rigged.configuration))
+        if against is not None:
+            raise UsageError(f"{options.rig} does not hold for this recording: {against}")
+    seen = observe(window, rigged.depth, rigged.images, rigged.configuration, baseline)
+    wrong = seen.flagged or bool(seen.causes)
+    metrics = {metric.name: metric_of(metric) for metric in seen.metrics}
+    if options.as_json:
+        document: dict[str, Any] = {
+            "flagged": seen.flagged,
+            "flagged_by_paper": seen.flagged_by_paper,
+            "causes": [{"code": cause.code, "text": cause.text} for cause in seen.causes],
+            "offset": _in_degrees(seen.offset),
+            "sigma": _in_degrees(seen.sigma),
+            "metrics": {name: metric.model_dump(mode="json") for name, metric in metrics.items()},
+        }
+        console.print_json(document)
+        return int(wrong)
+    axes = console.table("axis", "offset", "± σ", "unit", right=(1, 2))
+    offset, sigma = _in_degrees(seen.offset), _in_degrees(seen.sigma)
+    for axis, name in enumerate(console.AXIS_NAMES):
+        axes.add_row(name, console.figure(offset[axis], sign=True), console.figure(sigma[axis]), console.UNITS[axis])
+    console.out.print(axes)
+    console.out.print("extrinsic ", console.styled("failed" if wrong else "accepted"), sep="")
+    for cause in seen.causes:
+        console.show(f"  {cause.code}: {cause.text}", "yellow")
+    console.show_metrics(metrics)
+    return int(wrong)
+
+
+def _in_degrees(rad_m: Any) -> list[float]:
+    values = np.array(rad_m, dtype=np.float64)
+    values[:3] = np.degrees(values[:3])
+    return [float(value) for value in values]

@@ -1,0 +1,193 @@
+"""`coec paper`: the published experiments on a recording, with their figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from math import degrees, radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coec.adapters import paper_plots, plots
+from coec.adapters.depth import open_depth
+from coec.calibration import evaluation, paper, starts
+from coec.calibration.estimators import look
+from coec.calibration.evaluation import Outcome
+from coec.calibration.objective import range_and_depth
+from coec.calibration.ports import Silence
+from coec.cli import calibrate as calibrate_command
+from coec.cli import console, files, windows
+from coec.cli.evaluation_bench import Bench, Stages, greys_of, inferred
+from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
+
+FAR_DEG, DRIVE_DEG = 25.0, (5.0, 10.0)
+"""Starts of the published experiments."""
+
+MARGIN_DEG = 5.0
+"""How far the search reaches beyond its start."""
+
+DRIVE_PAIRS = 5
+"""Pairs of one slice of the drive; the paper takes 25 of 11,518 frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    source: str
+    output: Path
+    depth: str | None = None
+    objective: str = "mi"
+    runs: int = 100
+    samples: int = 100
+    frames: int | None = None
+    as_json: bool = False
+
+
+def run(options: Options) -> int:
+    """Writes metrics.png, bullseye.png, drive.png and report.json, and prints what is in them.
+
+    Raises:
+        CoecError: an experiment cannot be done.
+    """
+    with console.progress() as bars:
+        stages = Stages(bars)
+        load = stages.begin("load", None)
+        loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
+        configuration = calibrate_command.configuration_of(
+            calibrate_command.Options(source=options.source, depth=options.depth, objective=options.objective),
+            loaded.configuration,
+        )
+        window = loaded.window
+        depth = inferred(
+            window, open_depth(configuration.depth, LimitsConfig()), stages.begin("depth", len(window.pairs))
+        )
+        bench = Bench(window, depth, greys_of(window), configuration)
+        document = {
+            "source": options.source,
+            "objective": options.objective,
+            "pairs": len(window.pairs),
+            "failure_metrics": _failure_metrics(bench, options, stages),
+            "bullseye": _bullseye(bench, options, stages),
+            "drive": _drive(bench, options, stages),
+        }
+    written = files.write(options.output / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
+    if options.as_json:
+        console.print_json(document)
+    else:
+        _show(document)
+        console.show(f"written to {written.parent}")
+    return 0
+
+
+def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
+    """Limits learned on every second pair, tried on the others."""
+    sight = look(bench.window, bench.depth, bench.images, bench.configuration, Silence())
+    frames = [range_and_depth(c.xyz_m, d) for c, d in zip(sight.clouds, sight.depths(), strict=True)]
+    heard = stages.begin("metrics", 2 * options.samples)
+    rig, right = bench.window.rig, bench.reference
+    known = paper.failure_figures(
+        frames[::2], rig, right, bench.configuration, options.samples, lambda done, _: heard(done, "")
+    )
+    limits = paper.learned(known)
+    tried = paper.failure_figures(
+        frames[1::2] or frames, rig, right, bench.configuration, options.samples,
+        lambda done, _: heard(options.samples + done, ""),
+    )  # fmt: skip
+    rows = [
+        {
+            "moved_deg": moved,
+            "looks": options.samples,
+            "flagged": float(np.mean([limits.flags(f) for f in tried if f.moved_deg == moved])),
+        }
+        for moved in paper.MOVES_DEG
+    ]
+    shares = ", ".join(f"{row['moved_deg']:g}°: {100 * row['flagged']:.1f} %" for row in rows)
+    title = (
+        f"{bench.window.window_id}: equation (2), limits learned on the other half of the pairs; flagged at {shares}"
+    )
+    files.write(options.output / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
+    return {"limits": asdict(limits), "moves": rows}
+
+
+def _bullseye(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
+    heard = stages.begin(f"{FAR_DEG:g} deg", options.runs)
+    far = Bench(bench.window, bench.depth, bench.images, _reaching(bench.configuration, FAR_DEG))
+    outcomes = []
+    for start in starts.starts(bench.reference, options.runs, radians(FAR_DEG), 0.0):
+        outcomes.append(far.solve(start))
+        heard(len(outcomes), f"{sum(outcome.hit for outcome in outcomes)} hits")
+    of = evaluation.summarise(outcomes)
+    title = (
+        f"{bench.window.window_id}: {options.objective}, {options.runs} runs from {FAR_DEG:g}°: {of.hits} hits, "
+        f"{100 * of.classified_correctly:.0f} % classified correctly"
+    )
+    spheres = {"rotation vectors of the starts": starts.directions(options.runs)}
+    files.write(options.output / "bullseye.png", plots.bullseye(outcomes, spheres, title))
+    return {"start_deg": FAR_DEG, **_figures(outcomes)}
+
+
+def _drive(bench: Bench, options: Options, stages: Stages) -> list[dict[str, Any]]:
+    """Every slice of neighbouring pairs from starts all around, so that together they are `runs` for each radius."""
+    pairs = bench.window.pairs
+    runs_of = paper.slices(len(pairs), min(DRIVE_PAIRS, len(pairs)))
+    per_slice = max(options.runs // len(runs_of), 1)
+    heard = stages.begin("drive", len(DRIVE_DEG) * len(runs_of) * per_slice)
+    found: dict[str, list[tuple[float, Outcome]]] = {}
+    rows, done = [], 0
+    for radius_deg in DRIVE_DEG:
+        near = Bench(bench.window, bench.depth, bench.images, _reaching(bench.configuration, radius_deg))
+        poses = starts.starts(bench.reference, per_slice * len(runs_of), radians(radius_deg), 0.0)
+        outcomes = []
+        for number, indices in enumerate(runs_of):
+            middle_s = (pairs[indices[len(indices) // 2]].stamp_ns - pairs[0].stamp_ns) * 1e-9
+            # Every slice gets starts from all over the sphere.
+            for start in poses[number :: len(runs_of)]:
+                outcomes.append((middle_s, near.solve(start, indices)))
+                done += 1
+                heard(done, "")
+        found[f"from {radius_deg:g}°"] = outcomes
+        rows.append({"start_deg": radius_deg, **_figures([outcome for _, outcome in outcomes])})
+    title = f"{bench.window.window_id}: {options.objective}, slices of {len(runs_of[0])} pairs"
+    files.write(options.output / "drive.png", paper_plots.drive(found, title))
+    return rows
+
+
+def _reaching(configuration: CalibrationConfig, radius_deg: float) -> CalibrationConfig:
+    """A search that reaches beyond starts at this radius."""
+    reach = {"rotation_deg": radius_deg + MARGIN_DEG, "reach_deg": radius_deg + MARGIN_DEG}
+    return configuration.model_copy(update={"search": configuration.search.model_copy(update=reach)})
+
+
+def _figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    of = evaluation.summarise(outcomes)
+    errors = np.degrees([outcome.error[:3] for outcome in outcomes])
+    return {
+        "runs": of.starts,
+        "hits": of.hits,
+        "classified_correctly": of.classified_correctly,
+        "verdicts": asdict(of.verdicts),
+        "rotation_deg": {
+            "median": degrees(of.rotation_rad.median),
+            "p95": degrees(of.rotation_rad.p95),
+            "max": degrees(of.rotation_rad.max),
+        },
+        "mean_deg": errors.mean(axis=0).tolist(),
+        "std_deg": errors.std(axis=0).tolist(),
+    }
+
+
+def _show(document: dict[str, Any]) -> None:
+    moves = console.table("extrinsic off by", "looks", "flagged by equation (2)", right=(1, 2))
+    for row in document["failure_metrics"]["moves"]:
+        moves.add_row(f"{row['moved_deg']:g}°", str(row["looks"]), f"{100 * row['flagged']:.1f} %")
+    console.out.print(moves)
+    solves = console.table("solves", "runs", "hits", "classified", "pitch", "yaw", "roll", right=(1, 2, 3, 4, 5, 6))
+    for name, row in [("all pairs", document["bullseye"]), *(("slices", row) for row in document["drive"])]:
+        spread = [f"{mean:+.3f} ± {std:.3f}°" for mean, std in zip(row["mean_deg"], row["std_deg"], strict=True)]
+        correct = f"{100 * row['classified_correctly']:.0f} %"
+        solves.add_row(f"{name}, from {row['start_deg']:g}°", str(row["runs"]), str(row["hits"]), correct, *spread)
+    console.out.print(solves)
