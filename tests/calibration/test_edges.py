@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 
 from coec.adapters.images import GreyImages
-from coec.calibration.edges import BANDS, COARSEST_BLUR_RAD, MAX_PIXELS, THINNED_POINTS, EdgeWitness, build_edges
+from coec.calibration.edges import (
+    BANDS,
+    COARSEST_BLUR_RAD,
+    MAX_PIXELS,
+    RANKED_POINTS,
+    THINNED_POINTS,
+    EdgeWitness,
+    build_edges,
+)
 from coec.calibration.motion import compensate
 from coec.calibration.values import Rig, Window
 from coec.config import LimitsConfig
 from coec.geometry.cameras import Camera, build
-from coec.geometry.edge_charts import CELLS_PER_BLUR
+from coec.geometry.edge_charts import CELLS_PER_BLUR, MAX_CHART_POINTS
 from coec.geometry.image_edges import BLUR_SIGMA_PX, edge_pyramid
 from coec.geometry.projection import project, unproject
 from coec.geometry.range_edges import range_edges
@@ -90,11 +98,13 @@ def test_points_are_the_range_edges_where_they_were_at_the_exposure(
         np.testing.assert_array_equal(sharp_edges.whole.weight[first[f] : first[f + 1]], found.weight)
 
 
-def test_charts_are_of_the_coarse_bands_with_all_points_or_some(sharp_edges: EdgeWitness) -> None:
-    for charts, blur_rad in zip(sharp_edges.charts, reversed(sharp_edges.band_blur_rad[1:]), strict=True):
+def test_charts_are_of_the_coarse_bands_with_all_of_their_points_or_some(sharp_edges: EdgeWitness) -> None:
+    for charts, band, blur_rad in zip(
+        sharp_edges.charts, sharp_edges.bands[:0:-1], sharp_edges.band_blur_rad[:0:-1], strict=True
+    ):
         assert charts.cells_per_unit == pytest.approx(2.0 * CELLS_PER_BLUR / blur_rad)
-        np.testing.assert_array_equal(charts.xyz_m, sharp_edges.whole.xyz_m)
-        np.testing.assert_array_equal(np.bincount(charts.frame), np.diff(sharp_edges.whole.first_point))
+        np.testing.assert_array_equal(charts.xyz_m, band.xyz_m)
+        np.testing.assert_array_equal(np.bincount(charts.frame), np.diff(band.first_point))
     for thinned, charts in zip(sharp_edges.thinned, sharp_edges.charts, strict=True):
         assert thinned.xyz_m.shape[1] == THINNED_POINTS < charts.xyz_m.shape[1]
         assert thinned.cells is charts.cells
@@ -103,11 +113,18 @@ def test_charts_are_of_the_coarse_bands_with_all_points_or_some(sharp_edges: Edg
         assert share == pytest.approx(THINNED_POINTS / charts.xyz_m.shape[1], rel=0.02)
 
 
-def test_more_points_than_a_chart_holds_are_thinned(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.calibration.edges.MAX_CHART_POINTS", 200)
+def test_basins_are_ranked_with_some_of_the_points_where_there_are_very_many(
+    street: Window, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert RANKED_POINTS <= MAX_CHART_POINTS
+    monkeypatch.setattr("coec.calibration.edges.RANKED_POINTS", 200)
     edges = with_camera(street, CAMERAS["coarse"])
     assert [charts.xyz_m.shape[1] for charts in (*edges.charts, *edges.thinned)] == [200] * 4
-    assert edges.whole.xyz_m.shape[1] > 200
+    assert [band.xyz_m.shape[1] for band in edges.bands] == [200] * BANDS
+    assert edges.whole.xyz_m.shape[1] == edges.sharp.xyz_m.shape[1] > 200
+    # The ones that are kept are the same everywhere, with their weights.
+    every = {tuple(column) for column in np.vstack([edges.whole.xyz_m, edges.whole.weight]).T}
+    assert all(tuple(column) in every for column in np.vstack([edges.bands[0].xyz_m, edges.bands[0].weight]).T)
 
 
 def test_a_mask_hides_pixels_on_every_level(street: Window) -> None:

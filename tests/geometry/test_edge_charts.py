@@ -129,8 +129,8 @@ def test_every_pixel_has_a_place_on_the_chart(model: str) -> None:
 def test_strong_edges_end_at_what_a_cell_can_tell() -> None:
     maps = np.zeros((1, HEIGHT, WIDTH), np.float32)
     maps[0, :, : WIDTH // 2], maps[0, :, WIDTH // 2 :] = 1e3, -1e3
-    camera, none = CAMERAS["pinhole"], np.zeros(0)
-    charts = edge_charts(camera, maps, blur_rad(camera), np.zeros((3, 0), np.float32), none.astype(np.float32), none)
+    camera, nowhere = CAMERAS["pinhole"], np.zeros((3, 0), np.float32)
+    charts = edge_charts(camera, maps, blur_rad(camera), nowhere, np.zeros(0, np.float32), np.zeros(0, np.int64))
     assert set(np.unique(charts.cells)) == {2 * 127 + 1, 0, -2 * 127 + 1}
 
 
@@ -224,7 +224,7 @@ def test_the_order_of_the_points_does_not_matter_to_the_bit() -> None:
 def threads() -> Iterator[tuple[int, ...]]:
     """One thread, and as many as there are; afterwards it is as before."""
     before = numba.get_num_threads()
-    yield (1, numba.config.NUMBA_NUM_THREADS)
+    yield (1, before)
     numba.set_num_threads(before)
 
 

@@ -14,7 +14,7 @@ from coec.calibration.values import FramePair, Rig
 from coec.errors import CalibrationError
 from coec.geometry.alignment import EdgeFrames
 from coec.geometry.cameras import Camera, scaled
-from coec.geometry.edge_charts import MAX_CHART_POINTS, EdgeCharts, edge_charts
+from coec.geometry.edge_charts import EdgeCharts, edge_charts
 from coec.geometry.image_edges import BLUR_SIGMA_PX, edge_pyramid
 from coec.geometry.projection import project
 from coec.geometry.range_edges import range_edges
@@ -31,6 +31,9 @@ COARSEST_BLUR_RAD = radians(0.6)
 it is below twice that. Wider, the layout of a scene hides the true pose (measured: in a garage the true pose comes 80th
 of the cover at 1.9° and first to tenth at 0.9°); narrower, the cover of the global stage has to be finer."""
 
+RANKED_POINTS = 60_000
+"""Range edges of the window that rank basins, at most: bounded time for a window of many frames."""
+
 THINNED_POINTS = 3_000
 """Range edges of the window that the cover visits; significance falls with the square root of their number only."""
 
@@ -43,9 +46,10 @@ class EdgeWitness:
         sharp: every range edge on the image edges as they are, through the model of the lens: settles a pose.
         whole: the same on blurred edges: leads there.
         whole_blur_rad: its blur, an angle about the optical axis.
-        bands: from fine to coarse, every range edge on one band each, through the model of the lens: ranks basins.
+        bands: from fine to coarse, `RANKED_POINTS` evenly chosen range edges on one band each, through the model of the
+            lens: ranks basins.
         band_blur_rad: the blur of each.
-        charts: the coarsest and the next finer band with every range edge that they hold: fast.
+        charts: the coarsest and the next finer band with the same range edges: fast.
         thinned: the same with `THINNED_POINTS` evenly chosen range edges: faster.
     """
 
@@ -83,25 +87,28 @@ def build_edges(
     pyramids = [edge_pyramid(grey, lit, finest, coarsest) for grey in greys]
     points_m = np.ascontiguousarray(xyz_m.T)
 
-    def frames(level: int, maps: list[NDArray[np.float32]]) -> EdgeFrames:
+    def frames(level: int, maps: list[NDArray[np.float32]], chosen: NDArray[np.int64]) -> EdgeFrames:
         # Halving leaves out a last odd row or column: the scale is a half all the same.
         height, width = maps[0].shape
         camera = scaled(rig.camera, 0.5**level, 0.5**level)._replace(width=width, height=height)
-        return EdgeFrames(camera, points_m, weight, first_point, np.stack(maps))
+        first_chosen = np.searchsorted(chosen, first_point)
+        return EdgeFrames(
+            camera, np.ascontiguousarray(points_m[:, chosen]), weight[chosen], first_chosen, np.stack(maps)
+        )
 
-    ranked = range(coarsest + 1 - BANDS, coarsest + 1)
-    bands = tuple(frames(level, [pyramid.bands[level - finest] for pyramid in pyramids]) for level in ranked)
-    blur_rad = tuple(_blur_rad(rig.camera, level) for level in ranked)
-    charted = _evenly(len(weight), MAX_CHART_POINTS)
-    of_points = np.repeat(np.arange(len(pairs)), np.diff(first_point))[charted]
+    every, ranked = np.arange(len(weight)), _evenly(len(weight), RANKED_POINTS)
+    levels = range(coarsest + 1 - BANDS, coarsest + 1)
+    bands = tuple(frames(level, [pyramid.bands[level - finest] for pyramid in pyramids], ranked) for level in levels)
+    blur_rad = tuple(_blur_rad(rig.camera, level) for level in levels)
+    of_points = np.repeat(np.arange(len(pairs)), np.diff(first_point))[ranked]
     coarse, fine = (
-        edge_charts(bands[k].camera, bands[k].maps, blur_rad[k], points_m[:, charted], weight[charted], of_points)
+        edge_charts(bands[k].camera, bands[k].maps, blur_rad[k], points_m[:, ranked], weight[ranked], of_points)
         for k in (-1, -2)
     )
-    kept = _evenly(len(charted), THINNED_POINTS)
+    kept = _evenly(len(ranked), THINNED_POINTS)
     return EdgeWitness(
-        sharp=frames(finest, [pyramid.sharp for pyramid in pyramids]),
-        whole=frames(finest, [pyramid.whole for pyramid in pyramids]),
+        sharp=frames(finest, [pyramid.sharp for pyramid in pyramids], every),
+        whole=frames(finest, [pyramid.whole for pyramid in pyramids], every),
         whole_blur_rad=_blur_rad(rig.camera, finest),
         bands=bands,
         band_blur_rad=blur_rad,

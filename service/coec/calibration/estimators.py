@@ -37,8 +37,9 @@ Seen = TypeVar("Seen")
 POLISHED_BASINS = 6
 """Basins that are polished on the fused objective: the true one was never below the second place."""
 
-DEPTH_THINNING = 4
-"""One in so many points carries the depth witness of a fusion: its hill is degrees wide, the edges settle the rest."""
+DEPTH_POINTS = 300_000
+"""Points of the window's clouds, seen or not, that carry the depth witness of a fusion: its hill is degrees wide, the
+edges settle the rest."""
 
 SAME_BASIN_RAD = radians(1.5)
 """Poses nearer than this are one basin, not rivals."""
@@ -152,7 +153,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     window, progress = sight.window, sight.progress
     start = window.T_camera_lidar_start
     reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
-    features = [_thinned(frame) for frame in _depth_features(sight)]
+    features = thinned(_depth_features(sight))
     depth = build_mutual_information(features, window.rig, start, reach, config.objective)
     edges = build_edges(window.pairs, [cloud.xyz_m for cloud in sight.clouds], sight.greys(), window.rig)
     basins = find_basins(edges, start, reach)
@@ -169,6 +170,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     ]
     limits = config.verdict
     metrics = (
+        Metric("range_edges", len(edges.sharp.weight), limits.min_range_edges, at_least=True),
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
         Metric("runner_up", max(rivals, default=0.0) / max(contrast, 1e-9), limits.max_runner_up, at_least=False),
     )
@@ -197,8 +199,10 @@ def _depth_features(sight: Sight) -> list[Features]:
     return [range_and_depth(cloud.xyz_m, depth) for cloud, depth in zip(sight.clouds, sight.depths(), strict=True)]
 
 
-def _thinned(frame: Features) -> Features:
-    return Features(frame.xyz_m[::DEPTH_THINNING], frame.of_points[::DEPTH_THINNING], frame.of_pixels)
+def thinned(frames: Sequence[Features]) -> list[Features]:
+    """One in so many points of every frame, so that about `DEPTH_POINTS` are left."""
+    step = max(1, round(sum(len(frame.xyz_m) for frame in frames) / DEPTH_POINTS))
+    return [Features(frame.xyz_m[::step], frame.of_points[::step], frame.of_pixels) for frame in frames]
 
 
 def _by_mutual_information(frames: list[Features], sight: Sight, config: CalibrationConfig) -> Found:

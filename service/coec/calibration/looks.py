@@ -18,7 +18,7 @@ from coec.calibration.basins import find_basins
 from coec.calibration.causes import SceneFacts, scene_facts
 from coec.calibration.confidence import measure_curvature
 from coec.calibration.edges import THINNED_POINTS, EdgeWitness, build_edges
-from coec.calibration.estimators import DEPTH_THINNING, Sight
+from coec.calibration.estimators import Sight, thinned
 from coec.calibration.fused import Fusion
 from coec.calibration.motion import CompensatedCloud
 from coec.calibration.objective import (
@@ -129,9 +129,7 @@ def gather(sight: Sight) -> Evidence:
     scenes = [
         scene_facts(pair, grey, int(count)) for pair, grey, count in zip(window.pairs, greys, counts, strict=True)
     ]
-    return Evidence(
-        window.rig, window.pairs, sight.clouds, tuple(_thinned(frame) for frame in features), edges, tuple(scenes)
-    )
+    return Evidence(window.rig, window.pairs, sight.clouds, tuple(thinned(features)), edges, tuple(scenes))
 
 
 def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig) -> Look:
@@ -193,10 +191,6 @@ class _EdgesAlone:
         strength, square = frame_alignment(self._edges.whole, T_camera_lidar)
         of_frames = len(strength) * strength / np.sqrt(max(float(square.sum()), 1e-9))
         return Evaluation(float(of_frames.mean()), of_frames, mi=float("nan"), overlap=float("nan"), points_in_view=0)
-
-
-def _thinned(frame: Features) -> Features:
-    return Features(frame.xyz_m[::DEPTH_THINNING], frame.of_points[::DEPTH_THINNING], frame.of_pixels)
 
 
 def _witness_of(edges: EdgeWitness, indices: Sequence[int]) -> EdgeWitness:

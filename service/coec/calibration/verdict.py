@@ -22,6 +22,7 @@ ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 
 _MEANING = {
     "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",
+    "range_edges": "too little structure: the sweeps have too few jumps in range",
     "edge_contrast": "no pose stands out from the others",
     "runner_up": "ambiguous: another pose explains the window nearly as well",
     "newton_step_deg": "the objective is not at a maximum on every rotation axis",
