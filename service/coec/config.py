@@ -157,7 +157,7 @@ class DepthConfig(Stage):
     """The depth network."""
 
     model: str = Field(
-        default="stereo", description="an ONNX file, a built-in name, or `stereo` (maps that come with the frames)"
+        default="street", description="an ONNX file, a built-in name, or `stereo` (maps that come with the frames)"
     )
     providers: tuple[Literal["cpu", "cuda", "tensorrt"], ...] = Field(
         default=("cpu",), min_length=1, description="tried in this order; cpu is always the last resort"
@@ -199,7 +199,7 @@ class SearchConfig(Stage):
     reach_deg: float = Field(
         default=28.0, gt=0, le=60, description="radius of the global stage about the start (fused)"
     )
-    reach_m: float = Field(default=0.55, gt=0, le=2, description="radius of the global stage about the start (fused)")
+    reach_m: float = Field(default=0.65, gt=0, le=2, description="radius of the global stage about the start (fused)")
 
 
 class VerdictConfig(Stage):
@@ -214,6 +214,11 @@ class VerdictConfig(Stage):
     min_peakedness_per_deg2: float = Field(default=0.01, description="f''/score, per degree²; least of the rotations")
     min_overlap: float = Field(
         default=0.5, ge=0, le=1, description="points in view over the most any pose of the box sees"
+    )
+    min_range_edges: int = Field(
+        default=1000,
+        ge=1,
+        description="range jumps of the window's sweeps; a few hundred fit wrong poses by chance (fused)",
     )
     min_edge_contrast: float = Field(
         default=6.0, gt=0, description="edge significance, in standard deviations of that of other poses (fused)"
@@ -333,6 +338,11 @@ class LimitsConfig(Stage):
     max_message_bytes: int = Field(default=32 * 2**20, ge=2**16, le=2**30, description="as Zenoh's max_message_size")
     max_image_pixels: int = Field(default=33_000_000, ge=2**12, description="8K UHD")
     max_points: int = Field(default=1_000_000, ge=2**10)
+    max_held_bytes: int = Field(
+        default=256 * 2**20,
+        ge=2**20,
+        description="per pair, frames that wait until what was seen before them is judged; beyond, they do not wait",
+    )
 
 
 class StateConfig(Stage):

@@ -59,7 +59,8 @@ class Bench:
         self.folder = folder
         self.losses = LossCounter(logging.getLogger("test"), "front")
         self.recorded: queue.SimpleQueue[Recorded] = queue.SimpleQueue()
-        self.recorder = Recorder(plan, folder, self.losses, lambda *event: self.recorded.put(event))
+        self.lost: list[str] = []
+        self.recorder = Recorder(plan, folder, self.losses, lambda *event: self.recorded.put(event), self.lost.append)
 
     @contextmanager
     def running(self) -> Iterator[Recorder]:
@@ -108,6 +109,7 @@ def test_too_few_pairs_leave_no_file(bench: Bench) -> None:
         assert bench.recorded.get(timeout=DEADLINE_S)[0] == "front-50"
     assert bench.files() == ["front-50.mcap"]
     assert bench.losses.snapshot() == {("window", "too_few_pairs"): 1}
+    assert bench.lost == ["front-10"]
 
 
 def test_a_stop_finishes_the_open_window(bench: Bench) -> None:
@@ -154,6 +156,7 @@ def test_a_full_disk_costs_one_window_and_the_next_is_tried(bench: Bench, monkey
         assert recorder.trouble is None
     assert bench.losses.snapshot() == {("window", "recording_failed"): 1}
     assert bench.files() == ["front-50.mcap"]
+    assert bench.lost == ["front-10"]
 
 
 def test_no_window_starts_below_the_free_space_asked_for(tmp_path: Path) -> None:

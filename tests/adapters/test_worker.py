@@ -16,6 +16,7 @@ from coec.adapters import worker_link
 from coec.adapters.worker import (
     BUSY,
     ERRANDS_WAITING,
+    LOOKS_WAITING,
     PREFETCHES_WAITING,
     SUPERSEDED,
     Errand,
@@ -126,18 +127,19 @@ def test_a_refusal_is_an_answer_not_a_fault(tmp_path: Path) -> None:
         assert worker.status().starts == 1
 
 
-def test_the_newest_window_of_a_pair_wins_and_pairs_do_not_push_each_other_out(tmp_path: Path) -> None:
+def test_the_newest_windows_of_a_pair_win_and_pairs_do_not_push_each_other_out(tmp_path: Path) -> None:
     outcomes = Outcomes()
     worker = Worker(LIMITS, "{}", outcomes.events.put, outcomes.on_failed, fake_worker_command("none", tmp_path / "m"))
     worker.solve(job("old"))
     worker.solve(job("left-1", "left"))
     worker.solve(job("left-0", "left", live=False))
     worker.solve(job("new"))
+    worker.solve(job("newest"))
     failed, reason = outcomes.failed()
     assert (failed, reason.code) == (job("old"), "superseded")
     worker.start()
     try:
-        assert [outcomes.solved().job.window_id for _ in range(3)] == ["left-1", "new", "left-0"]
+        assert [outcomes.solved().job.window_id for _ in range(4)] == ["left-1", "new", "newest", "left-0"]
     finally:
         worker.request_stop()
         assert worker.thread.join(DEADLINE_S)
@@ -171,13 +173,13 @@ def test_an_errand_comes_back_with_its_answer(tmp_path: Path) -> None:
     assert answer["echo"] == {"kind": "overlay", "pair": "front", "number": 7}
 
 
-def test_of_the_looks_of_a_pair_the_newest_is_taken_and_errands_are_bounded(tmp_path: Path) -> None:
+def test_of_the_looks_of_a_pair_the_newest_are_taken_and_errands_are_bounded(tmp_path: Path) -> None:
     told: queue.SimpleQueue[object] = queue.SimpleQueue()
     outcomes = Outcomes()
     worker = Worker(LIMITS, "{}", outcomes.events.put, outcomes.on_failed, fake_worker_command("none", tmp_path / "m"))
     worker.look(errand("observe", told, 0, "rear"))
-    worker.look(errand("observe", told, 1))
-    worker.look(errand("observe", told, 2))
+    for number in range(1, 2 + LOOKS_WAITING):
+        worker.look(errand("observe", told, number))
     assert told.get_nowait() is SUPERSEDED
     for number in range(ERRANDS_WAITING):
         worker.run_errand(errand("overlay", told, 100 + number))
@@ -186,13 +188,13 @@ def test_of_the_looks_of_a_pair_the_newest_is_taken_and_errands_are_bounded(tmp_
     worker.solve(job("a"))
     worker.start()
     try:
-        answers = [told.get(timeout=DEADLINE_S) for _ in range(2 + ERRANDS_WAITING)]
+        answers = [told.get(timeout=DEADLINE_S) for _ in range(1 + LOOKS_WAITING + ERRANDS_WAITING)]
         assert outcomes.solved().job == job("a")
     finally:
         worker.request_stop()
         assert worker.thread.join(DEADLINE_S)
     numbers = [answer["echo"]["number"] for answer in answers if isinstance(answer, dict)]
-    assert numbers == [0, 2, *range(100, 100 + ERRANDS_WAITING)]
+    assert numbers == [0, *range(2, 2 + LOOKS_WAITING), *range(100, 100 + ERRANDS_WAITING)]
 
 
 @pytest.mark.parametrize("fault", ["sick", "sick-refuse"])

@@ -45,5 +45,20 @@ def test_the_published_experiments(coec: Coec, tmp_path: Path) -> None:
     assert [row["start_deg"] for row in outcome.document["drive"]] == [5.0, 10.0]
     assert outcome.document["bullseye"]["runs"] == 2
     assert [row["moved_deg"] for row in outcome.document["failure_metrics"]["moves"]] == [0.0, 1.0, 3.0]
+    assert [row["frames"] for row in outcome.document["run_times"]] == [5, 8]
+    assert all(0 < row["mi_ms"] < row["solve_ms"] for row in outcome.document["run_times"])
+    assert outcome.document["published"]["run_times_ms"]["25"] == [21.5, 4222.0]
     for name in ("metrics.png", "bullseye.png", "drive.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_published_experiments_on_every_window_of_a_drive(coec: Coec, tmp_path: Path) -> None:
+    options = ("--depth", "stereo", "--runs", 4, "--samples", 3, "--slice-s", 7, "--output", tmp_path)
+    outcome = coec("paper", RIG, *options, "--json")
+    assert outcome.status == 0
+    for row in outcome.document["drive"]:
+        assert [window["middle_s"] for window in row["windows"]] == [3.5, 3.5, 10.5, 10.5]
+        assert all(len(window["error_deg"]) == 3 for window in row["windows"])
+    shown = coec("paper", RIG, *options)
+    assert "published" in shown.out
+    assert "windows, from 10°" in shown.out

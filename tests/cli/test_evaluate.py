@@ -52,7 +52,17 @@ def test_report_has_the_figures_of_the_contract(coec: Coec) -> None:
 
 def test_starts_that_cannot_be_solved_are_counted_and_the_exit_is_0(coec: Coec) -> None:
     report = coec(
-        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "40", "--directions", "4", "--json"
+        "evaluate",
+        SMALL,
+        "--depth",
+        "stereo",
+        "--objective",
+        "mi",
+        "--rotation-deg",
+        "40",
+        "--directions",
+        "4",
+        "--json",
     ).document
     assert report["starts"] == 4
     assert report["hits"] < 4
@@ -200,3 +210,13 @@ def test_degrees_of_freedom_are_those_that_were_asked_for() -> None:
 def test_starts_too_far_for_any_box_are_a_usage_error() -> None:
     with pytest.raises(UsageError, match=r"search\.rotation_deg"):
         configuration_of(Options(source="", depth="stereo", directions=1, rotation_deg=50.0), None)
+
+
+def test_detection_is_the_table_of_diagnose(coec: Coec) -> None:
+    arguments = (SMALL, "--depth", "stereo", "--detection", "1")
+    report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
+    diagnosed = coec("diagnose", *arguments, "--json").document
+    detection = report.document["detection"]
+    assert detection == {key: diagnosed[key] for key in ("splits", "pairs", "moves")}
+    assert [row["name"] for row in detection["moves"]][:4] == ["right", "0.5 deg", "1 deg", "3 deg"]
+    assert all(row["looks"] == 10 for row in detection["moves"])

@@ -15,12 +15,14 @@ from coec.adapters.wire import result_of
 from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import Silence
 from coec.cli import windows
-from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig
+from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig
 from coec.errors import SourceError
 from coec.geometry import se3
 
 LIMITS = LimitsConfig()
-CONFIGURATION = CalibrationConfig(objective=ObjectiveConfig(kind="mi", depth_bins=24, range_bins=20))
+CONFIGURATION = CalibrationConfig(
+    depth=DepthConfig(model="stereo"), objective=ObjectiveConfig(kind="mi", depth_bins=24, range_bins=20)
+)
 """Not the defaults: what the file says must be used."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from math import degrees
 from typing import cast
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration import evaluation
+from coec.calibration.detection import Tried, table
 from coec.calibration.halves import Halves
 from coec.schemas import evaluation as wire
 from coec.schemas.replies import Maybe6
@@ -74,6 +75,12 @@ def halves_of(halves: Halves) -> wire.HalvesReport:
         claimed=cast("wire.Counts6", tuple(int(count) for count in halves.claimed)),
         covered=cast("Maybe6", tuple(_numbers(halves.covered))),
     )
+
+
+def detection_of(tried: Sequence[Tried], splits: int, pairs: int) -> wire.DetectionReport:
+    """The looks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
+    moves = tuple(wire.DetectionRow(**asdict(row)) for row in table(tried))
+    return wire.DetectionReport(splits=splits, pairs=pairs, moves=moves)
 
 
 def in_degrees(rad_m: NDArray[np.float64]) -> Maybe6:

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -23,7 +24,7 @@ from coec.adapters.state_store import Clocks, StateStore
 from coec.adapters.window_folder import WindowFolder
 from coec.adapters.wire import transform_of
 from coec.calibration.lifecycle import HealthState, PairState, Provenance, aged, initial_state
-from coec.calibration.values import Reason, Rig
+from coec.calibration.values import Matrix4, Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
 from coec.schemas import replies
@@ -42,6 +43,23 @@ WORDS = {
 """Where a state comes without reasons."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Served:
+    """An extrinsic (4, 4) that is or was served; `epoch` counts them."""
+
+    epoch: int
+    T_camera_lidar: Matrix4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Taken:
+    """A step: the states before and after it, and what is served after it."""
+
+    before: PairState
+    after: PairState
+    served: Served
+
+
 class Ledger:
     """Keeps the books of one pair.
 
@@ -49,7 +67,6 @@ class Ledger:
         history, evidence: what is kept.
         damage: why what was found on the disk could not all be used; None when it could.
         transitions: changes of health, by the state that was entered.
-        epoch: counts the extrinsics that were served: a look belongs to one of them.
     """
 
     def __init__(
@@ -72,7 +89,7 @@ class Ledger:
         self._since_ns = time.time_ns()
         self.damage: Reason | None = None
         self.transitions: Counter[str] = Counter()
-        self.epoch = 0
+        self._epoch = 0
         self._state, head = self._recall()
         self.history = History(config.directory / f"history-{rig.pair}.jsonl", config.history, head)
         self.evidence = Evidence(config.directory / "evidence", rig.pair, config.evidence)
@@ -88,6 +105,12 @@ class Ledger:
     def state(self) -> PairState:
         """The state now."""
         return self._state
+
+    @property
+    def served(self) -> Served:
+        """What is served now."""
+        with self._lock:
+            return Served(self._epoch, self._state.T_camera_lidar)
 
     @property
     def since_ns(self) -> int:
@@ -111,8 +134,8 @@ class Ledger:
         *,
         looked: bool,
         epoch: int | None = None,
-    ) -> tuple[PairState, PairState] | None:
-        """Take a step; the states before and after. None when the extrinsic has changed since `epoch`.
+    ) -> Taken | None:
+        """Take a step. None when the extrinsic has changed since `epoch`.
 
         Args:
             stamp_ns: sensor time of the data behind it.
@@ -122,7 +145,7 @@ class Ledger:
             CommandRefusedError: as `step` does; nothing has changed then.
         """
         with self._lock:
-            if epoch is not None and epoch != self.epoch:
+            if epoch is not None and epoch != self._epoch:
                 return None
             before = self._state
             after = self._state = step(before)
@@ -131,7 +154,7 @@ class Ledger:
                 self.damage = None if self.history.damage is None else self.damage
             self._note(before, after, stamp_ns)
             self.save()
-            return before, after
+            return Taken(before, after, self.served)
 
     def age(self, stale_after_s: float) -> None:
         """Time has passed."""
@@ -235,7 +258,7 @@ class Ledger:
         window_id = after.accepted.window_id if after.accepted else None
         moved = not np.array_equal(before.T_camera_lidar, after.T_camera_lidar)
         if moved or before.provenance is not after.provenance:
-            self.epoch += moved
+            self._epoch += moved
             entry = _entry("extrinsic", after.provenance.value, _ORIGIN[after.provenance], stamp_ns)
             served = {"camera_from_lidar": transform_of(after.T_camera_lidar), "window_id": window_id}
             self._write(entry.model_copy(update=served))

@@ -23,10 +23,12 @@ from coec.adapters import snapshots
 from coec.adapters.baseline_file import load_baseline
 from coec.adapters.depth import STEREO
 from coec.adapters.evidence import Side
+from coec.adapters.held_pairs import HeldPairs
 from coec.adapters.images import Inspector
 from coec.adapters.inbox import Call, Inbox
 from coec.adapters.intake import CAMERA, EGO, LIDAR, Intake, StreamCounts
-from coec.adapters.ledger import Ledger
+from coec.adapters.judgements import Effect, Judgements, Question
+from coec.adapters.ledger import Ledger, Served, Taken
 from coec.adapters.logs import LossCounter
 from coec.adapters.looks import pack_pairs, pack_pose, unpack_observation
 from coec.adapters.msgpack_frames import encode_camera
@@ -70,6 +72,10 @@ MOTIONS_WAITING = 512
 
 GRACE_NS = NS_PER_S
 """Sensor time after the end of a slice before silence ends it: late pairs may still be on their way."""
+
+WINDOW_PERIODS = 2
+"""Periods of the monitor after the end of a window from which on its result counts in the choice of further pairs: at
+10 s more than a solve takes, so that a live stream does not wait. The result of a look counts after one period."""
 
 IDLE_S = 0.25
 COMMAND_TIMEOUT_S = 10.0
@@ -117,7 +123,7 @@ class PairService:
         plan = RecordingPlan(
             self._rig, self._calibration(), pair.window.min_pairs, {"vehicle": config.vehicle, "pair": pair.name}
         )
-        self.recorder = Recorder(plan, outside.folder, self.losses, self._on_recorded)
+        self.recorder = Recorder(plan, outside.folder, self.losses, self._on_recorded, self._on_lost)
         self.ingest = ServiceThread(f"ingest-{pair.name}", self._run)
         # The ingest thread's own.
         self._intake = Intake(pair, config.limits, self.losses)
@@ -125,13 +131,20 @@ class PairService:
         self._cutter = WindowCutter(pair.window, self._rig, Inspector(config.limits))
         self._sampler = LookSampler(pair.monitor, pair.window)
         self._urgency = Urgency(pair.monitor, pair.window)
-        self._clock = SensorClock()
+        self._clock, self._pace = SensorClock(), SensorClock()
+        self._held = HeldPairs(config.limits.max_held_bytes, config.worker.timeout_s)
+        self._last_ns = self._window_due_ns = 0
+        self._unasked: list[tuple[FramePair, ...]] = []
+        self._period_ns = round(pair.monitor.period_s * NS_PER_S)
         self._pairs = 0
         self._sync_error_s: float | None = None
         self._frozen = False
         self._report = StreamReport()
         # Shared.
         self.ledger = Ledger(self._rig, config.vehicle, config.state, outside.store, outside.folder, self.losses)
+        self._view = self.ledger.served
+        self._judgements = Judgements()
+        self._asked: dict[str, Question] = {}
         self._overlays = Overlays(pair.name, outside.worker)
         self._lock = threading.RLock()
         self._look_metrics: tuple[Metric, ...] = ()
@@ -227,6 +240,7 @@ class PairService:
             lidar=stream(LIDAR),
             ego=stream(EGO) if self._pair.ego else None,
             pairs=report.pairs,
+            held=len(self._held),
             selected=report.selected,
             rejections=report.rejections,
             losses={**drops.get("window", {}), **drops.get("storage", {}), **drops.get("monitor", {})},
@@ -333,7 +347,7 @@ class PairService:
 
     def _replaced(self, name: str, code: str, text: str, window_id: str | None = None) -> replies.Acknowledgement:
         self._look_metrics = ()
-        self.inbox.call(self._urgency.calm)
+        self.inbox.call(self._start_over)
         return self._acknowledge(name, code, text, window_id=window_id)
 
     def _commission(self) -> replies.Acknowledgement:
@@ -379,78 +393,121 @@ class PairService:
 
     def finish_window(self) -> None:
         """End the open window; for the end of the service, after the ingest thread has ended."""
-        self._offer(self._pairer.flush())
+        self._take(self._pairer.flush())
+        self._choose_from_all()
         for event in self._cutter.finish():
-            self._end(event)
+            self._end(event, self._last_ns)
 
     def _run(self, thread: ServiceThread) -> None:
         while not thread.stopping:
             thread.beat()
-            item = self.inbox.take(IDLE_S)
+            item = self.inbox.take(0.0 if self._may_choose() else IDLE_S)
             if isinstance(item, Call):
                 item.run()
             elif item is not None:
                 frame = self._intake.frame(item)
                 if frame is not None:
-                    self._offer(self._pairer.push(frame))
-            self._end_in_silence()
+                    self._take(self._pairer.push(frame))
+            if self._may_choose():
+                self._choose_from_next()
+            if item is None:
+                self._end_in_silence()
             self._tell()
 
-    def _offer(self, pairs: list[FramePair]) -> None:
+    def _take(self, pairs: list[FramePair]) -> None:
+        """Pairs came: they wait their turn."""
         for pair in pairs:
             self._pairs += 1
             self._clock.observe(pair.stamp_ns, time.monotonic())
             self._sync_error_s = (pair.camera.stamp_ns - pair.lidar.stamp_ns) / NS_PER_S
-            T_camera_lidar = self.ledger.state.T_camera_lidar
-            for ended in self._urgency.heed(pair.stamp_ns, self._cutter, self._clock.rate_hz):
-                self._end(ended)
-            frozen_before = self._cutter.rejections["frozen"]
-            for event in self._cutter.offer(pair, T_camera_lidar):
-                if isinstance(event, PairSelected):
-                    self._frozen = False
-                    self._select(event, T_camera_lidar)
-                else:
-                    self._end(event)
-                    self._urgency.ended(event, self._cutter, self._clock.rate_hz)
-            self._frozen |= self._cutter.rejections["frozen"] > frozen_before
-            look = self._sampler.offer(pair)
-            if look is not None:
-                self._look(look)
+            self._held.add(pair)
+
+    def _may_choose(self) -> bool:
+        """Whether the next pair has come, and all is judged that has to be before it is looked at; or it has waited for
+        too long, or with too many."""
+        if not self._held:
+            return False
+        if self.recorder.has_room and not self._judgements.waits(self._held.next_ns):
+            self._held.may_go()
+            return True
+        return self._held.has_waited(time.monotonic())
+
+    def _choose_from_all(self) -> None:
+        """Look at every pair that waits, whatever it waits for."""
+        while self._held:
+            self._choose_from_next()
+
+    def _choose_from_next(self) -> None:
+        """Look at the next pair: is it one for the window, one for the monitor?"""
+        pair = self._held.take()
+        if self._judgements.waits(pair.stamp_ns):
+            self.losses.add("monitor", "not_awaited")
+        self._judgements.settle(pair.stamp_ns)
+        self._last_ns = pair.stamp_ns
+        self._pace.observe(pair.stamp_ns, time.monotonic())
+        T_camera_lidar = self._view.T_camera_lidar
+        for ended in self._urgency.heed(self._cutter, self._pace.rate_hz):
+            self._end(ended, pair.stamp_ns)
+        frozen_before = self._cutter.rejections["frozen"]
+        for event in self._cutter.offer(pair, T_camera_lidar):
+            if isinstance(event, PairSelected):
+                self._frozen = False
+                self._select(event, T_camera_lidar)
+            else:
+                self._end(event, pair.stamp_ns)
+                self._urgency.ended(event, self._cutter, self._pace.rate_hz)
+        self._frozen |= self._cutter.rejections["frozen"] > frozen_before
+        look = self._sampler.offer(pair)
+        if look is not None:
+            self._unasked.append(look)
+        if pair.stamp_ns >= self._window_due_ns:
+            self._look(pair.stamp_ns)
 
     def _select(self, event: PairSelected, T_camera_lidar: Matrix4) -> None:
         self.recorder.add(event.window_id, event.pair, T_camera_lidar)
         if self._pair.calibration.depth.model != STEREO:
             self._outside.worker.prefetch(self.name, encode_camera(event.pair.camera))
 
-    def _end(self, event: SliceEnded) -> None:
+    def _end(self, event: SliceEnded, stamp_ns: int) -> None:
+        """A slice ended, at this sensor time: what it holds goes to the disk, and from there to the worker."""
+        if event.complete:
+            question = self._judgements.ask(stamp_ns + WINDOW_PERIODS * self._period_ns)
+            self._asked[event.window_id], self._window_due_ns = question, question.due_ns
         fields = {"window": event.window_id, "pairs": event.pairs, "complete": event.complete}
         _log.info("a slice ended", extra={"fields": fields})
         self.recorder.end(event)
 
-    def _look(self, pairs: tuple[FramePair, ...]) -> None:
-        """Have the worker judge the latest pairs at what is served."""
-        epoch, pose = self.ledger.epoch, self.ledger.state.T_camera_lidar
-        body = {"pose": pack_pose(pose), "frames": pack_pairs(pairs)}
-        self._outside.worker.look(Errand("observe", self.name, body, partial(self._on_observed, epoch)))
+    def _look(self, stamp_ns: int) -> None:
+        """Have the worker judge the latest pairs at what is served. While a window is about to change that, they wait:
+        they would be judged at what is no longer served."""
+        for pairs in self._unasked:
+            question = self._judgements.ask(stamp_ns + self._period_ns)
+            body = {"pose": pack_pose(self._view.T_camera_lidar), "frames": pack_pairs(pairs)}
+            done = partial(self._on_observed, question, self._view.epoch)
+            self._outside.worker.look(Errand("observe", self.name, body, done))
+        self._unasked.clear()
 
     def _end_in_silence(self) -> None:
         """Let the slice end by extrapolated time when the streams have stopped."""
         end_ns = self._cutter.slice_end_ns
-        if end_ns is None:
+        if end_ns is None or self._held:
             return
         now_ns = self._clock.silent_now_ns(time.monotonic())
         if now_ns is None or now_ns < end_ns + GRACE_NS:
             return
-        self._offer(self._pairer.flush())
+        self._take(self._pairer.flush())
+        if self._held:
+            return
         for event in self._cutter.advance(now_ns):
-            self._end(event)
+            self._end(event, end_ns)
 
     def _calibrate_now(self) -> replies.Acknowledgement:
-        self._offer(self._pairer.flush())
+        self._take(self._pairer.flush())
+        self._choose_from_all()
         lacking = self._pair.window.min_pairs - self._cutter.selected
         if lacking <= 0:
             (ended,) = self._cutter.finish()
-            self._end(ended)
+            self._end(ended, self._last_ns)
             text = f"The window of {ended.pairs} pairs is being solved."
             return self._acknowledge("calibrate", "window_finished", text, window_id=ended.window_id)
         latest = self.recorder.latest
@@ -478,17 +535,17 @@ class PairService:
     # --- on the recorder's and the supervisor's threads -------------------------------------------------------------
 
     def _on_recorded(self, window_id: str, path: Path, live: bool) -> None:
-        waiting, since_ns = self.ledger.evidence.awaiting, self.ledger.state.flagged_since_ns
-        if waiting is not None and live:
-            begun_ns = waiting.stamp_ns if since_ns is None else since_ns
-            if start_ns_of(window_id) >= begun_ns:
-                self.ledger.evidence.add_window_after(window_id)
-                self.ledger.protect()
-                self._draw(waiting, window_id, "after")
         self._outside.worker.solve(SolveJob(self.name, window_id, path, live))
+
+    def _on_lost(self, window_id: str) -> None:
+        self._answer(self._asked.pop(window_id, None), lambda: None)
 
     def on_solved(self, solved: Solved) -> None:
         """A window was solved: keep the result, serve it, publish it."""
+        question = self._asked.pop(solved.job.window_id, None) if solved.job.live else None
+        self._answer(question, partial(self._take_result, solved))
+
+    def _take_result(self, solved: Solved) -> Effect | None:
         result = from_msgpack(CalibrationResult, solved.result)
         fields = {"window": result.window_id, "decision": result.verdict.decision, "elapsed_s": solved.elapsed_s}
         _log.info("a window was solved", extra={"fields": fields})
@@ -502,30 +559,42 @@ class PairService:
         if solved.job.live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
             estimate, start_ns = self._unbiased(estimate_of(result)), start_ns_of(result.window_id)
             self._step(
+                lambda state: lifecycle.before_estimate(state, estimate, start_ns, self._rules), result.data_stamp_ns
+            )
+            self._add_window_after(result.window_id)
+            return self._step(
                 lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules), result.data_stamp_ns
             )
-        else:
-            self.ledger.save()
-        self.refresh()
+        self.ledger.save()
+        return None
 
     def on_failed(self, job: SolveJob, reason: Reason) -> None:
         """A window came to nothing."""
         self.losses.add("window", reason.code, detail=reason.text)
-        if reason is SUPERSEDED or not job.live:
+        if not job.live:
             return
-        self._step(lambda state: lifecycle.after_failure(state, reason), None)
-        self.refresh()
 
-    def _on_observed(self, epoch: int, answer: dict[str, Any] | Reason) -> None:
+        def take() -> Effect | None:
+            if reason is SUPERSEDED:
+                return None
+            return self._step(lambda state: lifecycle.after_failure(state, reason), None)
+
+        self._answer(self._asked.pop(job.window_id, None), take)
+
+    def _on_observed(self, question: Question, epoch: int, answer: dict[str, Any] | Reason) -> None:
+        self._answer(question, partial(self._take_look, epoch, answer))
+
+    def _take_look(self, epoch: int, answer: dict[str, Any] | Reason) -> Effect | None:
         if isinstance(answer, Reason):
             self.losses.add("monitor", f"look_{answer.code}", detail=answer.text)
-            return
+            return None
         observation = unpack_observation(answer)
-        if not self._step(
+        effect = self._step(
             lambda state: lifecycle.after_observation(state, observation), observation.stamp_ns, observation, epoch
-        ):
+        )
+        if effect is None:
             self.losses.add("monitor", "look_overtaken")
-            return
+            return None
         self._looks += 1
         self._look_metrics = observation.metrics
         self.ledger.evidence.note(
@@ -535,6 +604,15 @@ class PairService:
                 metrics={metric.name: metric_of(metric).value for metric in observation.metrics},
             )
         )
+        return effect
+
+    def _answer(self, question: Question | None, take: Callable[[], Effect | None]) -> None:
+        """An answer came; one to a question that the stream did not ask takes effect at once."""
+        if question is not None:
+            self._judgements.answer(question, take)
+            self.inbox.wake()
+        elif (effect := take()) is not None:
+            self.inbox.call(effect)
         self.refresh()
 
     def _step(
@@ -543,33 +621,44 @@ class PairService:
         stamp_ns: int | None,
         observation: Observation | None = None,
         epoch: int | None = None,
-    ) -> bool:
-        """Data were judged: take the step, raise or end the alarm, draw what a red event needs. False when the step
-        was meant for another extrinsic."""
+    ) -> Effect | None:
+        """Data were judged: take the step, draw what a red event needs. What it changes for the pairs to come; None
+        when the step was meant for another extrinsic."""
         taken = self.ledger.update(step, stamp_ns, looked=True, epoch=epoch)
         if taken is None:
-            return False
-        before, after = taken
+            return None
+        before, after = taken.before, taken.after
         if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
             self._look_metrics = ()
-        self._hurry(before, after, observation)
         red = HealthState.MISCALIBRATED
         if after.health is red and before.health is not red:
             self._draw_new_event()
-        return True
+        return partial(self._go_on_with, taken, observation is not None)
 
-    def _hurry(self, before: PairState, after: PairState, observation: Observation | None) -> None:
-        """A window is wanted when the monitor's word has become worse, or a window did not settle it."""
+    # --- on the ingest thread again ---------------------------------------------------------------------------------
+
+    def _go_on_with(self, taken: Taken, by_look: bool) -> None:
+        """What a step changes for the pairs to come: the extrinsic at which they are looked at, and how soon a window
+        is wanted: soon when the monitor's word has become worse, or a window did not settle it."""
+        self._adopt(taken.served)
+        before, after = taken.before, taken.after
         if after.monitor.outcome not in (Outcome.SUSPECT, Outcome.CONFIRMED) or after.flagged_since_ns is None:
-            self.inbox.call(self._urgency.calm)
+            self._urgency.calm()
             return
         waiting = after.pending is not None and after.pending.contradicts
-        if waiting or (observation is not None and before.monitor.outcome is after.monitor.outcome):
-            return
-        since_ns, from_ns = after.flagged_since_ns, 0
-        if observation is not None:
-            from_ns = observation.stamp_ns + round(self._pair.monitor.period_s * NS_PER_S)
-        self.inbox.call(lambda: self._urgency.alarm(since_ns, from_ns))
+        if not waiting and not (by_look and before.monitor.outcome is after.monitor.outcome):
+            self._urgency.alarm(after.flagged_since_ns)
+
+    def _start_over(self) -> None:
+        """A person has replaced the extrinsic."""
+        self._adopt(self.ledger.served)
+        self._urgency.calm()
+
+    def _adopt(self, served: Served) -> None:
+        if served.epoch > self._view.epoch:
+            self._view = served
+
+    # --- evidence ---------------------------------------------------------------------------------------------------
 
     def _draw_new_event(self) -> None:
         event = self.ledger.evidence.newest
@@ -579,6 +668,15 @@ class PairService:
         for side, window_id in sides:
             if window_id is not None:
                 self._draw(event, window_id, side)
+
+    def _add_window_after(self, window_id: str) -> None:
+        """The first window that began after a red event did is part of its evidence."""
+        waiting, since_ns = self.ledger.evidence.awaiting, self.ledger.state.flagged_since_ns
+        if waiting is None or start_ns_of(window_id) < (waiting.stamp_ns if since_ns is None else since_ns):
+            return
+        self.ledger.evidence.add_window_after(window_id)
+        self.ledger.protect()
+        self._draw(waiting, window_id, "after")
 
     def _draw(self, event: EvidenceEvent, window_id: str, side: Side) -> None:
         """A picture for the evidence, at what was served when the event began."""
@@ -644,8 +742,8 @@ class PairService:
         text = f"Commissioned from {answer['windows']} windows, {answer['pairs']} pairs; baseline {answer['hash']}."
         self.ledger.note_commissioned(text)
         pose = np.array(answer["pose"], dtype=np.float64)
-        self._step(lambda state: lifecycle.after_commissioning(state, pose), self.ledger.evaluated_stamp_ns)
-        self.refresh()
+        stamp_ns = self.ledger.evaluated_stamp_ns
+        self._answer(None, lambda: self._step(lambda state: lifecycle.after_commissioning(state, pose), stamp_ns))
 
     # --- health -----------------------------------------------------------------------------------------------------
 

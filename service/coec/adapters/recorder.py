@@ -65,14 +65,16 @@ class Recorder:
         folder: WindowFolder,
         losses: LossCounter,
         on_recorded: Callable[[str, Path, bool], None],
+        on_lost: Callable[[str], None],
     ) -> None:
         """`on_recorded(window_id, path, live)` is called on the recorder's thread for each finished window, and with
-        `live` False for unsolved ones of earlier runs."""
+        `live` False for unsolved ones of earlier runs; `on_lost(window_id)` for each that ended and came to nothing."""
         self._plan = plan
         self._configuration = plan.configuration
         self._folder = folder
         self._losses = losses
         self._on_recorded = on_recorded
+        self._on_lost = on_lost
         self._condition = threading.Condition()
         self._queue: deque[_Add | SliceEnded] = deque()
         self._adds = 0
@@ -87,6 +89,11 @@ class Recorder:
     def latest(self) -> Path | None:
         """The latest finished window; None when there is none on the disk."""
         return self._latest
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a chosen pair would be taken now."""
+        return self._adds < PAIRS_WAITING
 
     def use(self, configuration: CalibrationConfig) -> None:
         """The next window is to be calibrated with this: the limits of the rig were learned anew."""
@@ -194,15 +201,18 @@ class Recorder:
 
     def _end(self, window_id: str) -> None:
         if self._open is None or self._open.window_id != window_id:
+            self._on_lost(window_id)
             return
         opened = self._open
         if opened.pairs < self._plan.min_pairs:
             self._close_stray()
+            self._on_lost(window_id)
             return
         try:
             recorded = opened.writer.finish()
         except (RecordingError, OSError) as error:
             self._lose(window_id, error)
+            self._on_lost(window_id)
             return
         self._open = None
         self._finished(recorded)

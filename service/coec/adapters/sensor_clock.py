@@ -10,8 +10,8 @@ NS_PER_S = 1_000_000_000
 OBSERVATIONS = 32
 """Pairs from which the ratio of sensor time to wall time is taken: three seconds at 10 Hz."""
 
-MIN_SILENCE_S = 2.0
-"""Wall time without a pair before time is extrapolated at all."""
+MIN_SILENCE_S = 5.0
+"""Wall time without a pair before time is extrapolated at all: longer than a busy machine keeps a sender waiting."""
 
 SILENT_GAPS = 3.0
 """The silence must also be so many times the longest recent pause: a slow replay is not a silent one."""

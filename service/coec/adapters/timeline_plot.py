@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -32,7 +33,7 @@ def timeline(
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots()
-    for (begin, _, state), (end, *_) in zip(series, series[1:], strict=False):
+    for (begin, _, state), (end, *_) in pairwise(series):
         axes.axvspan(begin, end, color=STATE_COLOURS.get(state, "white"), alpha=0.3, linewidth=0)
     axes.plot([point[0] for point in series], [point[1] for point in series], color="black", linewidth=1.8)
     axes.axhline(limit_deg, color="grey", linestyle=":", linewidth=1.0)

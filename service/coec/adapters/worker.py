@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from coec.adapters.threads import ServiceThread
 from coec.adapters.worker_link import Link
@@ -39,6 +39,10 @@ PREFETCHES_WAITING = 8
 
 BACKLOG = 64
 """Unsolved windows of earlier runs that may wait."""
+
+LOOKS_WAITING, WINDOWS_WAITING = 4, 2
+"""Looks, and windows of this run, that may wait per pair. The service waits for answers before it asks more; these are
+for a worker that does not answer."""
 
 ERRANDS_WAITING = 8
 """Pictures and commissionings that may wait."""
@@ -117,6 +121,9 @@ class Errand:
 BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
 
 
+_Job = TypeVar("_Job", SolveJob, Errand)
+
+
 @dataclass(frozen=True, slots=True)
 class _Prefetch:
     pair: str
@@ -169,7 +176,7 @@ class Worker:
     """Owns the worker process. `start()` and `stop()` are for the daemon, the rest may be called from any thread.
 
     `on_solved` and `on_failed` are called on the supervisor's thread, one at a time.
-    Per pair only the newest live window waits: an older one that has not been begun is given up, with a call of
+    Per pair only the newest live windows wait: an older one that has not been begun is given up, with a call of
     `on_failed` whose reason is `superseded`.
     """
 
@@ -189,10 +196,10 @@ class Worker:
         self._on_failed = on_failed
         self._command = tuple(command)
         self._condition = threading.Condition()
-        self._live: dict[str, SolveJob] = {}
+        self._live: deque[SolveJob] = deque()
         self._backlog: deque[SolveJob] = deque()
         self._prefetches: deque[_Prefetch] = deque(maxlen=PREFETCHES_WAITING)
-        self._looks: dict[str, Errand] = {}
+        self._looks: deque[Errand] = deque()
         self._errands: deque[Errand] = deque()
         self._attempts: dict[SolveJob, int] = {}
         self._state = WorkerState.STARTING
@@ -220,12 +227,13 @@ class Worker:
         superseded = None
         with self._condition:
             if job.live:
-                superseded = self._live.pop(job.pair, None)
-                self._live[job.pair] = job
+                if job not in self._live:
+                    superseded = _oldest(self._live, job.pair, WINDOWS_WAITING)
+                    self._live.append(job)
             elif len(self._backlog) < BACKLOG:
                 self._backlog.append(job)
             self._condition.notify_all()
-        if superseded is not None and superseded != job:
+        if superseded is not None:
             self._on_failed(superseded, SUPERSEDED)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
@@ -237,10 +245,10 @@ class Worker:
             self._condition.notify_all()
 
     def look(self, errand: Errand) -> None:
-        """Queue a look of the monitor, in front of everything: it is short. Per pair only the newest waits."""
+        """Queue a look of the monitor, in front of everything: it is short. Per pair only the newest wait."""
         with self._condition:
-            superseded = self._looks.pop(errand.pair, None)
-            self._looks[errand.pair] = errand
+            superseded = _oldest(self._looks, errand.pair, LOOKS_WAITING)
+            self._looks.append(errand)
             self._condition.notify_all()
         if superseded is not None:
             superseded.done(SUPERSEDED)
@@ -268,7 +276,7 @@ class Worker:
     def status(self) -> WorkerStatus:
         """How the worker is."""
         with self._condition:
-            waiting = len(self._live) + len(self._backlog)
+            waiting = len(self._looks) + len(self._live) + len(self._backlog)
             return WorkerStatus(
                 self._state,
                 self._starts,
@@ -374,10 +382,10 @@ class Worker:
                 given_up = Reason("worker_failed", text)
             elif not job.live:
                 self._backlog.appendleft(job)
-            elif job.pair in self._live:
+            elif sum(waiting.pair == job.pair for waiting in self._live) >= WINDOWS_WAITING:
                 given_up = SUPERSEDED
             else:
-                self._live = {job.pair: job, **self._live}
+                self._live.appendleft(job)
         if given_up is not None:
             del self._attempts[job]
             self._on_failed(job, given_up)
@@ -398,9 +406,9 @@ class Worker:
 
     def _take(self) -> SolveJob | Errand | _Prefetch | None:
         if self._looks:
-            return self._looks.pop(next(iter(self._looks)))
+            return self._looks.popleft()
         if self._live:
-            return self._live.pop(next(iter(self._live)))
+            return self._live.popleft()
         if self._errands:
             return self._errands.popleft()
         if self._prefetches:
@@ -446,6 +454,15 @@ class Worker:
             while not self.thread.stopping and time.monotonic() < deadline_s:
                 self.thread.beat()
                 self._condition.wait(POLL_S)
+
+
+def _oldest(waiting: deque[_Job], pair: str, most: int) -> _Job | None:
+    """Takes out the oldest job of a pair if there are `most` of them."""
+    of_pair = [job for job in waiting if job.pair == pair]
+    if len(of_pair) < most:
+        return None
+    waiting.remove(of_pair[0])
+    return of_pair[0]
 
 
 def _cause(child: _Child, error: Exception) -> str:

@@ -105,7 +105,7 @@ def polish(
         return perturbation
 
     step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)[moved]
-    found, exhausted = _bobyqa(score, np.zeros(len(moved)), 4.0 * step, 4.0 * step, 0.5 * step, config)
+    found, exhausted = _bobyqa(score, np.zeros(len(moved)), 4.0 * step, 4.0 * step, step, config)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
     return SearchResult(_pose(basin, placed(found)), evaluations, stop_reason)
 

@@ -25,28 +25,26 @@ class Urgency:
         self._monitor = monitor
         self._window = window
         self._since_ns: int | None = None
-        self._from_ns = 0
         self._tries = 0
         self._hurried = False
 
-    def alarm(self, since_ns: int, from_ns: int) -> None:
-        """A window is wanted of pairs since `since_ns`; nothing happens before a pair of `from_ns`, so that it does not
-        matter how long the look took that raised the alarm."""
+    def alarm(self, since_ns: int) -> None:
+        """A window is wanted of pairs since `since_ns`."""
         if self._since_ns is None and self._tries < TRIES:
-            self._since_ns, self._from_ns, self._hurried = since_ns, from_ns, False
+            self._since_ns, self._hurried = since_ns, False
             self._tries += 1
 
     def calm(self) -> None:
         """The suspicion is over."""
         self._since_ns, self._tries = None, 0
 
-    def heed(self, stamp_ns: int, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
+    def heed(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
         """Before a pair is offered to the cutter: ends its slice if that is called for.
 
         Args:
             rate_hz: at which pairs come; None while unknown.
         """
-        if self._since_ns is None or stamp_ns < self._from_ns:
+        if self._since_ns is None:
             return []
         start_ns, enough = cutter.slice_start_ns, cutter.selected >= self._window.min_pairs
         if start_ns is None:

@@ -166,6 +166,14 @@ def _evaluate(
             min=0,
         ),
     ] = 0,
+    detection: Annotated[
+        int,
+        typer.Option(
+            help="Also say how well moved extrinsics are seen, over N splits of the frames, as diagnose does.",
+            metavar="N",
+            min=0,
+        ),
+    ] = 0,
     output: Annotated[
         Path | None, typer.Option(help="Write plots, overlays, starts.csv and report.json.", metavar="DIR")
     ] = None,
@@ -188,6 +196,7 @@ def _evaluate(
         against_frames=against_frames,
         against_slice=against_slice,
         halves=halves,
+        detection=detection,
         output=output,
         as_json=as_json,
     )
@@ -284,6 +293,9 @@ def _paper(
     runs: Annotated[int, typer.Option(help="Solves per experiment.", min=1)] = 100,
     samples: Annotated[int, typer.Option(help="Samples of pairs for the failure metrics.", min=3)] = 100,
     frames: Frames = None,
+    slice_s: Annotated[
+        float | None, typer.Option(help="Cut the drive into windows of 25 pairs over so many seconds.", min=1.0)
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Repeat the published experiments on a recording: metrics.png, bullseye.png, drive.png."""
@@ -297,6 +309,7 @@ def _paper(
         runs=runs,
         samples=samples,
         frames=frames,
+        slice_s=slice_s,
         as_json=as_json,
     )
     raise typer.Exit(command.run(options))
@@ -564,7 +577,7 @@ def _demo(
     ),
     as_json: Json = False,
 ) -> None:
-    """The whole service on a small synthetic drive: no router, no network, no data; under a minute."""
+    """A simulated vehicle whose mount is knocked, and the service that notices and repairs it: no data, two minutes."""
     from coec.cli import demo as command
 
     raise typer.Exit(command.run(output, as_json=as_json))

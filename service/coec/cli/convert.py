@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from coec.adapters.bag_writer import write_bag
+from coec.adapters.depth import STEREO
 from coec.adapters.player import Streams
 from coec.adapters.rig import mask_to_png, matrix_rows
 from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
@@ -21,6 +22,7 @@ from coec.config import (
     CameraConfig,
     CameraIntrinsics,
     Config,
+    DepthConfig,
     EgoConfig,
     LidarConfig,
     PairConfig,
@@ -82,8 +84,13 @@ def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path 
         ego=None if motion is None else EgoConfig(key=str(streams.ego), T_lidar_ego=matrix_rows(rig.T_lidar_ego)),
         T_camera_lidar=matrix_rows(T_camera_lidar),
         window=window,
-        calibration=recording.configuration or CalibrationConfig(),
+        calibration=recording.configuration or _calibration(camera),
     )
+
+
+def _calibration(camera: CameraFrame) -> CalibrationConfig:
+    """The defaults, with the depth maps of the recording where it has them."""
+    return CalibrationConfig() if camera.depth is None else CalibrationConfig(depth=DepthConfig(model=STEREO))
 
 
 def first_frames(recording: Recording) -> list[CameraFrame | LidarFrame | EgoMotion]:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coec.adapters.baseline_file import load_baseline
+from coec.adapters.evaluation_report import detection_of
 from coec.adapters.wire import metric_of
 from coec.calibration.baseline import mismatch
 from coec.calibration.commissioning import learned_hash
-from coec.calibration.detection import table, try_detection
+from coec.calibration.detection import try_detection
 from coec.calibration.estimators import look
 from coec.calibration.looks import gather
 from coec.calibration.monitor import observe
 from coec.cli import calibrate as calibrate_command
-from coec.cli import commission, console, windows
+from coec.cli import commission, console, evaluation_text, windows
 from coec.errors import UsageError
 from coec.geometry import se3
 
@@ -64,17 +65,11 @@ def _tabulate(rigged: commission.Rigged, options: Options, times: calibrate_comm
         options.looks,
         lambda done, total: times.step("splits", done, total),
     )
-    rows = table(tried)
+    report = detection_of(tried, options.detection, len(evidence.pairs))
     if options.as_json:
-        console.print_json({"source": options.source, "splits": options.detection, "moves": [asdict(r) for r in rows]})
-        return 0
-    shown = console.table("extrinsic", "looks", "flagged", "by equation (2)", right=(1, 2, 3))
-    for row in rows:
-        shown.add_row(row.name, str(row.looks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
-    console.out.print(shown)
-    console.show(
-        f"{options.detection} splits of {len(evidence.pairs)} pairs: limits learned on one half, tried on the other"
-    )
+        console.print_json({"source": options.source, **report.model_dump(mode="json")})
+    else:
+        evaluation_text.show_detection(report)
     return 0
 
 

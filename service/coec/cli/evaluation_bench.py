@@ -10,15 +10,20 @@ from math import radians
 from rich.progress import Progress
 
 from coec.adapters.depth import CachedDepth
+from coec.adapters.evaluation_report import detection_of
 from coec.adapters.images import CachedGreys, GreyImages
 from coec.calibration import evaluation, halves, starts
 from coec.calibration.calibrator import calibrate
+from coec.calibration.detection import try_detection
+from coec.calibration.estimators import look
 from coec.calibration.evaluation import FramesPoint, Outcome, SlicePoint, Trial
 from coec.calibration.halves import Halves
+from coec.calibration.looks import gather
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.values import Matrix4, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.errors import CalibrationError, DecodeError, SourceError
+from coec.schemas.evaluation import DetectionReport
 
 SUBSETS = 20
 """Solves for every number of frames and every length of a slice, each with a start of its own."""
@@ -28,6 +33,9 @@ SLICE_SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 
 SLICES = 5
 """Places in a recording from which slices of one length are taken, at most; they do not overlap."""
+
+LOOKS = 10
+"""Looks per split and move at which detection is tried, unless told otherwise."""
 
 
 class Stages:
@@ -206,6 +214,17 @@ def in_halves(bench: Bench, splits: int, rotation_rad: float, translation_m: flo
         outcomes.append((bench.solve(poses[2 * trial], one), bench.solve(poses[2 * trial + 1], other)))
         heard(trial + 1, "")
     return halves.compare(outcomes, available // 2, bench.configuration.search.dof)
+
+
+def detected(bench: Bench, splits: int, looks: int, stages: Stages) -> DetectionReport:
+    """How well the monitor sees a wrong extrinsic: limits learned on some pairs, `looks` looks per split and move at
+    the others."""
+    decode, heard = stages.begin("looks", None), stages.begin("detection", splits)
+    window = replace(bench.window, T_camera_lidar_start=bench.reference)
+    evidence = gather(look(window, bench.depth, bench.images, bench.configuration, Silence()))
+    decode(1, "")
+    tried = try_detection(evidence, bench.reference, bench.configuration, splits, looks, lambda done, _: heard(done, ""))
+    return detection_of(tried, splits, len(evidence.pairs))
 
 
 def poses_of(bench: Bench, directions: int, rotation_deg: float, translation_m: float) -> list[Matrix4]:

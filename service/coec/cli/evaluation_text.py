@@ -14,7 +14,15 @@ from coec.calibration.evaluation import Outcome
 from coec.calibration.values import Matrix4
 from coec.cli import console
 from coec.geometry import se3
-from coec.schemas.evaluation import ComparisonReport, EvaluationReport, FramesPoint, HalvesReport, SlicePoint, Spread
+from coec.schemas.evaluation import (
+    ComparisonReport,
+    DetectionReport,
+    EvaluationReport,
+    FramesPoint,
+    HalvesReport,
+    SlicePoint,
+    Spread,
+)
 
 CSV_FIGURES = (
     *("rotation_deg", "translation_m", "hit", "verdict", "reasons", "stop_reason", "solve_s"),
@@ -73,7 +81,7 @@ def show_comparison(report: ComparisonReport) -> None:
     for name, reason in report.not_evaluated.items():
         console.show(f"{name} was not evaluated: {reason}", "yellow")
     for name, method in report.methods.items():
-        if method.frames or method.slices or method.halves is not None:
+        if method.frames or method.slices or method.halves is not None or method.detection is not None:
             console.show(name, "bold")
             _show_experiments(method)
     console.show(_seconds(report.elapsed_s))
@@ -171,6 +179,19 @@ def _show_experiments(report: EvaluationReport) -> None:
         console.out.print(slices)
     if report.halves is not None:
         _show_halves(report.halves, report.dof)
+    if report.detection is not None:
+        show_detection(report.detection)
+
+
+def show_detection(detection: DetectionReport) -> None:
+    """Looks at moved extrinsics: how many of them each classifier flags."""
+    table = console.table("extrinsic", "looks", "flagged", "by equation (2)", right=(1, 2, 3))
+    for row in detection.moves:
+        table.add_row(row.name, str(row.looks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
+    console.out.print(table)
+    console.show(
+        f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other"
+    )
 
 
 def _show_halves(halves: HalvesReport, dof: int) -> None:

@@ -1,10 +1,10 @@
-"""`coec paper`: the published experiments on a recording, with their figures."""
+"""`coec paper`: the published experiments on a recording, with their figures beside ours."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from math import degrees, radians
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,12 @@ from coec.calibration.evaluation import Outcome
 from coec.calibration.objective import range_and_depth
 from coec.calibration.ports import Silence
 from coec.cli import calibrate as calibrate_command
-from coec.cli import console, files, windows
+from coec.cli import console, files, paper_published, windows
 from coec.cli.evaluation_bench import Bench, Stages, greys_of, inferred
+from coec.cli.paper_speed import run_times
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
+from coec.errors import SourceError
+from coec.sources import open_source
 
 FAR_DEG, DRIVE_DEG = 25.0, (5.0, 10.0)
 """Starts of the published experiments."""
@@ -30,12 +33,13 @@ MARGIN_DEG = 5.0
 """How far the search reaches beyond its start."""
 
 DRIVE_PAIRS = 5
-"""Pairs of one slice of the drive; the paper takes 25 of 11,518 frames."""
+"""Pairs of one slice of a short drive; the paper takes 25 of 11,518 frames, and so does `slice_s`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The arguments of the command; None = not given."""
+    """The arguments of the command; None = not given. `slice_s`: the drive is cut into windows of so many seconds;
+    without it, every run of `DRIVE_PAIRS` neighbours among the pairs is one."""
 
     source: str
     output: Path
@@ -44,6 +48,7 @@ class Options:
     runs: int = 100
     samples: int = 100
     frames: int | None = None
+    slice_s: float | None = None
     as_json: bool = False
 
 
@@ -73,6 +78,8 @@ def run(options: Options) -> int:
             "failure_metrics": _failure_metrics(bench, options, stages),
             "bullseye": _bullseye(bench, options, stages),
             "drive": _drive(bench, options, stages),
+            "run_times": [asdict(row) for row in run_times(options.source, configuration, stages)],
+            "published": paper_published.document(),
         }
     written = files.write(options.output / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
     if options.as_json:
@@ -131,29 +138,74 @@ def _bullseye(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
 
 
 def _drive(bench: Bench, options: Options, stages: Stages) -> list[dict[str, Any]]:
-    """Every slice of neighbouring pairs from starts all around, so that together they are `runs` for each radius."""
-    pairs = bench.window.pairs
-    runs_of = paper.slices(len(pairs), min(DRIVE_PAIRS, len(pairs)))
-    per_slice = max(options.runs // len(runs_of), 1)
-    heard = stages.begin("drive", len(DRIVE_DEG) * len(runs_of) * per_slice)
-    found: dict[str, list[tuple[float, Outcome]]] = {}
-    rows, done = [], 0
-    for radius_deg in DRIVE_DEG:
-        near = Bench(bench.window, bench.depth, bench.images, _reaching(bench.configuration, radius_deg))
-        poses = starts.starts(bench.reference, per_slice * len(runs_of), radians(radius_deg), 0.0)
-        outcomes = []
-        for number, indices in enumerate(runs_of):
-            middle_s = (pairs[indices[len(indices) // 2]].stamp_ns - pairs[0].stamp_ns) * 1e-9
-            # Every slice gets starts from all over the sphere.
-            for start in poses[number :: len(runs_of)]:
-                outcomes.append((middle_s, near.solve(start, indices)))
+    """Every window of the drive from starts all around, so that together they are about `runs` for each radius."""
+    count = _window_count(bench, options)
+    per_window = max(options.runs // count, 1)
+    heard = stages.begin("drive", len(DRIVE_DEG) * count * per_window)
+    found: dict[float, list[tuple[float, Outcome]]] = {radius_deg: [] for radius_deg in DRIVE_DEG}
+    done = 0
+    for number, (middle_s, of_window, indices) in enumerate(_drive_windows(bench, options)):
+        for radius_deg in DRIVE_DEG:
+            near = replace(of_window, configuration=_reaching(bench.configuration, radius_deg))
+            poses = starts.starts(bench.reference, per_window * count, radians(radius_deg), 0.0)
+            # Every window gets starts from all over the sphere.
+            for start in poses[number::count]:
+                found[radius_deg].append((middle_s, near.solve(start, indices)))
                 done += 1
                 heard(done, "")
-        found[f"from {radius_deg:g}°"] = outcomes
-        rows.append({"start_deg": radius_deg, **_figures([outcome for _, outcome in outcomes])})
-    title = f"{bench.window.window_id}: {options.objective}, slices of {len(runs_of[0])} pairs"
-    files.write(options.output / "drive.png", paper_plots.drive(found, title))
+    if not done:
+        raise SourceError(f"{options.source}: no window of {options.slice_s:g} s has a pair of picture and sweep")
+    rows = [
+        {
+            "start_deg": radius_deg,
+            **_figures([outcome for _, outcome in outcomes]),
+            "windows": [
+                {
+                    "middle_s": middle_s,
+                    "error_deg": np.degrees(outcome.error[:3]).tolist(),
+                    "accepted": outcome.accepted,
+                }
+                for middle_s, outcome in outcomes
+            ],
+        }
+        for radius_deg, outcomes in found.items()
+    ]
+    title = f"{bench.window.window_id}: {options.objective}, {count} windows"
+    named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in found.items()}
+    files.write(options.output / "drive.png", paper_plots.drive(named, title))
     return rows
+
+
+def _window_count(bench: Bench, options: Options) -> int:
+    if options.slice_s is None:
+        return len(paper.slices(len(bench.window.pairs), DRIVE_PAIRS))
+    return max(int(_duration_s(options.source) // options.slice_s), 1)
+
+
+def _duration_s(source: str) -> float:
+    stamps_ns = open_source(source).camera_stamps_ns
+    return (stamps_ns[-1] - stamps_ns[0]) * 1e-9
+
+
+def _drive_windows(bench: Bench, options: Options) -> Iterator[tuple[float, Bench, list[int]]]:
+    """Middle (s after the first frame), bench and indices of the pairs of every window; one is loaded at a time."""
+    pairs = bench.window.pairs
+    if options.slice_s is None:
+        for indices in paper.slices(len(pairs), min(DRIVE_PAIRS, len(pairs))):
+            middle = pairs[indices[len(indices) // 2]]
+            yield (middle.stamp_ns - pairs[0].stamp_ns) * 1e-9, bench, indices
+        return
+    model = open_depth(bench.configuration.depth, LimitsConfig())
+    for number in range(_window_count(bench, options)):
+        begin_s, end_s = number * options.slice_s, (number + 1) * options.slice_s
+        try:
+            loaded = windows.load(options.source, None, WindowConfig().pairs, lambda *_: None, (begin_s, end_s))
+        except SourceError:
+            # No camera frame of this slice has a sweep: it is no window.
+            continue
+        depth = inferred(loaded.window, model, lambda *_: None)
+        of_slice = Bench(loaded.window, depth, greys_of(loaded.window), bench.configuration)
+        yield 0.5 * (begin_s + end_s), of_slice, list(range(len(loaded.window.pairs)))
 
 
 def _reaching(configuration: CalibrationConfig, radius_deg: float) -> CalibrationConfig:
@@ -181,13 +233,31 @@ def _figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def _show(document: dict[str, Any]) -> None:
-    moves = console.table("extrinsic off by", "looks", "flagged by equation (2)", right=(1, 2))
+    moves = console.table("extrinsic off by", "looks", "flagged by equation (2)", "published", right=(1, 2, 3))
     for row in document["failure_metrics"]["moves"]:
-        moves.add_row(f"{row['moved_deg']:g}°", str(row["looks"]), f"{100 * row['flagged']:.1f} %")
+        published = paper_published.FLAGGED.get(row["moved_deg"])
+        theirs = "" if published is None else f"{100 * published:.1f} %"
+        moves.add_row(f"{row['moved_deg']:g}°", str(row["looks"]), f"{100 * row['flagged']:.1f} %", theirs)
     console.out.print(moves)
     solves = console.table("solves", "runs", "hits", "classified", "pitch", "yaw", "roll", right=(1, 2, 3, 4, 5, 6))
-    for name, row in [("all pairs", document["bullseye"]), *(("slices", row) for row in document["drive"])]:
-        spread = [f"{mean:+.3f} ± {std:.3f}°" for mean, std in zip(row["mean_deg"], row["std_deg"], strict=True)]
+    for name, row in [("all pairs", document["bullseye"]), *(("windows", row) for row in document["drive"])]:
         correct = f"{100 * row['classified_correctly']:.0f} %"
+        spread = [_spread(*axis) for axis in zip(row["mean_deg"], row["std_deg"], strict=True)]
         solves.add_row(f"{name}, from {row['start_deg']:g}°", str(row["runs"]), str(row["hits"]), correct, *spread)
+        axes = paper_published.ERRORS_DEG.get(row["start_deg"])
+        if axes is not None:
+            solves.add_row("  published", "1400", "", "", *(_spread(*axis) for axis in axes))
+        else:
+            solves.add_row("  published", str(paper_published.FAR_RUNS), str(paper_published.FAR_HITS), "100 %")
     console.out.print(solves)
+    speed = console.table("frames", "one MI, ms", "published", "one solve, ms", "published", right=range(5))
+    for row in document["run_times"]:
+        mi_ms, solve_ms = paper_published.RUN_TIMES_MS.get(row["frames"], (None, None))
+        theirs_mi, theirs_solve = console.figure(mi_ms, 1), console.figure(solve_ms, 0)
+        ours_mi, ours_solve = console.figure(row["mi_ms"], 2), console.figure(row["solve_ms"], 0)
+        speed.add_row(str(row["frames"]), ours_mi, theirs_mi, ours_solve, theirs_solve)
+    console.out.print(speed)
+
+
+def _spread(mean_deg: float, std_deg: float) -> str:
+    return f"{mean_deg:+.3f} ± {std_deg:.3f}°"

@@ -73,6 +73,24 @@ class HalvesReport(Part):
     covered: Maybe6 = Field(description="share of these whose difference lies within 3 of them")
 
 
+class DetectionRow(Part):
+    """Looks at one kind of move of the extrinsic, and the share that each classifier flagged; of the right extrinsic
+    these are the false alarms."""
+
+    name: str = Field(description="`right`, or how far the extrinsic was moved")
+    looks: Count
+    flagged: float = Field(ge=0, le=1, description="by the distance of the local optimum")
+    flagged_by_paper: float = Field(ge=0, le=1, description="by equation (2) with learned limits")
+
+
+class DetectionReport(Part):
+    """How well a wrong extrinsic is seen: limits learned on one half of the pairs, tried on the other."""
+
+    splits: Count
+    pairs: Count = Field(description="camera-LiDAR pairs that were split in two")
+    moves: tuple[DetectionRow, ...]
+
+
 class EvaluationReport(Message):
     """What `coec evaluate --json` prints: solves from starts all around the source's calibration, on one window."""
 
@@ -110,6 +128,9 @@ class EvaluationReport(Message):
     frames: tuple[FramesPoint, ...] = Field(description="error against the number of frames; empty if not asked for")
     slices: tuple[SlicePoint, ...] = Field(description="error against the length of the slice; empty if not asked for")
     halves: HalvesReport | None = Field(description="agreement of disjoint halves; null if not asked for")
+    detection: DetectionReport | None = Field(
+        default=None, description="how well a wrong extrinsic is seen; null if not asked for"
+    )
     depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
     config_hash: str = Field(description="of everything that decides the results, but for the start")
     elapsed_s: dict[str, float] = Field(description="by stage, s")

@@ -307,6 +307,7 @@ class PairStatus(Part):
     lidar: StreamStatus = StreamStatus()
     ego: StreamStatus | None = Field(default=None, description="null when no ego-motion is configured")
     pairs: Count = Field(default=0, description="pairs formed")
+    held: Count = Field(default=0, description="pairs that wait until what was seen before them is judged")
     selected: Count = Field(default=0, description="pairs chosen for the open window")
     rejections: Counts = Field(default_factory=dict, description="pairs not chosen, by cause")
     losses: Counts = Field(default_factory=dict, description="frames that found no partner, and windows lost, by cause")

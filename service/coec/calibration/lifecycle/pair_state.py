@@ -13,6 +13,7 @@ from math import degrees, fsum, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.causes import CAUSES
 from coec.calibration.fusion import Measurement, StepState, Track, absorb, prior_sigma
 from coec.calibration.lifecycle import policy
 from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
@@ -157,6 +158,15 @@ def happened(state: PairState, event: Event, *reasons: Reason) -> PairState:
 # --- windows --------------------------------------------------------------------------------------------------------
 
 
+def before_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules) -> PairState:
+    """A window was solved, and `after_estimate` will follow: an accepted one that is elsewhere than an extrinsic which
+    the monitor suspects makes two witnesses. The mount has moved, even if the next step puts it right."""
+    mixed = state.flagged_since_ns is not None and window_start_ns < state.flagged_since_ns
+    if estimate.verdict.decision is Decision.FAILED or mixed or not _accused_elsewhere(state, estimate, rules):
+        return state
+    return _unless_red(state, Event.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
+
+
 def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules) -> PairState:
     """A window was solved. `window_start_ns` is the stamp of its first pair."""
     state = replace(state, latest=estimate, failures=())
@@ -188,12 +198,16 @@ def _fused(state: PairState, estimate: Estimate, rules: Rules) -> Track:
     already speaks against what is served: then two witnesses agree that the mount has moved."""
     measurement = Measurement.of(estimate)
     pose = estimate.optimum.T_camera_lidar
-    accused = state.monitor.outcome in (Outcome.SUSPECT, Outcome.CONFIRMED)
-    elsewhere = not agrees(state.T_camera_lidar, pose, rules.policy)
     track = state.track
-    if track is None or (accused and elsewhere):
+    if track is None or _accused_elsewhere(state, estimate, rules):
         track = Track.initial(pose, prior_sigma(rules.fusion), estimate.data_stamp_ns)
     return absorb(track, measurement, rules.fusion)
+
+
+def _accused_elsewhere(state: PairState, estimate: Estimate, rules: Rules) -> bool:
+    """Whether the monitor speaks against what is served, and the estimate is too far from it for both to be right."""
+    accused = state.monitor.outcome in (Outcome.SUSPECT, Outcome.CONFIRMED)
+    return accused and not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
 
 
 def _applied_or_waiting(state: PairState, pose: Matrix4, estimate: Estimate, rules: PolicyConfig) -> PairState:

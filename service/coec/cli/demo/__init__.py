@@ -1,0 +1,168 @@
+"""`coec demo`: a simulated vehicle whose mount is knocked, and the service that notices and repairs it.
+
+The vehicle renders and publishes, the service is a process of its own behind a Zenoh router, and a client watches:
+alarm and repair are the service's. Only the client knows the truth.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coec.adapters.rig import mask_to_png
+from coec.adapters.zenoh_client import connected
+from coec.calibration.values import Matrix4
+from coec.cli import console, files
+from coec.cli.commented_yaml import commented_yaml
+from coec.cli.demo import report, story
+from coec.cli.demo.daemon import Daemon, DemoError, free_endpoint, running
+from coec.cli.demo.outcome import Outcome, outcome_of
+from coec.cli.demo.screen import Screen
+from coec.cli.demo.vehicle import NS_PER_S, Vehicle
+from coec.cli.demo.watch import ASK_S, Seen, Watch
+from coec.cli.query import download_window
+from coec.config import Config
+from coec.schemas.keys import Keys
+
+if TYPE_CHECKING:
+    from coec.simulation.drive import SimulatedDrive
+
+POLL_S = 0.2
+START_S, DRIVE_S = 120.0, 600.0
+"""Limits for the service to come up and for the drive. The first run on a machine compiles the kernels."""
+
+
+def run(output: Path, *, as_json: bool) -> int:
+    """Runs the demonstration; 1 if the story did not come true: no alarm, no repair, or not within the limit.
+
+    Raises:
+        DemoError: the service does not start, answer or end.
+        SourceError: what casts the rays is not installed.
+        OutputError: a file cannot be written.
+    """
+    started_s = time.monotonic()
+    config_of_drive = story.drive_config()
+    from coec.simulation.drive import SimulatedDrive
+
+    drive = SimulatedDrive(config_of_drive)
+    with tempfile.TemporaryDirectory(prefix="coec-demo-") as temporary:
+        folder = Path(temporary)
+        config = _configure(drive, folder)
+        with running(folder / "coec.yaml", folder / "coec.log") as daemon, Screen() as screen:
+            screen.wait("The service starts, the street is built …")
+            # Compiles what the renderers then find compiled, while the service compiles its own.
+            next(drive.messages([0]))
+            with connected(config.zenoh.connect, START_S) as session:
+                watch = Watch(
+                    session,
+                    Keys(config.prefix, config.vehicle),
+                    config.pairs[0].name,
+                    drive.rig.T_camera_lidar_nominal,
+                    _truth(drive),
+                    drive.camera_stamps_ns[0],
+                    started_s,
+                )
+                _until_running(watch, daemon, screen)
+                vehicle = Vehicle(session, drive, watch.may_pass)
+                seen, outcome = _watch(watch, vehicle, daemon, screen)
+                screen.wait("The window is fetched, the pictures are drawn …")
+                window, blamed = _fetch(watch, seen, output)
+            daemon.end()
+            left = report.write(output, window, blamed, watch, seen, outcome)
+    if as_json:
+        console.print_json(_document(watch, outcome, left, started_s))
+    else:
+        report.show(watch.timeline, outcome, left)
+    return 0 if outcome.passed else 1
+
+
+def _configure(drive: SimulatedDrive, folder: Path) -> Config:
+    """Writes the configuration of the service, and what it names, into the folder."""
+    rig = drive.rig
+    mask = np.ones((rig.camera.height, rig.camera.width), bool) if rig.mask is None else rig.mask
+    files.write(folder / "mask.png", mask_to_png(mask))
+    config = story.service_config(rig, Path("mask.png"), free_endpoint())
+    files.write(folder / "coec.yaml", commented_yaml(config).encode())
+    return config
+
+
+def _truth(drive: SimulatedDrive) -> Callable[[float], Matrix4]:
+    """True T_camera_lidar by the second of the drive."""
+    first_ns = drive.camera_stamps_ns[0]
+    return lambda second: drive.truth(first_ns + round(second * NS_PER_S))
+
+
+def _until_running(watch: Watch, daemon: Daemon, screen: Screen) -> None:
+    deadline_s = time.monotonic() + START_S
+    while True:
+        daemon.check()
+        seen = watch.look(0.0)
+        if seen is not None:
+            screen.show(watch, seen)
+            if seen.status.state == "running":
+                return
+        if time.monotonic() > deadline_s:
+            raise DemoError(f"the service is not ready after {START_S:g} s; {daemon.last_words()}")
+        time.sleep(POLL_S)
+
+
+def _watch(watch: Watch, vehicle: Vehicle, daemon: Daemon, screen: Screen) -> tuple[Seen, Outcome]:
+    """Until the story is told, or the drive is over; what was seen last, and what became of it."""
+    deadline_s = time.monotonic() + DRIVE_S
+    try:
+        if vehicle.start(START_S):
+            raise DemoError(f"the service does not listen to its sensors; {daemon.last_words()}")
+        while True:
+            daemon.check()
+            arrived = vehicle.arrived
+            if vehicle.failure is not None:
+                raise vehicle.failure
+            seen = watch.look(vehicle.second)
+            if seen is None:
+                raise DemoError(f"the service answers no more; {daemon.last_words()}")
+            screen.show(watch, seen)
+            outcome = outcome_of(watch.timeline, story.KNOCK_S, story.MAX_ERROR_DEG)
+            told = outcome.repaired_s is not None and vehicle.second >= outcome.repaired_s + story.REST_S
+            if told or arrived or time.monotonic() > deadline_s:
+                return seen, outcome
+            time.sleep(POLL_S)
+    finally:
+        vehicle.stop()
+
+
+def _fetch(watch: Watch, seen: Seen, output: Path) -> tuple[Path | None, Matrix4]:
+    """The window on which what is served rests, if any, and what was served when the alarm was raised."""
+    events = watch.events()
+    blamed = np.array(events[-1].camera_from_lidar.matrix) if events else watch.nominal
+    window_id = seen.extrinsic.window_id
+    if window_id is None:
+        return None, blamed
+    path = output / f"{window_id}.mcap"
+    download_window(watch.session, watch.keys, watch.pair, window_id, path, ASK_S, lambda *_: None)
+    return path, blamed
+
+
+def _document(watch: Watch, outcome: Outcome, left: report.Left, started_s: float) -> dict[str, object]:
+    last = watch.timeline[-1]
+    return {
+        "timeline": [asdict(moment) for moment in watch.timeline],
+        "knock_s": outcome.knock_s,
+        "knock_deg": story.KNOCK_DEG,
+        "alarm_s": outcome.alarm_s,
+        "repaired_s": outcome.repaired_s,
+        "error_before_deg": outcome.error_before_deg,
+        "error_after_deg": outcome.error_after_deg,
+        "error_by_axis_after_deg": last.error_by_axis_deg,
+        "health": outcome.health,
+        "passed": outcome.passed,
+        "objections": outcome.objections(),
+        "drive_s": last.drive_s,
+        "elapsed_s": time.monotonic() - started_s,
+        "files": [str(path) for path in left.files],
+    }

@@ -1,0 +1,254 @@
+"""What the demonstration leaves behind: pictures, the window that repaired the mount, and a page that shows them."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.adapters.images import decode_bgr, encode_png
+from coec.adapters.mcap_windows import read_result, read_window
+from coec.adapters.overlay import draw
+from coec.adapters.timeline_plot import STATE_COLOURS, timeline
+from coec.calibration.motion import compensate
+from coec.calibration.values import Matrix4, Window
+from coec.cli import console, files, pictures, windows
+from coec.cli.demo import story
+from coec.cli.demo.outcome import Outcome
+from coec.cli.demo.watch import Moment, Seen, Watch
+from coec.config import LimitsConfig
+from coec.geometry import cameras
+from coec.schemas import replies
+from coec.schemas.base import to_json
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+h1 { margin-bottom: 0 } figure { margin: 1rem 0 } img { width: 100% } figcaption { color: #555 }
+table { border-collapse: collapse; margin: 1rem 0 } th, td { padding: .2rem .8rem; border-bottom: 1px solid #ddd }
+th { text-align: left } td.n { text-align: right; font-variant-numeric: tabular-nums }
+.state { border-radius: .6rem; padding: 0 .6rem }
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """Files that were written, and the result of the window that repaired the mount (None: there is none)."""
+
+    files: tuple[Path, ...]
+    result: replies.CalibrationResult | None
+
+
+def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen: Seen, outcome: Outcome) -> Left:
+    """All of it into the folder.
+
+    Args:
+        window: the recorded window that lies there already; None without one.
+        blamed: (4, 4) what was served when the alarm was raised.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    written = [] if window is None else [window]
+    plot = files.write(output / "timeline.png", timeline(watch.series, _marks(outcome), story.MAX_ERROR_DEG, _title()))
+    written.append(plot)
+    shown = {"timeline": plot}
+    result = None
+    if window is not None:
+        result = read_result(window)
+        pictured = _overlays(output, window, blamed, watch, seen)
+        written += pictured.values()
+        shown |= pictured
+    if result is not None:
+        written.append(files.write(output / "result.json", to_json(result)))
+    document = page(shown, watch.timeline, outcome, result, window)
+    written.append(files.write(output / "report.html", document.encode()))
+    return Left(tuple(written), result)
+
+
+def show(moments: Sequence[Moment], outcome: Outcome, left: Left) -> None:
+    """The summary in the terminal."""
+    steps = console.table("elapsed", "drive", "health", "extrinsic", "error", "", right=(0, 1, 4))
+    for moment, what in zip(moments, _happenings(moments, outcome), strict=True):
+        times = (f"{moment.t_s:.0f} s", f"{moment.drive_s:.1f} s")
+        served = f"{moment.provenance}, {moment.status}"
+        steps.add_row(*times, console.styled(moment.health), served, f"{moment.error_deg:.3f}°", what)
+    console.out.print(steps)
+    console.out.print()
+    summary = console.table("", "", right=(1,))
+    for name, value in _summary(outcome, moments[-1]):
+        summary.add_row(name, value)
+    console.out.print(summary)
+    console.out.print()
+    for path in left.files:
+        console.show(f"{path}  {path.stat().st_size} bytes")
+    for objection in outcome.objections():
+        console.show(objection, "bold red")
+    if outcome.passed:
+        console.out.print(console.styled("accepted"), ": the knock was noticed and repaired by the service", sep="")
+
+
+def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: Seen) -> dict[str, Path]:
+    """Overlays and close-ups, by name."""
+    window, configuration = read_window(path)
+    truth = watch.truth(seen.moment.drive_s)
+    before_deg = windows.rotation_error_deg(blamed, truth)
+    poses = {
+        "overlay_before": (blamed, f"after the knock: {before_deg:.2f} deg from the truth"),
+        "overlay_after": (seen.T_camera_lidar, f"after the repair: {seen.moment.error_deg:.2f} deg from the truth"),
+    }
+    whole = pictures.write_overlays(output, window, poses, configuration.motion_compensation)
+    cloud = compensate(pictures.middle(window), window.rig, enabled=configuration.motion_compensation).xyz_m
+    near = {
+        f"closeup_{name}": files.write(
+            output / f"closeup_{name}.png", _close_up(window, cloud, *poses[f"overlay_{name}"])
+        )
+        for name in ("before", "after")
+    }
+    return dict(zip(poses, whole, strict=True)) | near
+
+
+def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matrix4, title: str) -> bytes:
+    """PNG of the part of the picture in which the street is, with the points (N, 3) of the sweep."""
+    pair, rig = pictures.middle(window), window.rig
+    left, top, width, height = story.CLOSE_UP_PX
+    part = slice(top, top + height), slice(left, left + width)
+    intrinsics = cameras.intrinsics_of(rig.camera)
+    moved = {"cx": intrinsics["cx"] - left, "cy": intrinsics["cy"] - top, "width": width, "height": height}
+    camera = cameras.build(cameras.name_of(rig.camera), **{**intrinsics, **moved})
+    image = np.ascontiguousarray(decode_bgr(pair.camera.image, LimitsConfig())[part])
+    mask = None if rig.mask is None else np.ascontiguousarray(rig.mask[part])
+    return encode_png(draw(image, camera, T_camera_lidar, xyz_m, mask, title))
+
+
+def _title() -> str:
+    return f"A mount that is knocked by {story.KNOCK_DEG:g}° while the vehicle drives"
+
+
+def _marks(outcome: Outcome) -> list[tuple[float, str]]:
+    named = ((outcome.knock_s, "knock"), (outcome.alarm_s, "alarm"), (outcome.repaired_s, "repair"))
+    return [(second, what) for second, what in named if second is not None]
+
+
+def _happenings(moments: Sequence[Moment], outcome: Outcome) -> list[str]:
+    """A remark for each moment, empty for some."""
+    firsts: tuple[tuple[str, Callable[[Moment], bool]], ...] = (
+        ("the service starts", lambda moment: moment.service == "starting"),
+        ("the drive begins", lambda moment: moment.service == "running"),
+        ("the first window", lambda moment: moment.provenance == "estimated"),
+        ("knocked", lambda moment: moment.drive_s >= outcome.knock_s),
+        ("alarm", lambda moment: moment.drive_s == outcome.alarm_s),
+        ("repaired", lambda moment: moment.drive_s == outcome.repaired_s),
+    )
+    remarks = [""] * len(moments)
+    for remark, is_so in firsts:
+        first = next((index for index, moment in enumerate(moments) if is_so(moment)), None)
+        if first is not None:
+            remarks[first] = remark
+    return remarks
+
+
+def _summary(outcome: Outcome, last: Moment) -> list[tuple[str, str]]:
+    def after_knock(second: float | None) -> str:
+        return "never" if second is None else f"{second - outcome.knock_s:.0f} s after it"
+
+    axes = "  ".join(f"{value:+.3f}°" for value in last.error_by_axis_deg)
+    return [
+        ("knock", f"{story.KNOCK_DEG:g}° in pitch at {outcome.knock_s:.0f} s of driving"),
+        ("alarm", after_knock(outcome.alarm_s)),
+        ("repair", after_knock(outcome.repaired_s)),
+        ("error after the knock", f"{outcome.error_before_deg:.3f}°"),
+        ("error after the repair", f"{outcome.error_after_deg:.3f}°"),
+        ("of it pitch, yaw, roll", axes),
+    ]
+
+
+# --- the page -------------------------------------------------------------------------------------------------------
+
+
+def page(
+    shown: Mapping[str, Path],
+    moments: Sequence[Moment],
+    outcome: Outcome,
+    result: replies.CalibrationResult | None,
+    window: Path | None,
+) -> str:
+    """One HTML file that needs no other."""
+    verdict = "The knock was noticed and repaired." if outcome.passed else " ".join(outcome.objections())
+    parts = [
+        "<!doctype html><html lang=en><meta charset=utf-8><title>coec demo</title>",
+        f"<style>{STYLE}</style><h1>{escape(_title())}</h1>",
+        f"<p><b>{escape(verdict)}</b> The vehicle, its street and its sensors are simulated, so the truth is "
+        "known; the service is the one that runs on a vehicle, in a process of its own, and has seen the frames alone.",
+        _table(("", ""), [(escape(name), escape(value)) for name, value in _summary(outcome, moments[-1])]),
+        _figure(shown["timeline"], "Error of the extrinsic that is served; the ground is what the service says of it."),
+    ]
+    if "closeup_before" in shown:
+        parts.append(_figure(shown["closeup_before"], "LiDAR points where the service put them before the repair …"))
+        parts.append(_figure(shown["closeup_after"], "… and after it, on the same picture. Colours are ranges."))
+    parts += ["<h2>What the service said</h2>", _timeline(moments, outcome)]
+    if result is not None:
+        parts += ["<h2>The window that repaired it</h2>", _result(result)]
+    if window is not None:
+        parts.append(
+            f"<p><code>{escape(window.name)}</code> is a ROS 2 MCAP file for Foxglove, Lichtblick or Rerun; "
+            f"<code>coec replay {escape(window.name)}</code> reaches the decision again from it alone."
+        )
+    return "\n".join(parts) + "\n"
+
+
+def _timeline(moments: Sequence[Moment], outcome: Outcome) -> str:
+    rows = [
+        (
+            f"{moment.t_s:.0f} s",
+            f"{moment.drive_s:.1f} s",
+            f"<span class=state style='background:{_colour(moment.health)}'>{escape(moment.health)}</span>",
+            escape(f"{moment.provenance}, {moment.status}"),
+            f"{moment.error_deg:.3f}°",
+            escape(what),
+        )
+        for moment, what in zip(moments, _happenings(moments, outcome), strict=True)
+    ]
+    return _table(("elapsed", "drive", "health", "extrinsic", "error", ""), rows, numbers=(0, 1, 4))
+
+
+def _result(result: replies.CalibrationResult) -> str:
+    rows = [
+        (
+            escape(name),
+            console.figure(metric.value),
+            f"{'≥' if metric.at_least else '≤'} {console.figure(metric.limit)}",
+            "✓" if metric.passed else "✗",
+        )
+        for name, metric in result.metrics.items()
+    ]
+    told = f"{result.pairs} pairs, verdict {result.verdict.decision}, configuration {result.config_hash}"
+    return f"<p>{escape(told)}</p>" + _table(("figure", "value", "limit", ""), rows, numbers=(1,))
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
+    """Cells are HTML."""
+    lines = ["<table>", "<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
+    for row in rows:
+        cells = (f"<td{' class=n' if i in numbers else ''}>{cell}</td>" for i, cell in enumerate(row))
+        lines.append("<tr>" + "".join(cells) + "</tr>")
+    return "\n".join([*lines, "</table>"])
+
+
+def _figure(path: Path, caption: str) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    return (
+        f'<figure><img alt="{escape(path.stem)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def _colour(health: str) -> str:
+    """As in the plot, in the names of CSS."""
+    return {
+        "tab:green": "#bfe3bf", "gold": "#ffe98a", "orange": "#ffd9a0", "tab:red": "#f3b4b4", "silver": "#ddd"
+    }.get(STATE_COLOURS.get(health, ""), "#eee")  # fmt: skip

@@ -1,0 +1,132 @@
+"""The live view of the demonstration in a terminal; where there is none, a line for each turn of the story."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import TracebackType
+
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from coec.cli import console
+from coec.cli.demo import story
+from coec.cli.demo.watch import Seen, Watch
+
+BARS = "▁▂▃▄▅▆▇█"
+BAR_WIDTH = 48
+CURVE_WIDTH = 72
+
+FIGURES = ("distance_rotation", "distance_pose", "edges_per_pair", "overlap", "mi")
+"""Of the latest look of the monitor: what it decides by, and mutual information."""
+
+
+class Screen:
+    """Shows what is seen, while it is open."""
+
+    def __init__(self) -> None:
+        self._live = Live(console=console.err, transient=True, auto_refresh=False)
+        self._told = ""
+
+    def __enter__(self) -> Screen:
+        self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._live.stop()
+
+    def wait(self, what: str) -> None:
+        """Nothing can be seen yet."""
+        if console.err.is_terminal:
+            self._live.update(Panel(Text(what), title="coec demo", width=CURVE_WIDTH + 30), refresh=True)
+
+    def show(self, watch: Watch, seen: Seen) -> None:
+        """The latest."""
+        if console.err.is_terminal:
+            self._live.update(view(watch, seen), refresh=True)
+            return
+        moment = seen.moment
+        told = f"{moment.health}, {moment.provenance}"
+        if told != self._told:
+            self._told = told
+            console.say(f"demo: {moment.drive_s:5.1f} s of driving: {told}, {moment.error_deg:.2f}° from the truth")
+
+
+def view(watch: Watch, seen: Seen) -> RenderableType:
+    """Everything about one instant."""
+    moment, pair = seen.moment, seen.pair
+    rows = Table.grid(padding=(0, 2))
+    rows.add_column(style="bold")
+    rows.add_column()
+    rows.add_row("drive", _drive(moment.drive_s))
+    rows.add_row("health", Text.assemble(console.styled(moment.health), "  ", _reason(seen)))
+    rows.add_row("error against the truth", _error(seen))
+    rows.add_row("", curve(watch.series))
+    rows.add_row("extrinsic", f"{moment.provenance}, latest window {moment.status}")
+    rows.add_row("correction", "  ".join(f"{value:+.3f}°" for value in moment.correction_deg) + "  pitch, yaw, roll")
+    rows.add_row("next window", _window(pair.selected))
+    rows.add_row("so far", f"{pair.pairs} pairs, {pair.looks} looks, {pair.solved} windows solved ({_worker(seen)})")
+    return Panel(Group(rows, Text(), _figures(seen)), title=f"coec demo  {moment.t_s:.0f} s", width=CURVE_WIDTH + 30)
+
+
+def curve(series: Sequence[tuple[float, float, str]], width: int = CURVE_WIDTH) -> Text:
+    """The error over the drive as a line of bars, 0 to a little more than the knock, in the colours of health."""
+    latest: dict[int, tuple[float, str]] = {}
+    seconds_per_bar = max(1.0, (series[-1][0] + 1.0) / width) if series else 1.0
+    for second, error_deg, health in series:
+        latest[int(second / seconds_per_bar)] = (error_deg, health)
+    text = Text()
+    for column in range(max(latest, default=-1) + 1):
+        if column not in latest:
+            text.append(" ")
+            continue
+        error_deg, health = latest[column]
+        height = min(int(error_deg / (story.KNOCK_DEG * 1.1) * len(BARS)), len(BARS) - 1)
+        text.append(BARS[height], console.STATE_STYLES.get(health, "dim"))
+    return text
+
+
+def _drive(second: float) -> Text:
+    if second < story.KNOCK_S:
+        return Text(f"{second:5.1f} s   the mount is knocked by {story.KNOCK_DEG:g}° in {story.KNOCK_S - second:.0f} s")
+    ago = f"{second - story.KNOCK_S:.0f} s ago"
+    return Text.assemble(f"{second:5.1f} s   ", (f"KNOCKED by {story.KNOCK_DEG:g}° {ago}", "bold magenta"))
+
+
+def _error(seen: Seen) -> Text:
+    style = "bold green" if seen.moment.error_deg < story.MAX_ERROR_DEG else "bold red"
+    return Text(f"{seen.moment.error_deg:.3f}°", style)
+
+
+def _reason(seen: Seen) -> str:
+    return seen.health.reasons[0].text if seen.health.reasons else "The monitor finds nothing wrong."
+
+
+def _worker(seen: Seen) -> str:
+    return {"idle": "idle", "busy": "at work"}.get(seen.status.worker.state, seen.status.worker.state)
+
+
+def _window(selected: int) -> RenderableType:
+    grid = Table.grid(padding=(0, 2))
+    bar = ProgressBar(total=story.WINDOW.pairs, completed=selected, width=BAR_WIDTH)
+    grid.add_row(bar, f"{selected} of {story.WINDOW.pairs} pairs")
+    return grid
+
+
+def _figures(seen: Seen) -> Table:
+    table = console.table("figure of the latest look", "value", "limit", "", right=(1,))
+    for name in FIGURES:
+        metric = seen.health.metrics.get(name)
+        if metric is None:
+            table.add_row(name, "-", "", "")
+            continue
+        if metric.limit is None:
+            table.add_row(name, console.figure(metric.value), "", "")
+            continue
+        limit = f"{'≥' if metric.at_least else '≤'} {console.figure(metric.limit)}"
+        mark = Text("✓", "green") if metric.passed else Text("✗", "red")
+        table.add_row(name, console.figure(metric.value), limit, mark)
+    return table

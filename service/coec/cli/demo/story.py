@@ -1,0 +1,111 @@
+"""What the demonstration plays: the drive, the knock, the service's configuration, and when the story has come true."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coec.adapters.depth import STEREO
+from coec.adapters.player import Streams
+from coec.adapters.rig import matrix_rows
+from coec.calibration.values import Rig
+from coec.config import (
+    CalibrationConfig,
+    CameraConfig,
+    CameraIntrinsics,
+    Config,
+    DepthConfig,
+    EgoConfig,
+    LidarConfig,
+    MonitorConfig,
+    PairConfig,
+    StateConfig,
+    WindowConfig,
+    WorkerConfig,
+    ZenohConfig,
+)
+from coec.geometry import cameras
+from coec.simulation.source import require_extra
+
+if TYPE_CHECKING:
+    from coec.simulation.drive import DriveConfig
+
+DEPTH_MODEL = STEREO
+"""Where the service gets depth from: a built-in network, or `stereo`, the exact depth of the simulation."""
+
+SEED = 1
+LONGEST_S = 240.0
+"""Of driving: the drive ends as soon as the story is told, and here at the latest."""
+
+KNOCK_S, KNOCK_DEG = 36.0, 3.0
+"""When and how far the mount is bent, in pitch: after the first window has been judged."""
+
+REST_S = 12.0
+"""Of driving after the repair: two more looks of the monitor."""
+
+CLOSE_UP_PX = (170, 285, 400, 170)
+"""Left, top, width and height of the part of the picture in which cars and kerbs are."""
+
+PAIR_HZ, EGO_HZ = 1.0, 50.0
+"""Frames per second of driving: one pair is rendered for every one that the service would choose."""
+
+WINDOW = WindowConfig(pairs=12, min_pairs=8, slice_s=24.0)
+MONITOR = MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0)
+"""Shorter than on a vehicle, where a window takes three minutes: nobody wants to watch that."""
+
+MAX_ERROR_DEG = 0.3
+"""What the repair must be within of the truth (geodesic angle)."""
+
+MIN_FREE_BYTES = 64 * 2**20
+"""Some windows of 20 MB are written; a demonstration need not leave more of the disk free."""
+
+
+def drive_config() -> DriveConfig:
+    """A vehicle with a 185° fisheye of 700×700 pixels and a LiDAR of 64 beams, and the knock.
+
+    Raises:
+        SourceError: what casts the rays is not installed.
+    """
+    require_extra()
+    from coec.simulation.drive import DriveConfig
+    from coec.simulation.faults import Step
+
+    return DriveConfig(
+        seed=SEED,
+        seconds=LONGEST_S,
+        camera="fisheye700",
+        lidar=64,
+        camera_hz=PAIR_HZ,
+        lidar_hz=PAIR_HZ,
+        ego_hz=EGO_HZ,
+        faults=(Step(KNOCK_S, LONGEST_S, rx=KNOCK_DEG),),
+        depth=DEPTH_MODEL == STEREO,
+    )
+
+
+def service_config(rig: Rig, mask: Path, endpoint: str) -> Config:
+    """Of the service: everything default, but for the rig, the address, and what is shorter here than on a vehicle."""
+    streams = Streams.default(rig.pair)
+    intrinsics = {"model": cameras.name_of(rig.camera), **cameras.intrinsics_of(rig.camera)}
+    pair = PairConfig(
+        name=rig.pair,
+        camera=CameraConfig(
+            key=streams.camera,
+            frame_id=rig.camera_frame,
+            intrinsics=CameraIntrinsics.model_validate(intrinsics),
+            mask=mask,
+        ),
+        lidar=LidarConfig(key=streams.lidar, frame_id=rig.lidar_frame),
+        ego=EgoConfig(key=str(streams.ego), T_lidar_ego=matrix_rows(rig.T_lidar_ego)),
+        T_camera_lidar=matrix_rows(rig.T_camera_lidar_nominal),
+        window=WINDOW,
+        monitor=MONITOR,
+        calibration=CalibrationConfig(depth=DepthConfig(model=DEPTH_MODEL)),
+    )
+    return Config(
+        zenoh=ZenohConfig(connect=(endpoint,), listen=(endpoint,)),
+        state=StateConfig(directory=Path("state"), min_free_bytes=MIN_FREE_BYTES),
+        # On a vehicle the cameras do not compete with the solver for the processor; here they are drawn on it.
+        worker=WorkerConfig(niceness=0),
+        pairs=(pair,),
+    )

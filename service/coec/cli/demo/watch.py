@@ -1,0 +1,159 @@
+"""What a client of the service sees during the demonstration, compared with the truth that only the vehicle knows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import zenoh
+
+from coec.adapters.zenoh_client import RemoteError, ask, ask_one
+from coec.calibration.values import Matrix4
+from coec.cli import windows
+from coec.errors import NotFoundError
+from coec.geometry import se3
+from coec.schemas import replies
+from coec.schemas.base import from_json
+from coec.schemas.keys import Keys
+
+LEAD_S = 7.0
+"""The drive waits while it is so far ahead of what the service has judged: a look of the monitor, and a little. So the
+story does not depend on how fast the machine is."""
+
+IDLE_S = 1.5
+"""A service that has had nothing to do for so long will judge nothing more of what it has got; what it says of its
+worker is renewed every second."""
+
+NS_PER_S = 1_000_000_000
+
+ASK_S = 10.0
+"""For one answer, on a machine that also draws the street."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """What the service said at one instant. `drive_s` counts seconds of driving; angles in degrees; errors are those of
+    the extrinsic that is served, which rests on the window `window_id`, against the truth at that time."""
+
+    t_s: float
+    drive_s: float
+    service: str
+    health: str
+    provenance: str
+    status: str
+    window_id: str | None
+    correction_deg: tuple[float, float, float]
+    error_by_axis_deg: tuple[float, float, float]
+    error_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """All answers of one instant."""
+
+    moment: Moment
+    status: replies.StatusReply
+    health: replies.HealthReply
+    extrinsic: replies.ExtrinsicReply
+
+    @property
+    def pair(self) -> replies.PairStatus:
+        """Counters of the pair."""
+        return self.status.pairs[0]
+
+    @property
+    def T_camera_lidar(self) -> Matrix4:
+        """(4, 4) what is served."""
+        return np.array(self.extrinsic.camera_from_lidar.matrix)
+
+
+@dataclass(slots=True)
+class Watch:
+    """Asks the service again and again, and keeps what changed.
+
+    Attributes:
+        truth: true T_camera_lidar (4, 4) at a second of the drive.
+        first_ns: sensor time at which the drive begins.
+        series: everything seen: (second of the drive, error in degrees, health).
+        timeline: the moments at which something was different from before.
+        latest: None before the first answer.
+    """
+
+    session: zenoh.Session
+    keys: Keys
+    pair: str
+    nominal: Matrix4
+    truth: Callable[[float], Matrix4]
+    first_ns: int
+    started_s: float
+    series: list[tuple[float, float, str]] = field(default_factory=list)
+    timeline: list[Moment] = field(default_factory=list)
+    latest: Seen | None = None
+    _idle_since_s: float | None = None
+
+    def may_pass(self, stamp_ns: int) -> bool:
+        """Whether the drive may go on to this sensor time: the service has kept up, or has nothing to do."""
+        if self.latest is None:
+            return False
+        judged_ns = self.latest.health.evaluated_ns or self.first_ns
+        if stamp_ns - judged_ns <= LEAD_S * NS_PER_S:
+            return True
+        return self._idle_since_s is not None and time.monotonic() - self._idle_since_s >= IDLE_S
+
+    def look(self, drive_s: float) -> Seen | None:
+        """The state now, or None while the service is not there yet."""
+        if not ask(self.session, self.keys.status, ASK_S):
+            return None
+        try:
+            seen = self._ask_all(drive_s)
+        except (NotFoundError, RemoteError):
+            return None
+        self.latest = seen
+        worker = seen.status.worker
+        if worker.state != "idle" or worker.queued:
+            self._idle_since_s = None
+        elif self._idle_since_s is None:
+            self._idle_since_s = time.monotonic()
+        self.series.append((drive_s, seen.moment.error_deg, seen.moment.health))
+        if not self.timeline or _essence(seen.moment) != _essence(self.timeline[-1]):
+            self.timeline.append(seen.moment)
+        return seen
+
+    def events(self) -> tuple[replies.EvidenceEvent, ...]:
+        """Red events that the service has kept."""
+        return from_json(replies.EvidenceReply, self._ask(self.keys.evidence(self.pair))).events
+
+    def _ask_all(self, drive_s: float) -> Seen:
+        status = from_json(replies.StatusReply, self._ask(self.keys.status))
+        health = from_json(replies.HealthReply, self._ask(self.keys.health(self.pair)))
+        extrinsic = from_json(replies.ExtrinsicReply, self._ask(self.keys.extrinsic(self.pair)))
+        served = np.array(extrinsic.camera_from_lidar.matrix)
+        truth = self.truth(drive_s)
+        moment = Moment(
+            t_s=round(time.monotonic() - self.started_s, 2),
+            drive_s=round(drive_s, 2),
+            service=status.state,
+            health=health.state,
+            provenance=extrinsic.provenance,
+            status=extrinsic.status,
+            window_id=extrinsic.window_id,
+            correction_deg=_degrees(served, self.nominal),
+            error_by_axis_deg=_degrees(served, truth),
+            error_deg=windows.rotation_error_deg(served, truth),
+        )
+        return Seen(moment, status, health, extrinsic)
+
+    def _ask(self, key: str) -> bytes:
+        return ask_one(self.session, f"{key}?format=json", ASK_S).payload
+
+
+def _degrees(T_one: Matrix4, T_other: Matrix4) -> tuple[float, float, float]:
+    rx, ry, rz = (float(angle) for angle in np.degrees(se3.difference(T_one, T_other)[:3]))
+    return rx, ry, rz
+
+
+def _essence(moment: Moment) -> tuple[object, ...]:
+    """What must change to make a new line of the timeline."""
+    return moment.service, moment.health, moment.provenance, moment.status, moment.error_deg

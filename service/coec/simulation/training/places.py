@@ -1,0 +1,238 @@
+"""Where the camera stands: in streets as they are, in a jam under a bridge, in a hall.
+
+Streets alone teach that what is low is near and what is high is far. Beside a lorry, under a bridge and indoors
+it is not so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.values import Matrix4
+from coec.geometry.se3 import rotation_exp
+from coec.simulation.mesh import Material, Mesh, box, join, quads
+from coec.simulation.props import car
+from coec.simulation.road import Road, build_road
+from coec.simulation.scene import Scene, Town
+from coec.simulation.sky import draw_sky
+
+Doubles = NDArray[np.float64]
+
+PLACES = 3
+"""Of each seed."""
+CROWDED = 1_000_000
+"""From this seed on, jams and halls take turns; below, there are streets."""
+TOWN_M = 1000.0
+LANE_M = 3.2
+WALLS = (Material.PAINT, Material.BRICK, Material.PLASTER, Material.CONCRETE, Material.TILES)
+
+
+class Place(Protocol):
+    """Somewhere to take pictures. The draws come in this order."""
+
+    def draw_spot(self, rng: np.random.Generator) -> float:
+        """Where along the place, metres."""
+
+    def stand(self, spot_m: float, rng: np.random.Generator) -> Matrix4:
+        """T_world_ego (4, 4) of a vehicle there."""
+
+    def draw_scene(self, rng: np.random.Generator) -> Scene:
+        """What is around."""
+
+
+def places(seed: int) -> Iterator[tuple[Place, np.random.Generator]]:
+    """The places of a seed, each with the generator of its frames."""
+    town = Town(seed, TOWN_M)
+    for number in range(PLACES):
+        rng = np.random.default_rng([seed, 140, number])
+        if seed < CROWDED:
+            yield Street(town, rng.uniform(0.0, TOWN_M)), rng
+        elif number % 2 == seed % 2:
+            yield Hall(rng), rng
+        else:
+            yield Jam(town, rng.uniform(0.0, TOWN_M), rng), rng
+
+
+class Street:
+    """A street of a town."""
+
+    def __init__(self, town: Town, at_m: float) -> None:
+        self._town = town
+        self._at_m = at_m
+
+    def draw_spot(self, rng: np.random.Generator) -> float:
+        """See `Place`."""
+        return self._at_m + rng.uniform(-20, 20)
+
+    def stand(self, spot_m: float, rng: np.random.Generator) -> Matrix4:
+        """See `Place`: mostly in the own lane."""
+        left_m = self._town.lane_left_m() * (1 if rng.random() < 0.8 else -1) + rng.normal(0, 0.5)
+        if rng.random() < 0.1:
+            left_m = rng.uniform(-6, 6)
+        return _ego(self._town.road, spot_m, left_m, rng)
+
+    def draw_scene(self, rng: np.random.Generator) -> Scene:
+        """See `Place`: with the traffic of some time."""
+        return self._town.scene(self._at_m, float(rng.uniform(0, 60)))
+
+
+class Jam:
+    """A street full of cars and lorries, at times under a bridge."""
+
+    def __init__(self, town: Town, at_m: float, rng: np.random.Generator) -> None:
+        self._road, self._at_m, self._left_m = town.road, at_m, town.lane_left_m()
+        street = town.scene(at_m)
+        parts = [street.street]
+        for lane in (-1, 0, 1, 2):
+            ahead_m = rng.uniform(-14, -7) if lane else rng.uniform(5.0, 12.0)
+            while ahead_m < 55:
+                one = _lorry(rng) if rng.random() < 0.3 else car(rng)
+                length_m = float(np.ptp(one.corners_m[:, :, 0]))
+                ahead_m += length_m / 2
+                parts.append(self._on_road(one, ahead_m, self._left_m + lane * LANE_M, street.origin_m))
+                ahead_m += length_m / 2 + rng.uniform(1.0, 9.0)
+        if rng.random() < 0.6:
+            parts.append(self._on_road(_bridge(rng), rng.uniform(-6, 30), 0.0, street.origin_m))
+        self._scene = Scene(town.road, street.sky, street.origin_m, join(parts), [])
+
+    def draw_spot(self, rng: np.random.Generator) -> float:
+        """See `Place`."""
+        return self._at_m + rng.uniform(-2, 2)
+
+    def stand(self, spot_m: float, rng: np.random.Generator) -> Matrix4:
+        """See `Place`."""
+        return _ego(self._road, spot_m, self._left_m + rng.normal(0, 0.25), rng)
+
+    def draw_scene(self, rng: np.random.Generator) -> Scene:  # noqa: ARG002 - as Place's
+        """See `Place`."""
+        return self._scene
+
+    def _on_road(self, mesh: Mesh, ahead_m: float, left_m: float, origin_m: Doubles) -> Mesh:
+        s = self._at_m + ahead_m
+        x, y, z = self._road.points(s, left_m, 0.0) - origin_m
+        return mesh.placed(x, y, z, float(self._road.at(s)[3]))
+
+
+class Hall:
+    """A closed hall with pillars, cars, doors and boxes."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._length_m, self._width_m = rng.uniform(8, 50), rng.uniform(7, 30)
+        height_m = rng.uniform(2.4, 7.0)
+        half = np.array([self._length_m / 2, self._width_m / 2])
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+        floor, ceiling = (np.column_stack([corners, np.full(4, z)]) for z in (0.0, height_m))
+        parts = [
+            quads(floor[None], _grey(rng), Material.CONCRETE),
+            quads(ceiling[None], _grey(rng), WALLS[rng.integers(len(WALLS))]),
+        ]
+        for k in range(4):
+            a, b = corners[k], corners[(k + 1) % 4]
+            wall = [[*a, 0.0], [*b, 0.0], [*b, height_m], [*a, height_m]]
+            parts.append(quads([wall], _grey(rng), WALLS[rng.integers(len(WALLS))]))
+            parts += _doors(a, b, height_m, rng)
+        for _ in range(int(rng.integers(2, 16))):
+            x, y = rng.uniform(-half, half)
+            if rng.random() < 0.3:
+                parts.append(_block(x, y, rng.uniform(0.15, 0.4, 2), 0.0, height_m, rng))
+            elif rng.random() < 0.4:
+                parts.append(car(rng).placed(x, y, 0.0, rng.uniform(-np.pi, np.pi)))
+            else:
+                parts.append(_block(x, y, rng.uniform(0.1, 0.8, 2), 0.0, rng.uniform(0.2, 2.0), rng))
+        for _ in range(int(rng.integers(2, 12))):  # beams, ducts, lamps
+            x, y = rng.uniform(-half, half)
+            low_m = height_m - rng.uniform(0.1, 0.6)
+            parts.append(
+                _block(x, y, rng.uniform(0.1, 3.0, 2), low_m, height_m - 0.01, rng, 3.0 * (rng.random() < 0.5))
+            )
+        road = build_road(0, -60.0, 60.0)
+        self._scene = Scene(road, draw_sky(int(rng.integers(2**31))), np.zeros(3), join(parts), [])
+
+    def draw_spot(self, rng: np.random.Generator) -> float:
+        """See `Place`."""
+        return rng.uniform(-0.4, 0.4) * self._length_m
+
+    def stand(self, spot_m: float, rng: np.random.Generator) -> Matrix4:
+        """See `Place`."""
+        return _upright([spot_m, rng.uniform(-0.35, 0.35) * self._width_m, 0.0], rng.uniform(-np.pi, np.pi))
+
+    def draw_scene(self, rng: np.random.Generator) -> Scene:  # noqa: ARG002 - as Place's
+        """See `Place`."""
+        return self._scene
+
+
+def _ego(road: Road, at_m: float, left_m: float, rng: np.random.Generator) -> Matrix4:
+    heading = float(road.at(at_m)[3]) + rng.normal(0, 0.05)
+    return _upright(road.points(at_m, left_m, 0.0), heading)
+
+
+def _upright(position_m: Doubles | list[float], heading_rad: float) -> Matrix4:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_exp(np.array([0.0, 0.0, heading_rad]))
+    pose[:3, 3] = position_m
+    return pose
+
+
+def _lorry(rng: np.random.Generator) -> Mesh:
+    """A load of any colour on wheels, box or tank, 6 to 14 m long."""
+    length_m, top_m = rng.uniform(6, 14), rng.uniform(2.6, 4.0)
+    load = box(
+        [-length_m / 2, -1.25, 1.0], [length_m / 2 - 2.2, 1.25, top_m], rng.uniform(0.05, 0.9, 3), Material.PAINT
+    )
+    cab = box(
+        [length_m / 2 - 2.0, -1.2, 0.5], [length_m / 2, 1.2, 0.8 * top_m], rng.uniform(0.05, 0.8, 3), Material.LACQUER
+    )
+    frame = box([-length_m / 2 + 0.3, -0.9, 0.4], [length_m / 2 - 1, 0.9, 1.0], (0.04, 0.04, 0.04), Material.RUBBER)
+    return join([load, cab, frame])
+
+
+def _bridge(rng: np.random.Generator) -> Mesh:
+    """A deck across the road, 4.2 to 6.5 m above it, with an underside."""
+    low_m, half_m = rng.uniform(4.2, 6.5), rng.uniform(3.0, 20.0)
+    colour = _grey(rng)
+    under = [[-half_m, -40, low_m], [half_m, -40, low_m], [half_m, 40, low_m], [-half_m, 40, low_m]]
+    deck = box([-half_m, -40, low_m], [half_m, 40, low_m + rng.uniform(0.8, 1.8)], colour, Material.CONCRETE)
+    pillars = [
+        box([x - 0.5, y - 0.5, 0.0], [x + 0.5, y + 0.5, low_m], colour, Material.CONCRETE)
+        for x in (-half_m + 1, half_m - 1)
+        for y in (-rng.uniform(7, 10), rng.uniform(9, 13))
+    ]
+    return join([deck, quads([under], colour, Material.CONCRETE), *pillars])
+
+
+def _doors(a: Doubles, b: Doubles, height_m: float, rng: np.random.Generator) -> list[Mesh]:
+    """Gates and doors, some ribbed, 5 cm in front of a wall from a to b (2,)."""
+    inward = -(a + b) / 2
+    inward /= np.linalg.norm(inward)
+    long_m = float(np.linalg.norm(b - a))
+    doors = []
+    for _ in range(int(rng.integers(0, 4))):
+        wide_m = rng.uniform(0.8, min(5.0, 0.6 * long_m))
+        begin = rng.uniform(0, long_m - wide_m)
+        first, last = (a + (b - a) * place / long_m + 0.05 * inward for place in (begin, begin + wide_m))
+        top_m = rng.uniform(0.6, 0.95) * height_m
+        rows = np.linspace(0.0, top_m, int(rng.choice([1, 1, 12, 30])) + 1)
+        colours = _grey(rng) * (1 + 0.4 * (np.arange(len(rows) - 1) % 2))[:, None]
+        strips = [[[*first, low], [*last, low], [*last, up], [*first, up]] for low, up in pairwise(rows)]
+        doors.append(quads(strips, colours, Material.PAINT))
+    return doors
+
+
+def _block(
+    x_m: float, y_m: float, half_m: Doubles, low_m: float, high_m: float, rng: np.random.Generator, glow: float = 0.0
+) -> Mesh:
+    """A box with an underside; `glow` is added to its reflectance: a lamp."""
+    colour = rng.uniform(0.03, 0.9, 3) + glow
+    low, high = [x_m - half_m[0], y_m - half_m[1], low_m], [x_m + half_m[0], y_m + half_m[1], high_m]
+    under = [[low[0], low[1], low_m], [high[0], low[1], low_m], [high[0], high[1], low_m], [low[0], high[1], low_m]]
+    return join([box(low, high, colour, Material.PAINT), quads([under], colour, Material.PAINT)])
+
+
+def _grey(rng: np.random.Generator) -> NDArray[np.float64]:
+    """A colour of walls: grey with a hint of a tint."""
+    return np.clip(rng.uniform(0.06, 0.8) * np.exp(rng.normal(0, 0.08, 3)), 0, 1)

@@ -1,0 +1,139 @@
+"""The parts of the demonstration that need no service: what counts as a story that came true, pace, view, page."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from coec.adapters.timeline_plot import timeline
+from coec.calibration.values import EgoMotion
+from coec.cli.demo import report, story
+from coec.cli.demo.outcome import Outcome, outcome_of
+from coec.cli.demo.screen import BARS, curve
+from coec.cli.demo.vehicle import NS_PER_S, paced
+from coec.cli.demo.watch import Moment
+
+KNOCK_S, MAX_ERROR_DEG = 36.0, 0.3
+
+START = Moment(
+    t_s=3.0, drive_s=0.0, service="running", health="unknown", provenance="nominal", status="not_accepted",
+    window_id=None,
+    correction_deg=(0.0, 0.0, 0.0), error_by_axis_deg=(0.0, 0.0, 0.0), error_deg=0.0,
+)  # fmt: skip
+HEALTHY = replace(
+    START, drive_s=28.0, health="healthy", provenance="estimated", status="accepted", window_id="w-1", error_deg=0.04
+)
+KNOCKED = replace(HEALTHY, drive_s=36.2, error_deg=3.01)
+SUSPECT = replace(KNOCKED, drive_s=46.0, health="suspect")
+ALARM = replace(KNOCKED, drive_s=51.0, health="miscalibrated")
+REPAIRED = replace(HEALTHY, drive_s=61.0, window_id="w-2", error_deg=0.06)
+
+
+def outcome(*moments: Moment) -> Outcome:
+    return outcome_of(moments, KNOCK_S, MAX_ERROR_DEG)
+
+
+def test_a_story_that_came_true() -> None:
+    told = outcome(START, HEALTHY, KNOCKED, SUSPECT, ALARM, REPAIRED)
+    assert told.passed
+    assert (told.alarm_s, told.repaired_s, told.false_alarm_s) == (51.0, 61.0, None)
+    assert (told.error_before_deg, told.error_after_deg) == (3.01, 0.06)
+
+
+@pytest.mark.parametrize(
+    ("moments", "complaint"),
+    [
+        ((START, HEALTHY, KNOCKED), "never noticed"),
+        ((START, HEALTHY, KNOCKED, SUSPECT, REPAIRED), "never noticed"),
+        ((START, HEALTHY, KNOCKED, ALARM), "did not repair"),
+        ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, error_deg=0.31)), "did not repair"),
+        ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, error_deg=0.31)), "did not repair"),
+        ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, provenance="nominal")), "did not repair"),
+        ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, health="degraded")), "degraded at the end"),
+        ((START, replace(ALARM, drive_s=20.0), HEALTHY, KNOCKED, ALARM, REPAIRED), "before the knock"),
+    ],
+)
+def test_a_story_that_did_not(moments: tuple[Moment, ...], complaint: str) -> None:
+    told = outcome(*moments)
+    assert not told.passed
+    assert complaint in " ".join(told.objections())
+
+
+def frames(count: int) -> Iterator[EgoMotion]:
+    for second in range(count):
+        yield EgoMotion((second + 1) * NS_PER_S, "ego", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def test_the_drive_waits_for_the_service() -> None:
+    refusals = {3 * NS_PER_S: 2, 5 * NS_PER_S: 1}
+    asked: list[int] = []
+
+    def may_pass(stamp_ns: int) -> bool:
+        asked.append(stamp_ns // NS_PER_S)
+        refusals[stamp_ns] = refusals.get(stamp_ns, 0) - 1
+        return refusals[stamp_ns] < 0
+
+    sent = [frame.stamp_ns // NS_PER_S for frame in paced(frames(6), may_pass, threading.Event(), rate=1e9)]
+    assert sent == [1, 2, 3, 4, 5, 6]
+    assert asked == [1, 2, 3, 3, 3, 4, 5, 5, 6]
+
+
+def test_the_drive_ends_when_it_is_told() -> None:
+    stop = threading.Event()
+    stop.set()
+    assert len(list(paced(frames(30), lambda _: False, stop, rate=1e-9))) == 30, "no wait is left"
+
+
+def test_the_curve_has_the_height_of_the_error_and_the_colour_of_the_health() -> None:
+    text = curve([(0.0, 0.0, "unknown"), (1.0, 3.0, "miscalibrated"), (3.0, 0.1, "healthy")])
+    assert text.plain == f"{BARS[0]}{BARS[7]} {BARS[0]}"
+    assert [str(span.style) for span in text.spans] == ["dim", "bold red", "bold green"]
+    assert len(curve([(float(second), 0.0, "healthy") for second in range(500)], width=40).plain) <= 40
+    assert curve([]).plain == ""
+
+
+def test_the_page_needs_no_other_file(tmp_path: Path) -> None:
+    moments = [START, HEALTHY, KNOCKED, ALARM, REPAIRED]
+    plot = tmp_path / "timeline.png"
+    series = [(moment.drive_s, moment.error_deg, moment.health) for moment in moments]
+    plot.write_bytes(timeline(series, [(KNOCK_S, "knock")], MAX_ERROR_DEG, "title"))
+    page = report.page({"timeline": plot}, moments, outcome(*moments), None, None)
+    assert page.count("src=") == page.count('src="data:image/png;base64,') == 1
+    assert "noticed and repaired" in page
+    assert "href" not in page
+    for moment in moments:
+        assert f"{moment.error_deg:.3f}°" in page
+    assert "never noticed" in report.page({"timeline": plot}, moments[:3], outcome(*moments[:3]), None, None)
+
+
+def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    monkeypatch.setattr("coec.cli.console.out", Console(file=stream, width=140))
+    moments = [START, HEALTHY, KNOCKED, ALARM, REPAIRED]
+    report.show(moments, outcome(*moments), report.Left((), None))
+    said = stream.getvalue()
+    assert "15 s after it" in said
+    assert "25 s after it" in said
+    for what in ("knocked", "alarm", "repaired", "accepted"):
+        assert what in said
+
+
+def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
+    pytest.importorskip("embreex", reason="needs ray casting")
+    from coec.simulation.drive import SimulatedDrive
+
+    drive = SimulatedDrive(replace(story.drive_config(), seconds=2.0))
+    config = story.service_config(drive.rig, Path("mask.png"), "tcp/127.0.0.1:1")
+    (pair,) = config.pairs
+    assert pair.calibration.objective.kind == "fused"
+    assert pair.calibration.depth.model == story.DEPTH_MODEL
+    assert (pair.policy, pair.fusion) == (type(pair.policy)(), type(pair.fusion)())
+    left, top, width, height = story.CLOSE_UP_PX
+    assert left + width <= drive.rig.camera.width
+    assert top + height <= drive.rig.camera.height
