@@ -25,6 +25,10 @@ RATIO_TO_NUMPY, RATIO_TO_SCALAR = 38.0, 5.8
 REGRESSION = 0.8
 """A fifth of a ratio may be lost to another machine or compiler; more is a regression."""
 
+ROUNDS = 60
+"""Rounds of all three, interleaved, until the least times of all show the ratio: a neighbour on the same core slows them
+by up to two, and not alike."""
+
 
 def spinning_lidar_window(frames: int) -> BinnedFrames:
     """A 64-beam sweep in a room of wavy walls, before a smooth depth map: memory is visited as on a real window."""
@@ -72,16 +76,19 @@ def test_ratios_to_the_plain_forms() -> None:
     numba.set_num_threads(1)
     try:
         kernel_s = numpy_s = scalar_s = np.inf
-        for _ in range(8):
+        limit_numpy, limit_scalar = REGRESSION * RATIO_TO_NUMPY, REGRESSION * RATIO_TO_SCALAR
+        for _ in range(ROUNDS):
             kernel_s = min(kernel_s, fastest_s(lambda: mutual_information(frames, pose), 40))
             scalar_s = min(scalar_s, fastest_s(lambda: by_scalar_loop(frames, pose), 2))
             numpy_s = min(numpy_s, fastest_s(lambda: by_numpy(frames, pose), 1))
+            if numpy_s >= limit_numpy * kernel_s and scalar_s >= limit_scalar * kernel_s:
+                break
     finally:
         numba.set_num_threads(threads)
     to_numpy, to_scalar = numpy_s / kernel_s, scalar_s / kernel_s
     print(f"\n{kernel_s * 1e3:.2f} ms; NumPy takes {to_numpy:.1f}, a scalar loop {to_scalar:.1f} times as long")
-    assert to_numpy >= REGRESSION * RATIO_TO_NUMPY
-    assert to_scalar >= REGRESSION * RATIO_TO_SCALAR
+    assert to_numpy >= limit_numpy
+    assert to_scalar >= limit_scalar
 
 
 @pytest.mark.parametrize("count", [5, 25, 50, 200])

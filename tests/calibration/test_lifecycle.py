@@ -21,6 +21,7 @@ from coec.calibration.lifecycle import (
     after_observation,
     aged,
     apply_pending,
+    before_estimate,
     held,
     initial_state,
     released,
@@ -214,6 +215,22 @@ def test_a_moved_mount_becomes_suspect_then_red_and_the_next_window_corrects_it(
     np.testing.assert_array_equal(fresh.T_camera_lidar, pose_of(estimate(1.5)))
     assert fresh.monitor.outcome is Outcome.UNKNOWN
     assert fresh.flagged_since_ns is None
+
+
+def test_a_window_elsewhere_and_a_monitor_that_suspects_are_two_witnesses() -> None:
+    suspect = watched(HEALTHY, *clear_from(110, 2), *flagged_from(120, 2))
+    assert suspect.health is HealthState.SUSPECT
+    begin_ns = suspect.flagged_since_ns
+    assert begin_ns is not None
+    moved, near = estimate(2.0, 200), estimate(0.05, 200)
+    red = before_estimate(suspect, moved, begin_ns, RULES)
+    assert red.health is HealthState.MISCALIBRATED
+    assert [reason.code for reason in red.reasons] == ["bent_mount"]
+    assert after_estimate(red, moved, begin_ns, RULES).health is HealthState.HEALTHY
+    assert before_estimate(suspect, near, begin_ns, RULES) is suspect
+    assert before_estimate(suspect, moved, begin_ns - 1, RULES) is suspect, "it mixes two mounts"
+    assert before_estimate(suspect, estimate(2.0, 200, Decision.FAILED), begin_ns, RULES) is suspect
+    assert before_estimate(HEALTHY, moved, begin_ns, RULES) is HEALTHY, "one witness"
 
 
 def test_where_no_look_was_ever_clear_the_first_window_counts_in_full() -> None:

@@ -49,6 +49,7 @@ def states(decided: dict[str, Any]) -> list[tuple[str, str]]:
     return [(entry["code"], entry["text"]) for entry in decided["entries"] if entry["kind"] == "state"]
 
 
+@pytest.mark.slow
 def test_live_restarted_and_replayed_the_decisions_are_the_same(tmp_path: Path, calibration: CalibrationConfig) -> None:
     whole = [without_depth(frame) for frame in between(0, SECONDS + 1)]
     with riding(configured(tmp_path / "live", calibration)) as ride:

@@ -70,7 +70,8 @@ def test_a_step_is_noticed_corrected_and_remembered(tmp_path: Path) -> None:
         again = ride.extrinsic()
         assert again["camera_from_lidar"] == before["camera_from_lidar"]
         assert (again["provenance"], again["held"]) == ("restored", True)
-        assert ride.ask(ride.keys.history(ride.pair))["entries"] == entries
+        # What was open when the service stopped is solved now, and moves nothing.
+        assert ride.ask(ride.keys.history(ride.pair))["entries"][: len(entries)] == entries
         assert ride.command("hold", b'{"release":true}')["code"] == "released"
         assert ride.command("reset")["code"] == "reset"
         assert ride.extrinsic()["provenance"] == "nominal"

@@ -13,6 +13,8 @@ from coec.calibration.looks import Look
 from coec.calibration.values import Matrix4, Rig
 from coec.config import VerdictConfig
 from coec.geometry import se3
+from coec.geometry.cameras import Camera
+from coec.geometry.projection import project
 
 FLOOR = np.array([radians(0.02)] * 3 + [0.004] * 3)
 """Standard deviation that no look is trusted to be below: what the interpolation of the edge maps leaves (rad, m)."""
@@ -25,6 +27,14 @@ PRIOR_SPREAD_POSE = np.array([radians(0.20), radians(0.10), radians(0.25), 0.02,
 UNCOMMISSIONED_BIAS = np.array([radians(0.12)] * 3 + [0.03] * 3)
 """Standard deviation of the estimator's unknown bias on a rig (rad, m): on the recordings tried up to 0.28° and 2 cm
 lie between the vendor's calibration and the edges."""
+
+
+PIXEL_SHARE = 0.25
+"""Share of a pixel that the local optimum of an unknown rig may be off for the pixels alone: edges of an image of 0.8°
+per pixel put a right pose 0.2 to 0.35° off."""
+
+PIXEL_RANGE_M = 8.0
+"""Range at which a pixel of rotation looks like one of translation, m: of the near edges, which tell translation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,10 +88,25 @@ class MonitorLimits:
     min_f2: float = -inf
 
 
-UNCOMMISSIONED_ACCURACY_ROTATION = Accuracy(
-    np.array([0.0] * 3 + [np.nan] * 3), UNCOMMISSIONED_BIAS, PRIOR_SPREAD_ROTATION
-)
-UNCOMMISSIONED_ACCURACY_POSE = Accuracy(np.zeros(6), UNCOMMISSIONED_BIAS, PRIOR_SPREAD_POSE)
+def pixel_rad(camera: Camera) -> float:
+    """The angle of a pixel on the optical axis, radians."""
+    ray = np.array([[0.0, 0.0, 1.0], [PIXEL_STEP, 0.0, 1.0], [0.0, PIXEL_STEP, 1.0]])
+    uv_px, _ = project(camera, ray)
+    steps_px = np.sqrt(((uv_px[1:] - uv_px[0]) ** 2).sum(axis=1))
+    return PIXEL_STEP / float(steps_px.min())
+
+
+PIXEL_STEP = 0.01
+"""Radians: within it every camera model is linear."""
+
+
+def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:
+    """What to expect of looks over three and six degrees of freedom on a rig of which only its camera is known."""
+    off_rad = PIXEL_SHARE * pixel_rad(camera)
+    pixels = np.array([off_rad] * 3 + [off_rad * PIXEL_RANGE_M] * 3)
+    bias_sigma = np.sqrt(UNCOMMISSIONED_BIAS**2 + pixels**2)
+    rotation = Accuracy(np.array([0.0] * 3 + [np.nan] * 3), bias_sigma, PRIOR_SPREAD_ROTATION)
+    return rotation, Accuracy(np.zeros(6), bias_sigma, PRIOR_SPREAD_POSE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import (
-    UNCOMMISSIONED_ACCURACY_POSE,
-    UNCOMMISSIONED_ACCURACY_ROTATION,
     Baseline,
     MonitorLimits,
     chi2_quantile,
+    uncommissioned,
 )
 from coec.calibration.causes import BENT_MOUNT, CAUSES, Cause, data_causes
 from coec.calibration.estimators import look
@@ -133,8 +132,8 @@ def observe(
 def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline | None) -> Observation:
     """A look at `pose` (4, 4) against the limits of the rig, and the causes of what is wrong with it."""
     limits = UNCOMMISSIONED if baseline is None else baseline.monitor
-    rotation = UNCOMMISSIONED_ACCURACY_ROTATION if baseline is None else baseline.rotation
-    accuracy = UNCOMMISSIONED_ACCURACY_POSE if baseline is None else baseline.pose
+    camera = evidence.rig.camera
+    rotation, accuracy = uncommissioned(camera) if baseline is None else (baseline.rotation, baseline.pose)
     of_rotation = rotation.distance2(seen.offset_rotation, seen.pairs) / limits.max_distance2_rotation
     of_pose = accuracy.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose
     metrics = _metrics(seen, of_rotation, of_pose, limits)

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.baseline import pixel_rad
 from coec.calibration.causes import EGO_MOTION_WRONG, TIME_OFFSET, Cause
 from coec.calibration.motion import compensate
 from coec.calibration.values import EgoMotion, FramePair, LidarFrame, Matrix4, Rig
@@ -33,6 +35,9 @@ it (its grid is coarser than the peak), and by which it must exceed that of the 
 GAIN, FRAMES_AGREE = 0.01, 0.6
 """Of any look: what a hypothesis must gain at the local optimum, and the share of pairs that must gain. On real drives
 a right clock and ego-motion lose 2 % by each of them; a wrong sign or a factor of three leaves 2 to 7 % to gain."""
+
+FINE_PIXEL_RAD = radians(0.15)
+"""Pixel up to which these gains hold; with coarser ones the edges sway by more between one pose and the next."""
 
 MIN_SPEED_MPS = 1.0
 """Slower, neither a clock nor an ego-motion moves anything."""
@@ -57,13 +62,14 @@ def explained_by_motion(
     edges = [_edges_only(pair) for pair in pairs]
     null, at_found = _significance(_per_frame(level, expected)), _per_frame(level, found)
     to_beat = _significance(at_found)
+    least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
     best, explanation = 0.0, None
     for changed, cause in _hypotheses(edges):
         xyz_m = np.concatenate([compensate(pair, rig, enabled=True).xyz_m for pair in changed])
         again = replace(level, xyz_m=np.ascontiguousarray(xyz_m.T))
         unmoved, moved = _significance(_per_frame(again, expected)), _per_frame(again, found)
         agree = float((moved[:, 0] > at_found[:, 0]).mean()) >= FRAMES_AGREE
-        gains = agree and _significance(moved) >= (1.0 + GAIN) * to_beat
+        gains = agree and _significance(moved) >= least_gain * to_beat
         enough = unmoved >= max(AS_GOOD * to_beat, BETTER * null)
         reached = max(unmoved if enough else 0.0, _significance(moved) if gains else 0.0)
         if reached > max(best, min_significance):
