@@ -8,10 +8,20 @@ import numpy as np
 import pytest
 
 from baselines import a_baseline
-from coec.calibration.baseline import Accuracy, chi2_quantile, drift, mismatch, normal_quantile
+from coec.calibration.baseline import (
+    PIXEL_SHARE,
+    Accuracy,
+    chi2_quantile,
+    drift,
+    mismatch,
+    normal_quantile,
+    pixel_rad,
+    uncommissioned,
+)
 from coec.calibration.values import Window
 from coec.config import VerdictConfig
 from coec.geometry import se3
+from coec.geometry.cameras import Camera, build
 
 
 class TestQuantiles:
@@ -77,3 +87,20 @@ class TestBaseline:
         assert "the pair" in (mismatch(replace(baseline, pair="rear"), street.rig, "d", "c") or "")
         other = replace(baseline, sensors={"camera_frame": "other"})
         assert "the camera other" in (mismatch(other, street.rig, "d", "c") or "")
+
+
+class TestUncommissioned:
+    @staticmethod
+    def camera(focal_px: float) -> Camera:
+        return build("pinhole", width=640, height=480, fx=focal_px, fy=focal_px, cx=320.0, cy=240.0)
+
+    @pytest.mark.parametrize("focal_px", [80.0, 700.0])
+    def test_a_pixel_is_an_angle(self, focal_px: float) -> None:
+        assert pixel_rad(self.camera(focal_px)) == pytest.approx(1.0 / focal_px, rel=1e-3)
+
+    def test_no_look_claims_much_less_than_a_pixel(self) -> None:
+        coarse, fine = (uncommissioned(self.camera(focal_px)) for focal_px in (80.0, 700.0))
+        for accuracy in coarse:
+            assert accuracy.sigma(1000)[:3].min() > PIXEL_SHARE / 80.0
+        assert coarse[1].sigma(6)[3:].min() > 1.2 * fine[1].sigma(6)[3:].min()
+        assert np.isnan(coarse[0].sigma(6)[3:]).all()

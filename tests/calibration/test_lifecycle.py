@@ -222,7 +222,7 @@ def test_a_window_elsewhere_and_a_monitor_that_suspects_are_two_witnesses() -> N
     assert suspect.health is HealthState.SUSPECT
     begin_ns = suspect.flagged_since_ns
     assert begin_ns is not None
-    moved, near = estimate(2.0, 200), estimate(0.05, 200)
+    moved, near = estimate(2.0, 200), estimate(0.55, 200)
     red = before_estimate(suspect, moved, begin_ns, RULES)
     assert red.health is HealthState.MISCALIBRATED
     assert [reason.code for reason in red.reasons] == ["bent_mount"]

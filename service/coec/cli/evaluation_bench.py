@@ -223,7 +223,9 @@ def detected(bench: Bench, splits: int, looks: int, stages: Stages) -> Detection
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
     evidence = gather(look(window, bench.depth, bench.images, bench.configuration, Silence()))
     decode(1, "")
-    tried = try_detection(evidence, bench.reference, bench.configuration, splits, looks, lambda done, _: heard(done, ""))
+    tried = try_detection(
+        evidence, bench.reference, bench.configuration, splits, looks, lambda done, _: heard(done, "")
+    )
     return detection_of(tried, splits, len(evidence.pairs))
 
 
