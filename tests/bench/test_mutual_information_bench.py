@@ -26,8 +26,8 @@ REGRESSION = 0.8
 """A fifth of a ratio may be lost to another machine or compiler; more is a regression."""
 
 ROUNDS = 60
-"""Rounds of all three, interleaved, until the least times of all show the ratio: a neighbour on the same core slows them
-by up to two, and not alike."""
+"""Rounds of all three, interleaved, until the least times of all show the ratio: a neighbour on the same core slows
+them by up to two, and not alike."""
 
 
 def spinning_lidar_window(frames: int) -> BinnedFrames:
