@@ -204,8 +204,8 @@ def charted_sums(
 ) -> tuple[int, int]:
     """Σ w·e and Σ w², in whole steps, of one frame on its chart, point by point.
 
-    p_camera (N, 3); cells (h, w): 2e + 1 where a strength of e steps is known, else 0. In single precision, as is what
-    it checks: which cell a point falls on is decided there.
+    p_camera (N, 3); cells (h, w): strengths in steps, -128 where none is known. In single precision, as is what it
+    checks: which cell a point falls on is decided there.
     """
     strength, square = 0, 0
     for (x, y, z), w in zip(p_camera, weight_steps.tolist(), strict=True):
@@ -214,8 +214,8 @@ def charted_sums(
             column, row = x * scale + (centre[0] + np.float32(0.5)), y * scale + (centre[1] + np.float32(0.5))
         if not (0.0 <= column < cells.shape[1] and 0.0 <= row < cells.shape[0]):
             continue
-        packed = int(cells[int(row), int(column)])
-        if packed:
-            strength += w * ((packed - 1) // 2)
+        steps = int(cells[int(row), int(column)])
+        if steps != -128:
+            strength += w * steps
             square += w * w
     return strength, square

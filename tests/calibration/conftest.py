@@ -36,8 +36,9 @@ def stereo() -> DepthModel:
 
 @pytest.fixture(scope="session")
 def sharp_street() -> Window:
-    """The same street at twice the resolution: 0.35° per pixel, below which its edges do not tell pitch from height."""
-    return pairs_of("synthetic:?seed=3&frames=8&width=640")[1]
+    """The same street at three times the resolution: 0.23° per pixel. With coarser ones its edges hardly tell pitch
+    from height."""
+    return pairs_of("synthetic:?seed=3&frames=10&width=960")[1]
 
 
 @pytest.fixture(scope="session")

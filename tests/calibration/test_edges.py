@@ -20,7 +20,7 @@ from coec.calibration.values import Rig, Window
 from coec.config import LimitsConfig
 from coec.geometry.cameras import Camera, build
 from coec.geometry.edge_charts import CELLS_PER_BLUR, MAX_CHART_POINTS
-from coec.geometry.image_edges import BLUR_SIGMA_PX, edge_pyramid
+from coec.geometry.image_edges import BLUR_SIGMA_PX, VOID, EdgeScales
 from coec.geometry.projection import project, unproject
 from coec.geometry.range_edges import range_edges
 
@@ -68,9 +68,10 @@ def test_levels_double_and_end_at_the_same_angle_for_any_lens(street: Window, le
     for frames, blur_rad in zip(edges.bands, edges.band_blur_rad, strict=True):
         assert frames.maps.shape == (1, frames.camera.height, frames.camera.width)
         assert blur_rad == pytest.approx(seen_blur_rad(frames.camera), rel=0.01)
-    assert edges.whole_blur_rad == pytest.approx(seen_blur_rad(edges.whole.camera), rel=0.01)
-    assert edges.whole_blur_rad <= edges.band_blur_rad[0]
-    assert edges.whole.maps.size <= MAX_PIXELS
+    assert edges.pixel_rad == pytest.approx(seen_blur_rad(edges.sharp.camera) / BLUR_SIGMA_PX, rel=0.01)
+    assert BLUR_SIGMA_PX * edges.pixel_rad <= edges.band_blur_rad[0]
+    assert edges.sharp.maps.shape == edges.whole.maps.shape
+    assert edges.sharp.maps.size <= MAX_PIXELS
     # Unless the image is too coarse for it.
     if seen_blur_rad(camera) * 2 ** (BANDS - 1) < COARSEST_BLUR_RAD:
         assert COARSEST_BLUR_RAD <= edges.band_blur_rad[-1] < 2.0 * COARSEST_BLUR_RAD
@@ -79,8 +80,9 @@ def test_levels_double_and_end_at_the_same_angle_for_any_lens(street: Window, le
 def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
     rig = sharp_street.rig
     lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
+    scales = EdgeScales(lit, 0, BANDS - 1)
     for f in (0, len(sharp_street.pairs) - 1):
-        pyramid = edge_pyramid(GREY.grey(sharp_street.pairs[f].camera), lit, 0, BANDS - 1)
+        pyramid = scales.pyramid(GREY.grey(sharp_street.pairs[f].camera))
         np.testing.assert_array_equal(sharp_edges.sharp.maps[f], pyramid.sharp)
         np.testing.assert_array_equal(sharp_edges.whole.maps[f], pyramid.whole)
         for frames, band in zip(sharp_edges.bands, pyramid.bands, strict=True):
@@ -90,12 +92,12 @@ def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeWit
 def test_points_are_the_range_edges_where_they_were_at_the_exposure(
     sharp_street: Window, sharp_edges: EdgeWitness
 ) -> None:
-    first = sharp_edges.whole.first_point
+    first = sharp_edges.sharp.first_point
     for f, pair in enumerate(sharp_street.pairs):
         found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
         cloud = compensate(pair, sharp_street.rig, enabled=True).xyz_m
-        np.testing.assert_array_equal(sharp_edges.whole.xyz_m[:, first[f] : first[f + 1]].T, cloud[found.index])
-        np.testing.assert_array_equal(sharp_edges.whole.weight[first[f] : first[f + 1]], found.weight)
+        np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, cloud[found.index])
+        np.testing.assert_array_equal(sharp_edges.sharp.weight[first[f] : first[f + 1]], found.weight)
 
 
 def test_charts_are_of_the_coarse_bands_with_all_of_their_points_or_some(sharp_edges: EdgeWitness) -> None:
@@ -121,9 +123,9 @@ def test_basins_are_ranked_with_some_of_the_points_where_there_are_very_many(
     edges = with_camera(street, CAMERAS["coarse"])
     assert [charts.xyz_m.shape[1] for charts in (*edges.charts, *edges.thinned)] == [200] * 4
     assert [band.xyz_m.shape[1] for band in edges.bands] == [200] * BANDS
-    assert edges.whole.xyz_m.shape[1] == edges.sharp.xyz_m.shape[1] > 200
+    assert edges.sharp.xyz_m.shape[1] > 200
     # The ones that are kept are the same everywhere, with their weights.
-    every = {tuple(column) for column in np.vstack([edges.whole.xyz_m, edges.whole.weight]).T}
+    every = {tuple(column) for column in np.vstack([edges.sharp.xyz_m, edges.sharp.weight]).T}
     assert all(tuple(column) in every for column in np.vstack([edges.bands[0].xyz_m, edges.bands[0].weight]).T)
 
 
@@ -136,5 +138,5 @@ def test_a_mask_hides_pixels_on_every_level(street: Window) -> None:
     edges = build_edges([pair], [pair.lidar.xyz_m], [GREY.grey(pair.camera)], rig)
     for frames in (edges.sharp, edges.whole, *edges.bands):
         height = frames.maps.shape[1]
-        assert np.isnan(frames.maps[0, -(height // 2) :]).all()
-        assert np.isfinite(frames.maps[0, : height // 2]).all()
+        assert (frames.maps[0, -(height // 2) :] == VOID).all()
+        assert (frames.maps[0, : height // 2] != VOID).all()

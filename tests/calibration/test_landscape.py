@@ -65,7 +65,7 @@ def test_edge_landscape_is_the_significance() -> None:
     # Pixels at integers, where both ways to look up a pixel agree.
     u, v = rng.integers(2, 37, 50), rng.integers(2, 27, 50)
     xyz = np.stack([(u - 19.5) / 30.0, (v - 14.5) / 30.0, np.ones(50)]).astype(np.float32)
-    maps = np.repeat(rng.normal(size=(1, 30, 1)), 40, axis=2).astype(np.float32)
+    maps = np.repeat(rng.integers(-40, 40, (1, 30, 1)), 40, axis=2).astype(np.int8)
     frames = EdgeFrames(camera, xyz, np.ones(50, np.float32), np.array([0, 50]), maps)
     expected = float(significances(frames, np.eye(4)[None])[0])
     assert EdgeLandscape(frames).score(np.eye(4)) == pytest.approx(expected, abs=1e-3)

@@ -8,7 +8,7 @@ from coec.calibration.objective import (
     MutualInformation,
     SearchBox,
     build_mutual_information,
-    range_and_depth,
+    distance_and_depth,
 )
 from coec.calibration.ports import DepthModel
 from coec.calibration.values import Window
@@ -18,7 +18,10 @@ from coec.geometry import se3
 
 def objective_of(window: Window, depth: DepthModel, box: SearchBox) -> MutualInformation:
     return build_mutual_information(
-        [range_and_depth(pair.lidar.xyz_m, depth.infer(pair.camera)) for pair in window.pairs],
+        [
+            distance_and_depth(pair.lidar.xyz_m, depth.infer(pair.camera), window.T_camera_lidar_start)
+            for pair in window.pairs
+        ],
         window.rig,
         window.T_camera_lidar_start,
         box,

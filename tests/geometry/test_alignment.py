@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from coec.geometry import se3
 from coec.geometry.alignment import EdgeFrames, frame_alignment, significances
 from coec.geometry.cameras import Camera, build
+from coec.geometry.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.projection import project
 from oracles import alignment_sums
 
@@ -23,8 +24,8 @@ POSE = se3.perturbation(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
 def frames_of(camera: Camera, counts: tuple[int, ...], seed: int = 0, blank: float = 0.1) -> EdgeFrames:
     """Points all around, a part of them behind the camera, on maps of noise; `blank` is the share of masked pixels."""
     rng = np.random.default_rng(seed)
-    maps = rng.normal(size=(len(counts), HEIGHT, WIDTH)).astype(np.float32)
-    maps[rng.random(maps.shape) < blank] = np.nan
+    maps = np.rint(STRENGTH_STEPS * rng.normal(size=(len(counts), HEIGHT, WIDTH))).astype(np.int8)
+    maps[rng.random(maps.shape) < blank] = VOID
     return EdgeFrames(
         camera=camera,
         xyz_m=rng.normal(scale=10.0, size=(3, sum(counts))).astype(np.float32),
@@ -36,10 +37,11 @@ def frames_of(camera: Camera, counts: tuple[int, ...], seed: int = 0, blank: flo
 
 def by_oracle(frames: EdgeFrames, pose: NDArray[np.float64], between_pixels: bool) -> NDArray[np.float64]:
     """(F, 2): Σ w·e and Σ w² of every frame."""
+    strengths = np.where(frames.maps == VOID, np.nan, frames.maps / STRENGTH_STEPS)
     uv_px, valid = project(frames.camera, frames.xyz_m.T.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
     return np.array(
         [
-            alignment_sums(uv_px[a:b], valid[a:b], frames.weight[a:b], frames.maps[f], between_pixels)
+            alignment_sums(uv_px[a:b], valid[a:b], frames.weight[a:b], strengths[f], between_pixels)
             for f, (a, b) in enumerate(zip(frames.first_point[:-1], frames.first_point[1:], strict=True))
         ]
     )
@@ -71,9 +73,7 @@ def test_points_behind_the_camera_and_masked_pixels_count_for_nothing() -> None:
     )
     assert [float(s[0]) for s in frame_alignment(behind, np.eye(4))] == [0.0, 0.0]
     assert significances(behind, np.eye(4)[None]).tolist() == [0.0]
-    masked = EdgeFrames(
-        frames.camera, frames.xyz_m, frames.weight, frames.first_point, np.full_like(frames.maps, np.nan)
-    )
+    masked = EdgeFrames(frames.camera, frames.xyz_m, frames.weight, frames.first_point, np.full_like(frames.maps, VOID))
     assert [float(s[0]) for s in frame_alignment(masked, np.eye(4))] == [0.0, 0.0]
     assert significances(masked, np.eye(4)[None]).tolist() == [0.0]
 

@@ -14,7 +14,6 @@ from coec.geometry.cameras import Camera, build
 from coec.geometry.edge_charts import (
     MAX_CHART_POINTS,
     MAX_FIELD_RAD,
-    STRENGTH_STEPS,
     WEIGHT_STEPS,
     EdgeCharts,
     climb,
@@ -22,7 +21,7 @@ from coec.geometry.edge_charts import (
     keep_apart,
     significances,
 )
-from coec.geometry.image_edges import BLUR_SIGMA_PX
+from coec.geometry.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, VOID
 from coec.geometry.projection import in_image, project, unproject
 from oracles import charted_sums, gaussian_blur, stereographic_ray
 
@@ -47,13 +46,14 @@ def blur_rad(camera: Camera) -> float:
     return BLUR_SIGMA_PX * 1e-3 / float(aside[0] - axis[0])
 
 
-def maps_of(frames: int, seed: int, blank: float) -> NDArray[np.float32]:
+def maps_of(frames: int, seed: int, blank: float) -> NDArray[np.int8]:
     """Noise as smooth as edge maps are; `blank` is the share of masked pixels."""
     rng = np.random.default_rng(seed)
     maps = np.stack([gaussian_blur(rng.normal(size=(HEIGHT, WIDTH)), BLUR_SIGMA_PX, 7) for _ in range(frames)])
     maps /= maps.std(axis=(1, 2), keepdims=True)
-    maps[rng.random(maps.shape) < blank] = np.nan
-    return maps.astype(np.float32)
+    steps = np.clip(np.rint(STRENGTH_STEPS * maps), -127, 127).astype(np.int8)
+    steps[rng.random(maps.shape) < blank] = VOID
+    return steps
 
 
 def both(
@@ -75,7 +75,7 @@ def turned(pose: NDArray[np.float64], angle_rad: float, count: int, seed: int = 
     return np.stack([se3.perturb(pose, np.array([*axis, 0.0, 0.0, 0.0])) for axis in axes])
 
 
-def chart_of(charts: EdgeCharts, frame: int) -> NDArray[np.int16]:
+def chart_of(charts: EdgeCharts, frame: int) -> NDArray[np.int8]:
     height, width = charts.size
     return charts.cells[1 + frame * height * width :][: height * width].reshape(height, width)
 
@@ -106,10 +106,9 @@ def test_a_cell_holds_the_strength_of_the_pixel_that_its_direction_falls_on(mode
     assert 0.2 < seen.mean() < 1.0
     for f in (0, 1):
         found = chart_of(charts, f).ravel()[chosen]
-        expected = np.zeros(len(chosen), int)
+        expected = np.full(len(chosen), VOID)
         for k in np.flatnonzero(seen):
-            e = float(frames.maps[f, int(np.floor(uv_px[k, 1] + 0.5)), int(np.floor(uv_px[k, 0] + 0.5))])
-            expected[k] = 0 if np.isnan(e) else 2 * round(e * STRENGTH_STEPS) + 1
+            expected[k] = frames.maps[f, int(np.floor(uv_px[k, 1] + 0.5)), int(np.floor(uv_px[k, 0] + 0.5))]
         assert (found == expected).all()
 
 
@@ -126,12 +125,12 @@ def test_every_pixel_has_a_place_on_the_chart(model: str) -> None:
     assert (at.max(axis=0) < [charts.size[1], charts.size[0]]).all()
 
 
-def test_strong_edges_end_at_what_a_cell_can_tell() -> None:
-    maps = np.zeros((1, HEIGHT, WIDTH), np.float32)
-    maps[0, :, : WIDTH // 2], maps[0, :, WIDTH // 2 :] = 1e3, -1e3
+def test_a_cell_holds_the_strongest_edges() -> None:
+    maps = np.zeros((1, HEIGHT, WIDTH), np.int8)
+    maps[0, :, : WIDTH // 2], maps[0, :, WIDTH // 2 :] = 127, -127
     camera, nowhere = CAMERAS["pinhole"], np.zeros((3, 0), np.float32)
     charts = edge_charts(camera, maps, blur_rad(camera), nowhere, np.zeros(0, np.float32), np.zeros(0, np.int64))
-    assert set(np.unique(charts.cells)) == {2 * 127 + 1, 0, -2 * 127 + 1}
+    assert set(np.unique(charts.cells)) == {127, VOID, -127}
 
 
 def test_so_many_points_that_their_sums_might_not_fit_are_refused() -> None:
@@ -145,7 +144,7 @@ def test_the_sums_of_as_many_points_as_are_allowed_fit() -> None:
     """All of them of the greatest weight, on the strongest edge."""
     camera, count = CAMERAS["pinhole"], MAX_CHART_POINTS
     xyz_m = np.tile(np.array([[0.0], [0.0], [9.0]], np.float32), (1, count))
-    maps, weight = np.full((1, HEIGHT, WIDTH), 1e3, np.float32), np.full(count, np.sqrt(3.0), np.float32)
+    maps, weight = np.full((1, HEIGHT, WIDTH), 127, np.int8), np.full(count, np.sqrt(3.0), np.float32)
     charts = edge_charts(camera, maps, blur_rad(camera), xyz_m, weight, np.zeros(count, np.int64))
     z = significances(charts, np.eye(4)[None])[0]
     assert z == pytest.approx(127 / STRENGTH_STEPS * np.sqrt(count), rel=1e-6)
@@ -191,7 +190,7 @@ def test_points_behind_at_the_camera_and_without_a_number_count_for_nothing() ->
         np.float32,
     )
     good = np.array([[0.1, 0.2, 4.0]], np.float32)
-    maps = np.ones((1, HEIGHT, WIDTH), np.float32)
+    maps = np.full((1, HEIGHT, WIDTH), STRENGTH_STEPS, np.int8)
 
     def z_of(points: NDArray[np.float32]) -> float:
         weight, frame = np.ones(len(points), np.float32), np.zeros(len(points), np.int64)
@@ -255,7 +254,7 @@ def aimed(seed: int = 3) -> EdgeCharts:
     blurred = (blurred - blurred.mean(axis=(1, 2), keepdims=True)) / blurred.std(axis=(1, 2), keepdims=True)
     return edge_charts(
         camera,
-        blurred.astype(np.float32),
+        np.clip(np.rint(STRENGTH_STEPS * blurred), -127, 127).astype(np.int8),
         blur_rad(camera),
         xyz_m.T.astype(np.float32),
         np.ones(sum(counts), np.float32),

@@ -19,7 +19,7 @@ from coec.calibration.confidence import measure_curvature
 from coec.calibration.estimators import Sight
 from coec.calibration.evaluation import HIT_RAD
 from coec.calibration.landscape import ObjectiveLandscape, Scan, Span, scan
-from coec.calibration.objective import MutualInformation, SearchBox, build_mutual_information, range_and_depth
+from coec.calibration.objective import MutualInformation, SearchBox, build_mutual_information, distance_and_depth
 from coec.calibration.ports import Silence
 from coec.calibration.search import maximise
 from coec.calibration.values import DepthMap, Matrix4, Rig
@@ -135,7 +135,9 @@ def assess(sight: Sight, config: CalibrationConfig, heard: Callable[[int, str], 
         for cloud, depth in zip(sight.clouds, maps, strict=True)
     )
     heard(1, "ranks")
-    features = [range_and_depth(cloud.xyz_m, depth) for cloud, depth in zip(sight.clouds, maps, strict=True)]
+    features = [
+        distance_and_depth(cloud.xyz_m, depth, reference) for cloud, depth in zip(sight.clouds, maps, strict=True)
+    ]
     box = SearchBox(radians(SEARCH_DEG), 0.0)
     objective = build_mutual_information(features, rig, reference, box, config.objective)
     search = config.search.model_copy(update={"dof": 3, "rotation_deg": SEARCH_DEG})

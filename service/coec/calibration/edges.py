@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import radians
 
@@ -15,7 +15,7 @@ from coec.errors import CalibrationError
 from coec.geometry.alignment import EdgeFrames
 from coec.geometry.cameras import Camera, scaled
 from coec.geometry.edge_charts import EdgeCharts, edge_charts
-from coec.geometry.image_edges import BLUR_SIGMA_PX, edge_pyramid
+from coec.geometry.image_edges import BLUR_SIGMA_PX, EdgeScales
 from coec.geometry.projection import project
 from coec.geometry.range_edges import range_edges
 
@@ -43,19 +43,20 @@ class EdgeWitness:
     """One witness in four forms.
 
     Attributes:
-        sharp: every range edge on the image edges as they are, through the model of the lens: settles a pose.
-        whole: the same on blurred edges: leads there.
-        whole_blur_rad: its blur, an angle about the optical axis.
+        sharp: every range edge on the sharpest image edges, through the model of the lens: settles a pose.
+        whole: the same on blurred edges, layout and all: leads there. It is drawn to where edges are dense, but its
+            hills are wide; those of a band as fine are not.
+        pixel_rad: a pixel of both, an angle about the optical axis.
         bands: from fine to coarse, `RANKED_POINTS` evenly chosen range edges on one band each, through the model of the
             lens: ranks basins.
-        band_blur_rad: the blur of each.
+        band_blur_rad: the blur of each, an angle likewise.
         charts: the coarsest and the next finer band with the same range edges: fast.
         thinned: the same with `THINNED_POINTS` evenly chosen range edges: faster.
     """
 
     sharp: EdgeFrames
     whole: EdgeFrames
-    whole_blur_rad: float
+    pixel_rad: float
     bands: tuple[EdgeFrames, ...]
     band_blur_rad: tuple[float, ...]
     charts: tuple[EdgeCharts, EdgeCharts]
@@ -63,7 +64,7 @@ class EdgeWitness:
 
 
 def build_edges(
-    pairs: Sequence[FramePair], clouds: Sequence[NDArray[np.float32]], greys: Sequence[NDArray[np.uint8]], rig: Rig
+    pairs: Sequence[FramePair], clouds: Sequence[NDArray[np.float32]], greys: Iterable[NDArray[np.uint8]], rig: Rig
 ) -> EdgeWitness:
     """Range edges of the sweeps (found as measured, placed motion-compensated) and edge maps of the images.
 
@@ -84,21 +85,20 @@ def build_edges(
     weight = np.concatenate([edges.weight for edges in found])
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
     finest = min(finest, coarsest + 1 - BANDS)
-    pyramids = [edge_pyramid(grey, lit, finest, coarsest) for grey in greys]
+    scales = EdgeScales(lit, finest, coarsest)
+    sharp, whole, *of_bands = _maps(scales, greys, len(pairs))
     points_m = np.ascontiguousarray(xyz_m.T)
 
-    def frames(level: int, maps: list[NDArray[np.float32]], chosen: NDArray[np.int64]) -> EdgeFrames:
+    def frames(level: int, maps: NDArray[np.int8], chosen: NDArray[np.int64]) -> EdgeFrames:
         # Halving leaves out a last odd row or column: the scale is a half all the same.
-        height, width = maps[0].shape
+        _, height, width = maps.shape
         camera = scaled(rig.camera, 0.5**level, 0.5**level)._replace(width=width, height=height)
         first_chosen = np.searchsorted(chosen, first_point)
-        return EdgeFrames(
-            camera, np.ascontiguousarray(points_m[:, chosen]), weight[chosen], first_chosen, np.stack(maps)
-        )
+        return EdgeFrames(camera, np.ascontiguousarray(points_m[:, chosen]), weight[chosen], first_chosen, maps)
 
     every, ranked = np.arange(len(weight)), _evenly(len(weight), RANKED_POINTS)
     levels = range(coarsest + 1 - BANDS, coarsest + 1)
-    bands = tuple(frames(level, [pyramid.bands[level - finest] for pyramid in pyramids], ranked) for level in levels)
+    bands = tuple(frames(level, maps, ranked) for level, maps in zip(levels, of_bands, strict=True))
     blur_rad = tuple(_blur_rad(rig.camera, level) for level in levels)
     of_points = np.repeat(np.arange(len(pairs)), np.diff(first_point))[ranked]
     coarse, fine = (
@@ -107,14 +107,30 @@ def build_edges(
     )
     kept = _evenly(len(ranked), THINNED_POINTS)
     return EdgeWitness(
-        sharp=frames(finest, [pyramid.sharp for pyramid in pyramids], every),
-        whole=frames(finest, [pyramid.whole for pyramid in pyramids], every),
-        whole_blur_rad=_blur_rad(rig.camera, finest),
+        sharp=frames(finest, sharp, every),
+        whole=frames(finest, whole, every),
+        pixel_rad=_blur_rad(rig.camera, finest) / BLUR_SIGMA_PX,
         bands=bands,
         band_blur_rad=blur_rad,
         charts=(coarse, fine),
         thinned=(coarse.of_points(kept), fine.of_points(kept)),
     )
+
+
+def _maps(scales: EdgeScales, greys: Iterable[NDArray[np.uint8]], frames: int) -> list[NDArray[np.int8]]:
+    """The sharpest map, the whole one and the last `BANDS` bands of all images, each (F, h, w).
+
+    An image at a time: none is in memory twice, nor longer than its turn where `greys` are decoded as they are asked
+    for.
+    """
+    stacks: list[NDArray[np.int8]] = []
+    for frame, grey in enumerate(greys):
+        pyramid = scales.pyramid(grey)
+        maps = (pyramid.sharp, pyramid.whole, *pyramid.bands[-BANDS:])
+        stacks = stacks or [np.empty((frames, *level.shape), np.int8) for level in maps]
+        for stack, level in zip(stacks, maps, strict=True):
+            stack[frame] = level
+    return stacks
 
 
 def _evenly(count: int, at_most: int) -> NDArray[np.int64]:

@@ -6,7 +6,8 @@ network that tells nothing adds noise of one unit, a scene without edges likewis
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import hypot, radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,10 @@ from coec.geometry.image_edges import BLUR_SIGMA_PX
 
 OTHER_POSES = 64
 """Poses within reach from which the mean and the standard deviation of a score are taken: known to an eighth."""
+
+OTHER_POSES_RAD = radians(28.0)
+"""The reach from which those of the edges are taken at least, whatever the search may reach: nearer to the truth, poses
+share too much of the layout of the scene with it to stand for wrong ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +54,7 @@ class FusedObjective:
 
     @property
     def step_rad(self) -> float:
-        """The blur of the edges, or a pixel where that is more."""
+        """The blur of the edges; a pixel for the sharpest: their hill has ripples of that width."""
         return self._step_rad
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
@@ -84,23 +89,17 @@ class Fusion:
     def __init__(self, edges: EdgeWitness, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
         self._edges, self._depth = edges, depth
         poses = sample_reach(start, reach, OTHER_POSES)
-        self._of_bands = Scale.of(np.mean([charted_significances(chart, poses) for chart in edges.charts], axis=0))
         self._of_depth = Scale.of(np.array([depth.evaluate(pose).score for pose in poses]))
+        poses = sample_reach(start, replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD)), OTHER_POSES)
+        self._of_bands = Scale.of(np.mean([charted_significances(chart, poses) for chart in edges.charts], axis=0))
         self.ranking = tuple(
             FusedObjective(band, blur_rad, depth, self._of_bands, self._of_depth)
             for band, blur_rad in reversed(list(zip(edges.bands[:-1], edges.band_blur_rad[:-1], strict=True)))
         )
-        blur_rad = edges.whole_blur_rad
+        of_whole, of_sharp = (Scale.of(significances(level, poses)) for level in (edges.whole, edges.sharp))
         self.settling = (
-            FusedObjective(edges.whole, blur_rad, depth, Scale.of(significances(edges.whole, poses)), self._of_depth),
-            # One pixel: the sharpest edges are narrower, but their hill has ripples of that width.
-            FusedObjective(
-                edges.sharp,
-                blur_rad / BLUR_SIGMA_PX,
-                depth,
-                Scale.of(significances(edges.sharp, poses)),
-                self._of_depth,
-            ),
+            FusedObjective(edges.whole, BLUR_SIGMA_PX * edges.pixel_rad, depth, of_whole, self._of_depth),
+            FusedObjective(edges.sharp, edges.pixel_rad, depth, of_sharp, self._of_depth),
         )
 
     def edge_contrast(self, T_camera_lidar: Matrix4) -> float:
@@ -113,5 +112,10 @@ class Fusion:
         return self._of_depth.standard(self._depth.evaluate(T_camera_lidar).score)
 
     def rank(self, T_camera_lidar: Matrix4) -> float:
-        """How outstanding a pose is to both witnesses, standard deviations."""
-        return self.edge_contrast(T_camera_lidar) + self.depth_contrast(T_camera_lidar)
+        """How outstanding a pose is to both witnesses, standard deviations.
+
+        The root of the sum of squares, as improbabilities combine (Fisher 1925: the logarithm of a normal tail falls
+        with the square). A plain sum would let two poor showings outdo one that cannot be chance.
+        """
+        edges, depth = self.edge_contrast(T_camera_lidar), self.depth_contrast(T_camera_lidar)
+        return hypot(max(edges, 0.0), max(depth, 0.0))

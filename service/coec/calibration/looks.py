@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.basins import find_basins
 from coec.calibration.causes import SceneFacts, scene_facts
-from coec.calibration.confidence import measure_curvature
+from coec.calibration.confidence import METRES_PER_RADIAN
 from coec.calibration.edges import THINNED_POINTS, EdgeWitness, build_edges
 from coec.calibration.estimators import Sight, thinned
 from coec.calibration.fused import Fusion
@@ -27,7 +27,7 @@ from coec.calibration.objective import (
     Objective,
     SearchBox,
     build_mutual_information,
-    range_and_depth,
+    distance_and_depth,
 )
 from coec.calibration.ports import Silence
 from coec.calibration.search import polish
@@ -36,6 +36,7 @@ from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import se3
 from coec.geometry.alignment import EdgeFrames, frame_alignment
 from coec.geometry.edge_charts import EdgeCharts
+from coec.geometry.image_edges import BLUR_SIGMA_PX
 
 REACH_RAD = radians(4.0)
 """How far about the pose a look searches. A pose further off leaves the local optimum at the rim, or nowhere: both are
@@ -72,15 +73,16 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """What a look at a pose tells. Derivatives are those of mutual information (Borer et al. 2023), at the pose.
+    """What a look at a pose tells. Derivatives are those of mutual information (Borer et al. 2023), at the pose, over
+    rx ry rz tx ty tz; equation (2) looks at the rotations.
 
     Attributes:
         T_rotation: (4, 4) local optimum of both witnesses over rotations, the translation being that of the pose.
         T_pose: (4, 4) local optimum over all six degrees of freedom.
         offset_rotation, offset_pose: (6,) ξ from the pose to these (rad, m).
         mi: equation (1), nats.
-        first_derivative: (3,) ∂MI/∂ξ of the rotations, nats per radian.
-        second_derivative: (3,) -∂²MI/∂ξ² of the rotations, nats per radian².
+        first_derivative: (6,) ∂MI/∂ξ, nats per radian or metre.
+        second_derivative: (6,) -∂²MI/∂ξ², nats per radian² or metre²; positive at a maximum.
         edges: significance of the edges at the pose.
         edges_at_best: that at the local optimum over rotations.
         contrast: how far the edges at the local optimum stand above other poses within reach, standard deviations.
@@ -107,12 +109,12 @@ class Look:
     @property
     def f1(self) -> float:
         """Largest slope of the rotations, nats per radian."""
-        return float(np.max(np.abs(self.first_derivative)))
+        return float(np.max(np.abs(self.first_derivative[:ROTATION_DOF])))
 
     @property
     def f2(self) -> float:
         """Least peakedness of the rotations, nats per radian²."""
-        return float(np.min(self.second_derivative))
+        return float(np.min(self.second_derivative[:ROTATION_DOF]))
 
 
 def gather(sight: Sight) -> Evidence:
@@ -121,9 +123,10 @@ def gather(sight: Sight) -> Evidence:
     Raises:
         CalibrationError: an image cannot be decoded, a frame has no depth, no sweep has a range edge.
     """
-    window, greys = sight.window, sight.greys()
+    window, greys = sight.window, list(sight.greys())
     xyz_m = [cloud.xyz_m for cloud in sight.clouds]
-    features = [range_and_depth(points, depth) for points, depth in zip(xyz_m, sight.depths(), strict=True)]
+    start = window.T_camera_lidar_start
+    features = [distance_and_depth(points, depth, start) for points, depth in zip(xyz_m, sight.depths(), strict=True)]
     edges = build_edges(window.pairs, xyz_m, greys, window.rig)
     counts = np.diff(edges.whole.first_point)
     scenes = [
@@ -153,9 +156,13 @@ def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig) -> Loo
     best = max((polished(fusion.ranking, basin) for basin in ranked), key=fusion.rank)
     T_rotation = polished(fusion.settling, best)
     in_all = config.search.model_copy(update={"dof": POSE_DOF})
-    T_pose = polished(fusion.settling, T_rotation, in_all)
+    # By two ways, as blurred edges can lead six degrees of freedom astray.
+    ways = (fusion.settling, (fusion.ranking[-1], *fusion.settling[1:]))
+    ends = [polished(way, T_rotation, in_all) for way in ways]
+    T_pose = max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score)
     T_edges, T_depth = polished([_EdgesAlone(evidence.edges)], T_rotation), polished([depth], T_rotation)
-    at_pose, curvature = fusion.settling[0].evaluate(pose), measure_curvature(depth, pose, ROTATION_DOF)
+    at_pose = fusion.settling[0].evaluate(pose)
+    first_derivative, second_derivative = axis_derivatives(depth, pose)
     of_edges = _EdgesAlone(evidence.edges)
     return Look(
         pairs=len(evidence.pairs),
@@ -164,8 +171,8 @@ def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig) -> Loo
         offset_rotation=se3.difference(T_rotation, pose),
         offset_pose=se3.difference(T_pose, pose),
         mi=at_pose.mi,
-        first_derivative=curvature.first_derivative[:3],
-        second_derivative=curvature.second_derivative[:3],
+        first_derivative=first_derivative,
+        second_derivative=second_derivative,
         edges=of_edges.evaluate(pose).score,
         edges_at_best=of_edges.evaluate(T_rotation).score,
         contrast=fusion.edge_contrast(T_rotation),
@@ -173,6 +180,19 @@ def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig) -> Loo
         overlap=at_pose.overlap,
         deficit=fusion.settling[0].evaluate(T_rotation).score - at_pose.score,
     )
+
+
+def axis_derivatives(objective: Objective, pose: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(6,) ∂S/∂ξ and (6,) -∂²S/∂ξ² at `pose` (4, 4), by central differences along each axis (per radian or metre)."""
+    steps = objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)
+    centre = objective.evaluate(pose).frame_scores
+    plus, minus = (
+        np.array([objective.evaluate(se3.perturb(pose, xi)).frame_scores for xi in np.diag(sign * steps)])
+        for sign in (1.0, -1.0)
+    )
+    first = ((plus - minus) / (2.0 * steps[:, None])).mean(axis=1)
+    second = -(plus + minus - 2.0 * centre).mean(axis=1) / steps**2
+    return first, second
 
 
 class _EdgesAlone:
@@ -184,7 +204,7 @@ class _EdgesAlone:
     @property
     def step_rad(self) -> float:
         """The blur of the edges."""
-        return self._edges.whole_blur_rad
+        return BLUR_SIGMA_PX * self._edges.pixel_rad
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
         """Significance; depth and overlap are not looked at."""

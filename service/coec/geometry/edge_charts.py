@@ -18,14 +18,12 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import Camera
-from coec.geometry.projection import in_image, project, unproject
+from coec.geometry.cameras import Camera, project_point
+from coec.geometry.image_edges import STRENGTH_STEPS, VOID
+from coec.geometry.projection import unproject
 
 CELLS_PER_BLUR = 2.5
 """Cells of a chart per standard deviation of the blur: the nearest cell is then as good as interpolation."""
-
-STRENGTH_STEPS = 16
-"""Whole steps of edge strength per standard deviation; strengths end at ±127 steps, eight deviations."""
 
 WEIGHT_STEPS = 64
 """Whole steps per unit of weight. With 127 steps of strength and a weight of √3, sums of 150,000 points fit 31 bits."""
@@ -42,7 +40,7 @@ class EdgeCharts:
     """Range edges and charted edge maps of the frames of a window, at one blur.
 
     Attributes:
-        cells: (1 + F·height·width,) int16; twice the strength plus one, or 0 where the image shows nothing. Cell 0
+        cells: (1 + F·height·width,) int8, strengths as in `EdgePyramid`; `VOID` where the image shows nothing. Cell 0
             stands for everything outside of the charts.
         size: height and width of one frame's chart.
         cells_per_unit: cells per unit of the stereographic plane.
@@ -52,7 +50,7 @@ class EdgeCharts:
         first_cell: (E,) int32, where the chart of the point's frame begins.
     """
 
-    cells: NDArray[np.int16]
+    cells: NDArray[np.int8]
     size: tuple[int, int]
     cells_per_unit: float
     centre: NDArray[np.float32]
@@ -73,7 +71,7 @@ class EdgeCharts:
 
 def edge_charts(
     camera: Camera,
-    maps: NDArray[np.float32],
+    maps: NDArray[np.int8],
     blur_rad: float,
     xyz_m: NDArray[np.float32],
     weight: NDArray[np.float32],
@@ -83,7 +81,7 @@ def edge_charts(
 
     Args:
         camera: intrinsics at the resolution of the maps.
-        maps: (F, h, w) float32, standardised; NaN where masked.
+        maps: (F, h, w) int8, as in `EdgePyramid`.
         blur_rad: standard deviation of the blur of the maps, an angle about the optical axis.
         xyz_m: (3, E) float32 LiDAR frame; no more than `MAX_CHART_POINTS`.
         weight: (E,) float32, up to √3.
@@ -98,21 +96,8 @@ def edge_charts(
     low, high = _extent(camera)
     width, height = (np.ceil((high - low) * unit).astype(np.int64) + 1).tolist()
     centre = (-low * unit).astype(np.float32)
-    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
-    x, y = (columns.ravel() - centre[0]) / unit, (rows.ravel() - centre[1]) / unit
-    # The inverse of (x, y) / (1 + z) on the unit sphere.
-    square = x * x + y * y
-    rays = np.column_stack([2.0 * x, 2.0 * y, 1.0 - square]) / (1.0 + square)[:, None]
-    uv, valid = project(camera, rays)
-    seen = valid & in_image(camera, uv)
-    pixel = np.floor(uv[seen] + 0.5).astype(np.int64)
-    cells = np.zeros((len(maps), height * width), np.int16)
-    for of_frame, strengths in zip(cells, maps, strict=True):
-        at = strengths[pixel[:, 1], pixel[:, 0]]
-        steps = np.clip(np.rint(np.nan_to_num(at) * STRENGTH_STEPS), -127, 127).astype(np.int16)
-        of_frame[seen] = np.where(np.isfinite(at), 2 * steps + 1, 0)
     return EdgeCharts(
-        cells=np.concatenate([np.zeros(1, np.int16), cells.ravel()]),
+        cells=_cells(maps.reshape(len(maps), -1), _pixels(camera, height, width, unit, centre)),
         size=(height, width),
         cells_per_unit=unit,
         centre=centre,
@@ -120,6 +105,34 @@ def edge_charts(
         weight=np.rint(weight * WEIGHT_STEPS).astype(np.int32),
         first_cell=(1 + frame * (height * width)).astype(np.int32),
     )
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _pixels(camera: Camera, height: int, width: int, unit: float, centre: NDArray[np.float32]) -> NDArray[np.int32]:
+    """(height·width,) the pixel (row · columns + column) at the direction of each cell of a chart; -1 = none."""
+    pixel = np.empty(height * width, np.int32)
+    for row in prange(height):
+        for column in range(width):
+            x, y = (column - centre[0]) / unit, (row - centre[1]) / unit
+            # The inverse of (x, y) / (1 + z) on the unit sphere.
+            square = x * x + y * y
+            u, v, valid = project_point(camera, 2.0 * x, 2.0 * y, 1.0 - square)
+            inside = u >= -0.5 and v >= -0.5 and u < camera.width - 0.5 and v < camera.height - 0.5
+            pixel[row * width + column] = int(v + 0.5) * camera.width + int(u + 0.5) if valid and inside else -1
+    return pixel
+
+
+@njit(cache=True, parallel=True)
+def _cells(maps: NDArray[np.int8], pixel: NDArray[np.int32]) -> NDArray[np.int8]:
+    """The cells of the charts of all maps (F, h·w), from the pixel of each cell of a chart."""
+    per_chart = pixel.shape[0]
+    cells = np.full(1 + maps.shape[0] * per_chart, VOID)
+    for f in prange(maps.shape[0]):
+        first = 1 + f * per_chart
+        for i in range(per_chart):
+            if pixel[i] >= 0:
+                cells[first + i] = maps[f, pixel[i]]
+    return cells
 
 
 def _extent(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -165,7 +178,7 @@ def climb(
 
 
 _Arguments = tuple[
-    NDArray[np.int16], int, int, np.float32, NDArray[np.float32], NDArray[np.float32], NDArray[np.int32],
+    NDArray[np.int8], int, int, np.float32, NDArray[np.float32], NDArray[np.float32], NDArray[np.int32],
     NDArray[np.int32],
 ]  # fmt: skip
 
@@ -180,7 +193,7 @@ def _arguments(charts: EdgeCharts) -> _Arguments:
 
 @njit(cache=True, error_model="numpy")
 def _significance(
-    cells: NDArray[np.int16],
+    cells: NDArray[np.int8],
     height: int,
     width: int,
     unit: np.float32,
@@ -212,16 +225,17 @@ def _significance(
         cell[i] = first_cell[i] + row * stride + column if inside else np.int32(0)
     strength, square = np.int32(0), np.int32(0)
     for i in range(xyz.shape[1]):
-        packed, w = np.int32(cells[cell[i]]), weight[i]
-        strength += w * (packed >> np.int32(1))
-        square += w * w * (packed & np.int32(1))
+        e = np.int32(cells[cell[i]])
+        w = weight[i] if e != VOID else np.int32(0)
+        strength += w * e
+        square += w * w
     # Both in steps: a step of weight cancels, one of strength is left.
     return strength / (STRENGTH_STEPS * math.sqrt(max(float(square), 1.0)))
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _significances(
-    cells: NDArray[np.int16],
+    cells: NDArray[np.int8],
     height: int,
     width: int,
     unit: np.float32,
@@ -240,7 +254,7 @@ def _significances(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _climb(
-    cells: NDArray[np.int16],
+    cells: NDArray[np.int8],
     height: int,
     width: int,
     unit: np.float32,

@@ -184,15 +184,18 @@ def _count_exactly(
         counts[np.uint64(depth_bin[np.uint64(pixel)]) * columns + np.uint64(range_bin)] += np.int32(1)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _information(
     counts: NDArray[np.int32], first_task: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """MI in nats and number of points of each frame, with H = log n - (1/n) Σ c·log c over the counts c."""
+    """MI in nats and number of points of each frame, with H = log n - (1/n) Σ c·log c over the counts c.
+
+    On one thread: 2 µs a frame, for 25 frames less than it takes to wake another thread.
+    """
     frames, depth_bins, range_bins = len(first_task) - 1, counts.shape[1] - 1, counts.shape[2]
     mi = np.zeros(frames)
     points = np.zeros(frames, np.int64)
-    for f in prange(frames):
+    for f in range(frames):
         joint = np.zeros((depth_bins, range_bins), np.int64)
         for task in range(first_task[f], first_task[f + 1]):
             joint += counts[task, :depth_bins]
