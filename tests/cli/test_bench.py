@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+from rich.console import Console
 
 from cli.conftest import SMALL, Coec
 from coec.calibration.objective import SearchBox
-from coec.cli import bench, bench_scene
+from coec.cli import bench, bench_live, bench_scene, bench_table, bench_worker
+from coec.cli.bench_process import ProcessReading
 from coec.geometry import se3
 
 PROMISED = {
@@ -25,18 +32,78 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "STREET", SMALL)
 
 
+@pytest.fixture
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the measurements of processes would bring."""
+    figures = {
+        row.key: 1.0 for row in bench_table.ROWS if row.key.startswith(("worker", "solve_memory", "io", "query"))
+    }
+    document = {**figures, "io_per_second": {"pairs": 10.0}}
+    monkeypatch.setattr(bench_worker, "measure", lambda *_: {})
+    monkeypatch.setattr(bench_live, "measure", lambda *_: dict(document))
+    return document
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small")
-def test_the_document_holds_what_is_promised(coec: Coec) -> None:
+def test_the_document_holds_what_is_promised(coec: Coec, no_processes: dict[str, Any]) -> None:
     outcome = coec("bench", "--json")
     assert outcome.status == 0
     document = outcome.document
-    assert set(document) >= PROMISED
+    assert set(document) >= PROMISED | set(no_processes) | {row.key for row in bench_table.ROWS}
     assert set(document["mi_25_frames_ms_by_model"]) == set(bench_scene.CAMERAS)
     assert set(document["mi_ms_by_frames"]) == {"5", "10"}
     assert all(document[name] > 0 for name in PROMISED - {"machine"})
     assert document["solve_10deg_3dof_error_deg"] < 0.3
     assert {"processor", "threads"} <= set(document["machine"])
+    assert set(document["required"]) < set(document)
+
+
+def test_a_worker_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_scene, "POINTS", 30_000)
+    monkeypatch.setattr(bench_worker, "SOLVES", {"mi": bench_worker.SOLVES["mi"]})
+    heard: list[str] = []
+    document = bench_worker.measure(tmp_path, 6, heard.append)
+    assert heard
+    assert min(document.values()) > 0.0
+    assert set(document) == {
+        "worker_first_result_s", "worker_ready_s_mi", "worker_window_s_mi", "worker_idle_mb_mi", "solve_memory_mb_mi",
+    }  # fmt: skip
+
+
+def test_a_daemon_is_measured_under_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_live, "SETTLE_S", 1.0)
+    monkeypatch.setattr(bench_live, "SECONDS", 1.5)
+    document = bench_live.measure(tmp_path, lambda _: None)
+    live = {row.key for row in bench_table.ROWS if row.key.startswith(("io", "query"))}
+    assert set(document) >= live
+    assert document["io_cpu_percent"] > 0.0
+    assert document["io_resident_mb"] > document["io_proportional_mb"] > 0.0
+    assert {"cameras", "lidars", "pairs", "windows"} <= set(document["io_per_second"])
+
+
+def test_the_table_says_what_is_not_as_required(capsys: pytest.CaptureFixture[str]) -> None:
+    figures = {"io_cpu_percent": 30.0, "ratio_to_numpy": 50.0, "mi_ms_by_frames": {"5": 0.4}, "query_idle_p99_ms": None}
+    Console(width=140).print(bench_table.table(figures))
+    lines = {line.split("  ")[0].strip(): line for line in capsys.readouterr().out.splitlines()}
+    assert "✗" in lines["I/O process under load, of one core"]
+    assert "≤ 25 %" in lines["I/O process under load, of one core"]
+    assert "✓" in lines["times as fast as NumPy"]
+    assert "≥ 40 ×" in lines["times as fast as NumPy"]
+    assert any("frames 5" in line and "0.40 ms" in line for line in lines.values())
+
+
+def test_a_process_is_read() -> None:
+    own = ProcessReading(os.getpid())
+    before_s = own.cpu_s
+    while own.cpu_s == before_s:
+        sum(range(100_000))
+    own.reset_peak()
+    assert own.peak_mb >= own.resident_mb * 0.9
+    assert own.resident_mb >= own.proportional_mb > 1.0
+    with subprocess.Popen(["sleep", "60"]) as child:
+        assert child.pid in own.children
+        child.kill()
 
 
 @pytest.mark.parametrize("model", bench_scene.CAMERAS)

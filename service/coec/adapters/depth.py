@@ -10,7 +10,6 @@ from pathlib import Path
 from coec.adapters.images import decode_depth
 from coec.adapters.incoming import Refusal
 from coec.adapters.model_cards import CARDS, ModelCard, built_in_cards, find_card
-from coec.adapters.onnx_depth import OnnxDepth, file_identity
 from coec.calibration.ports import DepthModel
 from coec.calibration.values import CameraFrame, DepthMap
 from coec.config import DepthConfig, LimitsConfig
@@ -91,6 +90,9 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
         ModelError: no such file or name, no card for it, a damaged network, or one that does not match its
             card.
     """
+    # Imported here: the runtime takes 20 MB, and the service knows this module, too, but opens no network.
+    from coec.adapters.onnx_depth import OnnxDepth, file_identity
+
     if config.model == STEREO:
         return PrecomputedDepth(limits)
     named = built_in_cards().get(config.model)

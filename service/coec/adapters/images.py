@@ -98,7 +98,8 @@ def decode_grey(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
         return _expect(_imdecode(image, cv2.IMREAD_GRAYSCALE, limits), (image.height, image.width))
     pixels = _raw(image, limits)
     if image.format is ImageFormat.MONO8:
-        return pixels[:, :, 0]
+        # A copy, as a decoder's output may be written to: kernels are compiled once more for what may not.
+        return pixels[:, :, 0].copy()
     code = cv2.COLOR_RGB2GRAY if image.format is ImageFormat.RGB8 else cv2.COLOR_BGR2GRAY
     return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
 

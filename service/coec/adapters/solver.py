@@ -30,6 +30,7 @@ from coec.calibration.ports import Silence
 from coec.calibration.values import (
     CameraFrame,
     DepthMap,
+    EgoMotion,
     EncodedImage,
     FramePair,
     ImageFormat,
@@ -39,13 +40,21 @@ from coec.calibration.values import (
     Window,
 )
 from coec.config import Config, DepthConfig
-from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, WindowError
+from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
+from coec.geometry.cameras import scaled
 from coec.schemas.replies import CalibrationResult
 
 _log = logging.getLogger(__name__)
 
 WARM_UP_POINTS = 4000
 WARM_UP_DEPTH_PX = (48, 64)
+
+WARM_UP_CAMERA_PX = 128
+"""Longer side of the images of the warm-up: kernels are compiled for types, not for sizes, and a few milliseconds of
+work on an image of this size would be more than a second on the camera's own."""
+
+WARM_UP_REACH_DEG, WARM_UP_EVALUATIONS = 4.0, 4
+"""Of the searches of the warm-up."""
 
 OVERLAY_JPEG_QUALITY = 88
 
@@ -80,13 +89,15 @@ class Solver:
     def warm_up(self) -> None:
         """Run every kernel once on a few invented points, so that no window waits for a compiler."""
         for pair in self._config.pairs:
-            search = pair.calibration.search.model_copy(update={"max_evaluations": 20})
+            few = {"max_evaluations": WARM_UP_EVALUATIONS, "reach_deg": WARM_UP_REACH_DEG}
+            search = pair.calibration.search.model_copy(update=few)
             configuration = pair.calibration.model_copy(update={"search": search})
+            rig = _small(self._rigs[pair.name])
             # An invented window need not lead to a calibration; that it ran is enough.
             with contextlib.suppress(CalibrationError, DecodeError):
-                calibrate(_invented_window(self._rigs[pair.name], 2), _Ramp(), self._images, configuration, Silence())
+                calibrate(_invented_window(rig, 2), _Ramp(), self._images, configuration, Silence())
             with contextlib.suppress(CalibrationError, DecodeError):
-                look = _invented_window(self._rigs[pair.name], pair.monitor.pairs)
+                look = _invented_window(rig, pair.monitor.pairs)
                 observe(look, _Ramp(), self._images, configuration, None)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
@@ -117,10 +128,11 @@ class Solver:
     def observe(
         self, pair: str, pose: Sequence[Sequence[float]], frames: Sequence[Sequence[bytes | None]]
     ) -> dict[str, Any]:
-        """A look of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `looks` packs them.
+        """A look of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `looks` packs them; and
+        why the baseline of the rig was not used, if there is one.
 
         Raises:
-            CalibrationError, DecodeError, ModelError, StateError: there is no answer.
+            CalibrationError, DecodeError, ModelError: there is no answer.
         """
         configuration = self._pairs[pair].calibration
         window = Window(
@@ -130,9 +142,9 @@ class Solver:
             unpack_pairs(frames, self._config.limits),
         )
         network = self._network(configuration.depth)
-        return pack_observation(
-            observe(window, network, self._images, configuration, self._baseline(pair, network.identity))
-        )
+        baseline, not_used = self._baseline(pair, network.identity)
+        observation = observe(window, network, self._images, configuration, baseline)
+        return {**pack_observation(observation), "baseline_not_used": not_used}
 
     def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> bytes:
         """JPEG of the points of a window's last pair on its image, at an extrinsic (rows of the (4, 4) matrix).
@@ -168,13 +180,17 @@ class Solver:
         told = {"windows": baseline.windows, "pairs": baseline.pairs, "hash": saved}
         return {**told, "pose": baseline.T_camera_lidar.tolist()}
 
-    def _baseline(self, pair: str, depth_identity: str) -> Baseline | None:
-        """What was learned of the rig, if it holds for this configuration and network."""
-        learned = load_baseline(self._config.state.directory / BASELINES, pair)
+    def _baseline(self, pair: str, depth_identity: str) -> tuple[Baseline | None, str | None]:
+        """What was learned of the rig, if it holds for this configuration and network; else why it does not."""
+        try:
+            learned = load_baseline(self._config.state.directory / BASELINES, pair)
+        except StateError as error:
+            return None, str(error)
+        if learned is None:
+            return None, None
         configured = learned_hash(self._pairs[pair].calibration)
-        if learned is None or mismatch(learned, self._rigs[pair], depth_identity, configured) is not None:
-            return None
-        return learned
+        against = mismatch(learned, self._rigs[pair], depth_identity, configured)
+        return (learned, None) if against is None else (None, against)
 
     def _network(self, config: DepthConfig) -> CachedDepth:
         if config not in self._networks:
@@ -195,16 +211,31 @@ class _Ramp:
         return DepthMap(np.tile(np.linspace(1.0, 2.0, width, dtype=np.float32), (height, 1)))
 
 
+def _small(rig: Rig) -> Rig:
+    """The rig with a camera of fewer pixels, and of as large a field of view."""
+    scale = min(1.0, WARM_UP_CAMERA_PX / max(rig.camera.width, rig.camera.height))
+    camera = scaled(rig.camera, scale, scale)
+    mask = None if rig.mask is None else np.ones((camera.height, camera.width), np.bool_)
+    return replace(rig, camera=camera, mask=mask)
+
+
 def _invented_window(rig: Rig, count: int) -> Window:
-    """Pairs with points all around the LiDAR, seeded."""
+    """Pairs with points all around the LiDAR, seeded; as a window from the disk holds them, so that the kernels are
+    compiled for the same arrays: sweeps that may not be written to, images from a decoder, motion to compensate."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(WARM_UP_POINTS, 3))
     range_m = rng.uniform(5.0, 30.0, size=(WARM_UP_POINTS, 1))
     xyz_m = (range_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    xyz_m.setflags(write=False)
     width, height = rig.camera.width, rig.camera.height
-    image = EncodedImage(ImageFormat.MONO8, width, height, rng.bytes(width * height))
+    jpeg = encode_jpeg(rng.integers(0, 256, (height, width), np.uint8))
+    image = EncodedImage(ImageFormat.JPEG, width, height, jpeg)
     pairs = tuple(
-        FramePair(CameraFrame(stamp, rig.camera_frame, image), LidarFrame(stamp, rig.lidar_frame, xyz_m))
+        FramePair(
+            CameraFrame(stamp, rig.camera_frame, image),
+            LidarFrame(stamp, rig.lidar_frame, xyz_m),
+            EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
+        )
         for stamp in range(0, count * 100_000_000, 100_000_000)
     )
     return Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)

@@ -118,6 +118,9 @@ class Errand:
     timeout_s: float | None = None
 
 
+LOOK = "observe"
+"""The kind of a look of the monitor."""
+
 BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
 
 
@@ -201,6 +204,7 @@ class Worker:
         self._prefetches: deque[_Prefetch] = deque(maxlen=PREFETCHES_WAITING)
         self._looks: deque[Errand] = deque()
         self._errands: deque[Errand] = deque()
+        self._look_was_fatal = False
         self._attempts: dict[SolveJob, int] = {}
         self._state = WorkerState.STARTING
         self._starts = 0
@@ -361,10 +365,13 @@ class Worker:
     def _run_errand(self, child: _Child, errand: Errand) -> None:
         try:
             child.link.send({**errand.body, "kind": errand.kind, "pair": errand.pair})
+            errand.body.clear()  # the frames of a look are 15 MB, and are not sent twice
             reply = self._reply(child, errand.timeout_s or self._config.timeout_s)
         except (_ChildError, OSError, EOFError) as error:
+            self._look_was_fatal |= errand.kind == LOOK
             errand.done(Reason("worker_failed", f"The worker {_cause(child, error)}."))
             raise
+        self._look_was_fatal &= errand.kind != LOOK
         if reply is None:
             errand.done(Reason("stopping", "The service is stopping."))
         elif reply["kind"] == "refused":
@@ -405,7 +412,8 @@ class Worker:
         return job
 
     def _take(self) -> SolveJob | Errand | _Prefetch | None:
-        if self._looks:
+        # Looks that kill must not keep every new worker from its windows.
+        if self._looks and not (self._look_was_fatal and self._live):
             return self._looks.popleft()
         if self._live:
             return self._live.popleft()
@@ -475,5 +483,7 @@ def _cause(child: _Child, error: Exception) -> str:
 def _environment(threads: int) -> dict[str, str]:
     inherited = os.environ.get("PYTHONPATH")
     path = os.pathsep.join([str(PACKAGE_ROOT), *([inherited] if inherited else [])])
-    limits = {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    limits = {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
+    # What is multiplied as matrices is (N, 3) by (3, 3): more threads only spin, for longer than the work takes.
+    limits["OPENBLAS_NUM_THREADS"] = "1"
     return {**os.environ, **limits, "PYTHONPATH": path}

@@ -1,4 +1,4 @@
-"""The wire between the service and its worker process: one socket pair, one msgpack map per message.
+"""The wire between the service and its worker process: one socket pair, one msgpack map per message, sent in parts.
 
 Both ends are ours, yet a dying end may leave half a message: sends and receives have a time limit, so that neither can
 block for good on the other.
@@ -8,10 +8,21 @@ from __future__ import annotations
 
 import socket
 import struct
+from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
 import msgpack
+
+_BIN32 = struct.Struct(">BI")
+_BIN32_CODE = 0xC6
+"""Of the msgpack format: the head of a byte string with a length of 32 bits."""
+
+LARGE_BYTES = 2**16
+"""A byte string from this size on is sent from where it lies."""
+
+END = b""
+"""The part behind the last one of a message."""
 
 MAX_MESSAGE_BYTES = 2**30
 """Largest message; a frame is bounded by `LimitsConfig.max_message_bytes`, which is at most 1 GiB."""
@@ -42,7 +53,9 @@ class Link:
         Raises:
             OSError: the other end is gone, or does not read.
         """
-        self._connection.send_bytes(msgpack.packb(message))
+        for part in _parts(message):
+            self._connection.send_bytes(part)
+        self._connection.send_bytes(END)
 
     def poll(self, timeout_s: float) -> bool:
         """Whether a message, or the end of the stream, can be received within `timeout_s`."""
@@ -54,7 +67,13 @@ class Link:
         Raises:
             OSError, EOFError: the other end is gone, or stopped in the middle of a message.
         """
-        message = msgpack.unpackb(self._connection.recv_bytes(MAX_MESSAGE_BYTES), max_bin_len=MAX_MESSAGE_BYTES)
+        unpacker = msgpack.Unpacker(max_buffer_size=MAX_MESSAGE_BYTES, max_bin_len=MAX_MESSAGE_BYTES)
+        while part := self._connection.recv_bytes(MAX_MESSAGE_BYTES):
+            try:
+                unpacker.feed(part)
+            except msgpack.BufferFull:
+                raise OSError("the message is too large") from None
+        message = unpacker.unpack()
         if not isinstance(message, dict):
             raise OSError("the message is not a map")
         return message
@@ -62,3 +81,34 @@ class Link:
     def close(self) -> None:
         """Close this end; the other end reads the end of the stream."""
         self._connection.close()
+
+
+def _parts(message: dict[str, Any]) -> Iterator[bytes]:
+    """The message in msgpack, piece by piece: a large byte string is a piece by itself, not copied, and what a lazy
+    sequence makes of its entries is in memory one entry at a time."""
+    packer = msgpack.Packer(autoreset=False)
+
+    def taken() -> bytes:
+        packed: bytes = packer.bytes()
+        packer.reset()
+        return packed
+
+    def add(value: Any) -> Iterator[bytes]:
+        if isinstance(value, dict):
+            packer.pack_map_header(len(value))
+            for key, entry in value.items():
+                packer.pack(key)
+                yield from add(entry)
+        elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+            packer.pack_array_header(len(value))
+            for entry in value:
+                yield from add(entry)
+        elif isinstance(value, bytes) and len(value) >= LARGE_BYTES:
+            yield taken() + _BIN32.pack(_BIN32_CODE, len(value))
+            yield value
+        else:
+            packer.pack(value)
+
+    yield from add(message)
+    if rest := taken():  # there is none behind a large byte string; an empty part would be the end
+        yield rest

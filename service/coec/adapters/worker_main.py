@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import logging
 import os
 import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coec.adapters import logs
+from coec.adapters import allocator, logs
 from coec.adapters.worker_link import Link
 from coec.config import Config
 from coec.errors import CoecError
@@ -23,7 +24,12 @@ from coec.schemas.base import to_msgpack
 if TYPE_CHECKING:
     from coec.adapters.solver import Solver
 
+_log = logging.getLogger(__name__)
+
 PR_SET_PDEATHSIG = 1  # prctl(2)
+
+INTERNAL_ERROR = "internal_error"
+"""Code of an answer to work in which the program failed."""
 
 DEPTH_MAPS_KEPT = 64
 """Maps kept per network: two windows of 25 and some; a map at network resolution is about 1 MB."""
@@ -38,6 +44,7 @@ def main(arguments: list[str]) -> int:
         config = Config.model_validate_json(link.receive()["settings"])
         logs.configure(config.log_level)
         os.nice(config.worker.niceness)
+        allocator.return_large()
         _serve(link, config)
     return 0
 
@@ -58,7 +65,23 @@ def _serve(link: Link, config: Config) -> None:
 
 
 def _answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
-    """The answer to one job. What is not a `CoecError` ends the process: the service replaces it and tries again."""
+    """The answer to one job. Of a window what is not a `CoecError` ends the process: the service replaces it and tries
+    again, within bounds."""
+    try:
+        return _solved(solver, message) if message["kind"] == "solve" else _errand(solver, message)
+    except CoecError as error:
+        return {"kind": "refused", "code": error.reply_code, "text": str(error)}
+
+
+def _solved(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
+    solution = solver.solve(Path(message["path"]))
+    note = solution.note
+    return {"kind": "solved", "result": to_msgpack(solution.result), "note": (note.code, note.text) if note else None}
+
+
+def _errand(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
+    """The answer to work that is done once or not at all. A fault of the program in it is an answer, too: looks come
+    every few seconds, and a worker that each of them ended would solve no window any more."""
     try:
         match message["kind"]:
             case "prefetch":
@@ -72,11 +95,13 @@ def _answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
             case "commission":
                 paths = [Path(path) for path in message["paths"]]
                 return {"kind": "commissioned", **solver.commission(message["pair"], message["pose"], paths)}
-        solution = solver.solve(Path(message["path"]))
-    except CoecError as error:
-        return {"kind": "refused", "code": error.reply_code, "text": str(error)}
-    note = solution.note
-    return {"kind": "solved", "result": to_msgpack(solution.result), "note": (note.code, note.text) if note else None}
+        raise ValueError(f"there is no work of the kind {message['kind']!r}")
+    except (CoecError, MemoryError):
+        raise
+    except Exception as error:
+        _log.exception("the work failed", extra={"fields": {"kind": message["kind"], "pair": message.get("pair")}})
+        text = f"The program failed ({type(error).__name__}: {error}); the log has the traceback."
+        return {"kind": "refused", "code": INTERNAL_ERROR, "text": text}
 
 
 def _tie_to(parent: int) -> None:

@@ -1,13 +1,15 @@
-"""`coec bench`: how fast this machine is, beside the plain forms in the same run.
+"""`coec bench`: how fast this machine is: the kernels beside the plain forms in the same run, the worker by itself, and
+the daemon under the load of a vehicle.
 
 Ratios compare runs of one process that alternate, each at its fastest: what else the machine does cancels out as far as
-it can.
+it can. Processor time is that of a process alone; round trips and starts are by the clock on the wall.
 """
 
 from __future__ import annotations
 
 import os
 import platform
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -24,7 +26,7 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.objective import MutualInformation, SearchBox
 from coec.calibration.ports import Silence
 from coec.calibration.search import box_of, maximise
-from coec.cli import bench_scene, console, windows
+from coec.cli import bench_live, bench_scene, bench_table, bench_worker, console, windows
 from coec.cli.calibrate import StageTimes
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
 from coec.geometry import se3
@@ -54,9 +56,9 @@ Runs = Mapping[str, tuple[Callable[[], Any], int]]
 
 
 def run(*, as_json: bool) -> int:
-    """Measures and prints the table; always 0."""
+    """Measures and prints the table; always 0: what is not as required is marked, and no verdict."""
     with console.progress(counted=False) as bars:
-        document = measure(bars)
+        document = measure(bars) | measure_processes(bars)
     if as_json:
         console.print_json(document)
     else:
@@ -104,6 +106,25 @@ def measure(bars: Progress) -> dict[str, Any]:
     document["solve_10deg_3dof_evaluations"] = found.evaluations
     document["solve_10deg_3dof_error_deg"] = windows.rotation_error_deg(found.T_camera_lidar, pose)
     return document | _fused(bars)
+
+
+def measure_processes(bars: Progress) -> dict[str, Any]:
+    """The figures of whole processes, by their names in `bench_table.ROWS`: worker and daemon, one after the other.
+
+    Raises:
+        CalibrationError: the worker came to no result.
+        ConnectionFailedError: the daemon did not become ready.
+    """
+    task = bars.add_task("processes", total=None, note="")
+
+    def heard(text: str) -> None:
+        bars.update(task, description=text)
+
+    with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
+        document = bench_worker.measure(Path(folder), FRAMES, heard)
+    with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
+        document |= bench_live.measure(Path(folder), heard)
+    return document | {"required": bench_table.required()}
 
 
 def _by_model(start: Any, box: SearchBox) -> dict[str, float]:
@@ -189,21 +210,6 @@ def _show(document: dict[str, Any]) -> None:
     console.show(
         f"{machine['processor']}, {machine['threads']} threads, Python {machine['python']}, numba {machine['numba']}"
     )
-    shown = console.table("work", "figure", right=(1,))
-    shown.add_row(f"one MI, {FRAMES} frames of 114,000 points", f"{document['mi_25_frames_ms']:.2f} ms")
-    shown.add_row(
-        "the same, free to turn anywhere",
-        f"{document['mi_25_frames_nothing_left_out_ms']:.2f} ms",
-    )
-    shown.add_row("times as fast as NumPy", f"{document['ratio_to_numpy']:.0f}")
-    shown.add_row("times as fast as a scalar compiled loop", f"{document['ratio_to_scalar']:.1f}")
-    for name, milliseconds in document["mi_25_frames_ms_by_model"].items():
-        shown.add_row(f"  camera {name}", f"{milliseconds:.2f} ms")
-    for count, milliseconds in document["mi_ms_by_frames"].items():
-        shown.add_row(f"  {count} frames", f"{milliseconds:.2f} ms")
-    evaluations = document["solve_10deg_3dof_evaluations"]
-    shown.add_row(
-        f"MI solve, 3 axes, from 10° ({evaluations} evaluations)", f"{document['solve_10deg_3dof_s'] * 1e3:.0f} ms"
-    )
-    shown.add_row("fused solve, 6 axes, from 25°", f"{document['solve_25deg_6dof_s']:.2f} s")
-    console.out.print(shown)
+    console.out.print(bench_table.table(document))
+    came = ", ".join(f"{figure:.1f} {name}" for name, figure in document["io_per_second"].items())
+    console.show(f"the load, a second: {came}")

@@ -5,12 +5,14 @@ in every direction, so that the depth map of any camera is exact and the true po
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.adapters.images import encode_jpeg
 from coec.calibration.objective import Features, MutualInformation, SearchBox, build_mutual_information
-from coec.calibration.values import Matrix4, Rig
+from coec.calibration.values import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.config import ObjectiveConfig
 from coec.geometry.cameras import Camera, build, name_of, scaled
 from coec.geometry.mutual_information import BinnedFrames
@@ -40,17 +42,55 @@ CAMERAS: dict[str, Camera] = {
 }
 
 
+JPEG_QUALITY, PLASTER_PX, PLASTER = 90, 6, 13.0
+"""Of a picture: walls with a grain of so many pixels and so many grey values (standard deviation) are as sharp as a
+street to the inspection, and make half a megabyte of an image of 1400²."""
+
 FISHEYES = ("double_sphere", "kannala_brandt", "mei", "eucm")
 """Cameras whose image is a circle that touches the borders; the corners are masked."""
 
 
 def objective_of(camera: Camera, frames: int, start: Matrix4, box: SearchBox) -> MutualInformation:
     """The objective of a window of so many frames of `POINTS` points, as the service builds it."""
-    across = np.arange(IMAGE_PX) - camera.cx
-    circle = across**2 + across[:, None] ** 2 <= (IMAGE_PX / 2) ** 2
-    rig = Rig("bench", camera, "camera", "lidar", T_TRUE, np.eye(4), circle if name_of(camera) in FISHEYES else None)
+    rig = rig_of(camera)
     seen = [_features(scaled(camera, MAP_PX / IMAGE_PX, MAP_PX / IMAGE_PX), seed) for seed in range(frames)]
     return build_mutual_information(seen, rig, start, box, ObjectiveConfig())
+
+
+def rig_of(camera: Camera) -> Rig:
+    """The camera at its true place, with the mask of its image circle."""
+    across = np.arange(IMAGE_PX) - camera.cx
+    circle = across**2 + across[:, None] ** 2 <= (IMAGE_PX / 2) ** 2
+    return Rig("bench", camera, "camera", "lidar", T_TRUE, np.eye(4), circle if name_of(camera) in FISHEYES else None)
+
+
+def pair(camera: Camera, seed: int, stamp_ns: int) -> FramePair:
+    """A picture and a sweep of the same room, as sensors would send them; the vehicle's motion is not known."""
+    return FramePair(picture(camera, seed, stamp_ns), sweep(seed, stamp_ns))
+
+
+def picture(camera: Camera, seed: int, stamp_ns: int) -> CameraFrame:
+    """A JPEG: the nearer the wall, the darker, of coarse plaster."""
+    rng, phases = _room(seed)
+    rays, valid = _pixel_rays(camera)
+    grey = np.where(valid, 20.0 + 8.0 * _walls_m(rays, phases), 0.0)
+    side = -(-IMAGE_PX // PLASTER_PX)
+    grain = PLASTER * rng.standard_normal((side, side), np.float32)
+    grain = grain.repeat(PLASTER_PX, axis=0).repeat(PLASTER_PX, axis=1)[:IMAGE_PX, :IMAGE_PX]
+    pixels = np.clip(grey.reshape(IMAGE_PX, IMAGE_PX) + grain, 0, 255).astype(np.uint8)
+    jpeg = encode_jpeg(np.repeat(pixels[:, :, None], 3, axis=2), JPEG_QUALITY)
+    return CameraFrame(stamp_ns, "camera", EncodedImage(ImageFormat.JPEG, IMAGE_PX, IMAGE_PX, jpeg), sequence=seed)
+
+
+def sweep(seed: int, stamp_ns: int) -> LidarFrame:
+    """A turn of `POINTS` points with intensity and ring: 2 MB."""
+    rng, phases = _room(seed)
+    rays = _beams()
+    range_m = _measured_m(rays, phases, rng)
+    ring = np.repeat(np.arange(BEAMS, dtype=np.uint16), -(-POINTS // BEAMS))[:POINTS]
+    intensity = rng.random(POINTS).astype(np.float32)
+    xyz_m = (rays * range_m[:, None]).astype(np.float32)
+    return LidarFrame(stamp_ns, "lidar", xyz_m, intensity, ring, sequence=seed)
 
 
 def first(frames: BinnedFrames, count: int) -> BinnedFrames:
@@ -79,21 +119,46 @@ def repeated(frames: BinnedFrames, times: int) -> BinnedFrames:
 
 
 def _features(camera: Camera, seed: int) -> Features:
-    rng = np.random.default_rng(seed)
-    phases = rng.uniform(0.0, 2.0 * np.pi, 4)
-    steps = -(-POINTS // BEAMS)
-    azimuth = np.tile(np.linspace(-np.pi, np.pi, steps, endpoint=False), BEAMS)[:POINTS]
-    elevation = np.repeat(np.linspace(HIGHEST_RAD, LOWEST_RAD, BEAMS), steps)[:POINTS]
-    rays = np.column_stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
-    range_m = _walls_m(rays, phases) * (1.0 + 0.005 * rng.standard_normal(POINTS))
+    rng, phases = _room(seed)
+    rays = _beams()
+    range_m = _measured_m(rays, phases, rng)
     u, v = np.meshgrid(np.arange(MAP_PX, dtype=np.float64), np.arange(MAP_PX, dtype=np.float64))
     of_pixels, valid = unproject(camera, np.column_stack([u.ravel(), v.ravel()]))
     depth_m = np.where(valid, _walls_m(of_pixels @ T_TRUE[:3, :3], phases), np.nan).reshape(MAP_PX, MAP_PX)
     return Features(
         (rays * range_m[:, None]).astype(np.float32), range_m.astype(np.float32), depth_m.astype(np.float32)
     )
+
+
+def _room(seed: int) -> tuple[np.random.Generator, NDArray[np.float64]]:
+    """What is left to chance, and the four phases (rad) of the room's walls."""
+    rng = np.random.default_rng(seed)
+    return rng, rng.uniform(0.0, 2.0 * np.pi, 4)
+
+
+@lru_cache(maxsize=1)
+def _pixel_rays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """(N, 3) unit directions of the pixels, LiDAR frame, row by row, and which of them there are."""
+    across = np.arange(IMAGE_PX, dtype=np.float64)
+    rays, valid = unproject(camera, np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2))
+    return rays @ T_TRUE[:3, :3], valid
+
+
+def _beams() -> NDArray[np.float64]:
+    """(`POINTS`, 3) unit directions of a turn, LiDAR frame, beam by beam."""
+    steps = -(-POINTS // BEAMS)
+    azimuth = np.tile(np.linspace(-np.pi, np.pi, steps, endpoint=False), BEAMS)[:POINTS]
+    elevation = np.repeat(np.linspace(HIGHEST_RAD, LOWEST_RAD, BEAMS), steps)[:POINTS]
+    return np.column_stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+
+
+def _measured_m(
+    rays: NDArray[np.float64], phases: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Range along each ray with the noise of a LiDAR."""
+    return np.asarray(_walls_m(rays, phases) * (1.0 + 0.005 * rng.standard_normal(len(rays))))
 
 
 def _walls_m(rays: NDArray[np.float64], phases: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from coec.config import Config, load_config
+
+MATRIX_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+"""What the service multiplies is (N, 3) by (3, 3): more threads only spin, for longer than the work takes. Read when
+NumPy is imported; the worker process gets its own."""
 
 
 def run(path: Path, *, embedded_router: bool, state_dir: Path | None) -> int:
@@ -18,9 +23,13 @@ def run(path: Path, *, embedded_router: bool, state_dir: Path | None) -> int:
         return _with_options(load_config(path), embedded_router, state_dir)
 
     config = read()
+    for name in MATRIX_THREADS:
+        os.environ.setdefault(name, "1")
     # After the configuration has been read, so that a mistake in it is told at once.
     from coec import daemon
+    from coec.adapters import allocator
 
+    allocator.share_arenas()
     return daemon.run(config, read)
 
 

@@ -1,0 +1,198 @@
+"""The daemon under the load of a vehicle: what its I/O process takes of the machine, and how soon it answers while its
+worker solves. Real processes: the daemon (which is the router, too), the sensors, and this one, which asks.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from coec.adapters.worker import PACKAGE_ROOT
+from coec.adapters.zenoh_client import ConnectionFailedError, ask_one, connected
+from coec.cli import bench_load, bench_scene
+from coec.cli.bench_process import ProcessReading
+from coec.config import (
+    CalibrationConfig,
+    CameraConfig,
+    CameraIntrinsics,
+    Config,
+    EgoConfig,
+    LidarConfig,
+    PairConfig,
+    SearchConfig,
+    StateConfig,
+    WindowConfig,
+    ZenohConfig,
+)
+from coec.errors import NotFoundError
+from coec.geometry.cameras import intrinsics_of
+from coec.schemas.keys import Keys
+
+VEHICLE, PAIR = "bench", "front"
+SETTLE_S, SECONDS = 10.0, 25.0
+"""Under load before anything counts; and each of the two times that count."""
+
+SLICE_S = 20.0
+"""25 pairs in so much time, nine times the default: the recorder, too, is at work all the while."""
+
+QUERY_PERIOD_S, COMMAND_PERIOD_S = 0.05, 0.5
+POLL_S, TIMEOUT_S = 0.1, 60.0
+BUSY_SHARE = 0.5
+"""Of a period between two queries: the worker is solving when it used more processor time."""
+
+
+@dataclass(slots=True)
+class Seen:
+    """Round trips of queries in ms, while the worker was at work and while it waited."""
+
+    solving_ms: list[float] = field(default_factory=list)
+    waiting_ms: list[float] = field(default_factory=list)
+
+
+def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
+    """Runs the daemon in `folder` under load: as it comes, and then with one solve after another.
+
+    Raises:
+        ConnectionFailedError: the daemon did not become ready.
+    """
+    heard("the daemon starts")
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    configuration = folder / "coec.yaml"
+    # JSON is YAML.
+    configuration.write_text(_configuration(endpoint, folder / "state").model_dump_json(exclude_none=True))
+    with (
+        _running("coec", "run", "--config", str(configuration)) as daemon,
+        connected([endpoint], TIMEOUT_S) as session,
+        _running("coec.cli.bench_load", endpoint),
+    ):
+        heard("the daemon under load")
+        return _under_load(session, daemon, heard)
+
+
+def _under_load(
+    session: zenoh.Session, daemon: subprocess.Popen[bytes], heard: Callable[[str], None]
+) -> dict[str, Any]:
+    keys = Keys("coec", VEHICLE)
+    _await_running(session, keys)
+    process = ProcessReading(daemon.pid)
+    _ask(session, keys, process, SETTLE_S, at_work=False)
+    heard("the daemon under load: processor and memory")
+    process.reset_peak()
+    cpu_s, begin_s = process.cpu_s, time.monotonic()
+    before = _counters(session, keys)
+    _ask(session, keys, process, SECONDS, at_work=False)
+    elapsed_s = time.monotonic() - begin_s
+    after = _counters(session, keys)
+    document: dict[str, Any] = {
+        "io_cpu_percent": 100.0 * (process.cpu_s - cpu_s) / elapsed_s,
+        "io_resident_mb": process.peak_mb,
+        "io_proportional_mb": process.proportional_mb,
+        "io_per_second": {name: (after[name] - before[name]) / elapsed_s for name in after},
+    }
+    heard("the daemon under load: queries during solves")
+    seen = _ask(session, keys, process, SECONDS, at_work=True)
+    document["query_during_solve_count"] = len(seen.solving_ms)
+    for name, times_ms in (("during_solve", seen.solving_ms), ("idle", seen.waiting_ms)):
+        for percent in (50, 99):
+            document[f"query_{name}_p{percent}_ms"] = float(np.percentile(times_ms, percent)) if times_ms else None
+    return document
+
+
+def _ask(session: zenoh.Session, keys: Keys, process: ProcessReading, seconds: float, *, at_work: bool) -> Seen:
+    """Asks for the extrinsic all the time and, to keep the worker `at_work`, for another solve as soon as it waits."""
+    seen = Seen()
+    worker = ProcessReading(process.children[0])
+    end_s = time.monotonic() + seconds
+    next_command_s = 0.0
+    while (now_s := time.monotonic()) < end_s:
+        worker_s = worker.cpu_s
+        begin_s = time.perf_counter()
+        ask_one(session, keys.extrinsic(PAIR), TIMEOUT_S)
+        elapsed_s = time.perf_counter() - begin_s
+        time.sleep(max(QUERY_PERIOD_S - (time.monotonic() - now_s), 0.0))
+        busy = worker.cpu_s - worker_s >= BUSY_SHARE * QUERY_PERIOD_S
+        (seen.solving_ms if busy else seen.waiting_ms).append(1e3 * elapsed_s)
+        if at_work and not busy and now_s >= next_command_s:
+            session.get(keys.command(PAIR, "calibrate"))  # whether there is a window to solve does not matter
+            next_command_s = now_s + COMMAND_PERIOD_S
+    return seen
+
+
+def _await_running(session: zenoh.Session, keys: Keys) -> None:
+    end_s = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < end_s:
+        with suppress(NotFoundError):  # the router is there before the service
+            if _status(session, keys)["state"] == "running":
+                return
+        time.sleep(POLL_S)
+    raise ConnectionFailedError(f"the daemon of the benchmark did not become ready within {TIMEOUT_S:g} s")
+
+
+def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
+    """What came and what became of it, since the start."""
+    pair = _status(session, keys)["pairs"][0]
+    streams = {f"{name}s": pair[name]["accepted"] for name in ("camera", "lidar")}
+    return {
+        **streams,
+        "pairs": pair["pairs"],
+        "windows": pair["windows"],
+        "solved": pair["solved"],
+        "looks": pair["looks"],
+    }
+
+
+def _status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(ask_one(session, keys.status + "?format=json", TIMEOUT_S).payload)
+    return document
+
+
+def _configuration(endpoint: str, state: Path) -> Config:
+    camera = bench_scene.CAMERAS[bench_load.CAMERA]
+    intrinsics = CameraIntrinsics.model_validate({"model": bench_load.CAMERA, **intrinsics_of(camera)})
+    pair = PairConfig(
+        name=PAIR,
+        camera=CameraConfig(key=bench_load.KEYS["camera"], intrinsics=intrinsics),
+        lidar=LidarConfig(key=bench_load.KEYS["lidar"]),
+        ego=EgoConfig(key=bench_load.KEYS["ego"]),
+        T_camera_lidar=bench_scene.T_TRUE.tolist(),
+        window=WindowConfig(slice_s=SLICE_S),
+        calibration=CalibrationConfig(search=SearchConfig(dof=6)),
+    )
+    return Config(
+        vehicle=VEHICLE,
+        zenoh=ZenohConfig(embedded_router=True, listen=(endpoint,), connect=()),
+        state=StateConfig(directory=state, min_free_bytes=0),
+        log_level="error",
+        pairs=(pair,),
+    )
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextmanager
+def _running(module: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A Python process of ours, asked to end at the end."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, *arguments], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=PACKAGE_ROOT
+    )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.communicate(timeout=TIMEOUT_S)

@@ -1,0 +1,88 @@
+"""The speed table: each figure of the benchmark beside what is required of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from coec.cli import console
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A figure by its name in the document. `required` is a bound on it: from above, of a ratio from below."""
+
+    key: str
+    work: str
+    unit: str
+    digits: int = 1
+    required: float | None = None
+
+    @property
+    def at_least(self) -> bool:
+        """Whether more is better."""
+        return self.unit == "×"
+
+    def met(self, value: float) -> bool:
+        """Whether the figure is as required; without a bound it is."""
+        if self.required is None:
+            return True
+        return value >= self.required if self.at_least else value <= self.required
+
+
+ROWS: tuple[Row, ...] = (
+    Row("mi_25_frames_ms", "one MI, 25 frames of 114,000 points", "ms", 2, 2.5),
+    Row("mi_25_frames_nothing_left_out_ms", "the same, free to turn anywhere", "ms", 2),
+    Row("ratio_to_numpy", "times as fast as NumPy", "×", 0, 40.0),
+    Row("ratio_to_scalar", "times as fast as a scalar compiled loop", "×", 1, 8.0),
+    Row("mi_25_frames_ms_by_model", "camera", "ms", 2, 2.5),
+    Row("mi_ms_by_frames", "frames", "ms", 2),
+    Row("solve_10deg_3dof_s", "MI solve, 3 axes, from 10°", "s", 3, 0.25),
+    Row("solve_25deg_6dof_s", "fused solve, 6 axes, from 25°, depth apart", "s", 2, 2.0),
+    Row("worker_first_result_s", "worker: start to first result", "s", 2, 2.0),
+    Row("worker_window_s_mi", "worker: a window of 25 frames, MI, with depth and files", "s", 2),
+    Row("worker_window_s_fused", "worker: the same, fused", "s", 2),
+    Row("solve_memory_mb_mi", "worker: memory of that above idle, MI", "MB", 0, 300.0),
+    Row("solve_memory_mb_fused", "worker: memory of that above idle, fused", "MB", 0, 300.0),
+    Row("io_cpu_percent", "I/O process under load, of one core", "%", 1, 25.0),
+    Row("io_resident_mb", "I/O process under load, most resident memory (RSS)", "MB", 0, 250.0),
+    Row("io_proportional_mb", "I/O process under load, its share of it (PSS)", "MB", 0),
+    Row("query_during_solve_p50_ms", "query during solves, median", "ms", 2, 1.5),
+    Row("query_during_solve_p99_ms", "query during solves, 99th percentile", "ms", 2, 8.0),
+    Row("query_idle_p99_ms", "query while the worker waits, 99th percentile", "ms", 2),
+)
+"""The rows in their order. A figure that is a mapping becomes a row for each of its entries."""
+
+
+def table(document: Mapping[str, Any]) -> Table:
+    """What was measured, beside what is required."""
+    shown = console.table("work", "figure", "required", "", right=(1, 2))
+    for row in ROWS:
+        value = document.get(row.key)
+        figures = value.items() if isinstance(value, Mapping) else ((None, value),)
+        for name, figure in figures:
+            work = row.work if name is None else f"  {row.work} {name}"
+            if figure is None:
+                shown.add_row(work, "-", _bound(row), "")
+                continue
+            shown.add_row(work, f"{figure:.{row.digits}f} {row.unit}", _bound(row), _mark(row, figure))
+    return shown
+
+
+def required() -> dict[str, float]:
+    """The bounds by the names of their figures."""
+    return {row.key: row.required for row in ROWS if row.required is not None}
+
+
+def _bound(row: Row) -> str:
+    return "" if row.required is None else f"{'≥' if row.at_least else '≤'} {row.required:g} {row.unit}"
+
+
+def _mark(row: Row, figure: float) -> Text:
+    if row.required is None:
+        return Text("")
+    return Text("✓", "green") if row.met(figure) else Text("✗", "red")

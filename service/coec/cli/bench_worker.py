@@ -1,0 +1,139 @@
+"""The worker process by itself: how soon it is of use, and what a solve takes of the memory."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from coec.adapters.looks import pack_pairs, pack_pose
+from coec.adapters.mcap_windows import WindowWriter, read_window
+from coec.adapters.worker import Errand, Solved, SolveJob, Worker, WorkerState
+from coec.calibration.values import Reason
+from coec.cli import bench_scene
+from coec.cli.bench_process import ProcessReading
+from coec.config import (
+    CalibrationConfig,
+    CameraConfig,
+    CameraIntrinsics,
+    Config,
+    LidarConfig,
+    ObjectiveConfig,
+    PairConfig,
+    SearchConfig,
+    StateConfig,
+)
+from coec.errors import CalibrationError
+from coec.geometry.cameras import intrinsics_of
+
+CAMERA = "double_sphere"
+POLL_S, TIMEOUT_S = 0.005, 300.0
+"""A first start compiles every kernel."""
+
+SOLVES: Mapping[str, CalibrationConfig] = {
+    "mi": CalibrationConfig(objective=ObjectiveConfig(kind="mi"), search=SearchConfig(dof=3)),
+    "fused": CalibrationConfig(search=SearchConfig(dof=6)),
+}
+"""Whose memory is looked at: the paper's, and the default objective with all six degrees of freedom."""
+
+
+def measure(folder: Path, frames: int, heard: Callable[[str], None]) -> dict[str, Any]:
+    """Starts a worker for each of `SOLVES` and gives it a window of `frames` frames, with all that belongs to it:
+    reading, depth inference, the solve, writing the result into the file. One more gets a look of the monitor at once.
+
+    Raises:
+        CalibrationError: the worker came to no result.
+    """
+    document: dict[str, Any] = {}
+    heard("windows for the worker")
+    windows = {name: _window(folder, name, frames) for name in SOLVES}
+    for name, window in windows.items():
+        heard(f"the worker: {name}")
+        document |= _solve(name, window, _configuration(folder, name))
+    heard("the worker: first result")
+    last, window = windows.popitem()
+    return document | {"worker_first_result_s": _first_result_s(last, window, _configuration(folder, last))}
+
+
+Answers = queue.SimpleQueue[Solved | dict[str, Any] | Reason]
+
+
+@contextmanager
+def _worker(config: Config, answers: Answers) -> Iterator[Worker]:
+    worker = Worker(config.worker, config.model_dump_json(), answers.put, lambda _, reason: answers.put(reason))
+    try:
+        yield worker
+    finally:
+        worker.request_stop()
+        worker.thread.join(TIMEOUT_S)
+
+
+def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
+    answers: Answers = queue.SimpleQueue()
+    with _worker(config, answers) as worker:
+        begin = time.perf_counter()
+        worker.start()
+        while (status := worker.status()).state is WorkerState.STARTING:
+            if status.failure is not None:
+                raise CalibrationError(f"the worker of the benchmark does not start: {status.failure.text}")
+            time.sleep(POLL_S)
+        ready_s = time.perf_counter() - begin
+        process = ProcessReading(worker.pid or 0)
+        idle_mb = process.resident_mb
+        process.reset_peak()
+        begin = time.perf_counter()
+        worker.solve(SolveJob(name, window.stem, window))
+        _expected(answers.get(timeout=TIMEOUT_S), Solved)
+        solve_s, peak_mb = time.perf_counter() - begin, process.peak_mb
+    return {
+        f"worker_ready_s_{name}": ready_s,
+        f"worker_window_s_{name}": solve_s,
+        f"worker_idle_mb_{name}": idle_mb,
+        f"solve_memory_mb_{name}": peak_mb - idle_mb,
+    }
+
+
+def _first_result_s(name: str, window: Path, config: Config) -> float:
+    answers: Answers = queue.SimpleQueue()
+    pairs = read_window(window)[0].pairs[: config.pairs[0].monitor.pairs]
+    look = {"pose": pack_pose(bench_scene.T_TRUE), "frames": pack_pairs(pairs)}
+    with _worker(config, answers) as worker:
+        begin = time.perf_counter()
+        worker.look(Errand("observe", name, look, answers.put))
+        worker.start()
+        _expected(answers.get(timeout=TIMEOUT_S), dict)
+        return time.perf_counter() - begin
+
+
+def _expected(answer: Solved | dict[str, Any] | Reason, kind: type) -> None:
+    """Raises:
+    CalibrationError: the worker gave a reason instead.
+    """
+    if not isinstance(answer, kind):
+        raise CalibrationError(f"the worker could not do the work of the benchmark: {answer}")
+
+
+def _window(folder: Path, name: str, frames: int) -> Path:
+    camera = bench_scene.CAMERAS[CAMERA]
+    path = folder / f"{name}-0.mcap"
+    writer = WindowWriter(path, bench_scene.rig_of(camera), bench_scene.T_TRUE, path.stem, SOLVES[name], {})
+    for seed in range(frames):
+        writer.add(bench_scene.pair(camera, seed, seed * 1_000_000_000))
+    return writer.finish().path
+
+
+def _configuration(folder: Path, name: str) -> Config:
+    camera = bench_scene.CAMERAS[CAMERA]
+    pair = PairConfig(
+        name=name,
+        camera=CameraConfig(
+            key="camera", intrinsics=CameraIntrinsics.model_validate({"model": CAMERA, **intrinsics_of(camera)})
+        ),
+        lidar=LidarConfig(key="lidar"),
+        T_camera_lidar=bench_scene.T_TRUE.tolist(),
+        calibration=SOLVES[name],
+    )
+    return Config(log_level="error", state=StateConfig(directory=folder), pairs=(pair,))
