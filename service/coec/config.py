@@ -355,6 +355,7 @@ class StateConfig(Stage):
         default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
     )
     history: int = Field(default=500, ge=1, le=10_000, description="entries kept per pair")
+    looks: int = Field(default=2000, ge=1, le=100_000, description="looks of the monitor kept per pair, 2 kB each")
     evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
 
 

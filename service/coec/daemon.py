@@ -269,7 +269,7 @@ class Daemon:
         )
 
     def _metrics(self) -> bytes:
-        health = {name: pair.health_state for name, pair in self._pairs.items()}
+        health = {name: pair.health_reply for name, pair in self._pairs.items()}
         return metrics.render(self._status_reply, health, self._worker.status().rss_bytes)
 
 

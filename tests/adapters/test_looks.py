@@ -4,6 +4,7 @@ import msgpack
 import numpy as np
 
 from coec.adapters.looks import pack_observation, pack_pairs, unpack_observation, unpack_pairs
+from coec.calibration.baseline import Drift
 from coec.calibration.causes import CAUSES
 from coec.calibration.monitor import Observation
 from coec.calibration.pairing import Pairer
@@ -16,7 +17,7 @@ def test_pairs_survive() -> None:
     pairer = Pairer(PairingConfig(), expects_motion=True)
     pairs = [p for frame in open_source("synthetic:?frames=2&width=64").messages() for p in pairer.push(frame)]
     pairs += pairer.flush()
-    back = unpack_pairs(msgpack.unpackb(msgpack.packb(pack_pairs(pairs)), max_bin_len=2**30), LimitsConfig())
+    back = unpack_pairs(msgpack.unpackb(msgpack.packb([*pack_pairs(pairs)]), max_bin_len=2**30), LimitsConfig())
     assert len(back) == 2
     for one, other in zip(pairs, back, strict=True):
         assert one.camera == other.camera
@@ -36,10 +37,21 @@ def test_an_observation_survives_with_its_nans() -> None:
         weak=False,
         flagged_by_paper=None,
         causes=(CAUSES["dark"],),
+        first_derivative=np.arange(6) / 7,
+        second_derivative=np.arange(6) / 9,
+        drift=Drift(np.arange(6) / 3, np.full(6, np.nan)),
+        dirty=(3, 575),
+        textured=400,
     )
     back = unpack_observation(msgpack.unpackb(msgpack.packb(pack_observation(made))))
     np.testing.assert_array_equal(back.offset, made.offset)
     np.testing.assert_array_equal(back.sigma, made.sigma)
+    np.testing.assert_array_equal(back.first_derivative, made.first_derivative)
+    np.testing.assert_array_equal(back.second_derivative, made.second_derivative)
+    assert (back.dirty, back.textured) == ((3, 575), 400)
+    assert back.drift is not None
+    np.testing.assert_array_equal(back.drift.value, np.arange(6) / 3)
+    assert np.isnan(back.drift.sigma).all()
     assert (back.stamp_ns, back.pair_stamps_ns, back.distance2, back.causes) == (7, (5, 7), 1 / 7, made.causes)
     assert (back.flagged, back.weak, back.flagged_by_paper) == (True, False, None)
     assert back.metrics[0].value == 1 / 3

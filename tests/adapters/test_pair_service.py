@@ -12,6 +12,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from baselines import a_baseline
+from coec.adapters.baseline_file import save_baseline
 from coec.adapters.inbox import Call
 from coec.adapters.looks import pack_observation, unpack_pairs
 from coec.adapters.pair_service import Outside, PairService
@@ -21,6 +23,7 @@ from coec.adapters.window_folder import WindowFolder, start_ns_of
 from coec.adapters.wire import result_of
 from coec.adapters.worker import Errand, Solved, SolveJob, Worker
 from coec.calibration.causes import CAUSES
+from coec.calibration.commissioning import learned_hash
 from coec.calibration.monitor import Observation
 from coec.calibration.values import (
     CameraFrame,
@@ -106,9 +109,14 @@ class KnowingWorker:
 
     service: Callable[[], PairService]
     cause: str | None = None
+    baseline_not_used: str | None = None
+    fault: Reason | None = None
     estimates: dict[str, Estimate] = field(default_factory=dict)
 
     def look(self, errand: Errand) -> None:
+        if self.fault is not None:
+            errand.done(self.fault)
+            return
         pairs = unpack_pairs(errand.body["frames"], LimitsConfig())
         wrong = [se3.difference(np.array(errand.body["pose"]), truth(pair.stamp_ns)) for pair in pairs]
         offset = np.mean(wrong, axis=0)
@@ -124,7 +132,7 @@ class KnowingWorker:
             flagged_by_paper=None,
             causes=() if self.cause is None else (CAUSES[self.cause],),
         )
-        errand.done({"kind": "observed", **pack_observation(observation)})
+        errand.done({"kind": "observed", **pack_observation(observation), "baseline_not_used": self.baseline_not_used})
 
     def run_errand(self, errand: Errand) -> None:
         errand.done({"kind": "drawn", "jpeg": b"jpeg"} if errand.kind == "overlay" else Reason("no", "not here"))
@@ -416,6 +424,79 @@ def test_a_red_event_leaves_evidence(bench: Bench) -> None:
     assert {point.state for point in whole.metrics} >= {"healthy", "suspect"}
     bench.restart()
     assert bench.service.ledger.evidence.event(event.event_id) == whole
+
+
+def test_every_look_can_be_read_afterwards(bench: Bench) -> None:
+    bench.drive(BEGIN_S, END_S)
+    history = bench.service.history(0, 2**63 - 1, 1000)
+    assert len(history.looks) == bench.service.status().looks > 20
+    states = [look.state for look in history.looks]
+    assert [state for state, before in zip(states, [None, *states], strict=False) if state != before] == [
+        "unknown",
+        "healthy",
+        "suspect",
+        "healthy",
+    ], "red is the word of a window here"
+    suspect = next(look for look in history.looks if look.state == "suspect")
+    assert (suspect.outcome, suspect.flagged) == ("suspect", True)
+    assert suspect.evidence >= 1.5
+    told = bench.service.history(STEP_S * S, 2**63 - 1, 3).looks
+    assert told == history.looks[-3:]
+    health = bench.service.health_reply
+    assert health.look == history.looks[-1]
+    bench.restart()
+    assert bench.service.history(0, 2**63 - 1, 1000).looks == history.looks
+
+
+def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: Bench) -> None:
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    assert bench.service.health_reply.state == "healthy"
+    bench.worker.fault = Reason("internal_error", "The program failed (ZeroDivisionError: division by zero).")
+    bench.drive(BEGIN_S + 60, BEGIN_S + 90)
+    told = bench.service.health_reply
+    assert told.state == "degraded"
+    (reason,) = told.reasons
+    assert reason.code == "monitor_blind"
+    assert "ZeroDivisionError" in reason.text
+    assert bench.service.status().losses["look_internal_error"] >= 3
+    assert bench.health == "healthy", "the decisions are not touched"
+    bench.worker.fault = None
+    bench.drive(BEGIN_S + 90, STEP_S)
+    assert bench.service.health_reply.state == "healthy"
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "word"),
+    [
+        ({"limits": {"min_mood": 1.0}}, "min_mood"),
+        ({"config_hash": "other"}, "another configuration"),
+        ({"pair": "front", "sensors": {"camera_frame": "other"}}, "the camera other"),
+    ],
+)
+def test_a_baseline_of_something_else_is_refused_aloud(bench: Bench, spoilt: dict[str, Any], word: str) -> None:
+    good = replace(
+        a_baseline(), config_hash=learned_hash(bench.config.pairs[0].calibration), depth_identity="precomputed"
+    )
+    save_baseline(bench.folder / "rig.json", good)
+    bench.restart()
+    assert "baseline_mismatch" not in [one.code for one in bench.service.health_reply.reasons]
+    assert bench.service.health_reply.drift is not None
+    save_baseline(bench.folder / "rig.json", replace(good, **spoilt))
+    bench.restart()
+    (reason,) = [one for one in bench.service.health_reply.reasons if one.code == "baseline_mismatch"]
+    assert word in reason.text
+    assert bench.service.health_reply.drift is None
+
+
+def test_a_baseline_of_another_network_is_refused_at_the_first_look(bench: Bench) -> None:
+    learned = learned_hash(bench.config.pairs[0].calibration)
+    save_baseline(bench.folder / "rig.json", replace(a_baseline(), config_hash=learned))
+    bench.restart()
+    bench.worker.baseline_not_used = "It was made with another depth network."
+    bench.drive(BEGIN_S, BEGIN_S + 12)
+    (reason,) = [one for one in bench.service.health_reply.reasons if one.code == "baseline_mismatch"]
+    assert "another depth network" in reason.text
+    assert bench.service.health_reply.drift is None
 
 
 @pytest.mark.parametrize("cause", ["lens_dirty", "camera_frozen", "lidar_beams_lost", "dark"])

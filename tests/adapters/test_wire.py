@@ -52,7 +52,11 @@ def estimate(seed: int = 0, **changes: Any) -> Estimate:
         first_derivative=np.array([*rng.normal(size=3), NAN, NAN, NAN]),
         second_derivative=np.array([*rng.normal(size=3) * 1e9, NAN, NAN, NAN]),
     )
-    metrics = (Metric("overlap", 0.9, 0.5, True), Metric("f1", NAN, 0.25, False), Metric("mi", math.inf, 3.0, True))
+    metrics = (
+        Metric("overlap", 0.9, 0.5, True),
+        Metric("f1", NAN, 0.25, False),
+        Metric("mi", math.inf, 3.0, True),
+    )
     built = Estimate(
         window_id="front-12",
         data_stamp_ns=2**62 + 1,
@@ -85,7 +89,12 @@ def same(one: Any, other: Any) -> bool:
 
 @given(st.integers(0, 2**32))
 def test_there_and_back_keeps_every_bit(seed: int) -> None:
-    metrics = (Metric("overlap", 0.9, 0.5, True), Metric("f1", NAN, 0.25, False))
+    metrics = (
+        Metric("overlap", 0.9, 0.5, True),
+        Metric("f1", NAN, 0.25, False),
+        Metric("unlimited", 7.0, math.inf, False),
+        Metric("unlimited_too", 7.0, -math.inf, True),
+    )
     sent = estimate(seed, verdict=Verdict(Decision.ACCEPTED, metrics, ()))
     result = result_of(sent, RIG, "truck-7")
 

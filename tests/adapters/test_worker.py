@@ -209,6 +209,23 @@ def test_an_errand_that_fails_is_answered_and_not_tried_again(tmp_path: Path, fa
         assert outcomes.solved().job == job("a")
 
 
+def test_looks_that_kill_do_not_keep_the_worker_from_its_windows(tmp_path: Path) -> None:
+    outcomes = Outcomes()
+    order: queue.SimpleQueue[str] = queue.SimpleQueue()
+    command = fake_worker_command("sick", tmp_path / "m")
+    worker = Worker(LIMITS, "{}", lambda solved: order.put(solved.job.window_id), outcomes.on_failed, command)
+    for number in range(3):
+        worker.look(Errand("observe", "front", {"number": number}, lambda _: order.put("look"), timeout_s=1.0))
+    worker.solve(job("a"))
+    worker.start()
+    try:
+        assert [order.get(timeout=DEADLINE_S) for _ in range(4)] == ["look", "a", "look", "look"]
+    finally:
+        worker.request_stop()
+        assert worker.thread.join(DEADLINE_S)
+    assert worker.status().starts >= 3
+
+
 def test_a_configuration_that_cannot_work_is_told(tmp_path: Path) -> None:
     with running("unusable", tmp_path) as (worker, _):
         wait_until(lambda: worker.unusable is not None, "the refusal")

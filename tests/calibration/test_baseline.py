@@ -85,6 +85,9 @@ class TestBaseline:
         assert "another depth network" in (mismatch(baseline, street.rig, "e", "c") or "")
         assert "another configuration" in (mismatch(baseline, street.rig, "d", "x") or "")
         assert "the pair" in (mismatch(replace(baseline, pair="rear"), street.rig, "d", "c") or "")
+        assert "min_mood, no_such" in (
+            mismatch(replace(baseline, limits={"no_such": 1.0, "min_mood": 2.0}), street.rig, "d", "c") or ""
+        )
         other = replace(baseline, sensors={"camera_frame": "other"})
         assert "the camera other" in (mismatch(other, street.rig, "d", "c") or "")
 

@@ -24,6 +24,7 @@ from coec.calibration.causes import (
     SceneBaseline,
     SceneFacts,
     data_causes,
+    dirty_blocks,
     scene_baseline,
 )
 from coec.calibration.commissioning import learn_accuracy
@@ -93,7 +94,7 @@ def unchanged(window: Window, rng: np.random.Generator) -> Window:
     return window
 
 
-def states(drive: Drive, change: Change, looks: int = 3) -> list[MonitorState]:
+def states(drive: Drive, change: Change, looks: int = 6) -> list[MonitorState]:
     """What looks at the changed drive add up to, each at pairs that were not seen before."""
     changed = change(drive.window, np.random.default_rng(1))
     seen = observe(changed, drive.depth, GreyImages(LimitsConfig()), CalibrationConfig(), drive.baseline)
@@ -192,14 +193,17 @@ class TestFacts:
         spot = np.full((BLOCK_ROWS, BLOCK_COLUMNS), 10.0)
         spot[:3] = 1.0
         scenes = drive_of()
-        assert data_causes([replace(scenes[0], gradient=spot), *scenes[1:]], usual()) == ()
-        dirty = data_causes([replace(scene, gradient=spot) for scene in scenes], usual())
-        assert [cause.code for cause in dirty] == ["lens_dirty"]
+        blocks = BLOCK_ROWS * BLOCK_COLUMNS
+        assert dirty_blocks([replace(scenes[0], gradient=spot), *scenes[1:]], usual()) == ((), blocks)
+        dirty = dirty_blocks([replace(scene, gradient=spot) for scene in scenes], usual())
+        assert dirty == (tuple(range(3 * BLOCK_COLUMNS)), blocks)
 
-    def test_dirt_needs_a_baseline(self) -> None:
-        spot = np.full((BLOCK_ROWS, BLOCK_COLUMNS), 10.0)
-        spot[:3] = 1.0
-        assert data_causes(drive_of(gradient=spot), None) == ()
+    def test_what_never_had_contrast_cannot_lose_it(self) -> None:
+        sky = np.full((BLOCK_ROWS, BLOCK_COLUMNS), 10.0)
+        sky[:3] = 1.0
+        assert dirty_blocks(drive_of(gradient=sky / 5.0), scene_baseline(drive_of(gradient=sky)))[1] == (
+            (BLOCK_ROWS - 3) * BLOCK_COLUMNS
+        )
 
     def test_a_beam_that_is_missing_once_is_not_lost(self) -> None:
         holes = np.full(BANDS, 400, np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from coec.adapters.baseline_file import baseline_hash
 from coec.adapters.images import CachedGreys, GreyImages
+from coec.calibration import commissioning, verdict_limits
 from coec.calibration.baseline import Baseline
 from coec.calibration.commissioning import commission, learned_hash
 from coec.calibration.detection import table, try_detection
@@ -25,6 +27,16 @@ from estimates import estimate
 
 CONFIG = CalibrationConfig(search=SearchConfig(reach_deg=8.0))
 """The starts are 5 degrees away: looking no further keeps the solves short."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_looks() -> Iterator[None]:
+    """What is learned from few looks is less precise, and learned in the same way."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commissioning, "LOOKS", 5)
+        patch.setattr(commissioning, "FAR_LOOKS", 3)
+        patch.setattr(verdict_limits, "SOLVES", 2)
+        yield
 
 
 @pytest.fixture(scope="module")

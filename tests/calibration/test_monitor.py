@@ -106,6 +106,7 @@ class TestEvidence:
             evidence=read["evidence"],
             outcome=Outcome(read["outcome"]),
             blind=read["blind"],
+            dirt=read["dirt"],
             offset=tuple(read["offset"]),
             last_stamps_ns=tuple(read["last_stamps_ns"]),
         )
@@ -129,6 +130,34 @@ class TestCauses:
         dark = [fresh(k, causes=(DARK,)) for k in range(3)]
         light = [fresh(10 + k, flagged=False) for k in range(3)]
         assert diagnose(after(*dark, *light)) is None
+
+
+class TestDirt:
+    SPOT = tuple(range(40, 52))
+
+    def looks(self, *dirty: tuple[int, ...], textured: int = 400) -> MonitorState:
+        return after(*[replace(fresh(k, flagged=False), dirty=seen, textured=textured) for k, seen in enumerate(dirty)])
+
+    def test_is_what_stays_where_it_is(self) -> None:
+        assert diagnose(self.looks(*[self.SPOT] * 4)) is None
+        assert diagnose(self.looks(*[self.SPOT] * 5)) == LENS_DIRTY
+
+    def test_a_sky_that_changes_is_none(self) -> None:
+        assert diagnose(self.looks(*[tuple(range(20 * k, 20 * k + 30)) for k in range(12)])) is None
+
+    def test_one_exposure_with_contrast_clears_a_block(self) -> None:
+        assert diagnose(self.looks(*[self.SPOT] * 3, (), *[self.SPOT] * 4)) is None
+
+    def test_a_few_blocks_are_no_dirty_lens(self) -> None:
+        assert diagnose(self.looks(*[self.SPOT[:4]] * 10)) is None
+
+    def test_goes_away_when_it_was_cleaned(self) -> None:
+        assert diagnose(self.looks(*[self.SPOT] * 8, *[()] * 3)) is None
+
+    def test_a_night_is_no_cleaning(self) -> None:
+        day = [replace(fresh(k, flagged=False), dirty=self.SPOT, textured=400) for k in range(5)]
+        night = [fresh(10 + k, causes=(DARK,)) for k in range(3)]
+        assert after(*day, *night).dirt.keys() == {str(block) for block in self.SPOT}
 
 
 class TestLook:

@@ -20,6 +20,7 @@ import numpy as np
 from coec.adapters.evidence import Evidence
 from coec.adapters.history_file import GENESIS, History, Kept
 from coec.adapters.logs import LossCounter
+from coec.adapters.look_log import LookLog
 from coec.adapters.state_store import Clocks, StateStore
 from coec.adapters.window_folder import WindowFolder
 from coec.adapters.wire import transform_of
@@ -28,7 +29,7 @@ from coec.calibration.values import Matrix4, Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
 from coec.schemas import replies
-from coec.schemas.replies import CalibrationResult, EvidenceEvent, HistoryEntry
+from coec.schemas.replies import CalibrationResult, EvidenceEvent, HistoryEntry, LookReply, MetricsPoint
 
 _log = logging.getLogger(__name__)
 
@@ -93,6 +94,7 @@ class Ledger:
         self._state, head = self._recall()
         self.history = History(config.directory / f"history-{rig.pair}.jsonl", config.history, head)
         self.evidence = Evidence(config.directory / "evidence", rig.pair, config.evidence)
+        self._looks = LookLog(config.directory / f"looks-{rig.pair}.jsonl", config.looks)
         folder.protect(rig.pair, self.evidence.window_ids)
         if self.history.damage is not None:
             losses.add("storage", "history_damaged", detail=self.history.damage)
@@ -168,6 +170,19 @@ class Ledger:
         text = reasons or f"A window of {result.pairs} pairs was accepted."
         entry = _entry("estimate", result.verdict.decision, text, result.data_stamp_ns)
         self._write(entry.model_copy(update={"window_id": result.window_id}), result)
+
+    def note_look(self, look: LookReply) -> None:
+        """The monitor had a look."""
+        values = {name: metric.value for name, metric in look.metrics.items()}
+        self.evidence.note(MetricsPoint(stamp_ns=look.stamp_ns, state=look.state, metrics=values))
+        try:
+            self._looks.append(look)
+        except StateError as error:
+            self._losses.add("storage", "look_not_saved", detail=str(error))
+
+    def looks(self) -> tuple[LookReply, ...]:
+        """The looks of the monitor that are kept, oldest first."""
+        return self._looks.looks()
 
     def note_command(self, name: str, code: str, text: str, sender: str, *, accepted: bool) -> None:
         """A command was carried out or refused. Of equal refusals in a row only the first is written down: whoever

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from coec.adapters.snapshots import AXES, UNITS
 from coec.calibration.lifecycle import HealthState
-from coec.schemas.replies import PairStatus, StatusReply
+from coec.schemas.replies import HealthReply, Maybe6, PairStatus, StatusReply
 
 ENCODING = "application/openmetrics-text"
 
@@ -31,8 +32,8 @@ class _Family:
             yield f"{self.name}{suffix}{{{text}}} {value:.17g}" if text else f"{self.name}{suffix} {value:.17g}"
 
 
-def render(status: StatusReply, health: Mapping[str, HealthState], worker_rss_bytes: int) -> bytes:
-    """OpenMetrics text, UTF-8. `health` maps each pair to its state; the worker's memory is in bytes."""
+def render(status: StatusReply, health: Mapping[str, HealthReply], worker_rss_bytes: int) -> bytes:
+    """OpenMetrics text, UTF-8. `health` maps each pair to its health; the worker's memory is in bytes."""
     pairs = status.pairs
     families = (
         _Family("coec_build", "info", "Version of the service.", (({"version": status.version}, 1.0),)),
@@ -42,11 +43,13 @@ def render(status: StatusReply, health: Mapping[str, HealthState], worker_rss_by
             "stateset",
             "State of each pair.",
             tuple(
-                ({"pair": pair, "coec_health": state.value}, float(state is current))
+                ({"pair": pair, "coec_health": state.value}, float(state == current.state))
                 for pair, current in health.items()
                 for state in HealthState
             ),
         ),
+        _Family("coec_look_age_seconds", "gauge", "Since data were last judged.", tuple(_ages(health))),
+        *_diagnosis(health),
         _Family("coec_samples_received", "counter", "Samples that came.", tuple(_streams(pairs, "received"))),
         _Family("coec_frames_accepted", "counter", "Frames made of samples.", tuple(_streams(pairs, "accepted"))),
         _Family("coec_losses", "counter", "What was lost, by cause.", tuple(_losses(status))),
@@ -64,6 +67,63 @@ def render(status: StatusReply, health: Mapping[str, HealthState], worker_rss_by
     )
     lines = [line for family in families for line in family.lines()]
     return "\n".join([*lines, "# EOF", ""]).encode()
+
+
+def _diagnosis(health: Mapping[str, HealthReply]) -> Iterable[_Family]:
+    """The figures of self-diagnosis: those with a limit by name, those of the six axes by axis and unit."""
+    figures = [(pair, name, one) for pair, reply in health.items() for name, one in sorted(reply.metrics.items())]
+
+    def told(values: Iterable[tuple[str, str, float | None]]) -> tuple[Sample, ...]:
+        return tuple(({"pair": pair, "metric": name}, value) for pair, name, value in values if value is not None)
+
+    def by_axis(choose: Callable[[HealthReply], Maybe6 | None]) -> tuple[Sample, ...]:
+        return tuple(
+            ({"pair": pair, "axis": axis, "unit": unit}, value)
+            for pair, reply in health.items()
+            for axis, unit, value in zip(AXES, UNITS, choose(reply) or (), strict=False)
+            if value is not None
+        )
+
+    def of_look(name: str) -> Callable[[HealthReply], Maybe6 | None]:
+        return lambda reply: getattr(reply.look, name, None)
+
+    values = told((pair, name, one.value) for pair, name, one in figures)
+    limits = told((pair, name, one.limit) for pair, name, one in figures)
+    return (
+        _Family("coec_diagnosis", "gauge", "Figures of self-diagnosis.", values),
+        _Family("coec_diagnosis_limit", "gauge", "Their limits.", limits),
+        _Family("coec_look_offset", "gauge", "From the pose to the local optimum.", by_axis(of_look("offset"))),
+        _Family("coec_look_offset_sigma", "gauge", "Its standard deviation.", by_axis(of_look("sigma"))),
+        _Family("coec_look_drift", "gauge", "Local optimum from commissioned.", by_axis(of_look("drift"))),
+        _Family("coec_look_drift_sigma", "gauge", "Its standard deviation.", by_axis(of_look("drift_sigma"))),
+        _Family("coec_drift", "gauge", "Served from commissioned.", by_axis(lambda reply: reply.drift)),
+        _Family("coec_drift_sigma", "gauge", "Its standard deviation.", by_axis(lambda reply: reply.drift_sigma)),
+        _Family("coec_result_drift", "gauge", "Last window from commissioned.", by_axis(lambda r: r.result_drift)),
+        _Family("coec_result_drift_sigma", "gauge", "Its deviation.", by_axis(lambda r: r.result_drift_sigma)),
+        _Family(
+            "coec_mi_first_derivative",
+            "gauge",
+            "Nats per rad or m, at what is served.",
+            _without_unit(by_axis(of_look("first_derivative"))),
+        ),
+        _Family(
+            "coec_mi_second_derivative",
+            "gauge",
+            "Negative, nats per rad2 or m2, at what is served.",
+            _without_unit(by_axis(of_look("second_derivative"))),
+        ),
+    )
+
+
+def _without_unit(samples: tuple[Sample, ...]) -> tuple[Sample, ...]:
+    """Derivatives: the help line names their units."""
+    return tuple(({"pair": labels["pair"], "axis": labels["axis"]}, value) for labels, value in samples)
+
+
+def _ages(health: Mapping[str, HealthReply]) -> Iterable[Sample]:
+    for pair, reply in health.items():
+        if reply.age_s is not None:
+            yield {"pair": pair}, reply.age_s
 
 
 def _per_pair(pairs: Iterable[PairStatus], name: str) -> tuple[Sample, ...]:

@@ -7,7 +7,6 @@ thread the files, the worker's supervisor the results. What they share is the le
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +40,7 @@ from coec.adapters.state_store import BASELINES, StateStore
 from coec.adapters.stream_report import StreamReport
 from coec.adapters.threads import ServiceThread
 from coec.adapters.window_folder import WindowFolder, start_ns_of
-from coec.adapters.wire import estimate_of, metric_of, result_of
+from coec.adapters.wire import degrees_or_null, estimate_of, look_of, result_of
 from coec.adapters.worker import SUPERSEDED, Errand, Solved, SolveJob, Worker
 from coec.adapters.zenoh_bus import Answer
 from coec.calibration import lifecycle
@@ -52,7 +51,7 @@ from coec.calibration.monitor import Observation, Outcome
 from coec.calibration.pairing import Pairer
 from coec.calibration.sampler import LookSampler
 from coec.calibration.urgency import Urgency
-from coec.calibration.values import Estimate, FramePair, Matrix4, Metric, Reason
+from coec.calibration.values import Estimate, FramePair, Matrix4, Reason
 from coec.calibration.window import PairSelected, SliceEnded, WindowCutter
 from coec.config import CalibrationConfig, Config, PairConfig, config_hash
 from coec.errors import NotFoundError, StateError
@@ -60,7 +59,7 @@ from coec.geometry import se3
 from coec.schemas import replies
 from coec.schemas.base import from_msgpack
 from coec.schemas.keys import Format, Keys
-from coec.schemas.replies import CalibrationResult, EvidenceEvent, MetricsPoint
+from coec.schemas.replies import CalibrationResult, EvidenceEvent
 
 _log = logging.getLogger(__name__)
 
@@ -79,6 +78,9 @@ WINDOW_PERIODS = 2
 
 IDLE_S = 0.25
 COMMAND_TIMEOUT_S = 10.0
+
+LOOKS_IN_VAIN = 3
+"""Looks in a row that came to nothing, from which on health says so."""
 
 COMMISSIONING_WINDOWS = 8
 """Windows that a rig is commissioned from, the newest: 200 pairs."""
@@ -147,10 +149,12 @@ class PairService:
         self._asked: dict[str, Question] = {}
         self._overlays = Overlays(pair.name, outside.worker)
         self._lock = threading.RLock()
-        self._look_metrics: tuple[Metric, ...] = ()
+        self._latest_look: replies.LookReply | None = None
         self._looks = 0
+        self._looks_in_vain = 0
+        self._monitor_trouble: Reason | None = None
         self._solved = 0
-        self._health = Health(HealthState.UNKNOWN, ())
+        self._health: replies.HealthReply
         self._served: dict[str, Snapshot] = {}
         self._published: dict[str, object] = {}
         self._commands: dict[str, int] = {}
@@ -158,9 +162,9 @@ class PairService:
     # --- asked from outside -----------------------------------------------------------------------------------------
 
     @property
-    def health_state(self) -> HealthState:
-        """The state that `health` serves."""
-        return self._health.state
+    def health_reply(self) -> replies.HealthReply:
+        """What `health` serves, at most a tick old."""
+        return self._health
 
     @property
     def percent_complete(self) -> float:
@@ -190,6 +194,7 @@ class PairService:
             total=len(results),
             results=tuple(result for result in results if since_ns <= result.data_stamp_ns <= until_ns)[-limit:],
             entries=tuple(kept.chained for kept in entries if inside(kept.entry))[-limit:],
+            looks=tuple(look for look in self.ledger.looks() if since_ns <= look.stamp_ns <= until_ns)[-limit:],
         )
 
     def windows(self) -> replies.WindowsReply:
@@ -272,7 +277,7 @@ class PairService:
                 config_hash(self._pair.calibration),
                 self._pair.fusion,
             )
-            health = self._health_reply(state, latest)
+            health = self._health = self._health_of(state, latest)
             self._served = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
             changed = {
                 "extrinsic": extrinsic.model_copy(update={"percent_complete": 0.0}),
@@ -346,7 +351,7 @@ class PairService:
         return self._acknowledge("hold", "held", "The extrinsic stays as it is until it is released.")
 
     def _replaced(self, name: str, code: str, text: str, window_id: str | None = None) -> replies.Acknowledgement:
-        self._look_metrics = ()
+        self._latest_look = None
         self.inbox.call(self._start_over)
         return self._acknowledge(name, code, text, window_id=window_id)
 
@@ -586,8 +591,11 @@ class PairService:
 
     def _take_look(self, epoch: int, answer: dict[str, Any] | Reason) -> Effect | None:
         if isinstance(answer, Reason):
-            self.losses.add("monitor", f"look_{answer.code}", detail=answer.text)
+            self._note_look_in_vain(answer)
             return None
+        self._looks_in_vain, self._monitor_trouble = 0, None
+        if (why_not := answer["baseline_not_used"]) is not None:
+            self._refuse_baseline(why_not)
         observation = unpack_observation(answer)
         effect = self._step(
             lambda state: lifecycle.after_observation(state, observation), observation.stamp_ns, observation, epoch
@@ -596,15 +604,19 @@ class PairService:
             self.losses.add("monitor", "look_overtaken")
             return None
         self._looks += 1
-        self._look_metrics = observation.metrics
-        self.ledger.evidence.note(
-            MetricsPoint(
-                stamp_ns=observation.stamp_ns,
-                state=self.ledger.state.health.value,
-                metrics={metric.name: metric_of(metric).value for metric in observation.metrics},
-            )
-        )
+        self._latest_look = look_of(observation, self.ledger.state)
+        self.ledger.note_look(self._latest_look)
         return effect
+
+    def _note_look_in_vain(self, reason: Reason) -> None:
+        """Whoever cannot look must not go on saying that all is well."""
+        self.losses.add("monitor", f"look_{reason.code}", detail=reason.text)
+        if reason is SUPERSEDED:
+            return
+        self._looks_in_vain += 1
+        if self._looks_in_vain >= LOOKS_IN_VAIN:
+            text = f"The last {self._looks_in_vain} looks came to nothing. {reason.text}"
+            self._monitor_trouble = Reason("monitor_blind", text)
 
     def _answer(self, question: Question | None, take: Callable[[], Effect | None]) -> None:
         """An answer came; one to a question that the stream did not ask takes effect at once."""
@@ -629,7 +641,7 @@ class PairService:
             return None
         before, after = taken.before, taken.after
         if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
-            self._look_metrics = ()
+            self._latest_look = None
         red = HealthState.MISCALIBRATED
         if after.health is red and before.health is not red:
             self._draw_new_event()
@@ -721,8 +733,12 @@ class PairService:
         """Only a result tells which network the worker has opened."""
         baseline = self._baseline
         if baseline is not None and baseline.depth_identity != result.depth_identity:
+            self._refuse_baseline("It was made with another depth network.")
+
+    def _refuse_baseline(self, why: str) -> None:
+        if self._baseline is not None:
             self._baseline = None
-            self._baseline_trouble = _mismatched("It was made with another depth network.")
+            self._baseline_trouble = _mismatched(why)
             self.recorder.use(self._calibration())
 
     def _unbiased(self, estimate: Estimate) -> Estimate:
@@ -747,10 +763,10 @@ class PairService:
 
     # --- health -----------------------------------------------------------------------------------------------------
 
-    def _health_reply(self, state: PairState, latest: CalibrationResult | None) -> replies.HealthReply:
+    def _health_of(self, state: PairState, latest: CalibrationResult | None) -> replies.HealthReply:
         health = self._with_troubles(Health(state.health, state.reasons))
-        self._health = health
         value, sigma = self._drift(state)
+        result_value, result_sigma = self._drift_of_latest(state)
         metrics = dict(latest.metrics) if latest else {}
         return replies.HealthReply(
             vehicle=self._config.vehicle,
@@ -758,10 +774,13 @@ class PairService:
             state=health.state.value,
             level=replies.ROS_LEVELS[health.state.value],
             reasons=snapshots.reasons_of(health.reasons),
-            metrics={**metrics, **{metric.name: metric_of(metric) for metric in self._look_metrics}},
+            metrics={**metrics, **(self._latest_look.metrics if self._latest_look else {})},
             axes=snapshots.axes_of(latest, state.status),
             drift=value,
             drift_sigma=sigma,
+            result_drift=result_value,
+            result_drift_sigma=result_sigma,
+            look=self._latest_look,
             needs=self._report.needs(self._pair, state.latest),
             data_quality=self._report.data_quality(self.losses.snapshot()),
             since_ns=self.ledger.since_ns,
@@ -775,11 +794,19 @@ class PairService:
             return None, None
         sigma = np.full(6, np.nan) if state.accepted is None else state.accepted.sigma
         drifted = drift(se3.perturb(state.T_camera_lidar, self._baseline.bias), sigma, self._baseline)
-        return _maybe(drifted.value), _maybe(drifted.sigma)
+        return degrees_or_null(drifted.value), degrees_or_null(drifted.sigma)
+
+    def _drift_of_latest(self, state: PairState) -> tuple[replies.Maybe6 | None, replies.Maybe6 | None]:
+        """The same of the latest result, which has its bias taken off already."""
+        if self._baseline is None or state.latest is None:
+            return None, None
+        pose = se3.perturb(state.latest.optimum.T_camera_lidar, self._baseline.bias)
+        drifted = drift(pose, state.latest.sigma, self._baseline)
+        return degrees_or_null(drifted.value), degrees_or_null(drifted.sigma)
 
     def _with_troubles(self, health: Health) -> Health:
         """What ails the service itself makes a healthy pair degraded, and is said in every state."""
-        own = (self.ledger.damage, self._baseline_trouble, self.recorder.trouble)
+        own = (self.ledger.damage, self._baseline_trouble, self._monitor_trouble, self.recorder.trouble)
         troubles = (*(reason for reason in own if reason is not None), *self._outside.vehicle_troubles())
         if self.ledger.state.frozen:
             troubles = (*troubles, Reason("held", "The extrinsic is held by command."))
@@ -791,9 +818,3 @@ class PairService:
 
 def _mismatched(text: str) -> Reason:
     return Reason("baseline_mismatch", f"The baseline of the rig is not used: {text}")
-
-
-def _maybe(rad_m: np.ndarray[Any, np.dtype[np.float64]]) -> replies.Maybe6:
-    """(6,) in degrees and metres; NaN becomes null."""
-    told = snapshots.degrees_and_metres(rad_m)
-    return cast("replies.Maybe6", tuple(None if math.isnan(value) else value for value in told))

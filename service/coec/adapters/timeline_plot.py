@@ -35,18 +35,21 @@ def timeline(
     axes = figure.subplots()
     for (begin, _, state), (end, *_) in pairwise(series):
         axes.axvspan(begin, end, color=STATE_COLOURS.get(state, "white"), alpha=0.3, linewidth=0)
-    axes.plot([point[0] for point in series], [point[1] for point in series], color="black", linewidth=1.8)
-    axes.axhline(limit_deg, color="grey", linestyle=":", linewidth=1.0)
-    axes.set_ylim(0.0, max(point[1] for point in series) * 1.25 + 0.1)
+    seconds, errors_deg = [point[0] for point in series], [point[1] for point in series]
+    # What is served changes at once, and so does the truth.
+    curve = axes.plot(seconds, errors_deg, color="black", linewidth=1.8, drawstyle="steps-post", label="error")
+    limit = axes.axhline(limit_deg, color="grey", linestyle=":", linewidth=1.0, label=f"{limit_deg:g}°: a good error")
+    axes.set_ylim(0.0, max(errors_deg) * 1.25 + 0.1)
     for second, what in marks:
         axes.axvline(second, color="black", linestyle="--", linewidth=1.0)
         axes.annotate(
-            f" {what}, {second:.0f} s", (second, axes.get_ylim()[1]), rotation=90, ha="right", va="top", fontsize=9
+            f"{what}, {second:.0f} s ", (second, axes.get_ylim()[1]), rotation=90, ha="right", va="top", fontsize=9
         )
     axes.set_xlim(series[0][0], series[-1][0])
     axes.set_xlabel("drive, s")
     axes.set_ylabel("rotation error against the truth, deg")
     seen = dict.fromkeys(state for _, _, state in series)
-    handles = [Patch(color=STATE_COLOURS.get(state, "white"), alpha=0.3, label=state) for state in seen]
+    grounds = [Patch(color=STATE_COLOURS.get(state, "white"), alpha=0.3, label=state) for state in seen]
+    handles = [*curve, limit, *grounds]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return png(figure)

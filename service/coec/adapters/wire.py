@@ -11,6 +11,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.lifecycle import PairState
+from coec.calibration.monitor import Observation
 from coec.calibration.values import (
     Decision,
     Estimate,
@@ -54,7 +56,7 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         pairs=estimate.pairs,
         camera_from_lidar=transform_of(optimum.T_camera_lidar),
         correction=cast("replies.Vector6", tuple(float(v) for v in _in_degrees(estimate.correction))),
-        sigma=_maybe6(_in_degrees(estimate.sigma)),
+        sigma=degrees_or_null(estimate.sigma),
         correction_rad_m=cast("replies.Vector6", tuple(float(v) for v in estimate.correction)),
         sigma_rad_m=_maybe6(estimate.sigma),
         solved=cast("replies.Flags6", tuple(bool(v) for v in estimate.solved)),
@@ -101,7 +103,7 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
         verdict=Verdict(
             decision=Decision(result.verdict.decision),
             metrics=tuple(
-                Metric(name, _or_nan(metric.value), _or_nan(metric.limit), metric.at_least)
+                Metric(name, _or_nan(metric.value), _limit_of(metric), metric.at_least)
                 for name, metric in sorted(result.metrics.items())
             ),
             reasons=tuple(Reason(reason.code, reason.text) for reason in result.verdict.reasons),
@@ -124,6 +126,41 @@ def metric_of(metric: Metric) -> replies.MetricReply:
         at_least=metric.at_least,
         passed=bool(metric.passed),
     )
+
+
+def look_of(observation: Observation, after: PairState) -> replies.LookReply:
+    """A look, and the state of the pair after it."""
+    drift = observation.drift
+    return replies.LookReply(
+        stamp_ns=observation.stamp_ns,
+        pair_stamps_ns=observation.pair_stamps_ns,
+        flagged=observation.flagged,
+        weak=observation.weak,
+        flagged_by_paper=observation.flagged_by_paper,
+        causes=tuple(replies.Reason(code=cause.code, text=cause.text) for cause in observation.causes),
+        metrics={metric.name: metric_of(metric) for metric in observation.metrics},
+        first_derivative=_maybe6(observation.first_derivative),
+        second_derivative=_maybe6(observation.second_derivative),
+        offset=degrees_or_null(observation.offset),
+        sigma=degrees_or_null(observation.sigma),
+        drift=None if drift is None else degrees_or_null(drift.value),
+        drift_sigma=None if drift is None else degrees_or_null(drift.sigma),
+        outcome=after.monitor.outcome.value,
+        evidence=after.monitor.evidence,
+        state=after.health.value,
+    )
+
+
+def _limit_of(metric: replies.MetricReply) -> float:
+    """No limit is one that every figure keeps."""
+    if metric.limit is not None:
+        return metric.limit
+    return -math.inf if metric.at_least else math.inf
+
+
+def degrees_or_null(rad_m: NDArray[np.float64]) -> replies.Maybe6:
+    """(6,) in the units of the wire; NaN becomes null."""
+    return _maybe6(_in_degrees(rad_m))
 
 
 def _in_degrees(rad_m: NDArray[np.float64]) -> NDArray[np.float64]:

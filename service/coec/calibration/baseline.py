@@ -29,9 +29,9 @@ UNCOMMISSIONED_BIAS = np.array([radians(0.12)] * 3 + [0.03] * 3)
 lie between the vendor's calibration and the edges."""
 
 
-PIXEL_SHARE = 0.25
-"""Share of a pixel that the local optimum of an unknown rig may be off for the pixels alone: edges of an image of 0.8°
-per pixel put a right pose 0.2 to 0.35° off."""
+PIXEL_SHARE = 0.3
+"""Share of a pixel that the local optimum may be off for the pixels alone, whatever the scenes of a commissioning say:
+edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
 
 PIXEL_RANGE_M = 8.0
 """Range at which a pixel of rotation looks like one of translation, m: of the near edges, which tell translation."""
@@ -96,15 +96,19 @@ def pixel_rad(camera: Camera) -> float:
     return PIXEL_STEP / float(steps_px.min())
 
 
+def pixel_floor(camera: Camera) -> NDArray[np.float64]:
+    """(6,) standard deviation that the pixels of a camera leave to any look, however many pairs it has (rad, m)."""
+    off_rad = PIXEL_SHARE * pixel_rad(camera)
+    return np.array([off_rad] * 3 + [off_rad * PIXEL_RANGE_M] * 3)
+
+
 PIXEL_STEP = 0.01
 """Radians: within it every camera model is linear."""
 
 
 def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:
     """What to expect of looks over three and six degrees of freedom on a rig of which only its camera is known."""
-    off_rad = PIXEL_SHARE * pixel_rad(camera)
-    pixels = np.array([off_rad] * 3 + [off_rad * PIXEL_RANGE_M] * 3)
-    bias_sigma = np.sqrt(UNCOMMISSIONED_BIAS**2 + pixels**2)
+    bias_sigma = np.sqrt(UNCOMMISSIONED_BIAS**2 + pixel_floor(camera) ** 2)
     rotation = Accuracy(np.array([0.0] * 3 + [np.nan] * 3), bias_sigma, PRIOR_SPREAD_ROTATION)
     return rotation, Accuracy(np.zeros(6), bias_sigma, PRIOR_SPREAD_POSE)
 
@@ -199,6 +203,8 @@ def mismatch(baseline: Baseline, rig: Rig, depth_identity: str, config_hash: str
         return "It was made with another depth network."
     if baseline.config_hash != config_hash:
         return "It was made with another configuration of the calibration."
+    if unknown := sorted(set(baseline.limits) - set(VerdictConfig.model_fields)):
+        return f"It holds limits of figures that no longer exist: {', '.join(unknown)}."
     return None
 
 

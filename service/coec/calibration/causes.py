@@ -34,8 +34,12 @@ TEXTURED_GRADIENT = 2.0
 """Blocks with a smaller gradient when the rig was commissioned cannot show dirt."""
 
 DIRTY_RATIO, DIRTY_SHARE = 0.4, 0.012
-"""A block is dirty when its sharpest exposure has less than this share of the gradient that it had when the rig was
-commissioned; so many of the textured blocks make a dirty lens. Scenes change gradients, but not in every exposure."""
+"""A block looks dirty when its sharpest exposure has less than this share of the gradient that it had when the rig was
+commissioned; so many of the textured blocks make a dirty lens, if it is the same blocks in `DIRTY_LOOKS` looks running.
+Another street does the same to 6 % of them for 5 s, and to less than 0.6 % for 20 s: dirt stays where it is."""
+
+DIRTY_LOOKS = 3.5
+"""Independent looks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
 
 SAME_PICTURE = 0.01
 """Mean absolute difference of two exposures over the standard deviation of their grey values below which they are the
@@ -168,8 +172,8 @@ def scene_baseline(scenes: Sequence[SceneFacts]) -> SceneBaseline:
 
 
 def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) -> tuple[Cause, ...]:
-    """Every reason in the frames themselves not to believe a look at them, those that hide others first. Dirt and lost
-    beams are seen against a commissioned rig only."""
+    """Every reason in the frames themselves not to believe a look at them, those that hide others first. Lost beams are
+    seen against a commissioned rig only, dirt only over several looks."""
     gradient = np.array([scene.gradient for scene in scenes])
     causes = []
     dark = float(np.median([scene.bright for scene in scenes])) < DARK_LEVEL
@@ -179,11 +183,6 @@ def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) ->
         causes.append(LENS_COVERED)
     if _is_frozen(scenes):
         causes.append(CAMERA_FROZEN)
-    if baseline is not None and not causes:
-        textured = baseline.gradient >= TEXTURED_GRADIENT
-        dirty = gradient.max(axis=0) < DIRTY_RATIO * baseline.gradient
-        if textured.any() and float(dirty[textured].mean()) > DIRTY_SHARE:
-            causes.append(LENS_DIRTY)
     if (
         baseline is not None
         and max(
@@ -198,6 +197,15 @@ def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) ->
     if edges < few and not causes:
         causes.append(OPEN_FIELD)
     return tuple(causes)
+
+
+def dirty_blocks(scenes: Sequence[SceneFacts], baseline: SceneBaseline) -> tuple[tuple[int, ...], int]:
+    """Blocks of the image, by their number, that are dirty for all that these pairs show, and of how many that can
+    be."""
+    textured = baseline.gradient >= TEXTURED_GRADIENT
+    sharpest = np.max([scene.gradient for scene in scenes], axis=0)
+    dirty = textured & (sharpest < DIRTY_RATIO * baseline.gradient)
+    return tuple(int(block) for block in np.flatnonzero(dirty)), int(textured.sum())
 
 
 def _lost(counts: NDArray[np.int64], usual: NDArray[np.float64]) -> float:

@@ -23,6 +23,7 @@ from coec.calibration.baseline import (
     MonitorLimits,
     chi2_quantile,
     normal_quantile,
+    pixel_floor,
 )
 from coec.calibration.causes import scene_baseline
 from coec.calibration.estimators import look
@@ -68,6 +69,10 @@ MOVES = (
 )
 """By name: rotations about random axes (rad) and translations in random directions (m)."""
 
+FIGURES = "camera-distance"
+"""Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a look at
+the same pairs gives other figures: limits of the old ones would not fit."""
+
 SEED = 20_230_617
 
 AGREEMENT_RAD = radians(0.5)
@@ -105,8 +110,8 @@ def commission(
     rotation, pose = _accuracies(evidence, right, config, heard)
     _check(rotation)
     looks = _Looks(evidence, right, config, heard)
-    clean = looks.moved(0.0, 0.0, "right")
-    moved = {name: looks.moved(turn_rad, shift_m, name) for name, turn_rad, shift_m in MOVES}
+    clean = looks.moved(0.0, 0.0, "right", LOOKS)
+    moved = {name: looks.moved(turn_rad, shift_m, name, LOOKS) for name, turn_rad, shift_m in MOVES}
     far = looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS)
     monitor = _monitor_limits(clean, moved, far, rotation, pose, false_alarm_rate)
     accuracy = rotation if config.search.dof == ROTATION_DOF else pose
@@ -136,7 +141,7 @@ def commission(
 
 def learned_hash(config: CalibrationConfig) -> str:
     """Of the configuration that a baseline holds for: all that moves an optimum; the limits are what it replaces."""
-    return config_hash(config.objective, config.search, str(config.motion_compensation))
+    return config_hash(config.objective, config.search, str(config.motion_compensation), FIGURES)
 
 
 def is_flagged(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> bool:
@@ -158,9 +163,9 @@ def learn_limits(
     """The limits of looks, at a false-alarm rate."""
     rotation, pose = accuracies
     looks = _Looks(evidence, right, config, Silence())
-    moved = {name: looks.moved(turn_rad, shift_m, name) for name, turn_rad, shift_m in MOVES[::3]}
+    moved = {name: looks.moved(turn_rad, shift_m, name, LOOKS) for name, turn_rad, shift_m in MOVES[::3]}
     return _monitor_limits(
-        looks.moved(0.0, 0.0, "right"), moved, looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS), rotation, pose, rate
+        looks.moved(0.0, 0.0, "right", LOOKS), moved, looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS), rotation, pose, rate
     )
 
 
@@ -192,24 +197,31 @@ def _accuracies(
     at_rotation = np.array([seen.offset_rotation for seen in without])
     at_pose = np.array([seen.offset_pose for seen in without])
     not_searched = np.array([0.0] * 3 + [np.nan] * 3)
+    # Translations are told by near edges, where a pixel is little: their floor is that of every rig.
+    pixels = np.where(np.arange(6) < ROTATION_DOF, pixel_floor(evidence.rig.camera), 0.0)
     return (
-        _accuracy(whole.offset_rotation + not_searched, at_rotation, PRIOR_SPREAD_ROTATION, count),
-        _accuracy(whole.offset_pose, at_pose, PRIOR_SPREAD_POSE, count),
+        _accuracy(whole.offset_rotation + not_searched, at_rotation, PRIOR_SPREAD_ROTATION, count, pixels),
+        _accuracy(whole.offset_pose, at_pose, PRIOR_SPREAD_POSE, count, pixels),
     )
 
 
 def _accuracy(
-    bias: NDArray[np.float64], without: NDArray[np.float64], prior: NDArray[np.float64], count: int
+    bias: NDArray[np.float64],
+    without: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    count: int,
+    pixels: NDArray[np.float64],
 ) -> Accuracy:
     """From the looks that each left a block out, and what is known of other rigs: the variance of few blocks is itself
-    uncertain (the posterior mean under an inverse gamma prior of `PRIOR_BLOCKS` degrees of freedom)."""
+    uncertain (the posterior mean under an inverse gamma prior of `PRIOR_BLOCKS` degrees of freedom). The bias is
+    that of the streets that were driven; on others it is another share of a pixel (`pixels`, (6,))."""
     blocks = len(without)
     apart = np.abs(without - np.median(without, axis=0))
     # One look that ended in another basin must not make the rig look blind.
     apart = np.minimum(apart, OUTLIER * np.median(apart, axis=0) + FLOOR)
     variance = (blocks - 1) / blocks * (apart**2).sum(axis=0) * count
     spread = np.sqrt((PRIOR_BLOCKS * prior**2 + (blocks - 1) * variance) / (PRIOR_BLOCKS + blocks - 1))
-    return Accuracy(bias=bias, bias_sigma=spread / sqrt(count), spread=spread)
+    return Accuracy(bias=bias, bias_sigma=np.sqrt(spread**2 / count + pixels**2), spread=spread)
 
 
 def _check(rotation: Accuracy) -> None:
@@ -234,7 +246,7 @@ class _Looks:
         self._config = config
         self._heard = heard
 
-    def moved(self, turn_rad: float, shift_m: float, name: str, count: int = LOOKS) -> list[Look]:
+    def moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[Look]:
         """`count` looks after a turn and a shift."""
         rng = np.random.default_rng([SEED, round(turn_rad * 1e6), round(shift_m * 1e6)])
         pairs = len(self._evidence.pairs)

@@ -10,18 +10,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from math import degrees
+from math import degrees, inf
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import (
     Baseline,
+    Drift,
     MonitorLimits,
     chi2_quantile,
+    drift_of,
     uncommissioned,
 )
-from coec.calibration.causes import BENT_MOUNT, CAUSES, Cause, data_causes
+from coec.calibration.causes import (
+    BENT_MOUNT,
+    CAUSES,
+    DIRTY_LOOKS,
+    DIRTY_SHARE,
+    LENS_DIRTY,
+    Cause,
+    data_causes,
+    dirty_blocks,
+)
 from coec.calibration.estimators import look
 from coec.calibration.looks import POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
 from coec.calibration.ports import DepthModel, ImageReader, Silence
@@ -56,6 +67,10 @@ UNCOMMISSIONED = MonitorLimits(
 """Of an uncommissioned rig. Edges at the right pose are at 10 to 24 on every recording tried."""
 
 
+def _unknown() -> NDArray[np.float64]:
+    return np.full(6, np.nan)
+
+
 class Outcome(StrEnum):
     """What the looks so far say. `unknown`: nothing was seen that could tell."""
 
@@ -80,6 +95,11 @@ class Observation:
         weak: the edges at the local optimum are fainter than they should be.
         flagged_by_paper: equation (2) with learned limits; None until the rig is commissioned.
         causes: what is wrong with the data, those that hide others first; such a look says nothing of the pose.
+        first_derivative, second_derivative: (6,) ∂MI/∂ξ and -∂²MI/∂ξ² at the pose: the paper's f' and f'' on each axis
+            (nats per rad or m, and per rad² or m²).
+        drift: of the local optimum from the commissioned calibration; None until the rig is commissioned.
+        dirty: blocks of the image, by number, that have no contrast in any pair; for commissioned rigs in daylight.
+        textured: blocks that could be, 0 where it is not known.
     """
 
     stamp_ns: int
@@ -92,6 +112,11 @@ class Observation:
     weak: bool
     flagged_by_paper: bool | None
     causes: tuple[Cause, ...]
+    first_derivative: NDArray[np.float64] = field(default_factory=_unknown)
+    second_derivative: NDArray[np.float64] = field(default_factory=_unknown)
+    drift: Drift | None = None
+    dirty: tuple[int, ...] = ()
+    textured: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +127,7 @@ class MonitorState:
         evidence: in independent looks that say the mount is bent, floor 0.
         outcome: see there.
         blind: the same for every cause in the data, by code.
+        dirt: the same for every block of the image that was dirty in all looks since, by its number.
         offset: running mean of the flagged offsets (rad, m); empty without one.
         last_stamps_ns: of the pairs of the last look.
     """
@@ -109,6 +135,7 @@ class MonitorState:
     evidence: float = 0.0
     outcome: Outcome = Outcome.UNKNOWN
     blind: Mapping[str, float] = field(default_factory=dict)
+    dirt: Mapping[str, float] = field(default_factory=dict)
     offset: tuple[float, ...] = ()
     last_stamps_ns: tuple[int, ...] = ()
 
@@ -139,6 +166,7 @@ def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline
     metrics = _metrics(seen, of_rotation, of_pose, limits)
     flagged, weak = max(of_rotation, of_pose) > 1.0, edges_per_pair(seen) < limits.min_edges_per_pair
     causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
+    dirty, textured = ((), 0) if baseline is None or causes else dirty_blocks(evidence.scenes, baseline.scene)
     if not causes:
         explained = explained_by_motion(
             evidence.pairs,
@@ -161,6 +189,11 @@ def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline
         weak=weak,
         flagged_by_paper=None if baseline is None else by_equation_2(seen, limits),
         causes=causes,
+        first_derivative=seen.first_derivative,
+        second_derivative=seen.second_derivative,
+        drift=None if baseline is None else drift_of(seen, baseline),
+        dirty=dirty,
+        textured=textured,
     )
 
 
@@ -178,13 +211,16 @@ def after_observation(state: MonitorState, observation: Observation) -> MonitorS
     """The state after one more look. It counts by the share of its pairs that the last one did not hold."""
     counted = set(state.last_stamps_ns)
     fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
+    dirt = _dirt_after(state.dirt, observation, fresh)
     codes = {cause.code for cause in observation.causes}
+    if sum(run >= DIRTY_LOOKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
+        codes.add(LENS_DIRTY.code)
     blind = {
         code: min(max(state.blind.get(code, 0.0) + (fresh if code in codes else -fresh), 0.0), MOST)
         for code in {*state.blind, *codes}
     }
     blind = {code: blind[code] for code in sorted(blind) if blind[code] > 0.0}
-    after = replace(state, blind=blind, last_stamps_ns=observation.pair_stamps_ns)
+    after = replace(state, blind=blind, dirt=dirt, last_stamps_ns=observation.pair_stamps_ns)
     if codes:
         # Neither for nor against: the data cannot tell.
         return after
@@ -205,6 +241,14 @@ def diagnose(state: MonitorState) -> Cause | None:
         if state.blind.get(code, 0.0) >= BLIND_AT:
             return cause
     return BENT_MOUNT if state.outcome is Outcome.CONFIRMED else None
+
+
+def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: float) -> dict[str, float]:
+    """Whatever shows contrast once is not dirty; a look that cannot tell changes nothing."""
+    if observation.textured == 0:
+        return dict(dirt)
+    dirty = {str(block) for block in observation.dirty}
+    return {block: min(dirt.get(block, 0.0) + fresh, DIRTY_LOOKS + 1.0) for block in sorted(dirty)}
 
 
 def _outcome(before: Outcome, evidence: float) -> Outcome:
@@ -231,6 +275,7 @@ def _metrics(seen: Look, of_rotation: float, of_pose: float, limits: MonitorLimi
         Metric("f2", seen.f2, limits.min_f2, at_least=True),
         Metric("distance_rotation", of_rotation, 1.0, at_least=False),
         Metric("distance_pose", of_pose, 1.0, at_least=False),
+        Metric("edge_score", seen.edges, -inf, at_least=True),
         Metric("edges_per_pair", edges_per_pair(seen), limits.min_edges_per_pair, at_least=True),
         Metric("agreement_deg", degrees(seen.agreement_rad), degrees(limits.max_agreement_rad), at_least=False),
         Metric("overlap", seen.overlap, limits.min_overlap, at_least=True),

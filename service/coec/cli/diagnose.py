@@ -96,14 +96,25 @@ def _look(rigged: commission.Rigged, options: Options) -> int:
             "causes": [{"code": cause.code, "text": cause.text} for cause in seen.causes],
             "offset": _in_degrees(seen.offset),
             "sigma": _in_degrees(seen.sigma),
+            "drift": None if seen.drift is None else _in_degrees(seen.drift.value),
+            "drift_sigma": None if seen.drift is None else _in_degrees(seen.drift.sigma),
+            "first_derivative": seen.first_derivative.tolist(),
+            "second_derivative": seen.second_derivative.tolist(),
             "metrics": {name: metric.model_dump(mode="json") for name, metric in metrics.items()},
         }
         console.print_json(document)
         return int(wrong)
-    axes = console.table("axis", "offset", "± σ", "unit", right=(1, 2))
+    axes = console.table("axis", "offset", "± σ", "unit", "f'", "f''", right=(1, 2, 4, 5))
     offset, sigma = _in_degrees(seen.offset), _in_degrees(seen.sigma)
     for axis, name in enumerate(console.AXIS_NAMES):
-        axes.add_row(name, console.figure(offset[axis], sign=True), console.figure(sigma[axis]), console.UNITS[axis])
+        axes.add_row(
+            name,
+            console.figure(offset[axis], sign=True),
+            console.figure(sigma[axis]),
+            console.UNITS[axis],
+            console.figure(float(seen.first_derivative[axis]), sign=True),
+            console.figure(float(seen.second_derivative[axis]), sign=True),
+        )
     console.out.print(axes)
     console.out.print("extrinsic ", console.styled("failed" if wrong else "accepted"), sep="")
     for cause in seen.causes:

@@ -127,8 +127,8 @@ class CalibrationResult(Message):
     points_in_view: Count = Field(description="over all pairs")
     evaluations: Count = Field(description="of the objective")
     stop_reason: str
-    first_derivative: Maybe6 = Field(description="|dMI| per rad or m; null where not searched")
-    second_derivative: Maybe6 = Field(description="-d²MI per rad² or m²; null where not searched")
+    first_derivative: Maybe6 = Field(description="f': d(objective) per rad or m; null where not searched")
+    second_derivative: Maybe6 = Field(description="f'': -d²(objective) per rad² or m²; null where not searched")
     compensation: Counts = Field(description="pairs by outcome of motion compensation")
     depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
     config_hash: str = Field(description="of everything that decides the result")
@@ -186,6 +186,29 @@ class DataQuality(Part):
     frozen_image: bool = Field(default=False, description="the camera repeats the same picture")
 
 
+class LookReply(Part):
+    """One look of the monitor at the extrinsic that was served, and what the looks so far add up to."""
+
+    stamp_ns: int = Field(description="of the last pair, ns")
+    pair_stamps_ns: tuple[int, ...] = Field(description="of all of them, ns, ascending")
+    flagged: bool = Field(description="the pose is wrong, or the data are")
+    weak: bool = Field(description="the edges are fainter than they should be: the look counts less")
+    flagged_by_paper: bool | None = Field(description="equation (2); null until the rig is commissioned")
+    causes: tuple[Reason, ...] = Field(description="what is wrong with the data; such a look says nothing of the pose")
+    metrics: dict[str, MetricReply] = Field(description="by name")
+    first_derivative: Maybe6 = Field(description="f' at the pose: dMI, nats per rad or m")
+    second_derivative: Maybe6 = Field(description="f'' at the pose: -d²MI, nats per rad² or m²")
+    offset: Maybe6 = Field(description="from the pose to the local optimum, bias removed where known (deg, m)")
+    sigma: Maybe6 = Field(description="standard deviations of `offset` (deg, m)")
+    drift: Maybe6 | None = Field(
+        description="of the local optimum from commissioned (deg, m); null before commissioning"
+    )
+    drift_sigma: Maybe6 | None = Field(description="standard deviations of `drift` (deg, m)")
+    outcome: Literal["unknown", "clear", "suspect", "confirmed"] = Field(description="of all looks so far")
+    evidence: float = Field(description="for a moved mount, in independent looks")
+    state: HealthState = Field(description="of the pair after the look")
+
+
 class HealthReply(Message):
     """Is the calibration right? `unknown` is the state of not having looked."""
 
@@ -194,10 +217,19 @@ class HealthReply(Message):
     state: HealthState
     level: Literal[0, 1, 2, 3] = Field(description="ROS: 0 OK, 1 WARN, 2 ERROR, 3 STALE")
     reasons: tuple[Reason, ...]
-    metrics: dict[str, MetricReply] = Field(description="of the latest result, by name")
+    metrics: dict[str, MetricReply] = Field(description="of the latest result and of the latest look, by name")
     axes: Axes
-    drift: Maybe6 | None = Field(default=None, description="from commissioned (deg, m); null before commissioning")
+    drift: Maybe6 | None = Field(
+        default=None, description="of what is served from commissioned (deg, m); null before commissioning"
+    )
     drift_sigma: Maybe6 | None = Field(default=None, description="standard deviations of `drift` (deg, m)")
+    result_drift: Maybe6 | None = Field(
+        default=None, description="of the latest result, accepted or not, from commissioned (deg, m)"
+    )
+    result_drift_sigma: Maybe6 | None = Field(default=None, description="standard deviations of `result_drift`")
+    look: LookReply | None = Field(
+        default=None, description="the latest look; null when none was taken at what is served"
+    )
     needs: tuple[str, ...] = Field(description="what is still missing, one sentence each")
     data_quality: DataQuality
     since_ns: int = Field(description="wall clock when this state began, ns since 1970")
@@ -237,6 +269,7 @@ class HistoryReply(Message):
     total: Count = Field(description="results kept, before the selector")
     results: tuple[CalibrationResult, ...]
     entries: tuple[ChainedEntry, ...] = Field(default=(), description="of the hash chain, results without their bodies")
+    looks: tuple[LookReply, ...] = Field(default=(), description="of the monitor, as far as they are kept")
 
 
 class MetricsPoint(Part):

@@ -244,7 +244,7 @@ def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
 def _confirmed(state: PairState) -> PairState:
     """A window vouches for what is served: whatever the monitor had against it is settled. What is wrong with the data
     is not."""
-    fresh = MonitorState(blind=state.monitor.blind)
+    fresh = MonitorState(blind=state.monitor.blind, dirt=state.monitor.dirt)
     cause = diagnose(fresh)
     state = happened(replace(state, proven=True, monitor=fresh, flagged_since_ns=None), Event.CONFIRMED_BY_WINDOW)
     return state if cause is None else happened(state, Event.DATA_CAUSE, cause.as_reason())

@@ -21,6 +21,18 @@ class HealthState(StrEnum):
     STALE = "stale"
 
 
+STATES: Mapping[HealthState, str] = MappingProxyType(
+    {
+        HealthState.UNKNOWN: "what is served has not been looked at",
+        HealthState.HEALTHY: "what is served has been looked at and agrees with the data",
+        HealthState.SUSPECT: "something speaks against what is served; a window is being taken to tell",
+        HealthState.MISCALIBRATED: "what is served is wrong",
+        HealthState.DEGRADED: "the data, or the service, do not allow to tell",
+        HealthState.STALE: "what was healthy has not been looked at for longer than `stale_after_s`",
+    }
+)
+
+
 class Event(StrEnum):
     """What can happen to the health of a pair."""
 

@@ -1,0 +1,38 @@
+"""The page of the documentation about health, made of the tables that the code runs on."""
+
+from __future__ import annotations
+
+from coec.calibration import causes, monitor
+from coec.calibration.causes import BENT_MOUNT, CAUSES, Cause
+from coec.calibration.lifecycle.states import MEANING, STATES, HealthState, markdown
+
+
+def page() -> str:
+    """Markdown: states, events, the table of transitions, what the monitor needs, causes in the data."""
+    states = "".join(f"- `{state.value}`: {STATES[state]}\n" for state in HealthState)
+    events = "".join(f"- `{event.value}`: {meaning}\n" for event, meaning in MEANING.items())
+    told = "".join(
+        f"- `{cause.code}`: {cause.text} Then `{_state_of(cause).value}`.\n"
+        for cause in (BENT_MOUNT, *(cause for cause in CAUSES.values() if cause is not BENT_MOUNT))
+    )
+    return (
+        "# Health\n\n"
+        "Written by `python -m coec.calibration.lifecycle`; do not edit.\n\n"
+        f"## States\n\n{states}\n"
+        f"## Events\n\n{events}\n"
+        "## What follows\n\n"
+        "Rows: what happens. Columns: the state in which it happens. · means that nothing changes.\n\n"
+        f"{markdown()}\n"
+        "## What the monitor needs\n\n"
+        "Looks add up: a flagged look at pairs that were not counted yet adds 1, a clear one takes 1 off, a flagged\n"
+        f"one with faint edges adds {monitor.WEAK_SHARE:g}.\n"
+        f"`suspect` from {monitor.SUSPECT_AT:g} on, `miscalibrated` from {monitor.CONFIRMED_AT:g} on, clear again "
+        f"below {monitor.CLEAR_BELOW:g}; never more than {monitor.MOST:g}.\n"
+        f"A cause in the data is believed from {monitor.BLIND_AT:g} on; dirt is one after the same blocks of the\n"
+        f"image have shown no contrast for {causes.DIRTY_LOOKS:g} looks.\n\n"
+        f"## Causes\n\n{told}"
+    )
+
+
+def _state_of(cause: Cause) -> HealthState:
+    return HealthState.MISCALIBRATED if cause is BENT_MOUNT else HealthState.DEGRADED
