@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 
 from cli.conftest import SMALL, Coec
+from coec.adapters.depth import open_depth
+from coec.calibration.ports import DepthModel
 from coec.cli.calibrate import Options, configuration_of
 from coec.cli.windows import evenly, perturbation_of
-from coec.config import CalibrationConfig, DepthConfig, SearchConfig
+from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig
 from coec.errors import UsageError
 
 TOLERANCE_DEG = 0.35
@@ -76,10 +78,34 @@ def test_time_offset_is_reported_when_asked_for(coec: Coec) -> None:
     assert "time_offset" not in coec(*arguments, "--json").document
 
 
-def test_needs_a_depth_network(coec: Coec) -> None:
-    outcome = coec("calibrate", SMALL)
-    assert outcome.status == 2
-    assert "--depth" in outcome.err
+def test_without_a_network_the_one_that_comes_with_coec_is_used(coec: Coec) -> None:
+    options = ("calibrate", SMALL, "--objective", "mi", "--frames", "2", "--json")
+    ours = open_depth(DepthConfig(), LimitsConfig())
+    assert coec(*options).document["depth_identity"] == ours.identity
+    assert coec(*options, "--depth", "stereo").document["depth_identity"] != ours.identity
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module"),
+    [
+        (("evaluate", SMALL, "--rotation-deg", 1), "evaluate"),
+        (("commission", SMALL), "commission"),
+        (("diagnose", SMALL), "commission"),
+        (("paper", SMALL), "paper"),
+    ],
+)
+def test_so_do_the_other_commands(
+    coec: Coec, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], module: str
+) -> None:
+    asked: list[DepthConfig] = []
+
+    def enough(config: DepthConfig, _: LimitsConfig) -> DepthModel:
+        asked.append(config)
+        raise UsageError("enough")
+
+    monkeypatch.setattr(f"coec.cli.{module}.open_depth", enough)
+    assert coec(*arguments).status == 2
+    assert asked == [DepthConfig()]
 
 
 def test_unknown_objective_is_a_usage_error(coec: Coec) -> None:
@@ -95,6 +121,7 @@ def test_unknown_camera_model_is_a_usage_error(coec: Coec) -> None:
 def test_options_override_the_recorded_configuration_and_nothing_else() -> None:
     recorded = CalibrationConfig(depth=DepthConfig(model="stereo", threads=7), search=SearchConfig(dof=3, step_deg=1.0))
     assert configuration_of(Options(source=""), recorded) == recorded
+    assert configuration_of(Options(source=""), None) == CalibrationConfig()
     changed = configuration_of(Options(source="", dof=6, no_motion_compensation=True), recorded)
     assert changed.search == SearchConfig(dof=6, step_deg=1.0)
     assert changed.depth == recorded.depth

@@ -18,6 +18,8 @@ def test_one_look_at_a_right_and_at_a_wrong_extrinsic(coec: Coec) -> None:
     assert right.status == 0
     assert right.document["causes"] == []
     assert right.document["flagged_by_paper"] is None
+    assert right.document["drift"] is None
+    assert [len(right.document[name]) for name in ("first_derivative", "second_derivative")] == [6, 6]
     wrong = coec("diagnose", RIG, "--depth", "stereo", "--perturb", "2,-2,1", "--json")
     assert wrong.status == 1
     assert wrong.document["flagged"]

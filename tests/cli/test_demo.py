@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from rich.console import Console
@@ -15,16 +16,18 @@ from coec.adapters.timeline_plot import timeline
 from coec.calibration.values import EgoMotion
 from coec.cli.demo import report, story
 from coec.cli.demo.outcome import Outcome, outcome_of
+from coec.cli.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
 from coec.cli.demo.screen import BARS, curve
 from coec.cli.demo.vehicle import NS_PER_S, paced
 from coec.cli.demo.watch import Moment
+from coec.schemas import replies
 
-KNOCK_S, MAX_ERROR_DEG = 36.0, 0.3
+KNOCK_S, MAX_ERROR_DEG = story.KNOCK_S, story.MAX_ERROR_DEG
 
 START = Moment(
     t_s=3.0, drive_s=0.0, service="running", health="unknown", provenance="nominal", status="not_accepted",
     window_id=None,
-    correction_deg=(0.0, 0.0, 0.0), error_by_axis_deg=(0.0, 0.0, 0.0), error_deg=0.0,
+    correction_deg=(0.0, 0.0, 0.0), error_by_axis_deg=(0.0, 0.0, 0.0), error_deg=0.9,
 )  # fmt: skip
 HEALTHY = replace(
     START, drive_s=28.0, health="healthy", provenance="estimated", status="accepted", window_id="w-1", error_deg=0.04
@@ -90,6 +93,46 @@ def test_the_drive_ends_when_it_is_told() -> None:
     assert len(list(paced(frames(30), lambda _: False, stop, rate=1e-9))) == 30, "no wait is left"
 
 
+def test_a_drive_waits_for_a_service_at_work() -> None:
+    pace = Pace(judged_ns=0)
+    pace.saw(None, at_rest=False, stamp_ns=LEAD_NS)
+    assert pace.may_pass(LEAD_NS)
+    assert not pace.may_pass(LEAD_NS + 1)
+    pace.saw(5 * NS_PER_S, at_rest=False, stamp_ns=LEAD_NS)
+    assert pace.may_pass(LEAD_NS + 5 * NS_PER_S)
+    assert not pace.may_pass(LEAD_NS + 5 * NS_PER_S + 1)
+
+
+def test_a_service_that_waits_for_more_gets_a_little_more() -> None:
+    pace = Pace(judged_ns=0)
+    pace.saw(None, at_rest=True, stamp_ns=LEAD_NS)
+    assert pace.may_pass(LEAD_NS + STEP_NS)
+    assert not pace.may_pass(LEAD_NS + STEP_NS + 1)
+    pace.saw(None, at_rest=True, stamp_ns=NS_PER_S)
+    assert pace.may_pass(LEAD_NS + STEP_NS), "never less than before"
+
+
+@pytest.mark.parametrize(
+    ("state", "queued", "held", "received", "lost", "rests"),
+    [
+        ("idle", 0, 0, 20, 0, True),
+        ("idle", 0, 0, 19, 0, True),
+        ("idle", 0, 0, 18, 0, False),
+        ("idle", 0, 0, 17, 2, True),
+        ("busy", 0, 0, 20, 0, False),
+        ("starting", 0, 0, 20, 0, False),
+        ("idle", 1, 0, 20, 0, False),
+        ("idle", 0, 1, 20, 0, False),
+    ],
+)
+def test_a_service_rests_that_has_everything_and_no_work(
+    state: Literal["starting", "idle", "busy"], queued: int, held: int, received: int, lost: int, rests: bool
+) -> None:
+    worker = replies.WorkerStatus(state=state, queued=queued)
+    camera = replies.StreamStatus(received=received, losses={"overrun": lost})
+    assert at_rest(worker, replies.PairStatus(name="sim", camera=camera, held=held), sent=20) is rests
+
+
 def test_the_curve_has_the_height_of_the_error_and_the_colour_of_the_health() -> None:
     text = curve([(0.0, 0.0, "unknown"), (1.0, 3.0, "miscalibrated"), (3.0, 0.1, "healthy")])
     assert text.plain == f"{BARS[0]}{BARS[7]} {BARS[0]}"
@@ -115,11 +158,15 @@ def test_the_page_needs_no_other_file(tmp_path: Path) -> None:
 def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr("coec.cli.console.out", Console(file=stream, width=140))
-    moments = [START, HEALTHY, KNOCKED, ALARM, REPAIRED]
+    moments = [START, HEALTHY, KNOCKED, replace(SUSPECT, drive_s=ALARM.drive_s), ALARM, REPAIRED]
     report.show(moments, outcome(*moments), report.Left((), None))
     said = stream.getvalue()
+    for error in ("0.900°", "0.040°", "3.010°", "0.060°"):
+        assert error in said
     assert "15 s after it" in said
     assert "25 s after it" in said
+    (alarm,) = (line for line in said.splitlines() if line.rstrip().endswith("alarm"))
+    assert "miscalibrated" in alarm, "not the line before, of the same second"
     for what in ("knocked", "alarm", "repaired", "accepted"):
         assert what in said
 
@@ -132,7 +179,7 @@ def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
     config = story.service_config(drive.rig, Path("mask.png"), "tcp/127.0.0.1:1")
     (pair,) = config.pairs
     assert pair.calibration.objective.kind == "fused"
-    assert pair.calibration.depth.model == story.DEPTH_MODEL
+    assert pair.calibration == type(pair.calibration)(), "with the network that comes with it"
     assert (pair.policy, pair.fusion) == (type(pair.policy)(), type(pair.fusion)())
     left, top, width, height = story.CLOSE_UP_PX
     assert left + width <= drive.rig.camera.width

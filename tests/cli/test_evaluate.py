@@ -182,9 +182,8 @@ def test_fitted_camera_and_uncompensated_clouds(coec: Coec) -> None:
     assert report["std"] == [None] * 6
 
 
-def test_needs_a_radius_and_a_depth_network(coec: Coec) -> None:
+def test_needs_a_radius(coec: Coec) -> None:
     assert coec("evaluate", SMALL, "--depth", "stereo").status == 2
-    assert coec("evaluate", SMALL, "--rotation-deg", "5").status == 2
 
 
 def test_search_box_holds_the_starts() -> None:

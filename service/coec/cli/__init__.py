@@ -59,7 +59,15 @@ class DegreesOfFreedom(StrEnum):
     ALL = "6"
 
 
-# What `calibrate` and `evaluate` both take.
+# What several commands take.
+Depth = Annotated[
+    str | None,
+    typer.Option(
+        help="An ONNX file, a built-in name (`coec models`), or `stereo`: the maps of the source. Without it, what a "
+        "recorded window names, else the network that comes with coec.",
+        metavar="MODEL",
+    ),
+]
 Objective = Annotated[
     str | None,
     typer.Option(help="What is maximised: fused (edges and depth), mi (the paper), intensity.", metavar="NAME"),
@@ -79,14 +87,7 @@ NoMotionCompensation = Annotated[
 @app.command("calibrate")
 def _calibrate(
     source: Source,
-    depth: Annotated[
-        str | None,
-        typer.Option(
-            help="An ONNX file, a built-in name (`coec models`), or `stereo`: the maps of the source. A recorded "
-            "window names its own.",
-            metavar="MODEL",
-        ),
-    ] = None,
+    depth: Depth = None,
     objective: Objective = None,
     dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None,
     perturb: Annotated[
@@ -135,9 +136,7 @@ def _evaluate(
     translation_m: Annotated[
         float, typer.Option(help="Radius of the sphere of starts, metres.", metavar="T", min=0)
     ] = 0.0,
-    depth: Annotated[
-        str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
-    ] = None,
+    depth: Depth = None,
     objective: Annotated[
         str | None,
         typer.Option(
@@ -209,9 +208,7 @@ def _commission(
     output: Annotated[Path, typer.Option(help="Baseline to write, or to add the pair to.", metavar="FILE")] = Path(
         "rig.json"
     ),
-    depth: Annotated[
-        str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
-    ] = None,
+    depth: Depth = None,
     objective: Objective = None,
     dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None,
     frames: Frames = None,
@@ -244,9 +241,7 @@ def _commission(
 @app.command("diagnose")
 def _diagnose(
     source: Source,
-    depth: Annotated[
-        str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
-    ] = None,
+    depth: Depth = None,
     rig: Annotated[
         Path | None, typer.Option(help="Baseline from `coec commission`.", metavar="FILE", show_default=False)
     ] = None,
@@ -286,9 +281,7 @@ def _paper(
     output: Annotated[Path, typer.Option(help="Folder for the figures and report.json.", metavar="DIR")] = Path(
         "coec-paper"
     ),
-    depth: Annotated[
-        str | None, typer.Option(help="An ONNX file, a built-in name, or `stereo`, as for calibrate.", metavar="MODEL")
-    ] = None,
+    depth: Depth = None,
     objective: Annotated[str, typer.Option(help="mi (the paper's) or fused.", metavar="NAME")] = "mi",
     runs: Annotated[int, typer.Option(help="Solves per experiment.", min=1)] = 100,
     samples: Annotated[int, typer.Option(help="Samples of pairs for the failure metrics.", min=3)] = 100,
@@ -530,7 +523,11 @@ def _sim_drive(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a drive as a ROS 2 bag; the truth lies beside the sensors on /ground_truth/tf."""
+    """Write a drive as a ROS 2 bag; the truth lies beside the sensors on /ground_truth/tf.
+
+    A bag has no place for a mask: what reads it back finds the vehicle's own body and the rim of the lens from the
+    frames themselves, given five or more in motion.
+    """
     from coec.cli import sim as command
 
     options = command.Options(

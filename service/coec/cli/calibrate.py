@@ -124,10 +124,8 @@ def configuration_of(options: Options, recorded: CalibrationConfig | None) -> Ca
     """The recorded configuration, or the defaults, with what was given on the command line.
 
     Raises:
-        UsageError: a value that does not exist, or no depth.
+        UsageError: a value that does not exist.
     """
-    if recorded is None and options.depth is None:
-        raise UsageError("this source names no depth network: give --depth MODEL (`stereo` for maps of the source)")
     values: dict[str, Any] = (recorded or CalibrationConfig()).model_dump()
     if options.depth is not None:
         values["depth"]["model"] = options.depth

@@ -78,7 +78,7 @@ def load(sources: tuple[str, ...], options: Options, times: calibrate_command.St
     """The windows of all sources, with the configuration of the first.
 
     Raises:
-        UsageError: no source, no depth, or a value that does not exist.
+        UsageError: no source, or a value that does not exist.
     """
     if not sources:
         raise UsageError("name at least one recording of a rig whose calibration is right")

@@ -122,7 +122,7 @@ def configuration_of(options: Options, recorded: CalibrationConfig | None) -> Ca
     of freedom unless told otherwise.
 
     Raises:
-        UsageError: a value that does not exist, no depth, or starts too far for any search box.
+        UsageError: a value that does not exist, or starts too far for any search box.
     """
     configuration = calibrate_command.configuration_of(
         calibrate_command.Options(

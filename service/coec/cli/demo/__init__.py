@@ -23,6 +23,7 @@ from coec.cli.commented_yaml import commented_yaml
 from coec.cli.demo import report, story
 from coec.cli.demo.daemon import Daemon, DemoError, free_endpoint, running
 from coec.cli.demo.outcome import Outcome, outcome_of
+from coec.cli.demo.pace import Pace
 from coec.cli.demo.screen import Screen
 from coec.cli.demo.vehicle import NS_PER_S, Vehicle
 from coec.cli.demo.watch import ASK_S, Seen, Watch
@@ -66,6 +67,7 @@ def run(output: Path, *, as_json: bool) -> int:
                     drive.rig.T_camera_lidar_nominal,
                     _truth(drive),
                     drive.camera_stamps_ns[0],
+                    Pace(drive.camera_stamps_ns[0]),
                     started_s,
                 )
                 _until_running(watch, daemon, screen)
@@ -102,7 +104,7 @@ def _until_running(watch: Watch, daemon: Daemon, screen: Screen) -> None:
     deadline_s = time.monotonic() + START_S
     while True:
         daemon.check()
-        seen = watch.look(0.0)
+        seen = watch.look(0.0, 0)
         if seen is not None:
             screen.show(watch, seen)
             if seen.status.state == "running":
@@ -123,7 +125,7 @@ def _watch(watch: Watch, vehicle: Vehicle, daemon: Daemon, screen: Screen) -> tu
             arrived = vehicle.arrived
             if vehicle.failure is not None:
                 raise vehicle.failure
-            seen = watch.look(vehicle.second)
+            seen = watch.look(vehicle.second, vehicle.pictures)
             if seen is None:
                 raise DemoError(f"the service answers no more; {daemon.last_words()}")
             screen.show(watch, seen)

@@ -64,7 +64,7 @@ def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float)
     repaired = (
         moment.drive_s
         for moment in late
-        if alarm_s is not None and moment.drive_s >= alarm_s and _is_repaired(moment, max_error_deg)
+        if alarm_s is not None and moment.drive_s >= alarm_s and is_repaired(moment, max_error_deg)
     )
     return Outcome(
         knock_s=knock_s,
@@ -77,5 +77,6 @@ def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float)
     )
 
 
-def _is_repaired(moment: Moment, max_error_deg: float) -> bool:
+def is_repaired(moment: Moment, max_error_deg: float) -> bool:
+    """Whether what is served is an estimate of the service's own, within the limit of the truth, and it is healthy."""
     return moment.health == "healthy" and moment.provenance == "estimated" and moment.error_deg < max_error_deg

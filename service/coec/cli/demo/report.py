@@ -19,7 +19,7 @@ from coec.calibration.motion import compensate
 from coec.calibration.values import Matrix4, Window
 from coec.cli import console, files, pictures, windows
 from coec.cli.demo import story
-from coec.cli.demo.outcome import Outcome
+from coec.cli.demo.outcome import ALARM, Outcome, is_repaired
 from coec.cli.demo.watch import Moment, Seen, Watch
 from coec.config import LimitsConfig
 from coec.geometry import cameras
@@ -80,7 +80,7 @@ def show(moments: Sequence[Moment], outcome: Outcome, left: Left) -> None:
     console.out.print(steps)
     console.out.print()
     summary = console.table("", "", right=(1,))
-    for name, value in _summary(outcome, moments[-1]):
+    for name, value in _summary(outcome, moments):
         summary.add_row(name, value)
     console.out.print(summary)
     console.out.print()
@@ -141,8 +141,8 @@ def _happenings(moments: Sequence[Moment], outcome: Outcome) -> list[str]:
         ("the drive begins", lambda moment: moment.service == "running"),
         ("the first window", lambda moment: moment.provenance == "estimated"),
         ("knocked", lambda moment: moment.drive_s >= outcome.knock_s),
-        ("alarm", lambda moment: moment.drive_s == outcome.alarm_s),
-        ("repaired", lambda moment: moment.drive_s == outcome.repaired_s),
+        ("alarm", lambda moment: moment.drive_s == outcome.alarm_s and moment.health == ALARM),
+        ("repaired", lambda moment: moment.drive_s == outcome.repaired_s and is_repaired(moment, story.MAX_ERROR_DEG)),
     )
     remarks = [""] * len(moments)
     for remark, is_so in firsts:
@@ -152,18 +152,23 @@ def _happenings(moments: Sequence[Moment], outcome: Outcome) -> list[str]:
     return remarks
 
 
-def _summary(outcome: Outcome, last: Moment) -> list[tuple[str, str]]:
+def _summary(outcome: Outcome, moments: Sequence[Moment]) -> list[tuple[str, str]]:
+    last = moments[-1]
+    early = [moment for moment in moments if moment.drive_s < outcome.knock_s and moment.provenance == "estimated"]
+
     def after_knock(second: float | None) -> str:
         return "never" if second is None else f"{second - outcome.knock_s:.0f} s after it"
 
     axes = "  ".join(f"{value:+.3f}°" for value in last.error_by_axis_deg)
     return [
+        ("error of the workshop's calibration", f"{moments[0].error_deg:.3f}°"),
+        ("error after the first window", f"{early[-1].error_deg:.3f}°" if early else "no window was accepted"),
         ("knock", f"{story.KNOCK_DEG:g}° in pitch at {outcome.knock_s:.0f} s of driving"),
         ("alarm", after_knock(outcome.alarm_s)),
         ("repair", after_knock(outcome.repaired_s)),
         ("error after the knock", f"{outcome.error_before_deg:.3f}°"),
         ("error after the repair", f"{outcome.error_after_deg:.3f}°"),
-        ("of it pitch, yaw, roll", axes),
+        ("in pitch, yaw, roll", axes),
     ]
 
 
@@ -180,12 +185,18 @@ def page(
     """One HTML file that needs no other."""
     verdict = "The knock was noticed and repaired." if outcome.passed else " ".join(outcome.objections())
     parts = [
-        "<!doctype html><html lang=en><meta charset=utf-8><title>coec demo</title>",
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
+        "<title>coec demo</title>",
         f"<style>{STYLE}</style><h1>{escape(_title())}</h1>",
         f"<p><b>{escape(verdict)}</b> The vehicle, its street and its sensors are simulated, so the truth is "
-        "known; the service is the one that runs on a vehicle, in a process of its own, and has seen the frames alone.",
-        _table(("", ""), [(escape(name), escape(value)) for name, value in _summary(outcome, moments[-1])]),
-        _figure(shown["timeline"], "Error of the extrinsic that is served; the ground is what the service says of it."),
+        "known; the service is the one that runs on a vehicle, in a process of its own, and has seen the frames alone. "
+        "Its depth network is the one that comes with it, trained on other streets of the same simulation.",
+        _table(("", ""), [(escape(name), escape(value)) for name, value in _summary(outcome, moments)]),
+        _figure(
+            shown["timeline"],
+            "Error of the extrinsic that is served, which the service cannot know; the "
+            "ground is what it says of its calibration.",
+        ),
     ]
     if "closeup_before" in shown:
         parts.append(_figure(shown["closeup_before"], "LiDAR points where the service put them before the repair …"))
@@ -226,7 +237,10 @@ def _result(result: replies.CalibrationResult) -> str:
         )
         for name, metric in result.metrics.items()
     ]
-    told = f"{result.pairs} pairs, verdict {result.verdict.decision}, configuration {result.config_hash}"
+    told = (
+        f"{result.pairs} pairs, verdict {result.verdict.decision}, configuration {result.config_hash}. The figures of "
+        "its self-diagnosis, without the truth; a result is accepted if it keeps all limits:"
+    )
     return f"<p>{escape(told)}</p>" + _table(("figure", "value", "limit", ""), rows, numbers=(1,))
 
 

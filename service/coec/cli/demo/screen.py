@@ -102,7 +102,12 @@ def _error(seen: Seen) -> Text:
 
 
 def _reason(seen: Seen) -> str:
-    return seen.health.reasons[0].text if seen.health.reasons else "The monitor finds nothing wrong."
+    if seen.health.reasons:
+        return seen.health.reasons[0].text
+    figures = (seen.health.metrics.get(name) for name in FIGURES)
+    if any(figure is not None and not figure.passed for figure in figures):
+        return "The latest look speaks against it; one look alone is not believed."
+    return "The monitor finds nothing wrong."
 
 
 def _worker(seen: Seen) -> str:

@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coec.adapters.depth import STEREO
 from coec.adapters.player import Streams
 from coec.adapters.rig import matrix_rows
 from coec.calibration.values import Rig
 from coec.config import (
-    CalibrationConfig,
     CameraConfig,
     CameraIntrinsics,
     Config,
-    DepthConfig,
     EgoConfig,
     LidarConfig,
     MonitorConfig,
@@ -30,12 +27,12 @@ from coec.simulation.source import require_extra
 if TYPE_CHECKING:
     from coec.simulation.drive import DriveConfig
 
-DEPTH_MODEL = STEREO
-"""Where the service gets depth from: a built-in network, or `stereo`, the exact depth of the simulation."""
-
 SEED = 1
 LONGEST_S = 240.0
 """Of driving: the drive ends as soon as the story is told, and here at the latest."""
+
+WORKSHOP = (0.6, -0.5, 0.4, 0.0, 0.0, 0.0)
+"""By how much the calibration of the workshop is wrong: degrees in pitch, yaw, roll, and metres."""
 
 KNOCK_S, KNOCK_DEG = 36.0, 3.0
 """When and how far the mount is bent, in pitch: after the first window has been judged."""
@@ -53,7 +50,7 @@ WINDOW = WindowConfig(pairs=12, min_pairs=8, slice_s=24.0)
 MONITOR = MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0)
 """Shorter than on a vehicle, where a window takes three minutes: nobody wants to watch that."""
 
-MAX_ERROR_DEG = 0.3
+MAX_ERROR_DEG = 0.25
 """What the repair must be within of the truth (geodesic angle)."""
 
 MIN_FREE_BYTES = 64 * 2**20
@@ -79,7 +76,7 @@ def drive_config() -> DriveConfig:
         lidar_hz=PAIR_HZ,
         ego_hz=EGO_HZ,
         faults=(Step(KNOCK_S, LONGEST_S, rx=KNOCK_DEG),),
-        depth=DEPTH_MODEL == STEREO,
+        workshop=WORKSHOP,
     )
 
 
@@ -100,7 +97,6 @@ def service_config(rig: Rig, mask: Path, endpoint: str) -> Config:
         T_camera_lidar=matrix_rows(rig.T_camera_lidar_nominal),
         window=WINDOW,
         monitor=MONITOR,
-        calibration=CalibrationConfig(depth=DepthConfig(model=DEPTH_MODEL)),
     )
     return Config(
         zenoh=ZenohConfig(connect=(endpoint,), listen=(endpoint,)),

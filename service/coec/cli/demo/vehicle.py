@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from coec.adapters.player import Frame, Played, Player, Streams
+from coec.adapters.player import CAMERA, Frame, Played, Player, Streams
 
 if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
@@ -55,6 +55,11 @@ class Vehicle:
     def second(self) -> float:
         """Of the drive."""
         return max((self.stamp_ns - self._drive.camera_stamps_ns[0]) / NS_PER_S, 0.0)
+
+    @property
+    def pictures(self) -> int:
+        """How many have been sent."""
+        return self.played.frames[CAMERA]
 
     def start(self, wait_s: float) -> list[str]:
         """Drives off once the service listens; the keys that nobody listens to after `wait_s`."""

@@ -12,21 +12,12 @@ import zenoh
 from coec.adapters.zenoh_client import RemoteError, ask, ask_one
 from coec.calibration.values import Matrix4
 from coec.cli import windows
+from coec.cli.demo.pace import NS_PER_S, Pace, at_rest
 from coec.errors import NotFoundError
 from coec.geometry import se3
 from coec.schemas import replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import Keys
-
-LEAD_S = 7.0
-"""The drive waits while it is so far ahead of what the service has judged: a look of the monitor, and a little. So the
-story does not depend on how fast the machine is."""
-
-IDLE_S = 1.5
-"""A service that has had nothing to do for so long will judge nothing more of what it has got; what it says of its
-worker is renewed every second."""
-
-NS_PER_S = 1_000_000_000
 
 ASK_S = 10.0
 """For one answer, on a machine that also draws the street."""
@@ -76,6 +67,7 @@ class Watch:
     Attributes:
         truth: true T_camera_lidar (4, 4) at a second of the drive.
         first_ns: sensor time at which the drive begins.
+        pace: how far the drive may go on.
         series: everything seen: (second of the drive, error in degrees, health).
         timeline: the moments at which something was different from before.
         latest: None before the first answer.
@@ -87,23 +79,18 @@ class Watch:
     nominal: Matrix4
     truth: Callable[[float], Matrix4]
     first_ns: int
+    pace: Pace
     started_s: float
     series: list[tuple[float, float, str]] = field(default_factory=list)
     timeline: list[Moment] = field(default_factory=list)
     latest: Seen | None = None
-    _idle_since_s: float | None = None
 
     def may_pass(self, stamp_ns: int) -> bool:
-        """Whether the drive may go on to this sensor time: the service has kept up, or has nothing to do."""
-        if self.latest is None:
-            return False
-        judged_ns = self.latest.health.evaluated_ns or self.first_ns
-        if stamp_ns - judged_ns <= LEAD_S * NS_PER_S:
-            return True
-        return self._idle_since_s is not None and time.monotonic() - self._idle_since_s >= IDLE_S
+        """Whether the drive may go on to this sensor time."""
+        return self.latest is not None and self.pace.may_pass(stamp_ns)
 
-    def look(self, drive_s: float) -> Seen | None:
-        """The state now, or None while the service is not there yet."""
+    def look(self, drive_s: float, sent: int) -> Seen | None:
+        """The state now, or None while the service is not there yet; after so many seconds of driving and pictures."""
         if not ask(self.session, self.keys.status, ASK_S):
             return None
         try:
@@ -111,11 +98,8 @@ class Watch:
         except (NotFoundError, RemoteError):
             return None
         self.latest = seen
-        worker = seen.status.worker
-        if worker.state != "idle" or worker.queued:
-            self._idle_since_s = None
-        elif self._idle_since_s is None:
-            self._idle_since_s = time.monotonic()
+        rests = at_rest(seen.status.worker, seen.pair, sent)
+        self.pace.saw(seen.health.evaluated_ns, at_rest=rests, stamp_ns=self.first_ns + round(drive_s * NS_PER_S))
         self.series.append((drive_s, seen.moment.error_deg, seen.moment.health))
         if not self.timeline or _essence(seen.moment) != _essence(self.timeline[-1]):
             self.timeline.append(seen.moment)
