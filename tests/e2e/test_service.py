@@ -33,8 +33,8 @@ STEREO = CalibrationConfig(depth=MAPS)
 BY_DEPTH = CalibrationConfig(depth=MAPS, objective=ObjectiveConfig(kind="mi"))
 """The synthetic street has too few pixels for edges."""
 
-SLOW = CalibrationConfig(depth=MAPS, objective=ObjectiveConfig(depth_bins=512, range_bins=512))
-"""A quarter of a million cells per histogram: a solve takes seconds, so that there is a middle of it."""
+SLOW = CalibrationConfig(depth=MAPS, objective=ObjectiveConfig(depth_bins=256, range_bins=256))
+"""Sixty-five thousand cells per histogram: a solve takes seconds, so that there is a middle of it."""
 
 COMPUTED_S = 0.2
 """Processor time after which the worker is in that middle."""

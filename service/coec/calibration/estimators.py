@@ -55,14 +55,13 @@ MAX_GREY_WIDTH_PX = 800
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
     """A window as an estimator sees it: its pairs, P_i as the clouds at the instants of the exposures, and how to look
-    at the images. Depth is inferred only when an estimator asks, and images are decoded once: `greys_seen`."""
+    at the images. Depth is inferred and images are decoded when an estimator asks."""
 
     window: Window
     clouds: tuple[CompensatedCloud, ...]
     depth: DepthModel
     images: ImageReader
     progress: Progress
-    greys_seen: tuple[NDArray[np.uint8], ...] | None = None
 
     def depths(self) -> list[DepthMap]:
         """D_i of every pair.
@@ -78,8 +77,6 @@ class Sight:
         Raises:
             CalibrationError: an image cannot be decoded.
         """
-        if self.greys_seen is not None:
-            return iter(self.greys_seen)
         return self._each("images", lambda index: self.images.grey(self.window.pairs[index].camera))
 
     def _each(self, stage: str, look: Callable[[int], Seen]) -> Iterator[Seen]:
@@ -102,19 +99,20 @@ def look(
 
 
 def _masked(sight: Sight) -> Sight:
-    try:
-        greys = tuple(sight.greys())
-    except CalibrationError:
-        return sight  # an estimator that needs the images will say so
+    # The images are decoded once more when an estimator asks: to keep them all would cost more than that is worth.
     moving = (
         grey
-        for grey, pair in zip(greys, sight.window.pairs, strict=True)
+        for grey, pair in zip(sight.greys(), sight.window.pairs, strict=True)
         if pair.motion is None or pair.motion.speed_mps >= MIN_SPEED_MPS
     )
-    rig, mask = sight.window.rig, lit_pixels(moving)
+    rig = sight.window.rig
+    try:
+        mask = lit_pixels(moving)
+    except CalibrationError:
+        return sight  # an estimator that needs the images will say so
     if mask is None or mask.shape != (rig.camera.height, rig.camera.width):
-        return replace(sight, greys_seen=greys)
-    return replace(sight, window=replace(sight.window, rig=replace(rig, mask=mask)), greys_seen=greys)
+        return sight
+    return replace(sight, window=replace(sight.window, rig=replace(rig, mask=mask)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

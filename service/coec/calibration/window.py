@@ -180,4 +180,4 @@ def _directions_in_view(camera: Camera) -> NDArray[np.bool_]:
     rays = np.column_stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
     pixels = np.array([project_point(camera, *ray) for ray in rays.tolist()])
     seen = (pixels[:, 2] != 0.0) & in_image(camera, pixels[:, :2])
-    return seen.reshape(CELLS, CELLS)
+    return np.asarray(seen.reshape(CELLS, CELLS))
