@@ -13,8 +13,9 @@ from rich.console import Console
 
 from cli.conftest import SMALL, Coec
 from coec.calibration.objective import SearchBox
-from coec.cli import bench, bench_live, bench_scene, bench_table, bench_worker
-from coec.cli.bench_process import ProcessReading
+from coec.cli import bench
+from coec.cli.bench import live, rows, scene, worker
+from coec.cli.bench.process import ProcessReading
 from coec.geometry import se3
 
 PROMISED = {
@@ -24,7 +25,7 @@ PROMISED = {
 
 @pytest.fixture
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_scene, "POINTS", 4000)
+    monkeypatch.setattr(scene, "POINTS", 4000)
     monkeypatch.setattr(bench, "FRAMES", 5)
     monkeypatch.setattr(bench, "FRAME_COUNTS", (5, 10))
     monkeypatch.setattr(bench, "REPEATS", 2)
@@ -35,12 +36,10 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What the measurements of processes would bring."""
-    figures = {
-        row.key: 1.0 for row in bench_table.ROWS if row.key.startswith(("worker", "solve_memory", "io", "query"))
-    }
+    figures = {row.key: 1.0 for row in rows.ROWS if row.key.startswith(("worker", "solve_memory", "io", "query"))}
     document = {**figures, "io_per_second": {"pairs": 10.0}}
-    monkeypatch.setattr(bench_worker, "measure", lambda *_: {})
-    monkeypatch.setattr(bench_live, "measure", lambda *_: dict(document))
+    monkeypatch.setattr(worker, "measure", lambda *_: {})
+    monkeypatch.setattr(live, "measure", lambda *_: dict(document))
     return document
 
 
@@ -50,8 +49,8 @@ def test_the_document_holds_what_is_promised(coec: Coec, no_processes: dict[str,
     outcome = coec("bench", "--json")
     assert outcome.status == 0
     document = outcome.document
-    assert set(document) >= PROMISED | set(no_processes) | {row.key for row in bench_table.ROWS}
-    assert set(document["mi_25_frames_ms_by_model"]) == set(bench_scene.CAMERAS)
+    assert set(document) >= PROMISED | set(no_processes) | {row.key for row in rows.ROWS}
+    assert set(document["mi_25_frames_ms_by_model"]) == set(scene.CAMERAS)
     assert set(document["mi_ms_by_frames"]) == {"5", "10"}
     assert all(document[name] > 0 for name in PROMISED - {"machine"})
     assert document["solve_10deg_3dof_error_deg"] < 0.3
@@ -60,10 +59,10 @@ def test_the_document_holds_what_is_promised(coec: Coec, no_processes: dict[str,
 
 
 def test_a_worker_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_scene, "POINTS", 30_000)
-    monkeypatch.setattr(bench_worker, "SOLVES", {"mi": bench_worker.SOLVES["mi"]})
+    monkeypatch.setattr(scene, "POINTS", 30_000)
+    monkeypatch.setattr(worker, "SOLVES", {"mi": worker.SOLVES["mi"]})
     heard: list[str] = []
-    document = bench_worker.measure(tmp_path, 6, heard.append)
+    document = worker.measure(tmp_path, 6, heard.append)
     assert heard
     assert min(document.values()) > 0.0
     assert set(document) == {
@@ -72,11 +71,10 @@ def test_a_worker_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_daemon_is_measured_under_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_live, "SETTLE_S", 1.0)
-    monkeypatch.setattr(bench_live, "SECONDS", 1.5)
-    document = bench_live.measure(tmp_path, lambda _: None)
-    live = {row.key for row in bench_table.ROWS if row.key.startswith(("io", "query"))}
-    assert set(document) >= live
+    monkeypatch.setattr(live, "SETTLE_S", 1.0)
+    monkeypatch.setattr(live, "SECONDS", 1.5)
+    document = live.measure(tmp_path, lambda _: None)
+    assert set(document) >= {row.key for row in rows.ROWS if row.key.startswith(("io", "query"))}
     assert document["io_cpu_percent"] > 0.0
     assert document["io_resident_mb"] > document["io_proportional_mb"] > 0.0
     assert {"cameras", "lidars", "pairs", "windows"} <= set(document["io_per_second"])
@@ -84,7 +82,7 @@ def test_a_daemon_is_measured_under_load(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_the_table_says_what_is_not_as_required(capsys: pytest.CaptureFixture[str]) -> None:
     figures = {"io_cpu_percent": 30.0, "ratio_to_numpy": 50.0, "mi_ms_by_frames": {"5": 0.4}, "query_idle_p99_ms": None}
-    Console(width=140).print(bench_table.table(figures))
+    Console(width=140).print(rows.table(figures))
     lines = {line.split("  ")[0].strip(): line for line in capsys.readouterr().out.splitlines()}
     assert "✗" in lines["I/O process under load, of one core"]
     assert "≤ 25 %" in lines["I/O process under load, of one core"]
@@ -106,14 +104,14 @@ def test_a_process_is_read() -> None:
         child.kill()
 
 
-@pytest.mark.parametrize("model", bench_scene.CAMERAS)
+@pytest.mark.parametrize("model", scene.CAMERAS)
 @pytest.mark.usefixtures("_small")
 def test_the_scene_is_seen_best_from_the_truth(model: str) -> None:
     box = SearchBox(np.radians(10.0), 0.0)
-    objective = bench_scene.objective_of(bench_scene.CAMERAS[model], 2, bench_scene.T_TRUE, box)
-    truth = objective.evaluate(bench_scene.T_TRUE).score
+    objective = scene.objective_of(scene.CAMERAS[model], 2, scene.T_TRUE, box)
+    truth = objective.evaluate(scene.T_TRUE).score
     for axis in range(3):
         for degrees in (-3.0, 3.0):
             xi = np.zeros(6)
             xi[axis] = np.radians(degrees)
-            assert objective.evaluate(se3.perturb(bench_scene.T_TRUE, xi)).score < truth
+            assert objective.evaluate(se3.perturb(scene.T_TRUE, xi)).score < truth

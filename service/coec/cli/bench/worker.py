@@ -13,8 +13,8 @@ from coec.adapters.looks import pack_pairs, pack_pose
 from coec.adapters.mcap_windows import WindowWriter, read_window
 from coec.adapters.worker import Errand, Solved, SolveJob, Worker, WorkerState
 from coec.calibration.values import Reason
-from coec.cli import bench_scene
-from coec.cli.bench_process import ProcessReading
+from coec.cli.bench import scene
+from coec.cli.bench.process import ProcessReading
 from coec.config import (
     CalibrationConfig,
     CameraConfig,
@@ -99,7 +99,7 @@ def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
 def _first_result_s(name: str, window: Path, config: Config) -> float:
     answers: Answers = queue.SimpleQueue()
     pairs = read_window(window)[0].pairs[: config.pairs[0].monitor.pairs]
-    look = {"pose": pack_pose(bench_scene.T_TRUE), "frames": pack_pairs(pairs)}
+    look = {"pose": pack_pose(scene.T_TRUE), "frames": pack_pairs(pairs)}
     with _worker(config, answers) as worker:
         begin = time.perf_counter()
         worker.look(Errand("observe", name, look, answers.put))
@@ -117,23 +117,23 @@ def _expected(answer: Solved | dict[str, Any] | Reason, kind: type) -> None:
 
 
 def _window(folder: Path, name: str, frames: int) -> Path:
-    camera = bench_scene.CAMERAS[CAMERA]
+    camera = scene.CAMERAS[CAMERA]
     path = folder / f"{name}-0.mcap"
-    writer = WindowWriter(path, bench_scene.rig_of(camera), bench_scene.T_TRUE, path.stem, SOLVES[name], {})
+    writer = WindowWriter(path, scene.rig_of(camera), scene.T_TRUE, path.stem, SOLVES[name], {})
     for seed in range(frames):
-        writer.add(bench_scene.pair(camera, seed, seed * 1_000_000_000))
+        writer.add(scene.pair(camera, seed, seed * 1_000_000_000))
     return writer.finish().path
 
 
 def _configuration(folder: Path, name: str) -> Config:
-    camera = bench_scene.CAMERAS[CAMERA]
+    camera = scene.CAMERAS[CAMERA]
     pair = PairConfig(
         name=name,
         camera=CameraConfig(
             key="camera", intrinsics=CameraIntrinsics.model_validate({"model": CAMERA, **intrinsics_of(camera)})
         ),
         lidar=LidarConfig(key="lidar"),
-        T_camera_lidar=bench_scene.T_TRUE.tolist(),
+        T_camera_lidar=scene.T_TRUE.tolist(),
         calibration=SOLVES[name],
     )
     return Config(log_level="error", state=StateConfig(directory=folder), pairs=(pair,))

@@ -20,8 +20,8 @@ import zenoh
 
 from coec.adapters.worker import PACKAGE_ROOT
 from coec.adapters.zenoh_client import ConnectionFailedError, ask_one, connected
-from coec.cli import bench_load, bench_scene
-from coec.cli.bench_process import ProcessReading
+from coec.cli.bench import load, scene
+from coec.cli.bench.process import ProcessReading
 from coec.config import (
     CalibrationConfig,
     CameraConfig,
@@ -74,7 +74,7 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     with (
         _running("coec", "run", "--config", str(configuration)) as daemon,
         connected([endpoint], TIMEOUT_S) as session,
-        _running("coec.cli.bench_load", endpoint),
+        _running("coec.cli.bench.load", endpoint),
     ):
         heard("the daemon under load")
         return _under_load(session, daemon, heard)
@@ -158,14 +158,14 @@ def _status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
 
 
 def _configuration(endpoint: str, state: Path) -> Config:
-    camera = bench_scene.CAMERAS[bench_load.CAMERA]
-    intrinsics = CameraIntrinsics.model_validate({"model": bench_load.CAMERA, **intrinsics_of(camera)})
+    camera = scene.CAMERAS[load.CAMERA]
+    intrinsics = CameraIntrinsics.model_validate({"model": load.CAMERA, **intrinsics_of(camera)})
     pair = PairConfig(
         name=PAIR,
-        camera=CameraConfig(key=bench_load.KEYS["camera"], intrinsics=intrinsics),
-        lidar=LidarConfig(key=bench_load.KEYS["lidar"]),
-        ego=EgoConfig(key=bench_load.KEYS["ego"]),
-        T_camera_lidar=bench_scene.T_TRUE.tolist(),
+        camera=CameraConfig(key=load.KEYS["camera"], intrinsics=intrinsics),
+        lidar=LidarConfig(key=load.KEYS["lidar"]),
+        ego=EgoConfig(key=load.KEYS["ego"]),
+        T_camera_lidar=scene.T_TRUE.tolist(),
         window=WindowConfig(slice_s=SLICE_S),
         calibration=CalibrationConfig(search=SearchConfig(dof=6)),
     )

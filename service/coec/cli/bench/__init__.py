@@ -26,7 +26,8 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.objective import MutualInformation, SearchBox
 from coec.calibration.ports import Silence
 from coec.calibration.search import box_of, maximise
-from coec.cli import bench_live, bench_scene, bench_table, bench_worker, console, windows
+from coec.cli import console, windows
+from coec.cli.bench import live, rows, scene, worker
 from coec.cli.calibrate import StageTimes
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
 from coec.geometry import se3
@@ -72,9 +73,9 @@ def measure(bars: Progress) -> dict[str, Any]:
     task = bars.add_task("one evaluation", total=None, note="")
     search = SearchConfig(dof=3)
     start = _moved(START_DEG)
-    objective = bench_scene.objective_of(bench_scene.CAMERAS["double_sphere"], FRAMES, start, box_of(search))
+    objective = scene.objective_of(scene.CAMERAS["double_sphere"], FRAMES, start, box_of(search))
     whole = _nothing_left_out("double_sphere")
-    pose = bench_scene.T_TRUE
+    pose = scene.T_TRUE
     fastest = _fastest(
         {
             "kernel": (lambda: mutual_information(whole.binned, pose), REPEATS),
@@ -86,7 +87,7 @@ def measure(bars: Progress) -> dict[str, Any]:
     bars.update(task, description="camera models, numbers of frames")
     document: dict[str, Any] = {
         "machine": _machine(),
-        "points_per_frame": bench_scene.POINTS,
+        "points_per_frame": scene.POINTS,
         "points_visited_per_frame": int(objective.binned.first_point[-1]) // FRAMES,
         "mi_25_frames_ms": 1e3 * fastest["objective"],
         "mi_25_frames_nothing_left_out_ms": 1e3 * fastest["kernel"],
@@ -110,7 +111,7 @@ def measure(bars: Progress) -> dict[str, Any]:
 
 
 def measure_processes(bars: Progress) -> dict[str, Any]:
-    """The figures of whole processes, by their names in `bench_table.ROWS`: worker and daemon, one after the other.
+    """The figures of whole processes, by their names in `rows.ROWS`: worker and daemon, one after the other.
 
     Raises:
         CalibrationError: the worker came to no result.
@@ -122,27 +123,23 @@ def measure_processes(bars: Progress) -> dict[str, Any]:
         bars.update(task, description=text)
 
     with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
-        document = bench_worker.measure(Path(folder), FRAMES, heard)
+        document = worker.measure(Path(folder), FRAMES, heard)
     with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
-        document |= bench_live.measure(Path(folder), heard)
-    return document | {"required": bench_table.required()}
+        document |= live.measure(Path(folder), heard)
+    return document | {"required": rows.required()}
 
 
 def _by_model(start: Any, box: SearchBox) -> dict[str, float]:
-    objectives = {
-        name: bench_scene.objective_of(camera, FRAMES, start, box) for name, camera in bench_scene.CAMERAS.items()
-    }
-    runs: Runs = {
-        name: (partial(objective.evaluate, bench_scene.T_TRUE), REPEATS) for name, objective in objectives.items()
-    }
+    objectives = {name: scene.objective_of(camera, FRAMES, start, box) for name, camera in scene.CAMERAS.items()}
+    runs: Runs = {name: (partial(objective.evaluate, scene.T_TRUE), REPEATS) for name, objective in objectives.items()}
     return {name: 1e3 * seconds for name, seconds in _fastest(runs).items()}
 
 
 def _by_frames(objective: MutualInformation) -> dict[str, float]:
-    five = bench_scene.first(objective.binned, FRAME_COUNTS[0])
-    many = {count: bench_scene.repeated(five, count // FRAME_COUNTS[0]) for count in FRAME_COUNTS}
+    five = scene.first(objective.binned, FRAME_COUNTS[0])
+    many = {count: scene.repeated(five, count // FRAME_COUNTS[0]) for count in FRAME_COUNTS}
     runs: Runs = {
-        str(count): (partial(mutual_information, frames, bench_scene.T_TRUE), REPEATS) for count, frames in many.items()
+        str(count): (partial(mutual_information, frames, scene.T_TRUE), REPEATS) for count, frames in many.items()
     }
     return {count: 1e3 * seconds for count, seconds in _fastest(runs).items()}
 
@@ -166,11 +163,11 @@ def _fused(bars: Progress) -> dict[str, Any]:
 
 def _nothing_left_out(model: str) -> MutualInformation:
     """The objective with every point of every sweep, as no pose is out of reach: a box of half a turn."""
-    return bench_scene.objective_of(bench_scene.CAMERAS[model], FRAMES, bench_scene.T_TRUE, SearchBox(np.pi, 0.0))
+    return scene.objective_of(scene.CAMERAS[model], FRAMES, scene.T_TRUE, SearchBox(np.pi, 0.0))
 
 
 def _moved(degrees: tuple[float, float, float]) -> Any:
-    return se3.perturb(bench_scene.T_TRUE, np.array([*np.radians(degrees), 0.0, 0.0, 0.0]))
+    return se3.perturb(scene.T_TRUE, np.array([*np.radians(degrees), 0.0, 0.0, 0.0]))
 
 
 def _fastest(runs: Runs) -> dict[str, float]:
@@ -212,6 +209,6 @@ def _show(document: dict[str, Any]) -> None:
     console.show(
         f"{machine['processor']}, {machine['threads']} threads, Python {machine['python']}, numba {machine['numba']}"
     )
-    console.out.print(bench_table.table(document))
+    console.out.print(rows.table(document))
     came = ", ".join(f"{figure:.1f} {name}" for name, figure in document["io_per_second"].items())
     console.show(f"the load, a second: {came}")

@@ -1,4 +1,4 @@
-"""The sensors of the benchmark, in a process of their own: `python -m coec.cli.bench_load ENDPOINT`, until its standard
+"""The sensors of the benchmark, in a process of their own: `python -m coec.cli.bench.load ENDPOINT`, until its standard
 input ends. Camera, LiDAR and ego-motion of one pair at the rates of a vehicle, native msgpack.
 """
 
@@ -15,7 +15,7 @@ import zenoh
 from coec.adapters.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.adapters.zenoh_client import connected
 from coec.calibration.values import EgoMotion
-from coec.cli import bench_scene
+from coec.cli.bench import scene
 
 CAMERA_HZ, SWEEP_EVERY = 30.0, 3
 """Images a second, and of how many images each has a sweep: 10 sweeps a second."""
@@ -31,7 +31,7 @@ KEYS = {"camera": "bench/camera", "lidar": "bench/lidar", "ego": "bench/ego"}
 
 def main(endpoint: str) -> int:
     """Publishes until standard input ends; always 0."""
-    pairs = [bench_scene.pair(bench_scene.CAMERAS[CAMERA], seed, 0) for seed in range(ROOMS)]
+    pairs = [scene.pair(scene.CAMERAS[CAMERA], seed, 0) for seed in range(ROOMS)]
     with connected([endpoint], CONNECT_S) as session:
         encoding = zenoh.Encoding("application/msgpack")
         streams = {name: session.declare_publisher(key, encoding=encoding) for name, key in KEYS.items()}
