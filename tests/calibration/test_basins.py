@@ -1,13 +1,19 @@
 """The global stage: an even cover of the reach, and the true basin from far away."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration.conftest import pairs_of
+from coec.adapters.images import GreyImages
 from coec.calibration.basins import AT_RIM, FINE, ROUNDS, at_rim, find_basins, sample_reach
-from coec.calibration.edges import EdgeWitness
+from coec.calibration.edges import EdgeWitness, build_edges
+from coec.calibration.motion import compensate
 from coec.calibration.objective import SearchBox
 from coec.calibration.values import Matrix4, Window
+from coec.config import LimitsConfig
 from coec.geometry import se3
 from coec.geometry.edge_charts import significances
 
@@ -79,6 +85,19 @@ def test_the_true_basin_is_found_from_twenty_degrees_away(
     # On the hill of the fine chart, from where a basin is polished.
     nearest_deg = min(angle_deg(basin.T_camera_lidar, truth) for basin in basins)
     assert nearest_deg < 1.5 * np.degrees(sharp_edges.band_blur_rad[1])
+
+
+def test_the_true_translation_is_found_from_half_a_metre_away(sample_data: Path) -> None:
+    """From where the coarse chart alone settles 36 cm aside."""
+    _, window = pairs_of(f"kitti360:{sample_data}/kitti360?camera=image_00")
+    images = GreyImages(LimitsConfig())
+    clouds = [compensate(pair, window.rig, enabled=True).xyz_m for pair in window.pairs]
+    edges = build_edges(window.pairs, clouds, [images.grey(pair.camera) for pair in window.pairs], window.rig)
+    truth, shift = window.T_camera_lidar_start, np.array([0.355, -0.226, 0.271])
+    start = se3.perturb(truth, np.concatenate([np.radians(shift), shift]))
+    best = find_basins(edges, start, SearchBox(np.radians(3.5), 0.65))[0].T_camera_lidar
+    assert angle_deg(best, truth) < 0.5
+    assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.2
 
 
 def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, sharp_edges: EdgeWitness) -> None:

@@ -11,7 +11,7 @@ from coec.calibration.objective import (
     distance_and_depth,
 )
 from coec.calibration.ports import DepthModel
-from coec.calibration.values import Window
+from coec.calibration.values import DepthMap, Window
 from coec.config import ObjectiveConfig
 from coec.geometry import se3
 
@@ -75,3 +75,12 @@ def test_the_truth_is_a_maximum_along_every_rotation(objective: MutualInformatio
 def test_unrelated_depth_tells_less(objective: MutualInformation, street: Window) -> None:
     truth = objective.evaluate(street.T_camera_lidar_start)
     assert objective.mi_of_unrelated(street.T_camera_lidar_start) < truth.mi / 1.2
+
+
+def test_distance_counts_from_the_camera_however_it_is_turned(street: Window) -> None:
+    pose, xyz_m = street.T_camera_lidar_start, street.pairs[0].lidar.xyz_m
+    turned = se3.perturb(pose, np.array([0.3, -0.2, 0.4, 0.0, 0.0, 0.0]))
+    map_of_nothing = DepthMap(np.zeros((2, 2), np.float32))
+    expected = np.linalg.norm(xyz_m @ pose[:3, :3].T + pose[:3, 3], axis=1)
+    for T in (pose, turned):
+        np.testing.assert_allclose(distance_and_depth(xyz_m, map_of_nothing, T).of_points, expected, rtol=1e-5)

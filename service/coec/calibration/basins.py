@@ -49,6 +49,11 @@ ROUNDS = (
 what finds the true pose: on a coarse one, hundreds of layouts that happen to fit may stand above it (the 855th of the
 first round in a simulated street, six degrees of freedom; by the fine chart, the first to eleventh)."""
 
+SHIFTED_POSES, SHIFT_M = 4, 0.25
+"""Where translation is searched, six more poses climb once more for so many of the best, shifted by so much along each
+axis: poses of one rotation do not lie apart, so that the translation was chosen on the coarse chart, which hardly tells
+it (one start of 24, half a metre away, had ended 36 cm aside)."""
+
 METRES_PER_RADIAN = 7.0
 """Translation step per rotation step: what moves a point 7 m away as far."""
 
@@ -84,6 +89,10 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
         charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
         poses = poses[_apart(poses, significances(charts, poses), number.poses, number.apart_rad)]
         poses, z = _climbed(charts, poses, number, start, reach)
+    if reach.translation_m > 0.0:
+        more = _shifted(poses[np.argsort(-z, kind="stable")[:SHIFTED_POSES]])
+        more, z_more = _climbed(edges.charts[FINE], more, ROUNDS[-1], start, reach)
+        poses, z = np.concatenate([poses, more]), np.concatenate([z, z_more])
     return [Basin(poses[k], float(z[k])) for k in _apart(poses, z, len(poses), ROUNDS[-1].apart_rad)]
 
 
@@ -103,6 +112,14 @@ def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.flo
 def _cover(start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
     count = 4.0 / 3.0 * pi * (reach.rotation_rad / COVER_RAD) ** 3
     return np.concatenate([start[None], sample_reach(start, reach, int(min(max(count, MIN_COVER), MAX_COVER)))])
+
+
+def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6·K, 4, 4) poses (K, 4, 4) shifted either way along each camera axis."""
+    shifts = SHIFT_M * np.concatenate([np.eye(3), -np.eye(3)])
+    shifted = np.repeat(poses, len(shifts), axis=0)
+    shifted[:, :3, 3] += np.tile(shifts, (len(poses), 1))
+    return shifted
 
 
 def _climbed(
