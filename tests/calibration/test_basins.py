@@ -88,16 +88,17 @@ def test_the_true_basin_is_found_from_twenty_degrees_away(
 
 
 def test_the_true_translation_is_found_from_half_a_metre_away(sample_data: Path) -> None:
-    """From where the coarse chart alone settles 36 cm aside."""
+    """On real streets: the synthetic one hardly tells height."""
     _, window = pairs_of(f"kitti360:{sample_data}/kitti360?camera=image_00")
     images = GreyImages(LimitsConfig())
     clouds = [compensate(pair, window.rig, enabled=True).xyz_m for pair in window.pairs]
     edges = build_edges(window.pairs, clouds, [images.grey(pair.camera) for pair in window.pairs], window.rig)
-    truth, shift = window.T_camera_lidar_start, np.array([0.355, -0.226, 0.271])
-    start = se3.perturb(truth, np.concatenate([np.radians(shift), shift]))
-    best = find_basins(edges, start, SearchBox(np.radians(3.5), 0.65))[0].T_camera_lidar
-    assert angle_deg(best, truth) < 0.5
-    assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.2
+    truth = window.T_camera_lidar_start
+    for shift in 0.5 * np.concatenate([np.eye(3), -np.eye(3)]):
+        start = se3.perturb(truth, np.concatenate([np.radians(shift), shift]))
+        best = find_basins(edges, start, SearchBox(np.radians(3.5), 0.65))[0].T_camera_lidar
+        assert angle_deg(best, truth) < 0.6
+        assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.2
 
 
 def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
