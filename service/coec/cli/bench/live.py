@@ -46,6 +46,8 @@ SETTLE_S, SECONDS = 10.0, 25.0
 SLICE_S = 20.0
 """25 pairs in so much time, nine times the default: the recorder, too, is at work all the while."""
 
+SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(sys.argv[1]))"
+
 QUERY_PERIOD_S, COMMAND_PERIOD_S = 0.05, 0.5
 POLL_S, TIMEOUT_S = 0.1, 60.0
 BUSY_SHARE = 0.5
@@ -72,9 +74,9 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     # JSON is YAML.
     configuration.write_text(_configuration(endpoint, folder / "state").model_dump_json(exclude_none=True))
     with (
-        _running("coec", "run", "--config", str(configuration)) as daemon,
+        _running("-m", "coec", "run", "--config", str(configuration)) as daemon,
         connected([endpoint], TIMEOUT_S) as session,
-        _running("coec.cli.bench.load", endpoint),
+        _running("-c", SENSORS, endpoint),
     ):
         heard("the daemon under load")
         return _under_load(session, daemon, heard)
@@ -186,10 +188,10 @@ def _free_port() -> int:
 
 
 @contextmanager
-def _running(module: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+def _running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     """A Python process of ours, asked to end at the end."""
     process = subprocess.Popen(
-        [sys.executable, "-m", module, *arguments], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=PACKAGE_ROOT
+        [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=PACKAGE_ROOT
     )
     try:
         yield process

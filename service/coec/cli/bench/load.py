@@ -1,5 +1,5 @@
-"""The sensors of the benchmark, in a process of their own: `python -m coec.cli.bench.load ENDPOINT`, until its standard
-input ends. Camera, LiDAR and ego-motion of one pair at the rates of a vehicle, native msgpack.
+"""The sensors of the benchmark, in a process of their own, until its standard input ends: camera, LiDAR and ego-motion
+of one pair at the rates of a vehicle, native msgpack.
 """
 
 from __future__ import annotations
@@ -53,7 +53,3 @@ def _ended(wait_s: float) -> bool:
     """Whether standard input ends within so many seconds."""
     readable, _, _ = select.select([sys.stdin], [], [], max(wait_s, 0.0))
     return bool(readable) and not sys.stdin.buffer.read(1)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
