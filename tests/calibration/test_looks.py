@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coec.calibration.confidence import measure_curvature
-from coec.calibration.looks import axis_derivatives
+from coec.calibration.confidence import axis_derivatives, measure_curvature
 from coec.calibration.objective import Evaluation
 from coec.calibration.values import Matrix4
 from coec.geometry import se3

@@ -31,6 +31,7 @@ END_S = 15.0
 """SIGTERM to exit."""
 
 POLL_S = 0.1
+"""Between two questions to another process, up to a deadline."""
 
 
 def environment() -> dict[str, str]:

@@ -17,6 +17,7 @@ from coec.config import PairConfig
 
 NS_PER_S = 1_000_000_000
 POLL_S = 0.05
+"""Between two looks for a subscriber: Zenoh tells a publisher in Python of none."""
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 

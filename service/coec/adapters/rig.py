@@ -118,14 +118,16 @@ def mask_to_png(mask: NDArray[np.bool_]) -> bytes:
     return encode_png(np.where(mask, np.uint8(255), np.uint8(0)))
 
 
+def intrinsics_config(camera: cameras.Camera) -> CameraIntrinsics:
+    """The intrinsics as a configuration holds them."""
+    return CameraIntrinsics.model_validate({"model": cameras.name_of(camera), **cameras.intrinsics_of(camera)})
+
+
 def rig_to_json(rig: Rig) -> dict[str, Any]:
     """The rig without its mask, as JSON values."""
-    intrinsics = CameraIntrinsics.model_validate(
-        {"model": cameras.name_of(rig.camera), **cameras.intrinsics_of(rig.camera)}
-    )
     document = RigDocument(
         pair=rig.pair,
-        camera=intrinsics,
+        camera=intrinsics_config(rig.camera),
         camera_frame=rig.camera_frame,
         lidar_frame=rig.lidar_frame,
         T_camera_lidar_nominal=matrix_rows(rig.T_camera_lidar_nominal),

@@ -7,7 +7,7 @@ sum (the sandwich estimator of maximum-likelihood theory, Huber 1967: J⁻¹·V�
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import fsum, sqrt
@@ -41,19 +41,9 @@ class Curvature:
 def measure_curvature(objective: Objective, pose: Matrix4, dof: int, kept: Collection[int] = ()) -> Curvature:
     """Central differences per frame about `pose` (4, 4) on the first `dof` axes, less those in `kept`."""
     moved = [axis for axis in range(dof) if axis not in kept]
-    steps = objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)[moved]
-
-    def at(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        perturbation = np.zeros(6)
-        perturbation[moved] = offset
-        return objective.evaluate(se3.perturb(pose, perturbation)).frame_scores
-
-    axes = np.diag(steps)
-    centre = at(np.zeros(len(moved)))
-    plus = np.array([at(axis) for axis in axes])
-    minus = np.array([at(-axis) for axis in axes])
-    gradients = (plus - minus) / (2.0 * steps[:, None])  # (dof, F)
-    hessian = np.diag((plus + minus - 2.0 * centre).mean(axis=1) / steps**2)
+    at, steps = _frame_scores_about(objective, pose, moved)
+    gradients, second = _along_axes(at, steps)
+    axes, hessian = np.diag(steps), np.diag(second)
     for i, j in combinations(range(len(moved)), 2):
         both, against = axes[i] + axes[j], axes[i] - axes[j]
         mixed = (at(both) + at(-both) - at(against) - at(-against)).mean()
@@ -63,6 +53,38 @@ def measure_curvature(objective: Objective, pose: Matrix4, dof: int, kept: Colle
         second_derivative=_padded(-np.diag(hessian), moved),
         sigma=_padded(_sandwich(gradients, -hessian), moved),
     )
+
+
+def axis_derivatives(objective: Objective, pose: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(6,) ∂S/∂ξ and (6,) -∂²S/∂ξ² at `pose` (4, 4), per radian or metre: what `measure_curvature` says of each axis by
+    itself, for a fifth of the evaluations."""
+    gradients, second = _along_axes(*_frame_scores_about(objective, pose, range(6)))
+    return gradients.mean(axis=1), -second
+
+
+_FrameScores = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def _frame_scores_about(
+    objective: Objective, pose: Matrix4, moved: Sequence[int]
+) -> tuple[_FrameScores, NDArray[np.float64]]:
+    """The scores of the frames (F,) as a function of the perturbation of `pose` along the axes `moved`, and the
+    difference step of each."""
+
+    def at(offset: NDArray[np.float64]) -> NDArray[np.float64]:
+        perturbation = np.zeros(6)
+        perturbation[moved] = offset
+        return objective.evaluate(se3.perturb(pose, perturbation)).frame_scores
+
+    return at, objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)[moved]
+
+
+def _along_axes(at: _FrameScores, steps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Central differences along each of n axes: gradients of the frames (n, F), second derivatives of their mean."""
+    axes, centre = np.diag(steps), at(np.zeros(len(steps)))
+    plus = np.array([at(axis) for axis in axes])
+    minus = np.array([at(-axis) for axis in axes])
+    return (plus - minus) / (2.0 * steps[:, None]), (plus + minus - 2.0 * centre).mean(axis=1) / steps**2
 
 
 def _sandwich(gradients: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:

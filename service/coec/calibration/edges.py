@@ -96,7 +96,7 @@ def build_edges(
         first_chosen = np.searchsorted(chosen, first_point)
         return EdgeFrames(camera, np.ascontiguousarray(points_m[:, chosen]), weight[chosen], first_chosen, maps)
 
-    every, ranked = np.arange(len(weight)), _evenly(len(weight), RANKED_POINTS)
+    every, ranked = np.arange(len(weight)), evenly(len(weight), RANKED_POINTS)
     levels = range(coarsest + 1 - BANDS, coarsest + 1)
     bands = tuple(frames(level, maps, ranked) for level, maps in zip(levels, of_bands, strict=True))
     blur_rad = tuple(_blur_rad(rig.camera, level) for level in levels)
@@ -105,7 +105,7 @@ def build_edges(
         edge_charts(bands[k].camera, bands[k].maps, blur_rad[k], points_m[:, ranked], weight[ranked], of_points)
         for k in (-1, -2)
     )
-    kept = _evenly(len(ranked), THINNED_POINTS)
+    kept = evenly(len(ranked), THINNED_POINTS)
     return EdgeWitness(
         sharp=frames(finest, sharp, every),
         whole=frames(finest, whole, every),
@@ -133,7 +133,7 @@ def _maps(scales: EdgeScales, greys: Iterable[NDArray[np.uint8]], frames: int) -
     return stacks
 
 
-def _evenly(count: int, at_most: int) -> NDArray[np.int64]:
+def evenly(count: int, at_most: int) -> NDArray[np.int64]:
     """Indices of so many of `count` things, evenly chosen; of all where there are no more."""
     return np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(np.int64))
 

@@ -129,7 +129,7 @@ Estimator = Callable[[Sight, CalibrationConfig], Found]
 
 def by_depth(sight: Sight, config: CalibrationConfig) -> Found:
     """The paper's: BOBYQA on the mutual information of depth and range."""
-    return _by_mutual_information(_depth_features(sight), sight, config)
+    return _by_mutual_information(depth_features(sight, sight.window.T_camera_lidar_start), sight, config)
 
 
 def by_intensity(sight: Sight, config: CalibrationConfig) -> Found:
@@ -154,7 +154,8 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     window, progress = sight.window, sight.progress
     start = window.T_camera_lidar_start
     reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
-    depth = build_mutual_information(thinned(_depth_features(sight)), window.rig, start, reach, config.objective)
+    features = thinned(depth_features(sight, start))
+    depth = build_mutual_information(features, window.rig, start, reach, config.objective)
     edges = build_edges(window.pairs, [cloud.xyz_m for cloud in sight.clouds], sight.greys(), window.rig)
     basins = find_basins(edges, start, reach)
     progress.step("basins", 1, 1)
@@ -198,10 +199,14 @@ def _polished(
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
 
 
-def _depth_features(sight: Sight) -> list[Features]:
-    start = sight.window.T_camera_lidar_start
+def depth_features(sight: Sight, T_camera_lidar: Matrix4) -> list[Features]:
+    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4).
+
+    Raises:
+        CalibrationError: a frame has no usable depth.
+    """
     seen = zip(sight.clouds, sight.depths(), strict=True)
-    return [distance_and_depth(cloud.xyz_m, depth, start) for cloud, depth in seen]
+    return [distance_and_depth(cloud.xyz_m, depth, T_camera_lidar) for cloud, depth in seen]
 
 
 def thinned(frames: Sequence[Features]) -> list[Features]:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from coec.calibration.basins import find_basins
 from coec.calibration.causes import SceneFacts, scene_facts
-from coec.calibration.confidence import METRES_PER_RADIAN
-from coec.calibration.edges import THINNED_POINTS, EdgeWitness, build_edges
-from coec.calibration.estimators import Sight, thinned
+from coec.calibration.confidence import axis_derivatives
+from coec.calibration.edges import THINNED_POINTS, EdgeWitness, build_edges, evenly
+from coec.calibration.estimators import Sight, depth_features, thinned
 from coec.calibration.fused import Fusion
 from coec.calibration.motion import CompensatedCloud
 from coec.calibration.objective import (
@@ -27,7 +27,6 @@ from coec.calibration.objective import (
     Objective,
     SearchBox,
     build_mutual_information,
-    distance_and_depth,
 )
 from coec.calibration.ports import Silence
 from coec.calibration.search import polish
@@ -125,8 +124,7 @@ def gather(sight: Sight) -> Evidence:
     """
     window, greys = sight.window, list(sight.greys())
     xyz_m = [cloud.xyz_m for cloud in sight.clouds]
-    start = window.T_camera_lidar_start
-    features = [distance_and_depth(points, depth, start) for points, depth in zip(xyz_m, sight.depths(), strict=True)]
+    features = depth_features(sight, window.T_camera_lidar_start)
     edges = build_edges(window.pairs, xyz_m, greys, window.rig)
     counts = np.diff(edges.whole.first_point)
     scenes = [
@@ -160,10 +158,10 @@ def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig) -> Loo
     ways = (fusion.settling, (fusion.ranking[-1], *fusion.settling[1:]))
     ends = [polished(way, T_rotation, in_all) for way in ways]
     T_pose = max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score)
-    T_edges, T_depth = polished([_EdgesAlone(evidence.edges)], T_rotation), polished([depth], T_rotation)
+    of_edges = _EdgesAlone(evidence.edges)
+    T_edges, T_depth = polished([of_edges], T_rotation), polished([depth], T_rotation)
     at_pose = fusion.settling[0].evaluate(pose)
     first_derivative, second_derivative = axis_derivatives(depth, pose)
-    of_edges = _EdgesAlone(evidence.edges)
     return Look(
         pairs=len(evidence.pairs),
         T_rotation=T_rotation,
@@ -180,19 +178,6 @@ def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig) -> Loo
         overlap=at_pose.overlap,
         deficit=fusion.settling[0].evaluate(T_rotation).score - at_pose.score,
     )
-
-
-def axis_derivatives(objective: Objective, pose: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(6,) ∂S/∂ξ and (6,) -∂²S/∂ξ² at `pose` (4, 4), by central differences along each axis (per radian or metre)."""
-    steps = objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)
-    centre = objective.evaluate(pose).frame_scores
-    plus, minus = (
-        np.array([objective.evaluate(se3.perturb(pose, xi)).frame_scores for xi in np.diag(sign * steps)])
-        for sign in (1.0, -1.0)
-    )
-    first = ((plus - minus) / (2.0 * steps[:, None])).mean(axis=1)
-    second = -(plus + minus - 2.0 * centre).mean(axis=1) / steps**2
-    return first, second
 
 
 class _EdgesAlone:
@@ -216,7 +201,7 @@ class _EdgesAlone:
 def _witness_of(edges: EdgeWitness, indices: Sequence[int]) -> EdgeWitness:
     coarse, fine = (_charts_of(charts, indices) for charts in edges.charts)
     count = len(coarse.weight)
-    kept = np.unique(np.linspace(0, count - 1, min(count, THINNED_POINTS)).astype(np.int64))
+    kept = evenly(count, THINNED_POINTS)
     return replace(
         edges,
         sharp=_frames_of(edges.sharp, indices),
@@ -229,8 +214,7 @@ def _witness_of(edges: EdgeWitness, indices: Sequence[int]) -> EdgeWitness:
 
 def _charts_of(charts: EdgeCharts, indices: Sequence[int]) -> EdgeCharts:
     """The range edges of some frames; the charts of the others stay where they are."""
-    frame = (charts.first_cell - 1) // (charts.size[0] * charts.size[1])
-    return charts.of_points(np.flatnonzero(np.isin(frame, np.asarray(indices))))
+    return charts.of_points(np.flatnonzero(np.isin(charts.frame, np.asarray(indices))))
 
 
 def _frames_of(frames: EdgeFrames, indices: Sequence[int]) -> EdgeFrames:

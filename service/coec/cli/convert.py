@@ -12,7 +12,7 @@ import numpy as np
 from coec.adapters.bag_writer import write_bag
 from coec.adapters.depth import STEREO
 from coec.adapters.player import Streams
-from coec.adapters.rig import mask_to_png, matrix_rows
+from coec.adapters.rig import intrinsics_config, mask_to_png, matrix_rows
 from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 from coec.cli import console
 from coec.cli.commented_yaml import commented_yaml
@@ -20,7 +20,6 @@ from coec.cli.files import OutputError, write
 from coec.config import (
     CalibrationConfig,
     CameraConfig,
-    CameraIntrinsics,
     Config,
     DepthConfig,
     EgoConfig,
@@ -31,7 +30,6 @@ from coec.config import (
     WindowConfig,
 )
 from coec.errors import UsageError
-from coec.geometry import cameras
 from coec.sources import Recording, open_source
 
 
@@ -71,13 +69,12 @@ def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path 
     frames = len(recording.camera_stamps_ns)
     if frames < 2 * window.min_pairs:
         window = window.model_copy(update={"min_pairs": max(1, frames // 2)})
-    intrinsics = {"model": cameras.name_of(rig.camera), **cameras.intrinsics_of(rig.camera)}
     return PairConfig(
         name=rig.pair,
         camera=CameraConfig(
             key=streams.camera,
             frame_id=camera.frame_id,
-            intrinsics=CameraIntrinsics.model_validate(intrinsics),
+            intrinsics=intrinsics_config(rig.camera),
             mask=mask,
         ),
         lidar=LidarConfig(key=streams.lidar, frame_id=lidar.frame_id, sweep=_sweep(rig)),

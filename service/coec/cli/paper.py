@@ -14,9 +14,8 @@ import numpy as np
 from coec.adapters import paper_plots, plots
 from coec.adapters.depth import open_depth
 from coec.calibration import evaluation, paper, starts
-from coec.calibration.estimators import look
+from coec.calibration.estimators import depth_features, look
 from coec.calibration.evaluation import Outcome
-from coec.calibration.objective import distance_and_depth
 from coec.calibration.ports import Silence
 from coec.cli import calibrate as calibrate_command
 from coec.cli import console, files, paper_published, windows
@@ -93,9 +92,7 @@ def run(options: Options) -> int:
 def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
     """Limits learned on every second pair, tried on the others."""
     sight = look(bench.window, bench.depth, bench.images, bench.configuration, Silence())
-    frames = [
-        distance_and_depth(c.xyz_m, d, bench.reference) for c, d in zip(sight.clouds, sight.depths(), strict=True)
-    ]
+    frames = depth_features(sight, bench.reference)
     heard = stages.begin("metrics", 2 * options.samples)
     rig, right = bench.window.rig, bench.reference
     known = paper.failure_figures(

@@ -10,8 +10,8 @@ from math import radians
 import numpy as np
 
 from coec.adapters.depth import open_depth
-from coec.calibration.estimators import look
-from coec.calibration.objective import build_mutual_information, distance_and_depth
+from coec.calibration.estimators import depth_features, look
+from coec.calibration.objective import build_mutual_information
 from coec.calibration.ports import Silence
 from coec.calibration.search import box_of
 from coec.cli import windows
@@ -58,9 +58,7 @@ def run_times(source: str, configuration: CalibrationConfig, stages: Stages) -> 
 def _run_time(bench: Bench, chosen: list[int]) -> RunTime:
     window = replace(bench.window, pairs=tuple(bench.window.pairs[index] for index in chosen))
     sight = look(window, bench.depth, bench.images, bench.configuration, Silence())
-    features = [
-        distance_and_depth(c.xyz_m, d, bench.reference) for c, d in zip(sight.clouds, sight.depths(), strict=True)
-    ]
+    features = depth_features(sight, bench.reference)
     box = box_of(bench.configuration.search)
     mutual = build_mutual_information(features, window.rig, bench.reference, box, bench.configuration.objective)
     start = se3.perturb(bench.reference, START)

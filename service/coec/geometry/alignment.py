@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera, project_point
 from coec.geometry.image_edges import STRENGTH_STEPS, VOID
+from coec.geometry.pixel_lookup import moved
 
 BLOCK = 256
 """Points that are projected at a time: their pixels (4 kB) stay in the first-level cache until they are looked up."""
@@ -144,11 +145,6 @@ def _pixels(
     """Pixel coordinates of points (n,), LiDAR frame, into the first n of `u` and `v`; -1 where there is none. A loop of
     its own, without a branch: it runs in vector registers."""
     for i in range(x_m.shape[0]):
-        x, y, z = float(x_m[i]), float(y_m[i]), float(z_m[i])
-        across, down, valid = project_point(
-            camera,
-            T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
-            T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-            T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
-        )
+        x, y, z = moved(T, float(x_m[i]), float(y_m[i]), float(z_m[i]))
+        across, down, valid = project_point(camera, x, y, z)
         u[i], v[i] = (across if valid else -1.0), (down if valid else -1.0)

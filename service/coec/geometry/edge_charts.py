@@ -18,8 +18,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import Camera, project_point
+from coec.geometry.cameras import Camera
 from coec.geometry.image_edges import STRENGTH_STEPS, VOID
+from coec.geometry.pixel_lookup import OUTSIDE, exact_pixel
 from coec.geometry.projection import unproject
 
 CELLS_PER_BLUR = 2.5
@@ -109,16 +110,14 @@ def edge_charts(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _pixels(camera: Camera, height: int, width: int, unit: float, centre: NDArray[np.float32]) -> NDArray[np.int32]:
-    """(height·width,) the pixel (row · columns + column) at the direction of each cell of a chart; -1 = none."""
-    pixel = np.empty(height * width, np.int32)
+    """(height·width,) the pixel (row · columns + column) at the direction of each cell of a chart, or OUTSIDE."""
+    pixel, here = np.empty(height * width, np.int32), np.eye(4)
     for row in prange(height):
         for column in range(width):
             x, y = (column - centre[0]) / unit, (row - centre[1]) / unit
             # The inverse of (x, y) / (1 + z) on the unit sphere.
             square = x * x + y * y
-            u, v, valid = project_point(camera, 2.0 * x, 2.0 * y, 1.0 - square)
-            inside = u >= -0.5 and v >= -0.5 and u < camera.width - 0.5 and v < camera.height - 0.5
-            pixel[row * width + column] = int(v + 0.5) * camera.width + int(u + 0.5) if valid and inside else -1
+            pixel[row * width + column] = exact_pixel(camera, here, 2.0 * x, 2.0 * y, 1.0 - square)
     return pixel
 
 
@@ -130,7 +129,7 @@ def _cells(maps: NDArray[np.int8], pixel: NDArray[np.int32]) -> NDArray[np.int8]
     for f in prange(maps.shape[0]):
         first = 1 + f * per_chart
         for i in range(per_chart):
-            if pixel[i] >= 0:
+            if pixel[i] != OUTSIDE:
                 cells[first + i] = maps[f, pixel[i]]
     return cells
 

@@ -133,9 +133,9 @@ def _largest_error_px(
     largest = 0.0
     for i in range(xyz.shape[1]):
         x, y, z = float(xyz[0, i]), float(xyz[1, i]), float(xyz[2, i])
-        x, y, z = _moved(T, x, y, z)
+        x, y, z = moved(T, x, y, z)
         u, v, valid = project_point(camera, x, y, z)
-        x32, y32, z32 = _moved(T32, xyz[0, i], xyz[1, i], xyz[2, i])
+        x32, y32, z32 = moved(T32, xyz[0, i], xyz[1, i], xyz[2, i])
         u32, v32, valid32 = image_point(single, x32, y32, z32)
         d = math.sqrt(x * x + y * y + z * z)
         if abs(z - edge_cosine * d) < 0.5 * EDGE_BAND * d:
@@ -168,7 +168,7 @@ def certain_pixels(
     # No branch, and nothing wider than 32 bits: one 64-bit number or one count of truth values in this loop, and the
     # compiler takes registers of half the width (1.05 instead of 0.55 ns per point).
     for i in range(pixel.shape[0]):
-        x, y, z = _moved(T, x_m[i], y_m[i], z_m[i])
+        x, y, z = moved(T, x_m[i], y_m[i], z_m[i])
         u, v, in_domain = image_point(camera, x, y, z)
         # Far outside, a coordinate has no fraction left to tell anything by: nearer outside will do.
         across = min(max(u + _HALF, -_HALF), width + _HALF)
@@ -192,7 +192,7 @@ def certain_pixels(
 @njit(cache=True, error_model="numpy")
 def exact_pixel(camera: Camera, T: NDArray[np.float64], x_m: float, y_m: float, z_m: float) -> int:
     """The pixel of one point (row · width + column) or OUTSIDE, in double precision."""
-    x, y, z = _moved(T, x_m, y_m, z_m)
+    x, y, z = moved(T, x_m, y_m, z_m)
     u, v, valid = project_point(camera, x, y, z)
     if not (valid and u >= -0.5 and v >= -0.5 and u < camera.width - 0.5 and v < camera.height - 0.5):
         return OUTSIDE
@@ -200,7 +200,8 @@ def exact_pixel(camera: Camera, T: NDArray[np.float64], x_m: float, y_m: float, 
 
 
 @njit(cache=True, inline="always")
-def _moved(T: NDArray[np.floating], x: float, y: float, z: float) -> tuple[float, float, float]:
+def moved(T: NDArray[np.floating], x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A point at a pose (4, 4), in the precision of both."""
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],

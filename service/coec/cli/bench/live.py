@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from coec.adapters.rig import intrinsics_config
 from coec.adapters.worker import PACKAGE_ROOT
 from coec.adapters.zenoh_client import ConnectionFailedError, ask_one, connected
 from coec.cli.bench import load, scene
@@ -25,7 +26,6 @@ from coec.cli.bench.process import ProcessReading
 from coec.config import (
     CalibrationConfig,
     CameraConfig,
-    CameraIntrinsics,
     Config,
     EgoConfig,
     LidarConfig,
@@ -36,7 +36,6 @@ from coec.config import (
     ZenohConfig,
 )
 from coec.errors import NotFoundError
-from coec.geometry.cameras import intrinsics_of
 from coec.schemas.keys import Keys
 
 VEHICLE, PAIR = "bench", "front"
@@ -50,6 +49,8 @@ SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(sys.a
 
 QUERY_PERIOD_S, COMMAND_PERIOD_S = 0.05, 0.5
 POLL_S, TIMEOUT_S = 0.1, 60.0
+"""Between two questions whether the daemon runs: before it does, it can tell nobody."""
+
 BUSY_SHARE = 0.5
 """Of a period between two queries: the worker is solving when it used more processor time."""
 
@@ -160,8 +161,7 @@ def _status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
 
 
 def _configuration(endpoint: str, state: Path) -> Config:
-    camera = scene.CAMERAS[load.CAMERA]
-    intrinsics = CameraIntrinsics.model_validate({"model": load.CAMERA, **intrinsics_of(camera)})
+    intrinsics = intrinsics_config(scene.CAMERAS[load.CAMERA])
     pair = PairConfig(
         name=PAIR,
         camera=CameraConfig(key=load.KEYS["camera"], intrinsics=intrinsics),

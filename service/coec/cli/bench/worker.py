@@ -11,6 +11,7 @@ from typing import Any
 
 from coec.adapters.looks import pack_pairs, pack_pose
 from coec.adapters.mcap_windows import WindowWriter, read_window
+from coec.adapters.rig import intrinsics_config
 from coec.adapters.worker import Errand, Solved, SolveJob, Worker, WorkerState
 from coec.calibration.values import Reason
 from coec.cli.bench import scene
@@ -18,7 +19,6 @@ from coec.cli.bench.process import ProcessReading
 from coec.config import (
     CalibrationConfig,
     CameraConfig,
-    CameraIntrinsics,
     Config,
     LidarConfig,
     ObjectiveConfig,
@@ -27,11 +27,10 @@ from coec.config import (
     StateConfig,
 )
 from coec.errors import CalibrationError
-from coec.geometry.cameras import intrinsics_of
 
 CAMERA = "double_sphere"
 POLL_S, TIMEOUT_S = 0.005, 300.0
-"""A first start compiles every kernel."""
+"""The worker is asked whether it has started, as nothing tells it. A first start compiles every kernel."""
 
 SOLVES: Mapping[str, CalibrationConfig] = {
     "mi": CalibrationConfig(objective=ObjectiveConfig(kind="mi"), search=SearchConfig(dof=3)),
@@ -126,12 +125,9 @@ def _window(folder: Path, name: str, frames: int) -> Path:
 
 
 def _configuration(folder: Path, name: str) -> Config:
-    camera = scene.CAMERAS[CAMERA]
     pair = PairConfig(
         name=name,
-        camera=CameraConfig(
-            key="camera", intrinsics=CameraIntrinsics.model_validate({"model": CAMERA, **intrinsics_of(camera)})
-        ),
+        camera=CameraConfig(key="camera", intrinsics=intrinsics_config(scene.CAMERAS[CAMERA])),
         lidar=LidarConfig(key="lidar"),
         T_camera_lidar=scene.T_TRUE.tolist(),
         calibration=SOLVES[name],

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
 
 POLL_S = 0.2
+"""Of the live view: it asks the service as any user would, by query."""
+
 START_S, DRIVE_S = 120.0, 600.0
 """Limits for the service to come up and for the drive. The first run on a machine compiles the kernels."""
 

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coec.adapters.player import Streams
-from coec.adapters.rig import matrix_rows
+from coec.adapters.rig import intrinsics_config, matrix_rows
 from coec.calibration.values import Rig
 from coec.config import (
     CameraConfig,
-    CameraIntrinsics,
     Config,
     EgoConfig,
     LidarConfig,
@@ -21,7 +20,6 @@ from coec.config import (
     WorkerConfig,
     ZenohConfig,
 )
-from coec.geometry import cameras
 from coec.simulation.source import require_extra
 
 if TYPE_CHECKING:
@@ -83,13 +81,12 @@ def drive_config() -> DriveConfig:
 def service_config(rig: Rig, mask: Path, endpoint: str) -> Config:
     """Of the service: everything default, but for the rig, the address, and what is shorter here than on a vehicle."""
     streams = Streams.default(rig.pair)
-    intrinsics = {"model": cameras.name_of(rig.camera), **cameras.intrinsics_of(rig.camera)}
     pair = PairConfig(
         name=rig.pair,
         camera=CameraConfig(
             key=streams.camera,
             frame_id=rig.camera_frame,
-            intrinsics=CameraIntrinsics.model_validate(intrinsics),
+            intrinsics=intrinsics_config(rig.camera),
             mask=mask,
         ),
         lidar=LidarConfig(key=streams.lidar, frame_id=rig.lidar_frame),
