@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from coec.adapters.baseline_file import baseline_hash
 from coec.adapters.images import CachedGreys, GreyImages
 from coec.calibration import commissioning, verdict_limits
-from coec.calibration.baseline import Baseline
-from coec.calibration.commissioning import commission, learned_hash
-from coec.calibration.detection import table, try_detection
+from coec.calibration.baseline import PRIOR_SPREAD_POSE, Baseline
+from coec.calibration.commissioning import commission, learn_accuracy, learned_hash
+from coec.calibration.detection import MIN_RECORDED, table, try_detection
 from coec.calibration.estimators import look
-from coec.calibration.looks import gather
+from coec.calibration.looks import Evidence, gather
 from coec.calibration.monitor import observe
 from coec.calibration.ports import DepthModel, ImageReader, Silence
-from coec.calibration.values import Decision, Estimate, Metric, Verdict, Window
+from coec.calibration.values import Decision, Estimate, Metric, Rig, Verdict, Window
 from coec.calibration.verdict_limits import learned
 from coec.config import CalibrationConfig, LimitsConfig, SearchConfig
 from coec.errors import CalibrationError
@@ -98,6 +101,39 @@ class TestCommission:
         assert baseline_hash(again) == baseline_hash(baseline)
 
 
+class _Scripted:
+    """Pairs whose looks put the optimum at the mean of what each pair says (n, 6)."""
+
+    def __init__(self, says: NDArray[np.float64], rig: Rig) -> None:
+        self.says, self.rig, self.pairs = says, rig, range(len(says))
+
+    def of(self, indices: Sequence[int]) -> _Scripted:
+        return _Scripted(self.says[list(indices)], self.rig)
+
+
+def test_spread_of_a_pair_is_found_from_looks_at_halves(sharp_street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without bias: on the average of drives the variance is the true one and that of the prior, by their weights."""
+    true = np.array([np.radians(0.3)] * 3 + [0.1] * 3)
+
+    def look_of(evidence: _Scripted, *_: object) -> SimpleNamespace:
+        mean = evidence.says.mean(axis=0)
+        return SimpleNamespace(offset_rotation=np.where(np.arange(6) < 3, mean, 0.0), offset_pose=mean)
+
+    monkeypatch.setattr(commissioning, "look_at", look_of)
+    drives = true * np.random.default_rng(1).normal(size=(100, 48, 6))
+    learned_from = [
+        learn_accuracy(cast("Evidence", _Scripted(says, sharp_street.rig)), np.eye(4), CONFIG) for says in drives
+    ]
+    variance = np.mean([pose.spread**2 for _, pose in learned_from], axis=0)
+    free = commissioning.BLOCKS - 1
+    expected = commissioning.PRIOR_BLOCKS * PRIOR_SPREAD_POSE**2 + free * true**2
+    np.testing.assert_allclose(variance * (commissioning.PRIOR_BLOCKS + free), expected, rtol=0.15)
+    for says, (rotation, pose) in zip(drives, learned_from, strict=True):
+        np.testing.assert_allclose(pose.bias, says.mean(axis=0))
+        assert np.isfinite(rotation.spread[:3]).all()
+        assert np.isnan(rotation.bias[3:]).all()
+
+
 def test_detection_learns_on_some_pairs_and_tries_others(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
@@ -109,6 +145,15 @@ def test_detection_learns_on_some_pairs_and_tries_others(
     assert {"right", "0.5 deg", "1 deg", "3 deg"} <= set(rows)
     assert rows["3 deg"].flagged == 1.0
     assert all(row.looks == 3 for row in rows.values())
+
+
+def test_detection_refuses_looks_that_the_monitor_would_not_take(
+    sharp_street: Window, stereo: DepthModel, images: ImageReader
+) -> None:
+    few = replace(sharp_street, pairs=sharp_street.pairs[: MIN_RECORDED - 1])
+    evidence = gather(look(few, stereo, images, CONFIG, Silence()))
+    with pytest.raises(CalibrationError, match=f"needs {MIN_RECORDED} pairs, there are {MIN_RECORDED - 1}"):
+        try_detection(evidence, few.T_camera_lidar_start, CONFIG, 1, 3, lambda *_: None)
 
 
 def with_metrics(contrast: float, runner_up: float, sigma_deg: float) -> Estimate:

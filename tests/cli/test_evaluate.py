@@ -212,10 +212,16 @@ def test_starts_too_far_for_any_box_are_a_usage_error() -> None:
 
 
 def test_detection_is_the_table_of_diagnose(coec: Coec) -> None:
-    arguments = (SMALL, "--depth", "stereo", "--detection", "1")
+    arguments = (SMALL.replace("frames=6", "frames=9"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
     diagnosed = coec("diagnose", *arguments, "--json").document
     detection = report.document["detection"]
     assert detection == {key: diagnosed[key] for key in ("splits", "pairs", "moves")}
     assert [row["name"] for row in detection["moves"]][:4] == ["right", "0.5 deg", "1 deg", "3 deg"]
     assert all(row["looks"] == 10 for row in detection["moves"])
+
+
+def test_a_recording_too_short_for_detection_is_refused_before_the_work(coec: Coec) -> None:
+    outcome = coec("evaluate", SMALL, "--depth", "stereo", "--detection", "1", "--rotation-deg", "2")
+    assert outcome.status != 0
+    assert "needs 9 pairs" in outcome.err

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.commissioning import is_flagged, learn_accuracy, learn_limits
 from coec.calibration.looks import Evidence, Look, look_at
-from coec.calibration.monitor import FALSE_ALARM_RATE, by_equation_2
+from coec.calibration.monitor import FALSE_ALARM_RATE, MIN_PAIRS, by_equation_2
 from coec.calibration.values import Matrix4
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
@@ -32,8 +32,8 @@ MOVES = (
 OBSERVABLE_M = 0.02
 """An axis of translation is observable where a look knows it to this: 10 cm are five of them."""
 
-MIN_TRIED = 4
-"""Pairs of a look that is tried, if the recording has twice as many."""
+MIN_RECORDED = 2 * MIN_PAIRS + 1
+"""Pairs of a recording that can be split: a look needs `MIN_PAIRS`, commissioning one more."""
 
 SEED = 20_230_617
 
@@ -59,6 +59,19 @@ class Tried:
     look: Look
 
 
+def require_enough(pairs: int) -> None:
+    """Whether so many pairs can be split.
+
+    Raises:
+        CalibrationError: they are fewer than `MIN_RECORDED`.
+    """
+    if pairs < MIN_RECORDED:
+        raise CalibrationError(
+            f"learning limits on half of the pairs and trying them on the others needs {MIN_RECORDED} pairs, "
+            f"there are {pairs}"
+        )
+
+
 def try_detection(
     evidence: Evidence,
     right: Matrix4,
@@ -71,11 +84,10 @@ def try_detection(
     the other; `heard(done, total)` counts the splits.
 
     Raises:
-        CalibrationError: fewer than five pairs.
+        CalibrationError: fewer than `MIN_RECORDED` pairs.
     """
     count = len(evidence.pairs)
-    if count < MIN_TRIED + 1:
-        raise CalibrationError(f"learning and trying need at least {MIN_TRIED + 1} pairs, there are {count}")
+    require_enough(count)
     tried = []
     for split in range(splits):
         rng = np.random.default_rng([SEED, split])
@@ -89,7 +101,7 @@ def try_detection(
             if shift_m > 0.0 and not known:
                 continue
             for _ in range(looks):
-                size = int(rng.integers(min(MIN_TRIED, len(kept)), len(kept) + 1))
+                size = int(rng.integers(MIN_PAIRS, len(kept) + 1))
                 indices = sorted(rng.permutation(kept)[:size].tolist())
                 xi = _move(rng, turn_rad, shift_m, known)
                 seen = look_at(evidence.of(indices), se3.perturb(right, xi), config)

@@ -21,6 +21,7 @@ from coec.adapters.evaluation_report import (
     verdicts_of,
 )
 from coec.calibration import evaluation
+from coec.calibration.detection import require_enough
 from coec.calibration.evaluation import FramesPoint, Outcome, SlicePoint
 from coec.calibration.halves import Halves
 from coec.calibration.ports import DepthModel
@@ -150,9 +151,16 @@ def configuration_of(options: Options, recorded: CalibrationConfig | None) -> Ca
 
 
 def _subject(options: Options, stages: Stages) -> _Subject:
+    """The recording with its depth. What it is too short for is refused before anything is inferred.
+
+    Raises:
+        CalibrationError: detection is asked for and the pairs are too few, or a frame has no depth.
+    """
     load = stages.begin("load", None)
     loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
     window = loaded.window
+    if options.detection:
+        require_enough(len(window.pairs))
     if options.camera_model is not None:
         window, _ = calibrate_command.refitted(window, options.camera_model)
     model = open_depth(configuration_of(_first_of(options), loaded.configuration).depth, LimitsConfig())
