@@ -46,6 +46,11 @@ class Accuracy:
     bias_sigma: NDArray[np.float64]
     spread: NDArray[np.float64]
 
+    @property
+    def expected(self) -> NDArray[np.float64]:
+        """(6,) the bias; zero on axes that are not searched."""
+        return np.nan_to_num(self.bias)
+
     def sigma(self, pairs: int) -> NDArray[np.float64]:
         """(6,) standard deviation of the offset of a look at so many pairs, less the bias."""
         variance = self.spread**2 / max(pairs, 1) + self.bias_sigma**2 + FLOOR**2
@@ -73,6 +78,7 @@ class MonitorLimits:
         max_distance2_rotation: of the local optimum over rotations, in standard deviations, squared.
         max_farthest2_pose: the same over six degrees of freedom, of the axis that is farthest off.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
+        min_edges_kept: see `Look`; where fewer are kept, a quarter of the distance over rotations is too far.
         max_agreement_rad: between the local optima of the two witnesses.
         min_overlap: points in view over the most that any pose within reach sees.
         min_mi, max_f1, min_f2: equation (2) of Borer et al. 2023: nats, per radian, per radian².
@@ -81,6 +87,7 @@ class MonitorLimits:
     max_distance2_rotation: float
     max_farthest2_pose: float
     min_edges_per_pair: float
+    min_edges_kept: float = -inf
     max_agreement_rad: float = inf
     min_overlap: float = 0.5
     min_mi: float = -inf
@@ -154,7 +161,7 @@ class Baseline:
     @property
     def bias(self) -> NDArray[np.float64]:
         """(6,) the estimator's optimum less the reference (rad, m); zero on axes that are not searched."""
-        return np.nan_to_num(self.accuracy.bias)
+        return self.accuracy.expected
 
     @property
     def bias_sigma(self) -> NDArray[np.float64]:

@@ -104,7 +104,7 @@ def try_detection(
                 size = int(rng.integers(MIN_PAIRS, len(kept) + 1))
                 indices = sorted(rng.permutation(kept)[:size].tolist())
                 xi = _move(rng, turn_rad, shift_m, known)
-                seen = look_at(evidence.of(indices), se3.perturb(right, xi), config)
+                seen = look_at(evidence.of(indices), se3.perturb(right, xi), config, accuracies[0].expected)
                 tried.append(Tried(name, is_flagged(seen, *accuracies, limits), by_equation_2(seen, limits), seen))
         heard(split + 1, splits)
     return tried

@@ -33,7 +33,7 @@ from coec.calibration.search import polish
 from coec.calibration.values import FramePair, Matrix4, Rig
 from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import se3
-from coec.geometry.alignment import EdgeFrames, frame_alignment
+from coec.geometry.alignment import EdgeFrames, frame_alignment, significances
 from coec.geometry.edge_charts import EdgeCharts
 from coec.geometry.image_edges import BLUR_SIGMA_PX
 
@@ -45,6 +45,8 @@ BASINS = 2
 """Maxima that both witnesses judge: what a few pairs have two of, all blurs together have one of."""
 
 ROTATION_DOF, POSE_DOF = 3, 6
+
+NO_BIAS = np.zeros(6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +86,7 @@ class Look:
         second_derivative: (6,) -∂²MI/∂ξ², nats per radian² or metre²; positive at a maximum.
         edges: significance of the edges at the pose.
         edges_at_best: that at the local optimum over rotations.
+        edges_kept: that of the finest band where the optimum is expected, over that where it is.
         contrast: how far the edges at the local optimum stand above other poses within reach, standard deviations.
         agreement_rad: angle between the local optima of the two witnesses.
         overlap: points in view over the most that any pose within reach sees.
@@ -100,6 +103,7 @@ class Look:
     second_derivative: NDArray[np.float64]
     edges: float
     edges_at_best: float
+    edges_kept: float
     contrast: float
     agreement_rad: float
     overlap: float
@@ -133,8 +137,8 @@ def gather(sight: Sight) -> Evidence:
     return Evidence(window.rig, window.pairs, sight.clouds, tuple(thinned(features)), edges, tuple(scenes))
 
 
-def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig) -> Look:
-    """A look at `pose` (4, 4).
+def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig, bias: NDArray[np.float64] = NO_BIAS) -> Look:
+    """A look at `pose` (4, 4), from which the optimum over rotations is expected at ξ = `bias` (6,).
 
     Raises:
         CalibrationError: no point can come into view.
@@ -173,11 +177,17 @@ def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig) -> Loo
         second_derivative=second_derivative,
         edges=of_edges.evaluate(pose).score,
         edges_at_best=of_edges.evaluate(T_rotation).score,
+        edges_kept=_kept(evidence.edges.bands[0], se3.perturb(pose, bias), T_rotation),
         contrast=fusion.edge_contrast(T_rotation),
         agreement_rad=se3.rotation_angle_rad(T_edges @ se3.inverse(T_depth)),
         overlap=at_pose.overlap,
         deficit=fusion.settling[0].evaluate(T_rotation).score - at_pose.score,
     )
+
+
+def _kept(band: EdgeFrames, T_expected: Matrix4, T_best: Matrix4) -> float:
+    expected, best = significances(band, np.stack([T_expected, T_best])).tolist()
+    return float(expected / max(best, 1e-9))
 
 
 class _EdgesAlone:

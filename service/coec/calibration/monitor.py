@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import (
+    Accuracy,
     Baseline,
     Drift,
     MonitorLimits,
@@ -34,7 +35,7 @@ from coec.calibration.causes import (
     dirty_blocks,
 )
 from coec.calibration.estimators import look
-from coec.calibration.looks import POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
+from coec.calibration.looks import NO_BIAS, POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.timing import explained_by_motion
 from coec.calibration.values import Matrix4, Metric, Window
@@ -55,6 +56,10 @@ repaired mount clears within three looks, too. A bad frame is in at most one loo
 
 WEAK_SHARE = 0.5
 """A flagged look whose edges are faint counts half, and confirms nothing: a full solve has to."""
+
+LOST_SHARE = 0.25
+"""Of the limit of the squared distance over rotations, where the edges are lost at the pose. Standard deviations are
+those of a rig's looks at large; how sharply this scene tells the pose, its edges know."""
 
 BLIND_AT = 1.2
 """Evidence by which a cause in the data is believed: more than one look."""
@@ -151,9 +156,9 @@ def observe(
     if len(window.pairs) < MIN_PAIRS:
         raise CalibrationError(f"a look needs {MIN_PAIRS} pairs, there are {len(window.pairs)}")
     evidence = gather(look(window, depth, images, config, Silence()))
-    return judge_look(
-        evidence, look_at(evidence, window.T_camera_lidar_start, config), window.T_camera_lidar_start, baseline
-    )
+    pose = window.T_camera_lidar_start
+    bias = NO_BIAS if baseline is None else baseline.rotation.expected
+    return judge_look(evidence, look_at(evidence, pose, config, bias), pose, baseline)
 
 
 def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline | None) -> Observation:
@@ -161,8 +166,7 @@ def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline
     limits = UNCOMMISSIONED if baseline is None else baseline.monitor
     camera = evidence.rig.camera
     rotation, accuracy = uncommissioned(camera) if baseline is None else (baseline.rotation, baseline.pose)
-    of_rotation = rotation.distance2(seen.offset_rotation, seen.pairs) / limits.max_distance2_rotation
-    of_pose = accuracy.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose
+    of_rotation, of_pose = over_limits(seen, rotation, accuracy, limits)
     metrics = _metrics(seen, of_rotation, of_pose, limits)
     flagged, weak = max(of_rotation, of_pose) > 1.0, edges_per_pair(seen) < limits.min_edges_per_pair
     causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
@@ -172,7 +176,7 @@ def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline
             evidence.pairs,
             evidence.rig,
             evidence.edges.whole,
-            se3.perturb(pose, np.nan_to_num(rotation.bias)),
+            se3.perturb(pose, rotation.expected),
             seen.T_rotation,
             limits.min_edges_per_pair * float(np.sqrt(seen.pairs)),
         )
@@ -194,6 +198,16 @@ def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline
         drift=None if baseline is None else drift_of(seen, baseline),
         dirty=dirty,
         textured=textured,
+    )
+
+
+def over_limits(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> tuple[float, float]:
+    """Squared distances of the local optima over three and six degrees of freedom, over their limits: a look is flagged
+    above 1."""
+    within = limits.max_distance2_rotation * (LOST_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0)
+    return (
+        rotation.distance2(seen.offset_rotation, seen.pairs) / within,
+        pose.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose,
     )
 
 
@@ -277,6 +291,7 @@ def _metrics(seen: Look, of_rotation: float, of_pose: float, limits: MonitorLimi
         Metric("distance_pose", of_pose, 1.0, at_least=False),
         Metric("edge_score", seen.edges, -inf, at_least=True),
         Metric("edges_per_pair", edges_per_pair(seen), limits.min_edges_per_pair, at_least=True),
+        Metric("edges_kept", seen.edges_kept, limits.min_edges_kept, at_least=True),
         Metric("agreement_deg", degrees(seen.agreement_rad), degrees(limits.max_agreement_rad), at_least=False),
         Metric("overlap", seen.overlap, limits.min_overlap, at_least=True),
     )
