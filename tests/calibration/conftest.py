@@ -45,8 +45,12 @@ def sharp_street() -> Window:
 def sharp_edges(sharp_street: Window) -> EdgeWitness:
     """The edge witness of the sharp street."""
     rig, pairs, images = sharp_street.rig, sharp_street.pairs, GreyImages(LimitsConfig())
-    clouds = [compensate(pair, rig, enabled=True).xyz_m for pair in pairs]
-    return build_edges(pairs, clouds, [images.grey(pair.camera) for pair in pairs], rig)
+    return build_edges(
+        pairs,
+        lambda frame, chosen: compensate(pairs[frame], rig, enabled=True, chosen=chosen),
+        [images.grey(pair.camera) for pair in pairs],
+        rig,
+    )
 
 
 @pytest.fixture

@@ -91,8 +91,12 @@ def test_the_true_translation_is_found_from_half_a_metre_away(sample_data: Path)
     """On real streets: the synthetic one hardly tells height."""
     _, window = pairs_of(f"kitti360:{sample_data}/kitti360?camera=image_00")
     images = GreyImages(LimitsConfig())
-    clouds = [compensate(pair, window.rig, enabled=True).xyz_m for pair in window.pairs]
-    edges = build_edges(window.pairs, clouds, [images.grey(pair.camera) for pair in window.pairs], window.rig)
+    edges = build_edges(
+        window.pairs,
+        lambda frame, chosen: compensate(window.pairs[frame], window.rig, enabled=True, chosen=chosen),
+        [images.grey(pair.camera) for pair in window.pairs],
+        window.rig,
+    )
     truth = window.T_camera_lidar_start
     for shift in 0.5 * np.concatenate([np.eye(3), -np.eye(3)]):
         start = se3.perturb(truth, np.concatenate([np.radians(shift), shift]))

@@ -31,7 +31,7 @@ def with_camera(window: Window, camera: Camera) -> EdgeWitness:
     """The edges of one pair, seen through another lens in an image of noise."""
     pair, rig = window.pairs[0], replace(window.rig, camera=camera, mask=None)
     grey = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width)).astype(np.uint8)
-    return build_edges([pair], [pair.lidar.xyz_m], [grey], rig)
+    return build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [grey], rig)
 
 
 def pinhole(width: int, height: int, focal_px: float) -> Camera:
@@ -70,7 +70,7 @@ def test_levels_double_and_end_at_the_same_angle_for_any_lens(street: Window, le
         assert blur_rad == pytest.approx(seen_blur_rad(frames.camera), rel=0.01)
     assert edges.pixel_rad == pytest.approx(seen_blur_rad(edges.sharp.camera) / BLUR_SIGMA_PX, rel=0.01)
     assert BLUR_SIGMA_PX * edges.pixel_rad <= edges.band_blur_rad[0]
-    assert edges.sharp.maps.shape == edges.whole.maps.shape
+    assert edges.whole.maps.shape[1:] == tuple(side // 2 for side in edges.sharp.maps.shape[1:])
     assert edges.sharp.maps.size <= MAX_PIXELS
     # Unless the image is too coarse for it.
     if seen_blur_rad(camera) * 2 ** (BANDS - 1) < COARSEST_BLUR_RAD:
@@ -95,7 +95,7 @@ def test_points_are_the_range_edges_where_they_were_at_the_exposure(
     first = sharp_edges.sharp.first_point
     for f, pair in enumerate(sharp_street.pairs):
         found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
-        cloud = compensate(pair, sharp_street.rig, enabled=True).xyz_m
+        cloud = compensate(pair, sharp_street.rig, enabled=True)
         np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, cloud[found.index])
         np.testing.assert_array_equal(sharp_edges.sharp.weight[first[f] : first[f + 1]], found.weight)
 
@@ -135,7 +135,7 @@ def test_a_mask_hides_pixels_on_every_level(street: Window) -> None:
     mask[camera.height // 2 :] = False
     rig: Rig = replace(street.rig, mask=mask)
     pair = street.pairs[0]
-    edges = build_edges([pair], [pair.lidar.xyz_m], [GREY.grey(pair.camera)], rig)
+    edges = build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [GREY.grey(pair.camera)], rig)
     for frames in (edges.sharp, edges.whole, *edges.bands):
         height = frames.maps.shape[1]
         assert (frames.maps[0, -(height // 2) :] == VOID).all()

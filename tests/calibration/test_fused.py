@@ -43,7 +43,7 @@ def mutual_information_of(window: Window, depth: DepthModel) -> MutualInformatio
     return build_mutual_information(
         [
             distance_and_depth(
-                compensate(pair, window.rig, enabled=True).xyz_m, depth.infer(pair.camera), window.T_camera_lidar_start
+                compensate(pair, window.rig, enabled=True), depth.infer(pair.camera), window.T_camera_lidar_start
             )
             for pair in window.pairs
         ],

@@ -93,7 +93,7 @@ def test_messages_come_in_the_order_of_their_stamps() -> None:
 
 def share_consistent(drive: SimulatedDrive, pair: FramePair, *, compensated: bool) -> float:
     """Share of the points in view whose range is that of the depth map at their pixel."""
-    xyz = compensate(pair, drive.rig, enabled=compensated).xyz_m.astype(np.float64)
+    xyz = compensate(pair, drive.rig, enabled=compensated).astype(np.float64)
     T = drive.truth(pair.camera.stamp_ns)
     p_camera = xyz @ T[:3, :3].T + T[:3, 3]
     uv, valid = project(drive.camera, p_camera)

@@ -35,7 +35,7 @@ def pairs(recording: Recording) -> list[FramePair]:
 def _consistency(recording: Recording, pair: FramePair, T_camera_lidar: NDArray[np.float64], *, moved: bool) -> float:
     """Share of the points in view whose range from the camera is within 1 % of the exact depth where they
     project."""
-    xyz_m = compensate(pair, recording.rig, enabled=moved).xyz_m
+    xyz_m = compensate(pair, recording.rig, enabled=moved)
     p_camera = xyz_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
     uv_px, valid = project(recording.rig.camera, p_camera)
     range_m = np.linalg.norm(p_camera, axis=1)

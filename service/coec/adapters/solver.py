@@ -154,10 +154,10 @@ class Solver:
         """
         window, configuration = read_window(path)
         pair, rig = window.pairs[-1], window.rig
-        cloud = compensate(pair, rig, enabled=configuration.motion_compensation)
+        xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
         image = decode_bgr(pair.camera.image, self._config.limits)
         T_camera_lidar = np.array(pose, dtype=np.float64)
-        return encode_jpeg(draw(image, rig.camera, T_camera_lidar, cloud.xyz_m, rig.mask, title), OVERLAY_JPEG_QUALITY)
+        return encode_jpeg(draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title), OVERLAY_JPEG_QUALITY)
 
     def commission(self, pair: str, pose: Sequence[Sequence[float]], paths: Sequence[Path]) -> dict[str, Any]:
         """Learn the baseline of a rig at an extrinsic (rows of the (4, 4) matrix) from recorded windows; write it.

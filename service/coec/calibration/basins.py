@@ -24,6 +24,9 @@ COVER_RAD = radians(0.9)
 MIN_COVER, MAX_COVER = 10_000, 150_000
 """Poses of the cover, whatever the reach: enough for the translations of a small one, bounded time for a large one."""
 
+BLOCK = 10_000
+"""Poses that are made at once: what is needed between is many times as large as they are."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Round:
@@ -98,20 +101,24 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
 
 def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.float64]:
     """(count, 4, 4) poses that cover the reach evenly."""
-    rotation = _ball(count) * reach.rotation_rad
-    # Translations in another order, so that they do not go along with the rotations.
-    shift = _ball(count)[(np.arange(count) * 7919) % count] * reach.translation_m
-    turn = _rotations(rotation)
+    ball = _ball(count)
     poses = np.tile(np.eye(4), (count, 1, 1))
-    # einsum and not @: the last bit of a BLAS product may differ between two processes.
-    poses[:, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
-    poses[:, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
+    for begin in range(0, count, BLOCK):
+        block = np.arange(begin, min(begin + BLOCK, count))
+        turn = _rotations(ball[block] * reach.rotation_rad)
+        # Translations in another order, so that they do not go along with the rotations.
+        shift = ball[(block * 7919) % count] * reach.translation_m
+        # einsum and not @: the last bit of a BLAS product may differ between two processes.
+        poses[block, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
+        poses[block, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
     return poses
 
 
 def _cover(start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
     count = 4.0 / 3.0 * pi * (reach.rotation_rad / COVER_RAD) ** 3
-    return np.concatenate([start[None], sample_reach(start, reach, int(min(max(count, MIN_COVER), MAX_COVER)))])
+    poses = sample_reach(start, reach, 1 + int(min(max(count, MIN_COVER), MAX_COVER)))
+    poses[0] = start
+    return poses
 
 
 def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:

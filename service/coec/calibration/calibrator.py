@@ -8,6 +8,7 @@ import numpy as np
 
 from coec.calibration.confidence import measure_curvature
 from coec.calibration.estimators import ESTIMATORS, look
+from coec.calibration.motion import compensation
 from coec.calibration.observability import unobservable, without
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.values import Compensation, Estimate, Optimum, Window
@@ -46,7 +47,7 @@ def calibrate(
     verdict = judge(metrics, search.stop_reason)
     progress.step("diagnosis", 1, 1)
 
-    outcomes = Counter(cloud.outcome for cloud in sight.clouds)
+    outcomes = Counter(compensation(pair, window.rig, enabled=config.motion_compensation) for pair in window.pairs)
     return Estimate(
         window_id=window.window_id,
         data_stamp_ns=window.stamp_ns,

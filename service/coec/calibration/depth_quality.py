@@ -131,13 +131,10 @@ def assess(sight: Sight, config: CalibrationConfig, heard: Callable[[int, str], 
     reference = rig.T_camera_lidar_nominal
     maps = sight.depths()
     pairings = tuple(
-        pair_up(cloud.xyz_m, depth, rig, reference, config.objective)
-        for cloud, depth in zip(sight.clouds, maps, strict=True)
+        pair_up(sight.points(index), depth, rig, reference, config.objective) for index, depth in enumerate(maps)
     )
     heard(1, "ranks")
-    features = [
-        distance_and_depth(cloud.xyz_m, depth, reference) for cloud, depth in zip(sight.clouds, maps, strict=True)
-    ]
+    features = [distance_and_depth(sight.points(index), depth, reference) for index, depth in enumerate(maps)]
     box = SearchBox(radians(SEARCH_DEG), 0.0)
     objective = build_mutual_information(features, rig, reference, box, config.objective)
     search = config.search.model_copy(update={"dof": 3, "rotation_deg": SEARCH_DEG})

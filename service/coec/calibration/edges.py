@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import radians
 
@@ -45,8 +45,8 @@ class EdgeWitness:
     Attributes:
         sharp: every range edge on the sharpest image edges, through the model of the lens: settles a pose.
         whole: the same on blurred edges, layout and all: leads there. It is drawn to where edges are dense, but its
-            hills are wide; those of a band as fine are not.
-        pixel_rad: a pixel of both, an angle about the optical axis.
+            hills are wide; those of a band as fine are not. Half as many pixels a side: the blur is a pixel wide.
+        pixel_rad: a pixel of `sharp`, an angle about the optical axis.
         bands: from fine to coarse, `RANKED_POINTS` evenly chosen range edges on one band each, through the model of the
             lens: ranks basins.
         band_blur_rad: the blur of each, an angle likewise.
@@ -63,14 +63,17 @@ class EdgeWitness:
     thinned: tuple[EdgeCharts, EdgeCharts]
 
 
+Points = Callable[[int, NDArray[np.int64]], NDArray[np.float32]]
+
+
 def build_edges(
-    pairs: Sequence[FramePair], clouds: Sequence[NDArray[np.float32]], greys: Iterable[NDArray[np.uint8]], rig: Rig
+    pairs: Sequence[FramePair], points: Points, greys: Iterable[NDArray[np.uint8]], rig: Rig
 ) -> EdgeWitness:
     """Range edges of the sweeps (found as measured, placed motion-compensated) and edge maps of the images.
 
     Args:
         pairs: the window's.
-        clouds: (N_i, 3) float32, the sweeps of the pairs, motion-compensated.
+        points: places the chosen points of the sweep of a pair: motion-compensated, (N, 3) float32.
         greys: (height, width) uint8, the images of the pairs.
 
     Raises:
@@ -80,7 +83,7 @@ def build_edges(
     first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in found])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError("no sweep has a jump in range: there is nothing to lay onto the edges of the images")
-    xyz_m = np.concatenate([cloud[edges.index] for cloud, edges in zip(clouds, found, strict=True)])
+    xyz_m = np.concatenate([points(frame, edges.index) for frame, edges in enumerate(found)])
     lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
     weight = np.concatenate([edges.weight for edges in found])
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
@@ -108,7 +111,7 @@ def build_edges(
     kept = evenly(len(ranked), THINNED_POINTS)
     return EdgeWitness(
         sharp=frames(finest, sharp, every),
-        whole=frames(finest, whole, every),
+        whole=frames(finest + 1, whole, every),
         pixel_rad=_blur_rad(rig.camera, finest) / BLUR_SIGMA_PX,
         bands=bands,
         band_blur_rad=blur_rad,

@@ -15,7 +15,7 @@ from coec.calibration.basins import at_rim, find_basins
 from coec.calibration.dead_regions import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.edges import build_edges
 from coec.calibration.fused import FusedObjective, Fusion
-from coec.calibration.motion import CompensatedCloud, compensate
+from coec.calibration.motion import EVERY, Choice, compensate
 from coec.calibration.objective import (
     Features,
     MutualInformation,
@@ -54,14 +54,18 @@ MAX_GREY_WIDTH_PX = 800
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """A window as an estimator sees it: its pairs, P_i as the clouds at the instants of the exposures, and how to look
-    at the images. Depth is inferred and images are decoded when an estimator asks."""
+    """A window as an estimator sees it. Sweeps are motion-compensated, depth is inferred and images are decoded when an
+    estimator asks: of most windows it needs a part of each."""
 
     window: Window
-    clouds: tuple[CompensatedCloud, ...]
+    compensated: bool
     depth: DepthModel
     images: ImageReader
     progress: Progress
+
+    def points(self, index: int, chosen: Choice = EVERY) -> NDArray[np.float32]:
+        """P_i: (N, 3) the chosen points of the sweep of pair `index`, at the instant of the exposure."""
+        return compensate(self.window.pairs[index], self.window.rig, enabled=self.compensated, chosen=chosen)
 
     def depths(self) -> list[DepthMap]:
         """D_i of every pair.
@@ -92,9 +96,8 @@ class Sight:
 def look(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, progress: Progress
 ) -> Sight:
-    """The window with its sweeps motion-compensated; without a mask of the rig's, with the one its frames tell."""
-    clouds = tuple(compensate(pair, window.rig, enabled=config.motion_compensation) for pair in window.pairs)
-    sight = Sight(window, clouds, depth, images, progress)
+    """The window as `config` wants it seen; without a mask of the rig's, with the one its frames tell."""
+    sight = Sight(window, config.motion_compensation, depth, images, progress)
     return sight if window.rig.mask is not None or len(window.pairs) < MIN_FRAMES else _masked(sight)
 
 
@@ -139,13 +142,13 @@ def by_intensity(sight: Sight, config: CalibrationConfig) -> Found:
         CalibrationError: the sweeps carry no intensity.
     """
     frames = []
-    for pair, cloud, grey in zip(sight.window.pairs, sight.clouds, sight.greys(), strict=True):
+    for index, (pair, grey) in enumerate(zip(sight.window.pairs, sight.greys(), strict=True)):
         if pair.lidar.intensity is None:
             raise CalibrationError(f"the sweep at {pair.lidar.stamp_ns} ns carries no intensity: use another objective")
         pixels = grey.astype(np.float32)
         while pixels.shape[1] > MAX_GREY_WIDTH_PX:
             pixels = halved(pixels)
-        frames.append(Features(cloud.xyz_m, pair.lidar.intensity, pixels))
+        frames.append(Features(sight.points(index), pair.lidar.intensity, pixels))
     return _by_mutual_information(frames, sight, config)
 
 
@@ -154,9 +157,9 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     window, progress = sight.window, sight.progress
     start = window.T_camera_lidar_start
     reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
-    features = thinned(depth_features(sight, start))
+    features = depth_features(sight, start, DEPTH_POINTS)
     depth = build_mutual_information(features, window.rig, start, reach, config.objective)
-    edges = build_edges(window.pairs, [cloud.xyz_m for cloud in sight.clouds], sight.greys(), window.rig)
+    edges = build_edges(window.pairs, sight.points, sight.greys(), window.rig)
     basins = find_basins(edges, start, reach)
     progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
@@ -199,20 +202,19 @@ def _polished(
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
 
 
-def depth_features(sight: Sight, T_camera_lidar: Matrix4) -> list[Features]:
-    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4).
+def depth_features(sight: Sight, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:
+    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4); of one in so many
+    points of every sweep, so that about `at_most` are left.
 
     Raises:
         CalibrationError: a frame has no usable depth.
     """
-    seen = zip(sight.clouds, sight.depths(), strict=True)
-    return [distance_and_depth(cloud.xyz_m, depth, T_camera_lidar) for cloud, depth in seen]
-
-
-def thinned(frames: Sequence[Features]) -> list[Features]:
-    """One in so many points of every frame, so that about `DEPTH_POINTS` are left."""
-    step = max(1, round(sum(len(frame.xyz_m) for frame in frames) / DEPTH_POINTS))
-    return [Features(frame.xyz_m[::step], frame.of_points[::step], frame.of_pixels) for frame in frames]
+    points = sum(len(pair.lidar.xyz_m) for pair in sight.window.pairs)
+    step = slice(None, None, 1 if at_most is None else max(1, round(points / at_most)))
+    return [
+        distance_and_depth(sight.points(index, step), depth, T_camera_lidar)
+        for index, depth in enumerate(sight.depths())
+    ]
 
 
 def _by_mutual_information(frames: list[Features], sight: Sight, config: CalibrationConfig) -> Found:

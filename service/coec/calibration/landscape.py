@@ -104,8 +104,7 @@ def landscapes(sight: Sight, config: CalibrationConfig) -> dict[str, Landscape]:
     found: dict[str, Landscape] = {
         kind: ObjectiveLandscape(ESTIMATORS[kind](sight, config).objective) for kind in kinds
     }
-    clouds = [cloud.xyz_m for cloud in sight.clouds]
-    edges = build_edges(sight.window.pairs, clouds, sight.greys(), sight.window.rig)
+    edges = build_edges(sight.window.pairs, sight.points, sight.greys(), sight.window.rig)
     return {**found, "edges": EdgeLandscape(edges.whole)}
 
 

@@ -18,9 +18,8 @@ from coec.calibration.basins import find_basins
 from coec.calibration.causes import SceneFacts, scene_facts
 from coec.calibration.confidence import axis_derivatives
 from coec.calibration.edges import THINNED_POINTS, EdgeWitness, build_edges, evenly
-from coec.calibration.estimators import Sight, depth_features, thinned
+from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
 from coec.calibration.fused import Fusion
-from coec.calibration.motion import CompensatedCloud
 from coec.calibration.objective import (
     Evaluation,
     Features,
@@ -55,7 +54,6 @@ class Evidence:
 
     rig: Rig
     pairs: tuple[FramePair, ...]
-    clouds: tuple[CompensatedCloud, ...]
     features: tuple[Features, ...]
     edges: EdgeWitness
     scenes: tuple[SceneFacts, ...]
@@ -65,7 +63,6 @@ class Evidence:
         return Evidence(
             self.rig,
             tuple(self.pairs[i] for i in indices),
-            tuple(self.clouds[i] for i in indices),
             tuple(self.features[i] for i in indices),
             _witness_of(self.edges, indices),
             tuple(self.scenes[i] for i in indices),
@@ -127,14 +124,13 @@ def gather(sight: Sight) -> Evidence:
         CalibrationError: an image cannot be decoded, a frame has no depth, no sweep has a range edge.
     """
     window, greys = sight.window, list(sight.greys())
-    xyz_m = [cloud.xyz_m for cloud in sight.clouds]
-    features = depth_features(sight, window.T_camera_lidar_start)
-    edges = build_edges(window.pairs, xyz_m, greys, window.rig)
+    features = depth_features(sight, window.T_camera_lidar_start, DEPTH_POINTS)
+    edges = build_edges(window.pairs, sight.points, greys, window.rig)
     counts = np.diff(edges.whole.first_point)
     scenes = [
         scene_facts(pair, grey, int(count)) for pair, grey, count in zip(window.pairs, greys, counts, strict=True)
     ]
-    return Evidence(window.rig, window.pairs, sight.clouds, tuple(thinned(features)), edges, tuple(scenes))
+    return Evidence(window.rig, window.pairs, tuple(features), edges, tuple(scenes))
 
 
 def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig, bias: NDArray[np.float64] = NO_BIAS) -> Look:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,29 +9,36 @@ from coec.calibration.values import Compensation, EgoMotion, FramePair, LidarFra
 from coec.geometry import se3
 from coec.geometry.sweep import deskew
 
+Choice = NDArray[np.int64] | slice
+"""Of the points of a sweep."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CompensatedCloud:
-    """(N, 3) float32 points in the LiDAR frame at the camera stamp, and what was done to them."""
-
-    xyz_m: NDArray[np.float32]
-    outcome: Compensation
+EVERY = slice(None)
 
 
-def compensate(pair: FramePair, rig: Rig, *, enabled: bool) -> CompensatedCloud:
-    """Carries every point of the sweep to the camera stamp.
+def compensate(pair: FramePair, rig: Rig, *, enabled: bool, chosen: Choice = EVERY) -> NDArray[np.float32]:
+    """(N, 3) float32: the chosen points of the sweep in the LiDAR frame at the camera stamp.
 
     Per-point time comes with the cloud, or follows from azimuth (`rig.sweep`). Without either, the sweep is moved as a
-    whole from its stamp to the camera's and the outcome says `NO_POINT_TIME`. Without ego-motion nothing is moved.
+    whole from its stamp to the camera's. Without ego-motion nothing is moved.
     """
-    if not enabled:
-        return CompensatedCloud(pair.lidar.xyz_m, Compensation.DISABLED)
-    if pair.motion is None:
-        return CompensatedCloud(pair.lidar.xyz_m, Compensation.NO_EGO_MOTION)
-    offset_s, outcome = _point_offsets_s(pair.lidar, rig.sweep)
-    dt_s = offset_s + (pair.lidar.stamp_ns - pair.camera.stamp_ns) * 1e-9
+    xyz_m = np.ascontiguousarray(pair.lidar.xyz_m[chosen])
+    if not enabled or pair.motion is None:
+        return xyz_m
+    dt_s = _point_offsets_s(pair.lidar, xyz_m, rig.sweep, chosen)
+    dt_s += (pair.lidar.stamp_ns - pair.camera.stamp_ns) * 1e-9
     angular, linear = sensor_twist(pair.motion, rig.T_lidar_ego)
-    return CompensatedCloud(deskew(pair.lidar.xyz_m, dt_s, angular, linear), outcome)
+    return deskew(xyz_m, dt_s, angular, linear)
+
+
+def compensation(pair: FramePair, rig: Rig, *, enabled: bool) -> Compensation:
+    """What `compensate` does to the sweep of a pair."""
+    if not enabled:
+        return Compensation.DISABLED
+    if pair.motion is None:
+        return Compensation.NO_EGO_MOTION
+    if pair.lidar.time_offset_s is None and rig.sweep is None:
+        return Compensation.NO_POINT_TIME
+    return Compensation.DONE
 
 
 def azimuth_offsets_s(xyz_m: NDArray[np.float32], sweep: SweepTiming) -> NDArray[np.float64]:
@@ -54,9 +59,9 @@ def sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.fl
     return rotation @ angular, rotation @ linear
 
 
-def _point_offsets_s(lidar: LidarFrame, sweep: SweepTiming | None) -> tuple[NDArray[np.float64], Compensation]:
+def _point_offsets_s(
+    lidar: LidarFrame, xyz_m: NDArray[np.float32], sweep: SweepTiming | None, chosen: Choice
+) -> NDArray[np.float64]:
     if lidar.time_offset_s is not None:
-        return lidar.time_offset_s.astype(np.float64), Compensation.DONE
-    if sweep is not None:
-        return azimuth_offsets_s(lidar.xyz_m, sweep), Compensation.DONE
-    return np.zeros(len(lidar.xyz_m)), Compensation.NO_POINT_TIME
+        return lidar.time_offset_s[chosen].astype(np.float64)
+    return np.zeros(len(xyz_m)) if sweep is None else azimuth_offsets_s(xyz_m, sweep)

@@ -97,8 +97,11 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
     rig = window.rig
     twists = [sensor_twist(pair.motion, rig.T_lidar_ego) for pair in moving if pair.motion is not None]
     spread = _spread(np.array([angular for angular, _ in twists]))
-    clouds = [compensate(pair, rig, enabled=True).xyz_m for pair in moving]
-    edges = build_edges(moving, clouds, [images.grey(pair.camera) for pair in moving], rig)
+
+    def points(frame: int, chosen: NDArray[np.int64]) -> NDArray[np.float32]:
+        return compensate(moving[frame], rig, enabled=True, chosen=chosen)
+
+    edges = build_edges(moving, points, (images.grey(pair.camera) for pair in moving), rig)
     rotated, offset_s = _coarse(edges, twists, pose, limits)
     scores = _scores(edges.whole, twists, rotated)
     found = _maximum(lambda x: float(scores(x).mean()), offset_s, limits)

@@ -65,7 +65,7 @@ def explained_by_motion(
     least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
     best, explanation = 0.0, None
     for changed, cause in _hypotheses(edges):
-        xyz_m = np.concatenate([compensate(pair, rig, enabled=True).xyz_m for pair in changed])
+        xyz_m = np.concatenate([compensate(pair, rig, enabled=True) for pair in changed])
         again = replace(level, xyz_m=np.ascontiguousarray(xyz_m.T))
         unmoved, moved = _significance(_per_frame(again, expected)), _per_frame(again, found)
         agree = float((moved[:, 0] > at_found[:, 0]).mean()) >= FRAMES_AGREE

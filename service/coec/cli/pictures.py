@@ -29,7 +29,7 @@ def write_overlays(
     """
     pair, rig = middle(window), window.rig
     image = decode_bgr(pair.camera.image, LimitsConfig())
-    cloud = compensate(pair, rig, enabled=compensated).xyz_m
+    cloud = compensate(pair, rig, enabled=compensated)
     written = []
     for name, (T_camera_lidar, title) in poses.items():
         picture = draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, title)

@@ -146,7 +146,7 @@ def _extent(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def significances(charts: EdgeCharts, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4): (K,)."""
-    return np.asarray(_significances(*_arguments(charts), np.ascontiguousarray(poses[:, :3]).astype(np.float32)))
+    return np.asarray(_significances(*_arguments(charts), poses[:, :3].astype(np.float32, order="C")))
 
 
 def climb(

@@ -72,7 +72,7 @@ class EdgePyramid:
 
     Attributes:
         bands: level k at 1/2^(finest + k) of the resolution: what is as wide as its blur.
-        whole: at the resolution of `bands[0]`: all that is as wide as its blur or wider.
+        whole: all that is as wide as the blur of `bands[0]` or wider, at half of its resolution.
         sharp: `bands[0]` with what is narrower, blurred by `SHARP_SIGMA_PX` only.
     """
 
@@ -114,7 +114,7 @@ class EdgeScales:
         wide = [_doubled(coarse, *fine.shape) for fine, coarse in pairwise(smooth)]
         return EdgePyramid(
             bands=tuple(_standardised(s - w, lit) for s, w, lit in zip(smooth, wide, self._lit, strict=False)),
-            whole=_standardised(smooth[0], self._lit[0]),
+            whole=_standardised(halved(smooth[0]), self._lit[1]),
             sharp=_standardised(sharpest - wide[0], self._lit[0]),
         )
 

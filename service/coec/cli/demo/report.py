@@ -102,7 +102,7 @@ def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: See
         "overlay_after": (seen.T_camera_lidar, f"after the repair: {seen.moment.error_deg:.2f} deg from the truth"),
     }
     whole = pictures.write_overlays(output, window, poses, configuration.motion_compensation)
-    cloud = compensate(pictures.middle(window), window.rig, enabled=configuration.motion_compensation).xyz_m
+    cloud = compensate(pictures.middle(window), window.rig, enabled=configuration.motion_compensation)
     near = {
         f"closeup_{name}": files.write(
             output / f"closeup_{name}.png", _close_up(window, cloud, *poses[f"overlay_{name}"])
