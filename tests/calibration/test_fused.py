@@ -125,7 +125,7 @@ def test_basins_are_ranked_from_coarse_to_fine_and_settled_on_the_sharpest_edges
 ) -> None:
     assert [objective.step_rad for objective in fusion.ranking] == [*reversed(sharp_edges.band_blur_rad[:-1])]
     whole, sharp = fusion.settling
-    assert sharp.step_rad == sharp_edges.pixel_rad < whole.step_rad <= fusion.ranking[-1].step_rad
+    assert sharp.step_rad == whole.step_rad == sharp_edges.blur_rad <= fusion.ranking[-1].step_rad
 
 
 def test_a_score_that_does_not_vary_is_no_division_by_zero() -> None:

@@ -46,7 +46,7 @@ class EdgeWitness:
         sharp: every range edge on the sharpest image edges, through the model of the lens: settles a pose.
         whole: the same on blurred edges, layout and all: leads there. It is drawn to where edges are dense, but its
             hills are wide; those of a band as fine are not. Half as many pixels a side: the blur is a pixel wide.
-        pixel_rad: a pixel of `sharp`, an angle about the optical axis.
+        blur_rad: the blur of `whole`, an angle about the optical axis.
         bands: from fine to coarse, `RANKED_POINTS` evenly chosen range edges on one band each, through the model of the
             lens: ranks basins.
         band_blur_rad: the blur of each, an angle likewise.
@@ -56,7 +56,7 @@ class EdgeWitness:
 
     sharp: EdgeFrames
     whole: EdgeFrames
-    pixel_rad: float
+    blur_rad: float
     bands: tuple[EdgeFrames, ...]
     band_blur_rad: tuple[float, ...]
     charts: tuple[EdgeCharts, EdgeCharts]
@@ -112,7 +112,7 @@ def build_edges(
     return EdgeWitness(
         sharp=frames(finest, sharp, every),
         whole=frames(finest + 1, whole, every),
-        pixel_rad=_blur_rad(rig.camera, finest) / BLUR_SIGMA_PX,
+        blur_rad=_blur_rad(rig.camera, finest),
         bands=bands,
         band_blur_rad=blur_rad,
         charts=(coarse, fine),

@@ -18,7 +18,6 @@ from coec.calibration.objective import Evaluation, MutualInformation, SearchBox
 from coec.calibration.values import Matrix4
 from coec.geometry.alignment import EdgeFrames, frame_alignment, significances
 from coec.geometry.edge_charts import significances as charted_significances
-from coec.geometry.image_edges import BLUR_SIGMA_PX
 
 OTHER_POSES = 64
 """Poses within reach from which the mean and the standard deviation of a score are taken: known to an eighth."""
@@ -54,7 +53,7 @@ class FusedObjective:
 
     @property
     def step_rad(self) -> float:
-        """The blur of the edges; a pixel for the sharpest: their hill has ripples of that width."""
+        """The blur of the edges, or more: the hill of the sharpest has ripples a pixel wide."""
         return self._step_rad
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
@@ -98,8 +97,8 @@ class Fusion:
         )
         of_whole, of_sharp = (Scale.of(significances(level, poses)) for level in (edges.whole, edges.sharp))
         self.settling = (
-            FusedObjective(edges.whole, BLUR_SIGMA_PX * edges.pixel_rad, depth, of_whole, self._of_depth),
-            FusedObjective(edges.sharp, edges.pixel_rad, depth, of_sharp, self._of_depth),
+            FusedObjective(edges.whole, edges.blur_rad, depth, of_whole, self._of_depth),
+            FusedObjective(edges.sharp, edges.blur_rad, depth, of_sharp, self._of_depth),
         )
 
     def edge_contrast(self, T_camera_lidar: Matrix4) -> float:

@@ -34,7 +34,6 @@ from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import se3
 from coec.geometry.alignment import EdgeFrames, frame_alignment, significances
 from coec.geometry.edge_charts import EdgeCharts
-from coec.geometry.image_edges import BLUR_SIGMA_PX
 
 REACH_RAD = radians(4.0)
 """How far about the pose a look searches. A pose further off leaves the local optimum at the rim, or nowhere: both are
@@ -195,7 +194,7 @@ class _EdgesAlone:
     @property
     def step_rad(self) -> float:
         """The blur of the edges."""
-        return BLUR_SIGMA_PX * self._edges.pixel_rad
+        return self._edges.blur_rad
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
         """Significance; depth and overlap are not looked at."""
