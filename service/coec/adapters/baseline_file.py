@@ -26,6 +26,10 @@ from coec.errors import ConfigError, StateError
 Maybe6 = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
 
 
+BASELINES = "rig.json"
+"""In the state directory: what was learned when the pairs were commissioned."""
+
+
 class _Document(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

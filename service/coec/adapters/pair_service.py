@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from coec.adapters import snapshots
-from coec.adapters.baseline_file import load_baseline
+from coec.adapters.baseline_file import BASELINES, load_baseline
 from coec.adapters.depth import STEREO
 from coec.adapters.evidence import Side
 from coec.adapters.held_pairs import HeldPairs
@@ -36,7 +36,7 @@ from coec.adapters.recorder import Recorder, RecordingPlan
 from coec.adapters.rig import rig_of
 from coec.adapters.sensor_clock import NS_PER_S, SensorClock
 from coec.adapters.snapshots import Snapshot
-from coec.adapters.state_store import BASELINES, StateStore
+from coec.adapters.state_store import StateStore
 from coec.adapters.stream_report import StreamReport
 from coec.adapters.threads import ServiceThread
 from coec.adapters.window_folder import WindowFolder, start_ns_of

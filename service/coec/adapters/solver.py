@@ -7,24 +7,21 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coec.adapters.baseline_file import load_baseline, save_baseline
+from coec.adapters.baseline_file import BASELINES, load_baseline, save_baseline
 from coec.adapters.depth import CachedDepth, open_depth
-from coec.adapters.images import GreyImages, decode_bgr, encode_jpeg
+from coec.adapters.images import CachedGreys, GreyImages, decode_bgr, encode_jpeg
 from coec.adapters.looks import pack_observation, unpack_pairs
-from coec.adapters.mcap_windows import read_window, write_result
 from coec.adapters.msgpack_frames import decode_camera
 from coec.adapters.overlay import draw
 from coec.adapters.rig import rig_of
-from coec.adapters.state_store import BASELINES
-from coec.adapters.wire import result_of
 from coec.calibration.baseline import Baseline, mismatch
 from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning import commission, learned_hash
-from coec.calibration.monitor import observe
+from coec.calibration.monitor import MIN_PAIRS, observe
 from coec.calibration.motion import compensate
 from coec.calibration.ports import Silence
 from coec.calibration.values import (
@@ -42,7 +39,9 @@ from coec.calibration.values import (
 from coec.config import Config, DepthConfig
 from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.cameras import scaled
-from coec.schemas.replies import CalibrationResult
+
+if TYPE_CHECKING:
+    from coec.schemas.replies import CalibrationResult
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +67,11 @@ class Solution:
 
 
 class Solver:
-    """Opens the networks of the configuration once and keeps the depth of recent images."""
+    """Opens the networks of the configuration once and keeps the depth of recent images.
+
+    What belongs to window files and results is imported by what reads and writes them: the types of ROS messages and
+    the schemas take 0.15 s, and a look, which comes first, needs none.
+    """
 
     def __init__(self, config: Config, depth_maps_kept: int) -> None:
         """Open every depth model that a pair of `config` names.
@@ -93,12 +96,9 @@ class Solver:
             search = pair.calibration.search.model_copy(update=few)
             configuration = pair.calibration.model_copy(update={"search": search})
             rig = _small(self._rigs[pair.name])
-            # An invented window need not lead to a calibration; that it ran is enough.
+            # A look runs every kernel that a calibration runs. An invented one need not lead anywhere.
             with contextlib.suppress(CalibrationError, DecodeError):
-                calibrate(_invented_window(rig, 2), _Ramp(), self._images, configuration, Silence())
-            with contextlib.suppress(CalibrationError, DecodeError):
-                look = _invented_window(rig, pair.monitor.pairs)
-                observe(look, _Ramp(), self._images, configuration, None)
+                observe(_invented_window(rig, MIN_PAIRS), _Ramp(), self._images, configuration, None)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
@@ -114,6 +114,9 @@ class Solver:
         Raises:
             WindowError, CalibrationError, DecodeError, ModelError: there is no result.
         """
+        from coec.adapters.mcap_windows import read_window, write_result
+        from coec.adapters.wire import result_of
+
         window, configuration = read_window(path)
         estimate = calibrate(window, self._network(configuration.depth), self._images, configuration, Silence())
         result = result_of(estimate, window.rig, self._config.vehicle)
@@ -143,7 +146,8 @@ class Solver:
         )
         network = self._network(configuration.depth)
         baseline, not_used = self._baseline(pair, network.identity)
-        observation = observe(window, network, self._images, configuration, baseline)
+        images = CachedGreys(self._images, len(window.pairs))
+        observation = observe(window, network, images, configuration, baseline)
         return {**pack_observation(observation), "baseline_not_used": not_used}
 
     def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> bytes:
@@ -152,6 +156,8 @@ class Solver:
         Raises:
             WindowError, DecodeError: the window or its image cannot be read.
         """
+        from coec.adapters.mcap_windows import read_window
+
         window, configuration = read_window(path)
         pair, rig = window.pairs[-1], window.rig
         xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
@@ -165,6 +171,8 @@ class Solver:
         Raises:
             WindowError, CalibrationError, DecodeError, ModelError, StateError: there is no baseline.
         """
+        from coec.adapters.mcap_windows import read_window
+
         configuration = self._pairs[pair].calibration
         start = np.array(pose, dtype=np.float64)
         windows = [replace(read_window(path)[0], T_camera_lidar_start=start) for path in paths]

@@ -31,10 +31,6 @@ _log = logging.getLogger(__name__)
 Rows = tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]
 
 
-BASELINES = "rig.json"
-"""In the state directory: what was learned when the pairs were commissioned."""
-
-
 class StoredCandidate(Part):
     """`Candidate` on the disk."""
 

@@ -16,6 +16,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.dead_regions import cell_means
 from coec.calibration.values import FramePair, Reason
 
 BLOCK_ROWS, BLOCK_COLUMNS = 18, 32
@@ -40,6 +41,9 @@ Another street does the same to 6 % of them for 5 s, and to less than 0.6 % for 
 
 DIRTY_LOOKS = 3.5
 """Independent looks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
+
+THUMBNAIL_CELL_PX = 8
+"""Pixels a side that are one of the thumbnail by which pictures are compared."""
 
 SAME_PICTURE = 0.01
 """Mean absolute difference of two exposures over the standard deviation of their grey values below which they are the
@@ -112,7 +116,7 @@ class SceneFacts:
     Attributes:
         gradient: (BLOCK_ROWS, BLOCK_COLUMNS) mean absolute difference of neighbouring grey values.
         bright: grey value below which nine pixels in ten lie.
-        thumbnail: (h / 8, w / 8) float32, mean grey values.
+        thumbnail: float32, mean grey values of cells of `THUMBNAIL_CELL_PX`.
         digest: of the pixels.
         bands: (BANDS,) points by elevation.
         sectors: (SECTORS,) the same points by azimuth.
@@ -152,7 +156,7 @@ def scene_facts(pair: FramePair, grey: NDArray[np.uint8], range_edges: int) -> S
         stamp_ns=pair.stamp_ns,
         gradient=_block_gradients(grey),
         bright=float(np.quantile(grey[::4, ::4], 0.9)),
-        thumbnail=_thumbnail(grey),
+        thumbnail=cell_means(grey, THUMBNAIL_CELL_PX).astype(np.float32),
         digest=zlib.crc32(grey.tobytes()),
         bands=np.histogram(elevation, BANDS, BAND_RANGE_RAD)[0].astype(np.int64),
         sectors=np.histogram(azimuth, SECTORS, (-pi, pi))[0].astype(np.int64),
@@ -242,16 +246,11 @@ def _same_picture(a: SceneFacts, b: SceneFacts) -> bool:
 def _block_gradients(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
     h, w = (grey.shape[0] // BLOCK_ROWS) * BLOCK_ROWS, (grey.shape[1] // BLOCK_COLUMNS) * BLOCK_COLUMNS
     values = grey[:h, :w].astype(np.int16)
-    across = np.abs(np.diff(values, axis=1, append=values[:, -1:]))
-    down = np.abs(np.diff(values, axis=0, append=values[-1:]))
-    total = (across + down).astype(np.float64)
-    blocks: NDArray[np.float64] = total.reshape(BLOCK_ROWS, h // BLOCK_ROWS, BLOCK_COLUMNS, w // BLOCK_COLUMNS).mean(
-        axis=(1, 3)
-    )
-    return blocks
-
-
-def _thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
-    h, w = grey.shape[0] // 8, grey.shape[1] // 8
-    means: NDArray[np.float32] = grey[: 8 * h, : 8 * w].reshape(h, 8, w, 8).mean(axis=(1, 3)).astype(np.float32)
-    return means
+    total, down = np.zeros_like(values), values[1:] - values[:-1]
+    np.subtract(values[:, 1:], values[:, :-1], out=total[:, :-1])
+    np.abs(total, out=total)
+    total[:-1] += np.abs(down, out=down)
+    # Rows first: long sums of neighbours in memory.
+    of_rows = total.reshape(BLOCK_ROWS, h // BLOCK_ROWS, w).sum(axis=1, dtype=np.int64)
+    of_blocks = of_rows.reshape(BLOCK_ROWS, BLOCK_COLUMNS, w // BLOCK_COLUMNS).sum(axis=2)
+    return np.asarray(of_blocks * (BLOCK_ROWS * BLOCK_COLUMNS / (h * w)))

@@ -99,12 +99,12 @@ class DeadRegions:
     def begin(cls, grey: NDArray[np.uint8]) -> DeadRegions:
         """From the first frame, (height, width) uint8."""
         cell_px = max(1, round(grey.shape[1] / GRID_WIDTH))
-        none = np.zeros_like(_reduced(grey, cell_px))
-        return cls(cell_px, 0, none, none, none, none, none, none, none, none, none)._with(_reduced(grey, cell_px))
+        none = np.zeros_like(cell_means(grey, cell_px))
+        return cls(cell_px, 0, none, none, none, none, none, none, none, none, none)._with(cell_means(grey, cell_px))
 
     def after(self, grey: NDArray[np.uint8]) -> DeadRegions:
         """With one more frame of the same size; unchanged when the vehicle hardly moved since the last one."""
-        reduced = _reduced(grey, self.cell_px)
+        reduced = cell_means(grey, self.cell_px)
         return self._with(reduced) if np.abs(reduced - self.last).mean() >= MIN_CHANGE_LEVELS else self
 
     def mask(self, width: int, height: int) -> Cells | None:
@@ -186,7 +186,7 @@ def lit_pixels(greys: Iterable[NDArray[np.uint8]]) -> Cells | None:
     return None if regions is None or shape is None else regions.mask(shape[1], shape[0])
 
 
-def _reduced(grey: NDArray[np.uint8], cell_px: int) -> Grid:
+def cell_means(grey: NDArray[np.uint8], cell_px: int) -> Grid:
     """Mean of every full cell; a remainder at the right and the bottom is left out."""
     rows, columns = grey.shape[0] // cell_px, grey.shape[1] // cell_px
     # Rows first: long sums of neighbours in memory.

@@ -88,8 +88,7 @@ def build_edges(
     weight = np.concatenate([edges.weight for edges in found])
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
     finest = min(finest, coarsest + 1 - BANDS)
-    scales = EdgeScales(lit, finest, coarsest)
-    sharp, whole, *of_bands = _maps(scales, greys, len(pairs))
+    sharp, whole, *of_bands = _maps(EdgeScales(lit, finest, coarsest), greys, len(pairs))
     points_m = np.ascontiguousarray(xyz_m.T)
 
     def frames(level: int, maps: NDArray[np.int8], chosen: NDArray[np.int64]) -> EdgeFrames:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from coec.calibration.basins import find_basins
 from coec.calibration.causes import SceneFacts, scene_facts
 from coec.calibration.confidence import axis_derivatives
-from coec.calibration.edges import THINNED_POINTS, EdgeWitness, build_edges, evenly
-from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
+from coec.calibration.edges import THINNED_POINTS, EdgeWitness, evenly
+from coec.calibration.estimators import Sight, witnesses
 from coec.calibration.fused import Fusion
 from coec.calibration.objective import (
     Evaluation,
@@ -123,8 +123,7 @@ def gather(sight: Sight) -> Evidence:
         CalibrationError: an image cannot be decoded, a frame has no depth, no sweep has a range edge.
     """
     window, greys = sight.window, list(sight.greys())
-    features = depth_features(sight, window.T_camera_lidar_start, DEPTH_POINTS)
-    edges = build_edges(window.pairs, sight.points, greys, window.rig)
+    features, edges = witnesses(sight, greys)
     counts = np.diff(edges.whole.first_point)
     scenes = [
         scene_facts(pair, grey, int(count)) for pair, grey, count in zip(window.pairs, greys, counts, strict=True)

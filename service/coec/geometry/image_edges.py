@@ -82,7 +82,8 @@ class EdgePyramid:
 
 
 class EdgeScales:
-    """How the images of one camera become pyramids: what they share, the mask at every level, is dealt with once."""
+    """How the images of one camera become pyramids, one after the other: what they share, the mask at every level, is
+    dealt with once."""
 
     def __init__(self, lit: NDArray[np.bool_], finest: int, coarsest: int) -> None:
         """
@@ -100,53 +101,66 @@ class EdgeScales:
             self._lit.append(_halved_mask(self._lit[-1]))
         self._gain = [_gain(lit, _BLUR) for lit in self._lit]
         self._sharp_gain = _gain(self._lit[0], _SHARP)
+        # Arrays of the size of an image are made once: to map them anew took as long as to fill them.
+        self._gradient, self._edges = np.empty((2, *self._inner.shape), np.float32)
+        self._smooth = np.empty(self._lit[0].shape, np.float32)
 
     def pyramid(self, grey: NDArray[np.uint8]) -> EdgePyramid:
         """Standardised edge maps of an image (h, w)."""
-        edges = _normalised_gradient(grey, self._inner)
+        edges = [_normalised_gradient(grey, self._inner, self._gradient, self._edges)]
         for _ in range(self._finest):
-            edges = halved(edges)
-        sharpest = _smooth(edges, self._lit[0], self._sharp_gain, _SHARP)
-        smooth = [_smooth(edges, self._lit[0], self._gain[0], _BLUR)]
-        for level in range(1, len(self._lit)):
-            edges = halved(edges)
-            smooth.append(_smooth(edges, self._lit[level], self._gain[level], _BLUR))
-        wide = [_doubled(coarse, *fine.shape) for fine, coarse in pairwise(smooth)]
+            edges = [halved(edges[0])]
+        for _ in self._lit[1:]:
+            edges.append(halved(edges[-1]))
+        along = self._gradient.reshape(-1)[: edges[0].size].reshape(edges[0].shape)  # the gradient is done with
+        wider = [
+            _smoothed(level, lit, gain, _BLUR, np.empty_like(level), np.empty_like(level))
+            for level, lit, gain in zip(edges[1:], self._lit[1:], self._gain[1:], strict=True)
+        ]
+        sharp = _smoothed(edges[0], self._lit[0], self._sharp_gain, _SHARP, along, self._smooth)
+        sharp_map = _standardised(_less(sharp, wider[0]), self._lit[0])
+        smooth = _smoothed(edges[0], self._lit[0], self._gain[0], _BLUR, along, self._smooth)
         return EdgePyramid(
-            bands=tuple(_standardised(s - w, lit) for s, w, lit in zip(smooth, wide, self._lit, strict=False)),
-            whole=_standardised(halved(smooth[0]), self._lit[1]),
-            sharp=_standardised(sharpest - wide[0], self._lit[0]),
+            whole=_standardised(halved(smooth), self._lit[1]),
+            bands=tuple(
+                _standardised(_less(fine, coarse), lit)
+                for (fine, coarse), lit in zip(pairwise([smooth, *wider]), self._lit, strict=False)
+            ),
+            sharp=sharp_map,
         )
 
 
 def _gain(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
     """What a blur of the pixels that count has to be multiplied by: a mask is no valley."""
-    share = _blurred(lit.astype(np.float32), kernel)
+    if lit.all():
+        # Every pixel is the same then: one tells all.
+        return np.full(lit.shape, _gain_over(lit[:1, :1], kernel)[0, 0])
+    return _gain_over(lit, kernel)
+
+
+def _gain_over(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
+    one = np.ones(lit.shape, np.float32)
+    share = _smoothed(one, lit, one, kernel, np.empty_like(one), np.empty_like(one))
     return np.asarray(1.0 / np.maximum(share, LEAST_SHARE), np.float32)
 
 
-def _smooth(
-    edges: NDArray[np.float32], lit: NDArray[np.bool_], gain: NDArray[np.float32], kernel: NDArray[np.float32]
+def _normalised_gradient(
+    grey: NDArray[np.uint8], inner: NDArray[np.bool_], gradient: NDArray[np.float32], out: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Blurred over the pixels that count only."""
-    return _blurred(edges * lit, kernel) * gain
-
-
-def _normalised_gradient(grey: NDArray[np.uint8], inner: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The gradient over its local mean; zero but at `inner` pixels."""
-    gradient = _gradient(grey, inner)
+    """The gradient over its local mean; zero but at `inner` pixels. `gradient` (h, w) is scratch; returns `out`."""
+    _gradient(grey, inner, gradient)
     sample = gradient.ravel()[:: max(1, gradient.size // SAMPLES)]
     steep = sample[sample > 0.0]
     clip = np.float32(np.quantile(steep, CLIP_SHARE) if steep.size else 0.0)
     floor = FLOOR_SHARE * float(np.minimum(sample, clip).mean(dtype=np.float64))
-    return _over_local_mean(gradient, clip, np.float32(max(floor, 1e-6)))
+    return _over_local_mean(gradient, clip, np.float32(max(floor, 1e-6)), out)
 
 
 @njit(cache=True, parallel=True)
-def _gradient(grey: NDArray[np.uint8], inner: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _gradient(grey: NDArray[np.uint8], inner: NDArray[np.bool_], out: NDArray[np.float32]) -> None:
     """Magnitude of the Sobel gradient; zero on the border and but at `inner` pixels."""
     h, w = grey.shape
-    out = np.zeros((h, w), np.float32)
+    out[0], out[h - 1], out[:, 0], out[:, w - 1] = 0.0, 0.0, 0.0, 0.0
     for y in prange(1, h - 1):
         # Three rows of 32-bit numbers: the loop over the pixels runs in vector registers.
         above, here, below = grey[y - 1].astype(np.int32), grey[y].astype(np.int32), grey[y + 1].astype(np.int32)
@@ -156,16 +170,16 @@ def _gradient(grey: NDArray[np.uint8], inner: NDArray[np.bool_]) -> NDArray[np.f
             gy = along[x - 1] + np.int32(2) * along[x] + along[x + 1]
             steepness = np.sqrt(np.float32(gx * gx + gy * gy)) / np.float32(8.0)
             out[y, x] = steepness if inner[y, x] else np.float32(0.0)
-    return out
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _over_local_mean(values: NDArray[np.float32], clip: np.float32, floor: np.float32) -> NDArray[np.float32]:
+def _over_local_mean(
+    values: NDArray[np.float32], clip: np.float32, floor: np.float32, out: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Values up to `clip`, divided by `floor` and their mean over the square of `MEAN_RADIUS_PX` around each pixel, as
-    far as it lies in the image."""
+    far as it lies in the image. Returns `out`."""
     h, w = values.shape
     r = MEAN_RADIUS_PX
-    out = np.empty((h, w), np.float32)
     columns = np.empty(w, np.float32)
     for x in range(w):
         columns[x] = min(x + r, w - 1) - max(x - r, 0) + 1
@@ -198,6 +212,8 @@ def _over_local_mean(values: NDArray[np.float32], clip: np.float32, floor: np.fl
 
 def _eroded(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Without the pixels within two rows and columns of a masked one: the border of a mask is an edge of nothing."""
+    if lit.all():
+        return lit
     for axis in (0, 1):
         padded = np.pad(lit, [(2, 2) if axis == k else (0, 0) for k in (0, 1)], mode="edge")
         lit = np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=axis).all(axis=-1))
@@ -205,21 +221,30 @@ def _eroded(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @njit(cache=True, parallel=True)
-def _blurred(values: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Blurred along the rows and along the columns; the border is repeated outside.
+def _smoothed(
+    values: NDArray[np.float32],
+    lit: NDArray[np.bool_],
+    gain: NDArray[np.float32],
+    kernel: NDArray[np.float32],
+    along: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Blurred along the rows and along the columns, over the pixels that count; the border is repeated outside.
 
     Args:
-        values: (h, w).
+        values, lit, gain: (h, w).
         kernel: (taps + 1,) the middle and one side of a symmetric kernel.
+        along: (h, w) scratch.
+        out: (h, w), returned.
     """
     h, w = values.shape
     taps = kernel.shape[0] - 1
-    along, out = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
     for y in prange(h):
         row = np.empty(w + 2 * taps, np.float32)
-        row[:taps] = values[y, 0]
-        row[taps : taps + w] = values[y]
-        row[taps + w :] = values[y, w - 1]
+        for x in range(w):
+            row[taps + x] = values[y, x] if lit[y, x] else np.float32(0.0)
+        row[:taps] = row[taps]
+        row[taps + w :] = row[taps + w - 1]
         _weigh(row[taps : taps + w], kernel[0], along[y])
         for k in range(1, taps + 1):
             _add_both(row[taps - k : taps - k + w], row[taps + k : taps + k + w], kernel[k], along[y])
@@ -227,6 +252,8 @@ def _blurred(values: NDArray[np.float32], kernel: NDArray[np.float32]) -> NDArra
         _weigh(along[y], kernel[0], out[y])
         for k in range(1, taps + 1):
             _add_both(along[max(y - k, 0)], along[min(y + k, h - 1)], kernel[k], out[y])
+        for x in range(w):
+            out[y, x] *= gain[y, x]
     return out
 
 
@@ -264,10 +291,11 @@ def _halved_mask(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @njit(cache=True, parallel=True)
-def _doubled(values: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
-    """(height, width): interpolated between the pixels of an image that `halved` made; its border is repeated."""
-    h, w = values.shape
-    out = np.empty((height, width), np.float32)
+def _less(fine: NDArray[np.float32], coarse: NDArray[np.float32]) -> NDArray[np.float32]:
+    """`fine` less `coarse`, a map of half its size that is interpolated between its pixels and repeated beyond its
+    border. In place: returns `fine`."""
+    h, w = coarse.shape
+    height, width = fine.shape
     near, far = np.float32(0.75), np.float32(0.25)
     for y in prange(height):
         # Pixel j of the half lies between the pixels 2·j and 2·j + 1 of the whole; a last odd pixel has none.
@@ -276,10 +304,10 @@ def _doubled(values: NDArray[np.float32], height: int, width: int) -> NDArray[np
         for x in range(width):
             c = min(x // 2, w - 1)
             d = min(max(x // 2 - 1 if x % 2 == 0 else c + 1, 0), w - 1)
-            out[y, x] = near * (near * values[a, c] + far * values[a, d]) + far * (
-                near * values[b, c] + far * values[b, d]
+            fine[y, x] -= near * (near * coarse[a, c] + far * coarse[a, d]) + far * (
+                near * coarse[b, c] + far * coarse[b, d]
             )
-    return out
+    return fine
 
 
 def _standardised(values: NDArray[np.float32], lit: NDArray[np.bool_]) -> NDArray[np.int8]:
