@@ -57,7 +57,7 @@ repaired mount clears within three looks, too. A bad frame is in at most one loo
 WEAK_SHARE = 0.5
 """A flagged look whose edges are faint counts half, and confirms nothing: a full solve has to."""
 
-LOST_SHARE = 0.25
+LOST_EDGES_SHARE = 0.25
 """Of the limit of the squared distance over rotations, where the edges are lost at the pose. Standard deviations are
 those of a rig's looks at large; how sharply this scene tells the pose, its edges know."""
 
@@ -204,7 +204,7 @@ def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline
 def over_limits(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> tuple[float, float]:
     """Squared distances of the local optima over three and six degrees of freedom, over their limits: a look is flagged
     above 1."""
-    within = limits.max_distance2_rotation * (LOST_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0)
+    within = limits.max_distance2_rotation * (LOST_EDGES_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0)
     return (
         rotation.distance2(seen.offset_rotation, seen.pairs) / within,
         pose.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose,
