@@ -25,7 +25,8 @@ config = Config(pairs=(pair.model_copy(update={"calibration": configuration}),))
 
 
 def kernels():
-    return {(o.py_func.__qualname__, str(s)) for o in gc.get_objects() if isinstance(o, Dispatcher) for s in o.overloads}
+    compiled = [kernel for kernel in gc.get_objects() if isinstance(kernel, Dispatcher)]
+    return {(kernel.py_func.__qualname__, str(types)) for kernel in compiled for types in kernel.overloads}
 
 
 solver = Solver(config, 8)
