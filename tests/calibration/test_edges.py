@@ -18,6 +18,7 @@ from coec.calibration.edges import (
 from coec.calibration.motion import compensate
 from coec.calibration.values import Rig, Window
 from coec.config import LimitsConfig
+from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, build
 from coec.geometry.edge_charts import CELLS_PER_BLUR, MAX_CHART_POINTS
 from coec.geometry.image_edges import BLUR_SIGMA_PX, VOID, EdgeScales
@@ -127,6 +128,14 @@ def test_basins_are_ranked_with_some_of_the_points_where_there_are_very_many(
     # The ones that are kept are the same everywhere, with their weights.
     every = {tuple(column) for column in np.vstack([edges.sharp.xyz_m, edges.sharp.weight]).T}
     assert all(tuple(column) in every for column in np.vstack([edges.bands[0].xyz_m, edges.bands[0].weight]).T)
+
+
+@pytest.mark.parametrize("grown", [(1, 0), (0, 1), (-1, 0), (0, -1)])
+def test_an_image_of_another_size_is_refused(street: Window, grown: tuple[int, int]) -> None:
+    pair, camera = street.pairs[0], street.rig.camera
+    grey = np.zeros((camera.height + grown[0], camera.width + grown[1]), np.uint8)
+    with pytest.raises(CalibrationError, match="px, the camera model"):
+        build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [grey], street.rig)
 
 
 def test_a_mask_hides_pixels_on_every_level(street: Window) -> None:

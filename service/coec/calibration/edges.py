@@ -77,7 +77,7 @@ def build_edges(
         greys: (height, width) uint8, the images of the pairs.
 
     Raises:
-        CalibrationError: no sweep has a range edge.
+        CalibrationError: no sweep has a range edge, or an image is not of the camera's size.
     """
     found = [range_edges(pair.lidar.xyz_m, pair.lidar.ring) for pair in pairs]
     first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in found])]).astype(np.int64)
@@ -127,6 +127,9 @@ def _maps(scales: EdgeScales, greys: Iterable[NDArray[np.uint8]], frames: int) -
     """
     stacks: list[NDArray[np.int8]] = []
     for frame, grey in enumerate(greys):
+        if grey.shape != scales.shape:
+            (height, width), (rows, columns) = grey.shape, scales.shape
+            raise CalibrationError(f"an image has {width} x {height} px, the camera model {columns} x {rows} px")
         pyramid = scales.pyramid(grey)
         maps = (pyramid.sharp, pyramid.whole, *pyramid.bands[-BANDS:])
         stacks = stacks or [np.empty((frames, *level.shape), np.int8) for level in maps]

@@ -105,8 +105,16 @@ class EdgeScales:
         self._gradient, self._edges = np.empty((2, *self._inner.shape), np.float32)
         self._smooth = np.empty(self._lit[0].shape, np.float32)
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the images: (h, w)."""
+        return self._inner.shape
+
     def pyramid(self, grey: NDArray[np.uint8]) -> EdgePyramid:
-        """Standardised edge maps of an image (h, w)."""
+        """Standardised edge maps of an image (h, w), and of no other size.
+
+        `_less` works in place: what is needed as it is comes before.
+        """
         edges = [_normalised_gradient(grey, self._inner, self._gradient, self._edges)]
         for _ in range(self._finest):
             edges = [halved(edges[0])]
