@@ -327,8 +327,7 @@ def test_what_is_kept_lies_apart_and_what_is_left_out_does_not(count: int) -> No
     poses = turned(np.eye(4), 0.3, 150, seed=2)
     order = np.random.default_rng(4).permutation(150)
     limit_rad = 0.1
-    rotations = np.ascontiguousarray(poses[:, :3, :3].reshape(-1, 9))
-    kept = keep_apart(rotations, order, count, 1.0 + 2.0 * np.cos(limit_rad)).tolist()
+    kept = keep_apart(poses, order, count, 1.0 + 2.0 * np.cos(limit_rad)).tolist()
     expected: list[int] = []
     for index in order.tolist():
         gaps = [se3.rotation_angle_rad(poses[index] @ se3.inverse(poses[other])) for other in expected]

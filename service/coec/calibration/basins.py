@@ -139,8 +139,7 @@ def _climbed(
 
 def _apart(poses: NDArray[np.float64], z: NDArray[np.float64], count: int, apart_rad: float) -> NDArray[np.int64]:
     """Indices of the best poses, best first, no two closer in rotation than `apart_rad`."""
-    rotations = np.ascontiguousarray(poses[:, :3, :3].reshape(-1, 9))
-    return np.asarray(keep_apart(rotations, np.argsort(-z, kind="stable"), count, 1.0 + 2.0 * cos(apart_rad)))
+    return np.asarray(keep_apart(poses, np.argsort(-z, kind="stable"), count, 1.0 + 2.0 * cos(apart_rad)))
 
 
 def _ball(count: int) -> NDArray[np.float64]:
@@ -148,7 +147,11 @@ def _ball(count: int) -> NDArray[np.float64]:
     quasirandom sequences"), rejected from its cube."""
     ratio = 1.2207440846057596  # the real root of x⁴ = x + 1
     steps = (1.0 / ratio) ** np.arange(1, 4)
-    cube = 2.0 * np.modf(0.5 + np.outer(np.arange(1, int(count * 6.0 / pi * 1.02) + 100), steps))[0] - 1.0
+    cube = np.outer(np.arange(1, int(count * 6.0 / pi * 1.02) + 100), steps)
+    cube += 0.5
+    cube -= np.floor(cube)
+    cube *= 2.0
+    cube -= 1.0
     ball: NDArray[np.float64] = cube[(cube**2).sum(axis=1) <= 1.0][:count]
     return ball
 

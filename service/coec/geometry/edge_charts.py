@@ -146,7 +146,7 @@ def _extent(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def significances(charts: EdgeCharts, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4): (K,)."""
-    return np.asarray(_significances(*_arguments(charts), poses[:, :3].astype(np.float32, order="C")))
+    return _significances(*_arguments(charts), poses)
 
 
 def climb(
@@ -242,12 +242,13 @@ def _significances(
     xyz: NDArray[np.float32],
     weight: NDArray[np.int32],
     first_cell: NDArray[np.int32],
-    poses: NDArray[np.float32],
+    poses: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     z = np.empty(poses.shape[0])
     for k in prange(poses.shape[0]):
-        scratch = np.empty(xyz.shape[1], np.int32)
-        z[k] = _significance(cells, height, width, unit, centre, xyz, weight, first_cell, poses[k], scratch)
+        narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
+        narrow[:] = poses[k, :3]
+        z[k] = _significance(cells, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
     return z
 
 
@@ -337,17 +338,18 @@ def _moved(pose: NDArray[np.float64], axis: int, amount: float) -> NDArray[np.fl
 
 
 @njit(cache=True)
-def keep_apart(rotations: NDArray[np.float64], order: NDArray[np.int64], count: int, limit: float) -> NDArray[np.int64]:
-    """The first `count` indices of `order` whose rotations (K, 9) lie apart: the trace of R_a·R_bᵀ, which is the sum of
-    the products of the entries and 1 + 2 cos(angle), is at most `limit` for any two."""
+def keep_apart(poses: NDArray[np.float64], order: NDArray[np.int64], count: int, limit: float) -> NDArray[np.int64]:
+    """The first `count` indices of `order` whose poses (K, 4, 4) lie apart in rotation: the trace of R_a·R_bᵀ, which is
+    the sum of the products of the entries and 1 + 2 cos(angle), is at most `limit` for any two."""
     kept = np.empty(min(count, order.shape[0]), np.int64)
     found = 0
     for index in order:
         free = True
         for k in range(found):
             trace = 0.0
-            for j in range(9):
-                trace += rotations[index, j] * rotations[kept[k], j]
+            for i in range(3):
+                for j in range(3):
+                    trace += poses[index, i, j] * poses[kept[k], i, j]
             if trace > limit:
                 free = False
                 break
