@@ -27,6 +27,9 @@ MIN_COVER, MAX_COVER = 10_000, 150_000
 BLOCK = 10_000
 """Poses that are made at once: what is needed between is many times as large as they are."""
 
+CANDIDATES = 30_000
+"""Poses of the cover among which those that begin are looked for: most neighbours of a good pose are good, too."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Round:
@@ -87,7 +90,7 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
 
     The reach is a ball: so many radians about any axis, and so many metres in any direction (0: rotation only).
     """
-    poses = _cover(start, reach)
+    poses = _promising(edges.thinned[ROUNDS[0].chart], start, reach)
     for number in ROUNDS:
         charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
         poses = poses[_apart(poses, significances(charts, poses), number.poses, number.apart_rad)]
@@ -101,24 +104,40 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
 
 def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.float64]:
     """(count, 4, 4) poses that cover the reach evenly."""
-    ball = _ball(count)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    for begin in range(0, count, BLOCK):
-        block = np.arange(begin, min(begin + BLOCK, count))
-        turn = _rotations(ball[block] * reach.rotation_rad)
+    return _Cover(start, reach, count).poses(np.arange(count))
+
+
+class _Cover:
+    """So many poses that cover the reach evenly, made as they are asked for: all at once they would take more memory
+    than the edges of a window."""
+
+    def __init__(self, start: Matrix4, reach: SearchBox, count: int) -> None:
+        self._start, self._reach, self._ball = start, reach, _ball(count)
+
+    def poses(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(n, 4, 4) those with the given numbers."""
+        start, count = self._start, len(self._ball)
+        turn = _rotations(self._ball[index] * self._reach.rotation_rad)
         # Translations in another order, so that they do not go along with the rotations.
-        shift = ball[(block * 7919) % count] * reach.translation_m
+        shift = self._ball[(index * 7919) % count] * self._reach.translation_m
+        poses = np.tile(np.eye(4), (len(index), 1, 1))
         # einsum and not @: the last bit of a BLAS product may differ between two processes.
-        poses[block, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
-        poses[block, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
-    return poses
+        poses[:, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
+        poses[:, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
+        return poses
 
 
-def _cover(start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
-    count = 4.0 / 3.0 * pi * (reach.rotation_rad / COVER_RAD) ** 3
-    poses = sample_reach(start, reach, 1 + int(min(max(count, MIN_COVER), MAX_COVER)))
-    poses[0] = start
-    return poses
+def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
+    """The poses of the cover, and the start, that begin the first round."""
+    volume = 4.0 / 3.0 * pi * (reach.rotation_rad / COVER_RAD) ** 3
+    count = int(min(max(volume, MIN_COVER), MAX_COVER))
+    cover = _Cover(start, reach, count)
+    blocks = np.array_split(np.arange(count), -(-count // BLOCK))
+    z = np.concatenate([significances(charts, cover.poses(block)) for block in blocks])
+    best = np.argsort(-z, kind="stable")[:CANDIDATES]
+    poses = np.concatenate([start[None], cover.poses(best)])
+    z = np.concatenate([significances(charts, start[None]), z[best]])
+    return poses[_apart(poses, z, ROUNDS[0].poses, ROUNDS[0].apart_rad)]
 
 
 def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:

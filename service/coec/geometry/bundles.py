@@ -64,8 +64,18 @@ def bundle(xyz_m: NDArray[np.float32], first_point: NDArray[np.int64], half_view
         half_view_rad: largest angle from the optical axis at which the image has a pixel.
         shift_m: largest length of a pose's translation.
     """
-    starts = np.concatenate([np.arange(a, b, BUNDLE) for a, b in pairwise(first_point)])
-    owner = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, first_point[-1])))
+    # A frame at a time: in double precision, all at once would be the most that a solve ever holds.
+    frames = [_of_frame(xyz_m[:, a:b], half_view_rad, shift_m) for a, b in pairwise(first_point) if b > a]
+    axes, least = zip(*frames, strict=True)
+    return Bundles(np.concatenate(axes), np.concatenate(least), shift_m)
+
+
+def _of_frame(
+    xyz_m: NDArray[np.float32], half_view_rad: float, shift_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """`axis` (B, 3) and `least_cosine` (B,) of the points (3, N) of one frame."""
+    starts = np.arange(0, xyz_m.shape[1], BUNDLE)
+    owner = np.arange(xyz_m.shape[1]) // BUNDLE
     range_m = np.maximum(np.sqrt(np.square(xyz_m, dtype=np.float64).sum(axis=0)), 1e-9)
     rays = xyz_m / range_m
     axis = np.add.reduceat(rays, starts, axis=1)
@@ -76,4 +86,4 @@ def bundle(xyz_m: NDArray[np.float32], first_point: NDArray[np.int64], half_view
     angle = np.arccos(np.clip(cosine, -1.0, 1.0)) + parallax + half_view_rad + MARGIN_RAD
     # NaN compares as false: a bundle with a point that is no number, or that reaches all around, is never left out.
     least = np.where(angle < math.pi, np.cos(np.minimum(angle, math.pi)), -2.0)
-    return Bundles(np.nan_to_num(axis.T.copy()), least, shift_m)
+    return np.nan_to_num(axis.T.copy()), least
