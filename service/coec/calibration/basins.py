@@ -168,10 +168,10 @@ def _ball(count: int) -> NDArray[np.float64]:
     steps = (1.0 / ratio) ** np.arange(1, 4)
     cube = np.outer(np.arange(1, int(count * 6.0 / pi * 1.02) + 100), steps)
     cube += 0.5
-    cube -= np.floor(cube)
+    np.remainder(cube, 1.0, out=cube)
     cube *= 2.0
     cube -= 1.0
-    ball: NDArray[np.float64] = cube[(cube**2).sum(axis=1) <= 1.0][:count]
+    ball: NDArray[np.float64] = cube[np.einsum("ij,ij->i", cube, cube) <= 1.0][:count]
     return ball
 
 
