@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coec.adapters.baseline_file import BASELINES, load_baseline, save_baseline
-from coec.adapters.depth import CachedDepth, open_depth
+from coec.adapters.depth import CachedDepth, DepthAhead, open_depth
 from coec.adapters.images import CachedGreys, GreyImages, decode_bgr, encode_jpeg
 from coec.adapters.looks import pack_observation, unpack_pairs
 from coec.adapters.msgpack_frames import decode_camera
@@ -147,7 +147,8 @@ class Solver:
         network = self._network(configuration.depth)
         baseline, not_used = self._baseline(pair, network.identity)
         images = CachedGreys(self._images, len(window.pairs))
-        observation = observe(window, network, images, configuration, baseline)
+        with DepthAhead(network, (each.camera for each in window.pairs)) as depth:
+            observation = observe(window, depth, images, configuration, baseline)
         return {**pack_observation(observation), "baseline_not_used": not_used}
 
     def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> bytes:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import radians
 from types import MappingProxyType
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.basins import at_rim, find_basins
 from coec.calibration.dead_regions import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
-from coec.calibration.edges import EdgeWitness, build_edges
+from coec.calibration.edges import build_edges
 from coec.calibration.fused import FusedObjective, Fusion
 from coec.calibration.motion import EVERY, Choice, compensate
 from coec.calibration.objective import (
@@ -158,7 +157,9 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     window, progress = sight.window, sight.progress
     start = window.T_camera_lidar_start
     reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
-    features, edges = witnesses(sight, sight.greys())
+    # Edges first: depth may be inferred meanwhile.
+    edges = build_edges(window.pairs, sight.points, sight.greys(), window.rig)
+    features = depth_features(sight, start, DEPTH_POINTS)
     depth = build_mutual_information(features, window.rig, start, reach, config.objective)
     basins = find_basins(edges, start, reach)
     progress.step("basins", 1, 1)
@@ -200,21 +201,6 @@ def _polished(
 
 
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
-
-
-def witnesses(sight: Sight, greys: Iterable[NDArray[np.uint8]]) -> tuple[list[Features], EdgeWitness]:
-    """What both witnesses of a fusion need, from the images `greys` (h, w) of the pairs.
-
-    Depth is inferred on a thread of its own while edges are found: neither keeps all cores busy.
-
-    Raises:
-        CalibrationError: a frame has no usable depth, an image cannot be decoded, no sweep has a range edge.
-    """
-    window = sight.window
-    with ThreadPoolExecutor(1, "depth") as aside:
-        features = aside.submit(depth_features, sight, window.T_camera_lidar_start, DEPTH_POINTS)
-        edges = build_edges(window.pairs, sight.points, greys, window.rig)
-        return features.result(), edges
 
 
 def depth_features(sight: Sight, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:

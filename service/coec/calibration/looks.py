@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from coec.calibration.basins import find_basins
 from coec.calibration.causes import SceneFacts, scene_facts
 from coec.calibration.confidence import axis_derivatives
-from coec.calibration.edges import THINNED_POINTS, EdgeWitness, evenly
-from coec.calibration.estimators import Sight, witnesses
+from coec.calibration.edges import THINNED_POINTS, EdgeWitness, build_edges, evenly
+from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
 from coec.calibration.fused import Fusion
 from coec.calibration.objective import (
     Evaluation,
@@ -123,7 +123,9 @@ def gather(sight: Sight) -> Evidence:
         CalibrationError: an image cannot be decoded, a frame has no depth, no sweep has a range edge.
     """
     window, greys = sight.window, list(sight.greys())
-    features, edges = witnesses(sight, greys)
+    # Edges first: depth may be inferred meanwhile.
+    edges = build_edges(window.pairs, sight.points, greys, window.rig)
+    features = depth_features(sight, window.T_camera_lidar_start, DEPTH_POINTS)
     counts = np.diff(edges.whole.first_point)
     scenes = [
         scene_facts(pair, grey, int(count)) for pair, grey, count in zip(window.pairs, greys, counts, strict=True)

@@ -52,8 +52,7 @@ class ImageInspector(Protocol):
 
 
 class Progress(Protocol):
-    """Hears how far a calibration has come; it has no say in the result. Stages that overlap speak from threads of
-    their own."""
+    """Hears how far a calibration has come; it has no say in the result."""
 
     def step(self, stage: str, done: int, total: int) -> None:
         """`done` of `total` parts of the stage are complete."""
