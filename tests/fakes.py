@@ -13,7 +13,8 @@ from coec.adapters.worker_link import Link
 
 
 def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
-    """Return as soon as `condition` holds; fail with `what` after `timeout_s`."""
+    """Return as soon as `condition` holds; fail with `what` after `timeout_s`. It is asked again and again, as it is of
+    threads and processes that tell nobody."""
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline_s:

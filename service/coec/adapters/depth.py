@@ -88,7 +88,7 @@ class DepthAhead:
     context manager; what it did not come to is not inferred after it. Implements `DepthModel`."""
 
     def __init__(self, model: DepthModel, frames: Iterable[CameraFrame]) -> None:
-        self._model = model
+        self.identity = model.identity
         self._pool = ThreadPoolExecutor(1, "depth")
         self._begun = {id(frame): self._pool.submit(model.infer, frame) for frame in frames}
 
@@ -97,11 +97,6 @@ class DepthAhead:
 
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown(cancel_futures=True)
-
-    @property
-    def identity(self) -> str:
-        """That of the wrapped model."""
-        return self._model.identity
 
     def infer(self, frame: CameraFrame) -> DepthMap:
         """The map of one of the frames.

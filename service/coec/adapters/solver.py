@@ -52,7 +52,7 @@ WARM_UP_CAMERA_PX = 128
 """Longer side of the images of the warm-up: kernels are compiled for types, not for sizes, and a few milliseconds of
 work on an image of this size would be more than a second on the camera's own."""
 
-WARM_UP_REACH_DEG, WARM_UP_EVALUATIONS = 4.0, 4
+WARM_UP_EVALUATIONS = 4
 """Of the searches of the warm-up."""
 
 OVERLAY_JPEG_QUALITY = 88
@@ -92,13 +92,12 @@ class Solver:
     def warm_up(self) -> None:
         """Run every kernel once on a few invented points, so that no window waits for a compiler."""
         for pair in self._config.pairs:
-            few = {"max_evaluations": WARM_UP_EVALUATIONS, "reach_deg": WARM_UP_REACH_DEG}
-            search = pair.calibration.search.model_copy(update=few)
+            search = pair.calibration.search.model_copy(update={"max_evaluations": WARM_UP_EVALUATIONS})
             configuration = pair.calibration.model_copy(update={"search": search})
             rig = _small(self._rigs[pair.name])
             # A look runs every kernel that a calibration runs. An invented one need not lead anywhere.
             with contextlib.suppress(CalibrationError, DecodeError):
-                observe(_invented_window(rig, MIN_PAIRS), _Ramp(), self._images, configuration, None)
+                observe(_invented_window(rig), _Ramp(), self._images, configuration, None)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
@@ -228,7 +227,7 @@ def _small(rig: Rig) -> Rig:
     return replace(rig, camera=camera, mask=mask)
 
 
-def _invented_window(rig: Rig, count: int) -> Window:
+def _invented_window(rig: Rig) -> Window:
     """Pairs with points all around the LiDAR, seeded; as a window from the disk holds them, so that the kernels are
     compiled for the same arrays: sweeps that may not be written to, images from a decoder, motion to compensate."""
     rng = np.random.default_rng(0)
@@ -245,6 +244,6 @@ def _invented_window(rig: Rig, count: int) -> Window:
             LidarFrame(stamp, rig.lidar_frame, xyz_m),
             EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
         )
-        for stamp in range(0, count * 100_000_000, 100_000_000)
+        for stamp in range(0, MIN_PAIRS * 100_000_000, 100_000_000)
     )
     return Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)

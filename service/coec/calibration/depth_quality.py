@@ -130,11 +130,12 @@ def assess(sight: Sight, config: CalibrationConfig, heard: Callable[[int, str], 
     rig = sight.window.rig
     reference = rig.T_camera_lidar_nominal
     maps = sight.depths()
+    clouds = [sight.points(index) for index in range(len(maps))]
     pairings = tuple(
-        pair_up(sight.points(index), depth, rig, reference, config.objective) for index, depth in enumerate(maps)
+        pair_up(xyz_m, depth, rig, reference, config.objective) for xyz_m, depth in zip(clouds, maps, strict=True)
     )
     heard(1, "ranks")
-    features = [distance_and_depth(sight.points(index), depth, reference) for index, depth in enumerate(maps)]
+    features = [distance_and_depth(xyz_m, depth, reference) for xyz_m, depth in zip(clouds, maps, strict=True)]
     box = SearchBox(radians(SEARCH_DEG), 0.0)
     objective = build_mutual_information(features, rig, reference, box, config.objective)
     search = config.search.model_copy(update={"dof": 3, "rotation_deg": SEARCH_DEG})

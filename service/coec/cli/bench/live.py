@@ -123,6 +123,7 @@ def _ask(session: zenoh.Session, keys: Keys, process: ProcessReading, seconds: f
         begin_s = time.perf_counter()
         ask_one(session, keys.extrinsic(PAIR), TIMEOUT_S)
         elapsed_s = time.perf_counter() - begin_s
+        # The pace of the questions is part of what is measured.
         time.sleep(max(QUERY_PERIOD_S - (time.monotonic() - now_s), 0.0))
         busy = worker.cpu_s - worker_s >= BUSY_SHARE * QUERY_PERIOD_S
         (seen.solving_ms if busy else seen.waiting_ms).append(1e3 * elapsed_s)
