@@ -364,6 +364,23 @@ def test_polar_angle_is_the_arc_tangent(angle: float) -> None:
     assert polar_angle(radius, z) == pytest.approx(math.atan2(radius, z), rel=0, abs=9e-16)
 
 
+def test_polar_angle_in_single_precision_is_as_good_as_that_is() -> None:
+    angle_rad = np.random.default_rng(5).uniform(0.0, math.pi, 20_000)
+    radius, z = np.sin(angle_rad).astype(np.float32), np.cos(angle_rad).astype(np.float32)
+    found = _polar_angles(radius, z)
+    assert found.dtype == np.float32
+    expected = np.arctan2(radius.astype(np.float64), z.astype(np.float64))
+    assert np.abs(found - expected).max() < 2 * np.spacing(np.float32(math.pi))
+
+
+@njit(cache=False)
+def _polar_angles(radius: NDArray[np.float32], z: NDArray[np.float32]) -> NDArray[np.float32]:
+    angle = np.empty_like(radius)
+    for i in range(len(radius)):
+        angle[i] = polar_angle(radius[i], z[i])
+    return angle
+
+
 def test_polar_angle_over_the_whole_range() -> None:
     for angle in np.random.default_rng(4).uniform(0.0, math.pi, 20_000):
         radius, z = math.sin(angle), math.cos(angle)

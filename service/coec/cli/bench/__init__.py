@@ -85,6 +85,7 @@ def measure(bars: Progress) -> dict[str, Any]:
         }
     )
     bars.update(task, description="camera models, numbers of frames")
+    by_frames = _by_frames(objective)
     document: dict[str, Any] = {
         "machine": _machine(),
         "points_per_frame": scene.POINTS,
@@ -96,7 +97,8 @@ def measure(bars: Progress) -> dict[str, Any]:
         "kernel_ratio_to_numpy": fastest["numpy"] / fastest["kernel"],
         "kernel_ratio_to_scalar": fastest["scalar"] / fastest["kernel"],
         "mi_25_frames_ms_by_model": _by_model(start, box_of(search)),
-        "mi_ms_by_frames": _by_frames(objective),
+        "mi_ms_by_frames": by_frames,
+        "mi_per_frame_spread_percent": _spread_percent(by_frames),
     }
     bars.update(task, description="solves")
     times = []
@@ -142,6 +144,12 @@ def _by_frames(objective: MutualInformation) -> dict[str, float]:
         str(count): (partial(mutual_information, frames, scene.T_TRUE), REPEATS) for count, frames in many.items()
     }
     return {count: 1e3 * seconds for count, seconds in _fastest(runs).items()}
+
+
+def _spread_percent(ms_by_frames: Mapping[str, float]) -> float:
+    """How far the time of one frame is from the mean of its times over all numbers of frames, at most, %."""
+    per_frame = np.array([ms / int(count) for count, ms in ms_by_frames.items()])
+    return float(100.0 * np.abs(per_frame / per_frame.mean() - 1.0).max())
 
 
 def _fused(bars: Progress) -> dict[str, Any]:

@@ -41,6 +41,7 @@ ROWS: tuple[Row, ...] = (
     Row("ratio_to_scalar", "times as fast as a scalar compiled loop", "×", 1, 8.0),
     Row("mi_25_frames_ms_by_model", "camera", "ms", 2, 2.5),
     Row("mi_ms_by_frames", "frames", "ms", 2),
+    Row("mi_per_frame_spread_percent", "time of one frame, farthest of these from their mean", "%", 0, 15.0),
     Row("solve_10deg_3dof_s", "MI solve, 3 axes, from 10°", "s", 3, 0.25),
     Row("solve_25deg_6dof_s", "fused solve, 6 axes, from 25°, depth apart", "s", 2, 2.0),
     Row("worker_first_result_s", "worker: start to first result", "s", 2, 2.0),
