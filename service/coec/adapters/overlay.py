@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.values import Matrix4
 from coec.geometry.cameras import Camera
+from coec.geometry.lengths import lengths
 from coec.geometry.projection import in_image, project
 
 NEAREST_M, FURTHEST_M = 2.0, 80.0
@@ -63,7 +64,7 @@ def _visible(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixels (N, 2) and ranges from the LiDAR (N,), metres, of the points in view."""
     uv_px, valid = project(camera, xyz_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
-    range_m = np.linalg.norm(np.asarray(xyz_m, dtype=np.float64), axis=1)
+    range_m = lengths(np.asarray(xyz_m, dtype=np.float64))
     seen = valid & in_image(camera, uv_px) & (range_m >= NEAREST_M)
     if mask is not None:
         nearest = np.rint(uv_px[seen]).astype(np.int64)

@@ -17,6 +17,7 @@ from coec.calibration.objective import SearchBox
 from coec.calibration.values import Matrix4
 from coec.geometry import se3
 from coec.geometry.edge_charts import EdgeCharts, climb, keep_apart, significances
+from coec.geometry.lengths import lengths
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
@@ -177,7 +178,7 @@ def _ball(count: int) -> NDArray[np.float64]:
 
 def _rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 3, 3) of rotation vectors (N, 3), radians (Rodrigues, all at once)."""
-    angle = np.linalg.norm(vectors, axis=1)
+    angle = lengths(vectors)
     axis = vectors / np.maximum(angle, 1e-12)[:, None]
     cross = np.zeros((len(vectors), 3, 3))
     cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.dead_regions import cell_means
 from coec.calibration.values import FramePair, Reason
+from coec.geometry.lengths import lengths
 
 BLOCK_ROWS, BLOCK_COLUMNS = 18, 32
 """The image is judged in blocks: dirt covers some of them, a covered lens all."""
@@ -148,7 +149,7 @@ class SceneBaseline:
 def scene_facts(pair: FramePair, grey: NDArray[np.uint8], range_edges: int) -> SceneFacts:
     """The facts of a pair whose image is `grey` (h, w) and whose sweep has so many range edges."""
     xyz_m = pair.lidar.xyz_m
-    range_m = np.maximum(np.linalg.norm(xyz_m, axis=1), 1e-6)
+    range_m = np.maximum(lengths(xyz_m), 1e-6)
     elevation = np.arcsin(np.clip(xyz_m[:, 2] / range_m, -1.0, 1.0))
     downwards = (elevation >= BAND_RANGE_RAD[0]) & (elevation <= BAND_RANGE_RAD[1])
     azimuth = np.arctan2(xyz_m[downwards, 1], xyz_m[downwards, 0])
@@ -157,7 +158,7 @@ def scene_facts(pair: FramePair, grey: NDArray[np.uint8], range_edges: int) -> S
         gradient=_block_gradients(grey),
         bright=float(np.quantile(grey[::4, ::4], 0.9)),
         thumbnail=cell_means(grey, THUMBNAIL_CELL_PX).astype(np.float32),
-        digest=zlib.crc32(grey.tobytes()),
+        digest=zlib.crc32(np.ascontiguousarray(grey).data),
         bands=np.histogram(elevation, BANDS, BAND_RANGE_RAD)[0].astype(np.int64),
         sectors=np.histogram(azimuth, SECTORS, (-pi, pi))[0].astype(np.int64),
         range_edges=range_edges,
@@ -244,13 +245,14 @@ def _same_picture(a: SceneFacts, b: SceneFacts) -> bool:
 
 
 def _block_gradients(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
-    h, w = (grey.shape[0] // BLOCK_ROWS) * BLOCK_ROWS, (grey.shape[1] // BLOCK_COLUMNS) * BLOCK_COLUMNS
-    values = grey[:h, :w].astype(np.int16)
-    total, down = np.zeros_like(values), values[1:] - values[:-1]
-    np.subtract(values[:, 1:], values[:, :-1], out=total[:, :-1])
-    np.abs(total, out=total)
-    total[:-1] += np.abs(down, out=down)
-    # Rows first: long sums of neighbours in memory.
-    of_rows = total.reshape(BLOCK_ROWS, h // BLOCK_ROWS, w).sum(axis=1, dtype=np.int64)
-    of_blocks = of_rows.reshape(BLOCK_ROWS, BLOCK_COLUMNS, w // BLOCK_COLUMNS).sum(axis=2)
-    return np.asarray(of_blocks * (BLOCK_ROWS * BLOCK_COLUMNS / (h * w)))
+    rows, columns = grey.shape[0] // BLOCK_ROWS, grey.shape[1] // BLOCK_COLUMNS
+    whole = grey[: rows * BLOCK_ROWS, : columns * BLOCK_COLUMNS]
+    sums = np.empty((BLOCK_ROWS, BLOCK_COLUMNS), np.int64)
+    # A row of blocks at a time stays in the cache; the first pixels of the next belong to its last differences.
+    for block in range(BLOCK_ROWS):
+        values = whole[block * rows : (block + 1) * rows + 1].astype(np.int16)
+        across, down = np.abs(np.diff(values[:rows], axis=1)), np.abs(np.diff(values, axis=0))
+        of_columns = down.sum(axis=0, dtype=np.int64)
+        of_columns[:-1] += across.sum(axis=0, dtype=np.int64)
+        sums[block] = of_columns.reshape(BLOCK_COLUMNS, columns).sum(axis=1)
+    return np.asarray(sums / (rows * columns))

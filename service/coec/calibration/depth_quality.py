@@ -25,6 +25,7 @@ from coec.calibration.search import maximise
 from coec.calibration.values import DepthMap, Matrix4, Rig
 from coec.config import CalibrationConfig, ObjectiveConfig
 from coec.geometry import se3
+from coec.geometry.lengths import lengths
 from coec.geometry.projection import in_image, project
 
 SEARCH_DEG = 8.0
@@ -178,7 +179,7 @@ def pair_up(
 ) -> Pairing:
     """The points (N, 3) of a sweep within the range limits, on the map of its frame, at a pose (4, 4)."""
     points = np.asarray(xyz_m, np.float64)
-    range_m = np.linalg.norm(points, axis=1)
+    range_m = lengths(points)
     within = (range_m >= config.min_range_m) & (range_m <= config.max_range_m)
     points, range_m = points[within], range_m[within]
     uv_px, valid = project(rig.camera, points @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])

@@ -92,37 +92,24 @@ def _histograms_of_tasks(
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """The joint histogram of each task, with one more row for points on no value, and the first task of each frame."""
     T = np.ascontiguousarray(T_camera_lidar, np.float64)
-    task_frame, task_start, task_stop, task_bundle = _tasks(frames.first_point)
-    in_view = np.ones(int(task_bundle[-1]), np.bool_) if frames.bundles is None else frames.bundles.at(T)
+    bundles = int((-(-np.diff(frames.first_point) // BUNDLE)).sum())
+    in_view = np.ones(bundles, np.bool_) if frames.bundles is None else frames.bundles.at(T)
     single = filter_of(frames.camera)
-    counts = _count(
-        frames.camera, single.camera, single.at(T), T, frames.xyz_m, frames.range_bin, frames.depth_bin,
-        task_frame, task_start, task_stop, task_bundle, in_view, frames.depth_bins, frames.range_bins,
+    return _count(
+        frames.camera, single.camera, single.at(T), T, frames.xyz_m, frames.range_bin, frames.first_point,
+        frames.depth_bin, in_view, frames.depth_bins, frames.range_bins,
     )  # fmt: skip
-    return counts, np.searchsorted(task_frame, np.arange(frames.frames + 1))
-
-
-def _tasks(
-    first_point: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Frame, first point, end of the points and first bundle of each task, in order of the frames; the number of
-    bundles at the end of the last."""
-    per_frame = -(-np.diff(first_point) // TASK)
-    frame = np.repeat(np.arange(len(per_frame)), per_frame)
-    within = np.arange(len(frame)) - np.repeat(np.cumsum(per_frame) - per_frame, per_frame)
-    start = first_point[frame] + within * TASK
-    stop = np.minimum(start + TASK, first_point[frame + 1])
-    return frame, start, stop, np.concatenate([[0], np.cumsum(-(-(stop - start) // BUNDLE))])
 
 
 @njit(cache=True, parallel=True)
 def _count(
     camera: Camera, single: Camera, limits: Limits, T: NDArray[np.float64], xyz: NDArray[np.float32],
-    range_bin: NDArray[np.unsignedinteger], depth_bin: NDArray[np.unsignedinteger], task_frame: NDArray[np.int64],
-    task_start: NDArray[np.int64], task_stop: NDArray[np.int64], task_bundle: NDArray[np.int64],
+    range_bin: NDArray[np.unsignedinteger], first_point: NDArray[np.int64], depth_bin: NDArray[np.unsignedinteger],
     in_view: NDArray[np.bool_], depth_bins: int, range_bins: int,
-) -> NDArray[np.int32]:  # fmt: skip
-    """Joint histogram of each task. Integer counts: the sum does not depend on the number of threads."""
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:  # fmt: skip
+    """Joint histogram of each task, and the first task of each frame, with the number of tasks at the end. Integer
+    counts: the sum does not depend on the number of threads."""
+    first_task, task_frame, task_start, task_stop, task_bundle = _tasks(first_point)
     tasks = task_frame.shape[0]
     # One row more than there are depth bins: points that fall on no value are counted there, without a branch.
     counts = np.zeros((tasks, depth_bins + 1, range_bins), np.int32)
@@ -134,7 +121,29 @@ def _count(
             range_bin[start:stop], in_view[task_bundle[task] : task_bundle[task + 1]], depth_bin[task_frame[task]],
             counts[task],
         )  # fmt: skip
-    return counts
+    return counts, first_task
+
+
+@njit(cache=True)
+def _tasks(
+    first_point: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """First task of each frame, with their number at the end; frame, first point, end of the points and first bundle of
+    each task, with the number of bundles at the end."""
+    frames = first_point.shape[0] - 1
+    first_task = np.zeros(frames + 1, np.int64)
+    for f in range(frames):
+        first_task[f + 1] = first_task[f] + -(-(first_point[f + 1] - first_point[f]) // TASK)
+    tasks = first_task[frames]
+    frame, start, stop = np.empty(tasks, np.int64), np.empty(tasks, np.int64), np.empty(tasks, np.int64)
+    first_bundle = np.zeros(tasks + 1, np.int64)
+    for f in range(frames):
+        for task in range(first_task[f], first_task[f + 1]):
+            frame[task] = f
+            start[task] = first_point[f] + (task - first_task[f]) * TASK
+            stop[task] = min(start[task] + TASK, first_point[f + 1])
+            first_bundle[task + 1] = first_bundle[task] + -(-(stop[task] - start[task]) // BUNDLE)
+    return first_task, frame, start, stop, first_bundle
 
 
 @njit(cache=True, error_model="numpy")

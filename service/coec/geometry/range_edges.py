@@ -15,6 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from coec.geometry.lengths import lengths
+
 BAND_RAD = math.radians(0.42)
 """Height of a band of elevation where no ring is known: the beam spacing of a 64-beam sensor. Wider bands only cost
 time, narrower ones cut scan lines of a tilted sensor into pieces."""
@@ -56,7 +58,7 @@ def range_edges(xyz_m: NDArray[np.float32], ring: NDArray[np.uint16] | None) -> 
         xyz_m: (N, 3) float32, sensor frame, as measured (motion compensation would tear scan lines apart).
         ring: (N,) uint16 or None.
     """
-    range_m = np.linalg.norm(xyz_m, axis=1)
+    range_m = lengths(xyz_m)
     far = np.flatnonzero(range_m >= MIN_RANGE_M)
     xyz_m, range_m = xyz_m[far], range_m[far]
     azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
