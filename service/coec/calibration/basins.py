@@ -118,13 +118,15 @@ class _Cover:
     def poses(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
         """(n, 4, 4) those with the given numbers."""
         start, count = self._start, len(self._ball)
-        turn = _rotations(self._ball[index] * self._reach.rotation_rad)
-        # Translations in another order, so that they do not go along with the rotations.
-        shift = self._ball[(index * 7919) % count] * self._reach.translation_m
         poses = np.tile(np.eye(4), (len(index), 1, 1))
-        # einsum and not @: the last bit of a BLAS product may differ between two processes.
-        poses[:, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
-        poses[:, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
+        for begin in range(0, len(index), BLOCK):
+            block, made = index[begin : begin + BLOCK], poses[begin : begin + BLOCK]
+            turn = _rotations(self._ball[block] * self._reach.rotation_rad)
+            # Translations in another order, so that they do not go along with the rotations.
+            shift = self._ball[(block * 7919) % count] * self._reach.translation_m
+            # einsum and not @: the last bit of a BLAS product may differ between two processes.
+            made[:, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
+            made[:, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
         return poses
 
 
