@@ -22,8 +22,8 @@ from coec.adapters.state_store import StateStore
 from coec.adapters.window_folder import WindowFolder, start_ns_of
 from coec.adapters.wire import result_of
 from coec.adapters.worker import Errand, Solved, SolveJob, Worker
+from coec.calibration.baseline import learned_hash
 from coec.calibration.causes import CAUSES
-from coec.calibration.commissioning import learned_hash
 from coec.calibration.monitor import Observation
 from coec.calibration.values import (
     CameraFrame,

@@ -29,8 +29,9 @@ from coec.calibration.causes import (
 )
 from coec.calibration.commissioning import learn_accuracy
 from coec.calibration.estimators import look
+from coec.calibration.judging import UNCOMMISSIONED, observe
 from coec.calibration.looks import gather
-from coec.calibration.monitor import UNCOMMISSIONED, MonitorState, Outcome, after_observation, diagnose, observe
+from coec.calibration.monitor import MonitorState, Outcome, after_observation, diagnose
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.values import LidarFrame, Window
 from coec.cli import windows

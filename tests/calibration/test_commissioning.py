@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from coec.adapters.baseline_file import baseline_hash
 from coec.adapters.images import CachedGreys, GreyImages
 from coec.calibration import commissioning, verdict_limits
-from coec.calibration.baseline import PRIOR_SPREAD_POSE, Baseline
-from coec.calibration.commissioning import commission, learn_accuracy, learned_hash
+from coec.calibration.baseline import PRIOR_SPREAD_POSE, Baseline, learned_hash
+from coec.calibration.commissioning import commission, learn_accuracy
 from coec.calibration.detection import MIN_RECORDED, table, try_detection
 from coec.calibration.estimators import look
+from coec.calibration.judging import observe
 from coec.calibration.looks import Evidence, gather
-from coec.calibration.monitor import observe
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.values import Decision, Estimate, Metric, Rig, Verdict, Window
 from coec.calibration.verdict_limits import learned

@@ -11,8 +11,8 @@ from coec.adapters.images import GreyImages
 from coec.calibration.baseline import Accuracy, MonitorLimits
 from coec.calibration.confidence import axis_derivatives, measure_curvature
 from coec.calibration.estimators import look
+from coec.calibration.judging import over_limits
 from coec.calibration.looks import Evidence, Look, gather, look_at
-from coec.calibration.monitor import over_limits
 from coec.calibration.objective import Evaluation
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.values import Matrix4, Window

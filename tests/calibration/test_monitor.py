@@ -11,15 +11,8 @@ import pytest
 
 from coec.adapters.images import GreyImages
 from coec.calibration.causes import BENT_MOUNT, DARK, LENS_DIRTY, TIME_OFFSET, Cause
-from coec.calibration.monitor import (
-    MIN_PAIRS,
-    MonitorState,
-    Observation,
-    Outcome,
-    after_observation,
-    diagnose,
-    observe,
-)
+from coec.calibration.judging import MIN_PAIRS, observe
+from coec.calibration.monitor import MonitorState, Observation, Outcome, after_observation, diagnose
 from coec.calibration.ports import DepthModel
 from coec.calibration.values import Window
 from coec.config import CalibrationConfig, LimitsConfig

@@ -12,9 +12,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from coec.geometry import cameras
-from coec.geometry.cameras import Camera, project_point, unproject_point
-from coec.geometry.cameras.kernel import polar_angle
-from coec.geometry.projection import in_image, project, unproject
+from coec.geometry.cameras import Camera, in_image, project_point, unproject_point
+from coec.geometry.cameras.formulas import polar_angle
+from coec.geometry.projection import project, unproject
 from oracles import CAMERA_PIXELS
 from strategies import angles_rad, points_m
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from coec.geometry import se3
 from coec.geometry.alignment import EdgeFrames
 from coec.geometry.alignment import significances as through_the_lens
-from coec.geometry.cameras import Camera, build
+from coec.geometry.cameras import Camera, build, in_image
 from coec.geometry.edge_charts import (
     MAX_CHART_POINTS,
     MAX_FIELD_RAD,
@@ -22,7 +22,7 @@ from coec.geometry.edge_charts import (
     significances,
 )
 from coec.geometry.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, VOID
-from coec.geometry.projection import in_image, project, unproject
+from coec.geometry.projection import project, unproject
 from oracles import charted_sums, gaussian_blur, stereographic_ray
 
 WIDTH, HEIGHT = 96, 64

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import coec
-from coec.geometry import kernel_cache_directory
+from coec.geometry.compiler import kernel_cache_directory
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_a_directory_that_others_may_write_to_is_not_used(
 
 
 def _numba_cache_directory(environment: dict[str, str]) -> str:
-    code = "import coec.geometry, numba; print(numba.config.CACHE_DIR)"
+    code = "import coec.geometry.compiler, numba; print(numba.config.CACHE_DIR)"
     source_root = str(Path(coec.__file__).parents[1])
     result = subprocess.run(
         [sys.executable, "-c", code],

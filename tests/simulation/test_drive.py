@@ -16,7 +16,8 @@ from coec.calibration.values import CameraFrame, EgoMotion, FramePair, LidarFram
 from coec.config import LimitsConfig
 from coec.errors import UsageError
 from coec.geometry import cameras
-from coec.geometry.projection import in_image, project
+from coec.geometry.cameras import in_image
+from coec.geometry.projection import project
 from coec.geometry.se3 import difference, exp
 from coec.simulation.drive import NEAREST_M, START_NS, DriveConfig, SimulatedDrive
 from coec.simulation.faults import parse_fault

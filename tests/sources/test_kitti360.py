@@ -14,7 +14,8 @@ from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, SweepTim
 from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import cameras, se3
-from coec.geometry.projection import in_image, project
+from coec.geometry.cameras import in_image
+from coec.geometry.projection import project
 from coec.sources import open_source
 
 DRIVE = "2013_05_28_drive_0000_sync"

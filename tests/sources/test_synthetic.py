@@ -10,7 +10,8 @@ from coec.calibration.values import CameraFrame, EgoMotion, FramePair, LidarFram
 from coec.config import LimitsConfig
 from coec.errors import UsageError
 from coec.geometry import se3
-from coec.geometry.projection import in_image, project
+from coec.geometry.cameras import in_image
+from coec.geometry.projection import project
 from coec.sources import open_source
 from coec.sources.recording import Recording
 

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.values import Matrix4
-from coec.geometry.cameras import Camera
-from coec.geometry.lengths import lengths
-from coec.geometry.projection import in_image, project
+from coec.geometry.cameras import Camera, in_image
+from coec.geometry.projection import project
+from coec.geometry.rows import lengths
 
 NEAREST_M, FURTHEST_M = 2.0, 80.0
 """Ranges at the two ends of the colours, metres: those of the objective. The scale is logarithmic."""

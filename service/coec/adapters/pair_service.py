@@ -44,8 +44,7 @@ from coec.adapters.wire import degrees_or_null, estimate_of, look_of, result_of
 from coec.adapters.worker import SUPERSEDED, Errand, Solved, SolveJob, Worker
 from coec.adapters.zenoh_bus import Answer
 from coec.calibration import lifecycle
-from coec.calibration.baseline import Baseline, drift, mismatch
-from coec.calibration.commissioning import learned_hash
+from coec.calibration.baseline import Baseline, drift, learned_hash, mismatch
 from coec.calibration.lifecycle import Health, HealthState, PairState, Rules
 from coec.calibration.monitor import Observation, Outcome
 from coec.calibration.pairing import Pairer

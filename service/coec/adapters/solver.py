@@ -18,10 +18,10 @@ from coec.adapters.looks import pack_observation, unpack_pairs
 from coec.adapters.msgpack_frames import decode_camera
 from coec.adapters.overlay import draw
 from coec.adapters.rig import rig_of
-from coec.calibration.baseline import Baseline, mismatch
+from coec.calibration.baseline import Baseline, learned_hash, mismatch
 from coec.calibration.calibrator import calibrate
-from coec.calibration.commissioning import commission, learned_hash
-from coec.calibration.monitor import MIN_PAIRS, observe
+from coec.calibration.commissioning import commission
+from coec.calibration.judging import MIN_PAIRS, observe
 from coec.calibration.motion import compensate
 from coec.calibration.ports import Silence
 from coec.calibration.values import (

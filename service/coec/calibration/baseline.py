@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import fsum, inf, radians, sqrt
+from math import fsum, hypot, inf, radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.causes import SceneBaseline
-from coec.calibration.looks import Look
 from coec.calibration.values import Matrix4, Rig
-from coec.config import VerdictConfig
+from coec.config import CalibrationConfig, VerdictConfig, config_hash
 from coec.geometry import se3
-from coec.geometry.cameras import Camera
-from coec.geometry.projection import project
+from coec.geometry.cameras import Camera, project_point
 
 FLOOR = np.array([radians(0.02)] * 3 + [0.004] * 3)
 """Standard deviation that no look is trusted to be below: what the interpolation of the edge maps leaves (rad, m)."""
@@ -35,6 +33,11 @@ edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
 
 PIXEL_RANGE_M = 8.0
 """Range at which a pixel of rotation looks like one of translation, m: of the near edges, which tell translation."""
+
+
+FIGURES = "edges-kept"
+"""Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a look at
+the same pairs gives other figures: limits of the old ones would not fit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +100,9 @@ class MonitorLimits:
 
 def pixel_rad(camera: Camera) -> float:
     """The angle of a pixel on the optical axis, radians."""
-    ray = np.array([[0.0, 0.0, 1.0], [PIXEL_STEP, 0.0, 1.0], [0.0, PIXEL_STEP, 1.0]])
-    uv_px, _ = project(camera, ray)
-    steps_px = np.sqrt(((uv_px[1:] - uv_px[0]) ** 2).sum(axis=1))
-    return PIXEL_STEP / float(steps_px.min())
+    u, v, _ = project_point(camera, 0.0, 0.0, 1.0)
+    beside = project_point(camera, PIXEL_STEP, 0.0, 1.0), project_point(camera, 0.0, PIXEL_STEP, 1.0)
+    return PIXEL_STEP / min(hypot(right - u, down - v) for right, down, _ in beside)
 
 
 def pixel_floor(camera: Camera) -> NDArray[np.float64]:
@@ -193,12 +195,6 @@ def drift(T_camera_lidar: Matrix4, sigma: NDArray[np.float64], baseline: Baselin
     return Drift(value, np.asarray(np.sqrt(sigma**2 + np.nan_to_num(baseline.bias_sigma) ** 2)))
 
 
-def drift_of(look: Look, baseline: Baseline) -> Drift:
-    """How far the local optimum of a look lies from the commissioned calibration, over six degrees of freedom."""
-    value = se3.difference(look.T_pose, baseline.T_camera_lidar) - baseline.pose.bias
-    return Drift(value, baseline.pose.sigma(look.pairs))
-
-
 def mismatch(baseline: Baseline, rig: Rig, depth_identity: str, config_hash: str) -> str | None:
     """Why a baseline does not hold for a rig and its configuration, in one sentence; None if it does."""
     if baseline.pair != rig.pair:
@@ -213,6 +209,11 @@ def mismatch(baseline: Baseline, rig: Rig, depth_identity: str, config_hash: str
     if unknown := sorted(set(baseline.limits) - set(VerdictConfig.model_fields)):
         return f"It holds limits of figures that no longer exist: {', '.join(unknown)}."
     return None
+
+
+def learned_hash(config: CalibrationConfig) -> str:
+    """Of the configuration that a baseline holds for: all that moves an optimum; the limits are what it replaces."""
+    return config_hash(config.objective, config.search, str(config.motion_compensation), FIGURES)
 
 
 def chi2_quantile(probability: float, dof: int) -> float:

@@ -17,7 +17,7 @@ from coec.calibration.objective import SearchBox
 from coec.calibration.values import Matrix4
 from coec.geometry import se3
 from coec.geometry.edge_charts import EdgeCharts, climb, keep_apart, significances
-from coec.geometry.lengths import lengths
+from coec.geometry.rows import lengths
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""

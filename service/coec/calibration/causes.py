@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.dead_regions import cell_means
 from coec.calibration.values import FramePair, Reason
-from coec.geometry.lengths import lengths
+from coec.geometry.rows import lengths
 
 BLOCK_ROWS, BLOCK_COLUMNS = 18, 32
 """The image is judged in blocks: dirt covers some of them, a covered lens all."""

@@ -22,17 +22,18 @@ from coec.calibration.baseline import (
     Baseline,
     MonitorLimits,
     chi2_quantile,
+    learned_hash,
     normal_quantile,
     pixel_floor,
 )
 from coec.calibration.causes import scene_baseline
 from coec.calibration.estimators import look
+from coec.calibration.judging import FALSE_ALARM_RATE, MIN_PAIRS, edges_per_pair, over_limits
 from coec.calibration.looks import POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
-from coec.calibration.monitor import FALSE_ALARM_RATE, MIN_PAIRS, edges_per_pair, over_limits
 from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
 from coec.calibration.values import Matrix4, Window
 from coec.calibration.verdict_limits import verdict_limits
-from coec.config import CalibrationConfig, config_hash
+from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 
@@ -70,10 +71,6 @@ MOVES = (
     ("10 cm", 0.0, SMALL_M),
 )
 """By name: rotations about random axes (rad) and translations in random directions (m)."""
-
-FIGURES = "edges-kept"
-"""Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a look at
-the same pairs gives other figures: limits of the old ones would not fit."""
 
 SEED = 20_230_617
 
@@ -143,11 +140,6 @@ def commission(
         depth_identity=depth.identity,
         config_hash=learned_hash(config),
     )
-
-
-def learned_hash(config: CalibrationConfig) -> str:
-    """Of the configuration that a baseline holds for: all that moves an optimum; the limits are what it replaces."""
-    return config_hash(config.objective, config.search, str(config.motion_compensation), FIGURES)
 
 
 def is_flagged(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> bool:

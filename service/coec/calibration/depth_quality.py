@@ -25,8 +25,9 @@ from coec.calibration.search import maximise
 from coec.calibration.values import DepthMap, Matrix4, Rig
 from coec.config import CalibrationConfig, ObjectiveConfig
 from coec.geometry import se3
-from coec.geometry.lengths import lengths
-from coec.geometry.projection import in_image, project
+from coec.geometry.cameras import in_image
+from coec.geometry.projection import project
+from coec.geometry.rows import lengths
 
 SEARCH_DEG = 8.0
 """Half-width of the box in which the optimum is searched: several times the worst bias of a network that was of any use

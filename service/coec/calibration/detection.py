@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning import is_flagged, learn_accuracy, learn_limits
+from coec.calibration.judging import FALSE_ALARM_RATE, MIN_PAIRS, by_equation_2
 from coec.calibration.looks import Evidence, Look, look_at
-from coec.calibration.monitor import FALSE_ALARM_RATE, MIN_PAIRS, by_equation_2
 from coec.calibration.values import Matrix4
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError

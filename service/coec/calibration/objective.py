@@ -22,10 +22,10 @@ from coec.config import ObjectiveConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.bundles import azimuth_order, bundle
-from coec.geometry.cameras import Camera, scaled
-from coec.geometry.lengths import lengths
+from coec.geometry.cameras import Camera, domain_angle_rad, scaled
 from coec.geometry.mutual_information import BinnedFrames, mutual_information
-from coec.geometry.projection import domain_angle_rad, unproject
+from coec.geometry.projection import unproject
+from coec.geometry.rows import lengths
 
 GUARD_OVERLAP = 0.5
 """Share of a frame's best-seen number of points below which its MI counts for less, in proportion. Plain MI grows when

@@ -16,8 +16,7 @@ from coec.calibration.ports import ImageInspector
 from coec.calibration.values import FramePair, ImageQuality, Matrix4, Rig
 from coec.config import WindowConfig
 from coec.errors import DecodeError
-from coec.geometry.cameras import Camera, project_point
-from coec.geometry.projection import in_image
+from coec.geometry.cameras import Camera, in_image, project_point
 
 NS_PER_S = 1_000_000_000
 

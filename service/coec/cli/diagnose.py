@@ -11,12 +11,11 @@ import numpy as np
 from coec.adapters.baseline_file import load_baseline
 from coec.adapters.evaluation_report import detection_of
 from coec.adapters.wire import metric_of
-from coec.calibration.baseline import mismatch
-from coec.calibration.commissioning import learned_hash
+from coec.calibration.baseline import learned_hash, mismatch
 from coec.calibration.detection import try_detection
 from coec.calibration.estimators import look
+from coec.calibration.judging import observe
 from coec.calibration.looks import gather
-from coec.calibration.monitor import observe
 from coec.cli import calibrate as calibrate_command
 from coec.cli import commission, console, evaluation_text, windows
 from coec.errors import UsageError

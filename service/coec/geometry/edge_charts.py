@@ -15,10 +15,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera
+from coec.geometry.compiler import njit, prange
 from coec.geometry.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.pixel_lookup import OUTSIDE, exact_pixel
 from coec.geometry.projection import unproject

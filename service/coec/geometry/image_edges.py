@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
+
+from coec.geometry.compiler import njit, prange
 
 CLIP_SHARE = 0.95
 """Gradients are clipped at this quantile: reflections and lamps would outweigh the rest."""

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from coec.geometry.bundles import BUNDLE, Bundles
 from coec.geometry.cameras import Camera
+from coec.geometry.compiler import njit, prange
 from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Limits, certain_pixels, exact_pixel, filter_of
 from coec.geometry.prefetch import prefetch
 

@@ -15,11 +15,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import Camera, image_point, project_point
-from coec.geometry.projection import domain_angle_rad
+from coec.geometry.cameras import Camera, domain_angle_rad, image_point, project_point
+from coec.geometry.compiler import njit
 
 OUTSIDE, UNSURE = -2, -1
 """What stands for a pixel where there is none, and where single precision does not know. UNSURE is the larger: the

@@ -6,10 +6,10 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera, DoubleSphere, project_point
+from coec.geometry.compiler import njit
 from coec.geometry.mutual_information import BinnedFrames
 
 

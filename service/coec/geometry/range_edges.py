@@ -12,10 +12,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from coec.geometry.lengths import lengths
+from coec.geometry.compiler import njit
+from coec.geometry.rows import lengths
 
 BAND_RAD = math.radians(0.42)
 """Height of a band of elevation where no ring is known: the beam spacing of a 64-beam sensor. Wider bands only cost

@@ -3,5 +3,3 @@
 Needs the optional extra `sim` (embreex: Intel's Embree). World frame: x, y horizontal, z up, metres. Everything follows
 from a seed: the same seed gives the same bytes.
 """
-
-import coec.geometry  # noqa: F401  points numba's cache at the user's folder before a kernel is defined here

@@ -6,11 +6,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from coec.calibration.values import Matrix4
 from coec.geometry.cameras import Camera
+from coec.geometry.compiler import njit, prange
 from coec.geometry.projection import unproject
 from coec.simulation.mesh import Floats
 from coec.simulation.scene import Hits, Scene

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from coec.geometry.compiler import njit
 from coec.simulation import props
 from coec.simulation.mesh import Floats, Mesh, join
 from coec.simulation.road import Road, build_road

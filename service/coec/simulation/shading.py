@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from coec.geometry.compiler import njit, prange
 from coec.simulation.mesh import Floats
 from coec.simulation.scene import Hits, Scene
 from coec.simulation.sky import Sky

@@ -36,7 +36,7 @@ from coec.geometry.plain_forms import by_numpy, by_scalar_loop
 
 FRAMES = 25
 FRAME_COUNTS = (5, 25, 50, 200)
-REPEATS, FEW_REPEATS, TURNS = 60, 3, 6
+REPEATS, FEW_REPEATS, TURNS = 180, 3, 6
 """Runs of which the fastest counts; of the plain forms, which take a hundred times as long, fewer. In how many turns
 they are taken, so that what else the machine does falls on all."""
 

@@ -12,6 +12,7 @@ from coec.geometry.cameras.mei import Mei
 from coec.geometry.cameras.pinhole import Pinhole
 from coec.geometry.cameras.radtan import RadTan
 from coec.geometry.cameras.registry import MODELS, Camera, Model, build, intrinsics_of, name_of, scaled
+from coec.geometry.cameras.view import domain_angle_rad, in_image
 
 __all__ = [
     "MODELS",
@@ -24,7 +25,9 @@ __all__ = [
     "Pinhole",
     "RadTan",
     "build",
+    "domain_angle_rad",
     "image_point",
+    "in_image",
     "intrinsics_of",
     "name_of",
     "project_point",

@@ -8,9 +8,7 @@ D. C. Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8)
 
 import math
 
-from numba.extending import register_jitable
-
-from coec.geometry.cameras.kernel import like
+from coec.geometry.cameras.formulas import like
 from coec.geometry.cameras.polynomial import odd_polynomial, solve_odd_polynomial
 
 # Newton's method converges quadratically from the radial solution; real lenses need three to five steps.
@@ -20,7 +18,6 @@ _MAX_STEPS = 30
 _TOLERANCE = 1e-9
 
 
-@register_jitable(error_model="numpy")
 def distort(k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float) -> tuple[float, float]:
     """Distorted normalised coordinates of (x, y)."""
     two = like(2.0, x)
@@ -32,7 +29,6 @@ def distort(k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: 
     )
 
 
-@register_jitable(error_model="numpy")
 def undistort(
     k1: float, k2: float, p1: float, p2: float, k3: float, max_radius2: float, xd: float, yd: float
 ) -> tuple[float, float, bool]:

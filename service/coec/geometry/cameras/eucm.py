@@ -10,8 +10,8 @@ Camera Model", 3DV 2018, section on the EUCM, where the inverse is given as well
 import math
 from typing import NamedTuple
 
+from coec.geometry.cameras.formulas import guarded_ray, like
 from coec.geometry.cameras.intrinsics import positive, sensor, within
-from coec.geometry.cameras.kernel import guarded_ray, like
 
 
 class Eucm(NamedTuple):

@@ -13,8 +13,8 @@ d stops growing, and below pi. OpenCV has no such bound.
 import math
 from typing import NamedTuple
 
+from coec.geometry.cameras.formulas import guarded_ray, like, polar_angle
 from coec.geometry.cameras.intrinsics import finite, sensor
-from coec.geometry.cameras.kernel import guarded_ray, like, polar_angle
 from coec.geometry.cameras.polynomial import (
     monotonic_limit_squared,
     odd_polynomial,

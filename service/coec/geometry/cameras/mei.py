@@ -13,8 +13,8 @@ import math
 from typing import NamedTuple
 
 from coec.geometry.cameras.brown_conrady import distort, undistort
+from coec.geometry.cameras.formulas import guarded_ray, like
 from coec.geometry.cameras.intrinsics import finite, sensor, within
-from coec.geometry.cameras.kernel import guarded_ray, like
 from coec.geometry.cameras.polynomial import monotonic_limit_squared
 
 # Calibrations of real lenses have xi of 0 to 4; far above, the image no longer depends on it.

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
+from coec.geometry.cameras.formulas import guarded_ray, like
 from coec.geometry.cameras.intrinsics import sensor
-from coec.geometry.cameras.kernel import guarded_ray, like
 
 
 class Pinhole(NamedTuple):

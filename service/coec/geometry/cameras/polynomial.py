@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from numba.extending import register_jitable
 
-from coec.geometry.cameras.kernel import like
+from coec.geometry.cameras.formulas import like
 
 # A Newton step that halves its bracket when it fails gains a bit per step at worst: 52 bits of a float64 and the
 # doublings that find the bracket.
@@ -25,14 +24,12 @@ def monotonic_limit_squared(coefficients: tuple[float, ...]) -> float:
     return float(real[0]) if real.size else math.inf
 
 
-@register_jitable(error_model="numpy")
 def odd_polynomial(c1: float, c2: float, c3: float, c4: float, t: float) -> float:
     """t (1 + c1 t^2 + c2 t^4 + c3 t^6 + c4 t^8)."""
     s = t * t
     return t * (like(1.0, t) + s * (c1 + s * (c2 + s * (c3 + s * c4))))
 
 
-@register_jitable(error_model="numpy")
 def solve_odd_polynomial(c1: float, c2: float, c3: float, c4: float, target: float, limit: float) -> tuple[float, bool]:
     """The t in [0, limit) with odd_polynomial(t) = target >= 0, and whether there is one.
 

@@ -7,8 +7,8 @@ radius at which the radial polynomial stops growing; OpenCV itself has no such b
 from typing import NamedTuple
 
 from coec.geometry.cameras.brown_conrady import distort, undistort
+from coec.geometry.cameras.formulas import guarded_ray, like
 from coec.geometry.cameras.intrinsics import finite, sensor
-from coec.geometry.cameras.kernel import guarded_ray, like
 from coec.geometry.cameras.polynomial import monotonic_limit_squared
 
 

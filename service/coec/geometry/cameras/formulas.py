@@ -1,18 +1,11 @@
-"""What every camera model's compiled formula shares: compiler options, guards and an arc tangent that vectorises."""
+"""What the formulas of all camera models share: guards, and an arc tangent that vectorises.
+
+Plain Python on numbers, without a branch where a loop over many points has none to spare: `compiled` hands them to
+numba as they are.
+"""
 
 import math
-from collections.abc import Callable
-from typing import Any, Protocol
-
-import numpy as np
-from numba import types
-from numba.extending import overload, register_jitable
-
-# No fastmath in any of the formulas. numba compiles a parallel kernel anew for the process that first runs it and for
-# the cache; with leave to re-associate and to fuse, the two differ in the last bit, and a decision has to replay to the
-# byte. The loops vectorise all the same. (The one exception, `pixel_lookup.certain_pixels`, compiles these formulas for
-# itself and answers only where the last bits do not matter.) error_model="numpy": a division by zero gives an infinity,
-# not a branch to an exception.
+from typing import Protocol
 
 # A pixel further out than this is on no sensor; the bound keeps every coordinate inside int32. Unit: px.
 MAX_PIXEL_PX = 1e9
@@ -26,15 +19,10 @@ MAX_RANGE2_M2 = MAX_RANGE_M**2
 _TAN_PI_8 = math.sqrt(2.0) - 1.0
 
 # atan(t) = t p(t^2) on |t| <= tan(pi/8): p interpolates atan(sqrt(s))/sqrt(s) at the Chebyshev nodes of
-# 0 <= s <= tan(pi/8)^2. For a float64 11 nodes (solved with 50 digits, largest error 7e-17), for a float32 five (7e-9):
-# below the rounding of either.
+# 0 <= s <= tan(pi/8)^2, 11 of them (solved with 50 digits). Largest error 7e-17, below the rounding of a float64.
 _A1, _A2, _A3 = -0.3333333333332844, 0.199999999988551, -0.1428571418097571
 _A4, _A5, _A6 = 0.11111106180425145, -0.09090773074092884, 0.07689953486227682
 _A7, _A8, _A9, _A10 = -0.06640233842869744, 0.056883487686028446, -0.04348050891958043, 0.02113535694575133
-_S0, _S1, _S2, _S3, _S4 = (
-    np.float32(c)
-    for c in (0.9999999812646112, -0.3333278577192708, 0.19974082415558878, -0.13848490212710987, 0.07976291808000396)
-)
 
 
 def like(constant: float, value: float) -> float:  # noqa: ARG001  (only its type counts)
@@ -46,13 +34,6 @@ def like(constant: float, value: float) -> float:  # noqa: ARG001  (only its typ
     return constant
 
 
-@overload(like, strict=False)  # the annotations differ between the two signatures
-def _like(constant: types.Type, value: types.Type) -> Callable[..., Any]:  # noqa: ARG001
-    if value == types.float32:
-        return lambda constant, value: np.float32(constant)  # noqa: ARG005
-    return lambda constant, value: constant  # noqa: ARG005
-
-
 class _Sensor(Protocol):
     """The fields that every camera model has and that the guards read."""
 
@@ -62,7 +43,6 @@ class _Sensor(Protocol):
     def cy(self) -> float: ...
 
 
-@register_jitable(error_model="numpy")
 def guarded_pixel(
     camera: _Sensor, x: float, y: float, z: float, u: float, v: float, in_domain: bool
 ) -> tuple[float, float, bool]:
@@ -73,7 +53,6 @@ def guarded_pixel(
     return (u if valid else camera.cx), (v if valid else camera.cy), valid
 
 
-@register_jitable(error_model="numpy")
 def guarded_ray(x: float, y: float, z: float, in_domain: bool) -> tuple[float, float, float, bool]:
     """The unit vector along (x, y, z) and True, else the optical axis and False."""
     norm2 = x * x + y * y + z * z
@@ -82,22 +61,12 @@ def guarded_ray(x: float, y: float, z: float, in_domain: bool) -> tuple[float, f
     return (x * scale if valid else 0.0), (y * scale if valid else 0.0), (z * scale if valid else 1.0), valid
 
 
-def _arc_over_tangent(s: float) -> float:
+def arc_over_tangent(s: float) -> float:
     """atan(t)/t from s = t^2."""
     p = _A5 + s * (_A6 + s * (_A7 + s * (_A8 + s * (_A9 + s * _A10))))
     return 1.0 + s * (_A1 + s * (_A2 + s * (_A3 + s * (_A4 + s * p))))
 
 
-def _arc_over_tangent_single(s: np.float32) -> np.float32:
-    return _S0 + s * (_S1 + s * (_S2 + s * (_S3 + s * _S4)))
-
-
-@overload(_arc_over_tangent, jit_options={"error_model": "numpy"}, strict=False)
-def _arc_over_tangent_of(s: types.Type) -> Callable[..., Any]:
-    return _arc_over_tangent_single if s == types.float32 else _arc_over_tangent
-
-
-@register_jitable(error_model="numpy")
 def polar_angle(radius: float, z: float) -> float:
     """atan2(radius, z) for radius >= 0, in [0, pi], without a branch or a library call: a loop over it vectorises.
 
@@ -114,6 +83,6 @@ def polar_angle(radius: float, z: float) -> float:
     zero, one = like(0.0, z), like(1.0, z)
     t = numerator / (denominator if denominator > zero else one)
     s = t * t
-    angle = (like(0.25 * math.pi, z) if diagonal else zero) + t * _arc_over_tangent(s)
+    angle = (like(0.25 * math.pi, z) if diagonal else zero) + t * arc_over_tangent(s)
     angle = like(0.5 * math.pi, z) - angle if steep else angle
     return like(math.pi, z) - angle if z < zero else angle
