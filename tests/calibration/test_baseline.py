@@ -15,7 +15,6 @@ from coec.calibration.baseline import (
     drift,
     mismatch,
     normal_quantile,
-    pixel_rad,
     uncommissioned,
 )
 from coec.calibration.values import Window
@@ -96,10 +95,6 @@ class TestUncommissioned:
     @staticmethod
     def camera(focal_px: float) -> Camera:
         return build("pinhole", width=640, height=480, fx=focal_px, fy=focal_px, cx=320.0, cy=240.0)
-
-    @pytest.mark.parametrize("focal_px", [80.0, 700.0])
-    def test_a_pixel_is_an_angle(self, focal_px: float) -> None:
-        assert pixel_rad(self.camera(focal_px)) == pytest.approx(1.0 / focal_px, rel=1e-3)
 
     def test_no_look_claims_much_less_than_a_pixel(self) -> None:
         coarse, fine = (uncommissioned(self.camera(focal_px)) for focal_px in (80.0, 700.0))

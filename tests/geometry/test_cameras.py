@@ -312,6 +312,12 @@ def test_a_point_outside_the_image_is_valid_but_not_in_it() -> None:
     assert not in_image(camera, uv_px).any()
 
 
+@pytest.mark.parametrize("focal_px", [80.0, 700.0])
+def test_a_pixel_is_an_angle(focal_px: float) -> None:
+    camera = cameras.build("pinhole", width=640, height=480, fx=1.2 * focal_px, fy=focal_px, cx=320.0, cy=240.0)
+    assert cameras.pixel_rad(camera) == pytest.approx(1.0 / focal_px, rel=1e-5)
+
+
 def test_in_image_reaches_to_the_outer_edges_of_the_border_pixels() -> None:
     camera = cameras.build("pinhole", **SMALL)
     corners_px = np.array([[-0.5, -0.5], [639.499, 479.499], [-0.501, 0.0], [639.5, 0.0], [0.0, 479.5], [math.nan, 0]])

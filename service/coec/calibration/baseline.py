@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import fsum, hypot, inf, radians, sqrt
+from math import fsum, inf, radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from coec.calibration.causes import SceneBaseline
 from coec.calibration.values import Matrix4, Rig
 from coec.config import CalibrationConfig, VerdictConfig, config_hash
 from coec.geometry import se3
-from coec.geometry.cameras import Camera, project_point
+from coec.geometry.cameras import Camera, pixel_rad
 
 FLOOR = np.array([radians(0.02)] * 3 + [0.004] * 3)
 """Standard deviation that no look is trusted to be below: what the interpolation of the edge maps leaves (rad, m)."""
@@ -98,21 +98,10 @@ class MonitorLimits:
     min_f2: float = -inf
 
 
-def pixel_rad(camera: Camera) -> float:
-    """The angle of a pixel on the optical axis, radians."""
-    u, v, _ = project_point(camera, 0.0, 0.0, 1.0)
-    beside = project_point(camera, PIXEL_STEP, 0.0, 1.0), project_point(camera, 0.0, PIXEL_STEP, 1.0)
-    return PIXEL_STEP / min(hypot(right - u, down - v) for right, down, _ in beside)
-
-
 def pixel_floor(camera: Camera) -> NDArray[np.float64]:
     """(6,) standard deviation that the pixels of a camera leave to any look, however many pairs it has (rad, m)."""
     off_rad = PIXEL_SHARE * pixel_rad(camera)
     return np.array([off_rad] * 3 + [off_rad * PIXEL_RANGE_M] * 3)
-
-
-PIXEL_STEP = 0.01
-"""Radians: within it every camera model is linear."""
 
 
 def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from coec.calibration.values import FramePair, Rig
 from coec.errors import CalibrationError
 from coec.geometry.alignment import EdgeFrames
-from coec.geometry.cameras import Camera, scaled
+from coec.geometry.cameras import Camera, pixel_rad, scaled
 from coec.geometry.edge_charts import EdgeCharts, edge_charts
 from coec.geometry.image_edges import BLUR_SIGMA_PX, EdgeScales
-from coec.geometry.projection import project
 from coec.geometry.range_edges import range_edges
 
 BANDS = 3
@@ -154,6 +153,5 @@ def _coarsest_level(camera: Camera) -> int:
 
 
 def _blur_rad(camera: Camera, level: int) -> float:
-    """Blur of a level, an angle about the optical axis; the focal length of a fisheye is not in pixels per radian."""
-    (axis, aside), _ = project(camera, np.array([[0.0, 0.0, 1.0], [1e-3, 0.0, 1.0]]))
-    return 2.0**level * BLUR_SIGMA_PX * 1e-3 / float(aside[0] - axis[0])
+    """Blur of a level, an angle about the optical axis."""
+    return 2.0**level * BLUR_SIGMA_PX * pixel_rad(camera)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import radians
+from math import degrees, radians
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -36,6 +36,10 @@ Seen = TypeVar("Seen")
 
 POLISHED_BASINS = 6
 """Basins that are polished on the fused objective: the true one was never below the second place."""
+
+RANKED_NEAR = 0.1
+"""Share of the finest blur of the ranking within which the maxima of basins are found before they are ranked: there a
+significance is half a percent below its maximum, and it takes half as many evaluations."""
 
 SETTLED_POSES = 2
 """Poses of the best basin that are settled: with six degrees of freedom, blurred edges can lead one of them astray (to
@@ -165,7 +169,9 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
     ranked = sorted(((fusion.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
-    ends = [_polished(fusion.ranking, basin, config.search, progress) for _, basin in ranked[:POLISHED_BASINS]]
+    near_deg = RANKED_NEAR * degrees(fusion.ranking[-1].step_rad)
+    roughly = config.search.model_copy(update={"tolerance_deg": max(near_deg, config.search.tolerance_deg)})
+    ends = [_polished(fusion.ranking, basin, roughly, progress) for _, basin in ranked[:POLISHED_BASINS]]
     polished = [(fusion.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
     # A maximum outside of the reach is a rival, but what is asked for lies inside.
     _, pose = max(polished, key=lambda end: (not at_rim(end[1], start, reach), end[0]))

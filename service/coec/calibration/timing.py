@@ -15,11 +15,11 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.baseline import pixel_rad
 from coec.calibration.causes import EGO_MOTION_WRONG, TIME_OFFSET, Cause
 from coec.calibration.motion import compensate
 from coec.calibration.values import EgoMotion, FramePair, LidarFrame, Matrix4, Rig
 from coec.geometry.alignment import EdgeFrames, frame_alignment
+from coec.geometry.cameras import pixel_rad
 from coec.geometry.range_edges import range_edges
 
 OFFSETS_S = (-0.2, -0.15, -0.1, -0.075, -0.05, -0.03, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2)

@@ -12,7 +12,7 @@ from coec.geometry.cameras.mei import Mei
 from coec.geometry.cameras.pinhole import Pinhole
 from coec.geometry.cameras.radtan import RadTan
 from coec.geometry.cameras.registry import MODELS, Camera, Model, build, intrinsics_of, name_of, scaled
-from coec.geometry.cameras.view import domain_angle_rad, in_image
+from coec.geometry.cameras.view import domain_angle_rad, in_image, pixel_rad
 
 __all__ = [
     "MODELS",
@@ -30,6 +30,7 @@ __all__ = [
     "in_image",
     "intrinsics_of",
     "name_of",
+    "pixel_rad",
     "project_point",
     "scaled",
     "unproject_point",

@@ -1,4 +1,4 @@
-"""What a camera sees: which pixels there are, and how far from the optical axis a point has one."""
+"""What a camera sees: which pixels there are, how far from the optical axis a point has one, and how fine they are."""
 
 import math
 
@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from coec.geometry.cameras.dispatch import project_point
 from coec.geometry.cameras.registry import Camera
 from coec.geometry.rows import rows_of
+
+_STEP = 1e-3
+"""Radians: within it every camera model is linear."""
 
 
 def in_image(camera: Camera, uv_px: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -32,3 +35,11 @@ def domain_angle_rad(camera: Camera) -> float:
         else:
             high = middle
     return low
+
+
+def pixel_rad(camera: Camera) -> float:
+    """The angle of a pixel on the optical axis, radians; where rows and columns differ, the larger. The focal length
+    of a fisheye is not in pixels per radian."""
+    u, v, _ = project_point(camera, 0.0, 0.0, 1.0)
+    beside = project_point(camera, _STEP, 0.0, 1.0), project_point(camera, 0.0, _STEP, 1.0)
+    return _STEP / min(math.hypot(right - u, down - v) for right, down, _ in beside)
