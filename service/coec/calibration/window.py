@@ -160,7 +160,7 @@ class WindowCutter:
 
     def _points_in_view(self, pair: FramePair, T_camera_lidar: Matrix4) -> int:
         """By direction: the border of the view is a degree wide, which matters little to a limit for the whole. Without
-        a compiled kernel, which would cost the service 45 MB, and without BLAS, whose threads spin."""
+        a kernel, as the process that cuts windows loads no compiler, and without BLAS, whose threads spin."""
         x_m, y_m, z_m = pair.lidar.xyz_m.T
         T = T_camera_lidar.astype(np.float32)
         x, y, z = (T[i, 0] * x_m + T[i, 1] * y_m + T[i, 2] * z_m + T[i, 3] for i in range(3))

@@ -153,14 +153,14 @@ def _spread_percent(ms_by_frames: Mapping[str, float]) -> float:
 
 
 def _fused(bars: Progress) -> dict[str, Any]:
-    """The fused objective, six degrees of freedom, without depth inference. The second run finds all compiled."""
+    """The fused objective, six degrees of freedom, without depth inference. The first run may compile."""
     loaded = windows.load(STREET, None, WindowConfig().pairs, lambda *_: None)
     xi = np.array([*np.radians(FAR_START_DEG), 0.0, 0.0, 0.0])
     window = windows.started_at(loaded.window, xi)
     configuration = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=30.0))
     depth = open_depth(configuration.depth, LimitsConfig())
     seconds = []
-    for _ in range(2):
+    for _ in range(1 + FEW_REPEATS):
         times = StageTimes(bars)
         estimate = calibrate(window, depth, GreyImages(LimitsConfig()), configuration, times)
         elapsed = times.elapsed_s()
