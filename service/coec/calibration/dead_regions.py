@@ -12,12 +12,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import log
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Grid = NDArray[np.float64]
 Cells = NDArray[np.bool_]
+Value = TypeVar("Value", np.bool_, np.int64)
 
 GRID_WIDTH = 200
 """Cells across the image, about: 7 px of a 1400 px image, wider than shake and rounding move an edge of the body."""
@@ -197,13 +199,20 @@ def cell_means(grey: NDArray[np.uint8], cell_px: int) -> Grid:
 def _at_pixels(cells: Cells, cell_px: int, width: int, height: int) -> Cells:
     rows = np.minimum(np.arange(height) // cell_px, cells.shape[0] - 1)
     columns = np.minimum(np.arange(width) // cell_px, cells.shape[1] - 1)
-    return np.asarray(cells[rows[:, None], columns[None, :]])
+    return np.asarray(cells[rows][:, columns])
 
 
 def _grown(cells: Cells) -> Cells:
     """With the eight neighbours of every cell."""
-    padded = np.pad(cells, 1)
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).any(axis=(2, 3)))
+    return ~_least_around(~cells, outside=True)
+
+
+def _least_around(values: NDArray[Value], outside: int | bool) -> NDArray[Value]:
+    """The least of every cell and its eight neighbours; beyond the border the value is `outside`. Along one axis after
+    the other."""
+    padded = np.pad(values, 1, constant_values=outside)
+    columns = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
+    return np.asarray(np.minimum(np.minimum(columns[:-2], columns[1:-1]), columns[2:]))
 
 
 def _ring(black: Cells) -> Cells:
@@ -240,8 +249,7 @@ def _labels(cells: Cells) -> NDArray[np.int64]:
     big = cells.size + 1
     spread = np.where(cells, own, big)
     while True:
-        padded = np.pad(spread, 1, constant_values=big)
-        least = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).min(axis=(2, 3))
+        least = _least_around(spread, outside=big)
         # Follow the chain of least indices: halves the rounds that a long group would need.
         least = np.where(cells, np.minimum(least, spread), big)
         flat = np.append(least.ravel(), big)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from math import degrees, radians
+from math import radians
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coec.calibration.basins import at_rim, find_basins
 from coec.calibration.dead_regions import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.edges import build_edges
-from coec.calibration.fused import FusedObjective, Fusion
+from coec.calibration.fused import Fusion
 from coec.calibration.motion import EVERY, Choice, compensate
 from coec.calibration.objective import (
     Features,
@@ -25,9 +25,9 @@ from coec.calibration.objective import (
     distance_and_depth,
 )
 from coec.calibration.ports import DepthModel, ImageReader, Progress
-from coec.calibration.search import SearchResult, box_of, maximise, polish
+from coec.calibration.search import SearchResult, box_of, maximise, near, polish_in_turn
 from coec.calibration.values import DepthMap, Matrix4, Metric, StopReason, Window
-from coec.config import CalibrationConfig, SearchConfig
+from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
 from coec.geometry.image_edges import halved
@@ -36,10 +36,6 @@ Seen = TypeVar("Seen")
 
 POLISHED_BASINS = 6
 """Basins that are polished on the fused objective: the true one was never below the second place."""
-
-RANKED_NEAR = 0.1
-"""Share of the finest blur of the ranking within which the maxima of basins are found before they are ranked: there a
-significance is half a percent below its maximum, and it takes half as many evaluations."""
 
 SETTLED_POSES = 2
 """Poses of the best basin that are settled: with six degrees of freedom, blurred edges can lead one of them astray (to
@@ -169,9 +165,8 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
     ranked = sorted(((fusion.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
-    near_deg = RANKED_NEAR * degrees(fusion.ranking[-1].step_rad)
-    roughly = config.search.model_copy(update={"tolerance_deg": max(near_deg, config.search.tolerance_deg)})
-    ends = [_polished(fusion.ranking, basin, roughly, progress) for _, basin in ranked[:POLISHED_BASINS]]
+    to_rank = near(config.search, fusion.ranking[-1])
+    ends = [polish_in_turn(fusion.ranking, basin, to_rank, progress) for _, basin in ranked[:POLISHED_BASINS]]
     polished = [(fusion.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
     # A maximum outside of the reach is a rival, but what is asked for lies inside.
     _, pose = max(polished, key=lambda end: (not at_rim(end[1], start, reach), end[0]))
@@ -186,24 +181,13 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
         Metric("runner_up", max(rivals, default=0.0) / max(contrast, 1e-9), limits.max_runner_up, at_least=False),
     )
     alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
-    settled = [_polished(fusion.settling, near, config.search, progress) for _, near in alike[:SETTLED_POSES]]
+    settled = [polish_in_turn(fusion.settling, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
     finest = fusion.settling[-1]
     found = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
     found = replace(found, evaluations=sum(end.evaluations for end in (*ends, *settled)))
     if at_rim(found.T_camera_lidar, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
     return Found(finest, found, metrics)
-
-
-def _polished(
-    objectives: Sequence[FusedObjective], basin: Matrix4, config: SearchConfig, progress: Progress
-) -> SearchResult:
-    """The maximum next to a basin, from level to finer level."""
-    first, *finer = objectives
-    found = polish(first, basin, config, progress)
-    for objective in finer:
-        found = polish(objective, found.T_camera_lidar, config, progress, found.evaluations)
-    return found
 
 
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})

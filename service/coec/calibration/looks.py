@@ -28,7 +28,7 @@ from coec.calibration.objective import (
     build_mutual_information,
 )
 from coec.calibration.ports import Silence
-from coec.calibration.search import polish
+from coec.calibration.search import near, polish_in_turn
 from coec.calibration.values import FramePair, Matrix4, Rig
 from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import se3
@@ -145,13 +145,12 @@ def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig, bias: 
     rotation = config.search.model_copy(update={"dof": ROTATION_DOF})
 
     def polished(objectives: Sequence[Objective], start: Matrix4, search: SearchConfig = rotation) -> Matrix4:
-        for objective in objectives:
-            start = polish(objective, start, search, Silence()).T_camera_lidar
-        return start
+        return polish_in_turn(objectives, start, search, Silence()).T_camera_lidar
 
     basins = [basin.T_camera_lidar for basin in find_basins(evidence.edges, pose, reach)]
     ranked = sorted(basins, key=fusion.rank, reverse=True)[:BASINS]
-    best = max((polished(fusion.ranking, basin) for basin in ranked), key=fusion.rank)
+    to_rank = near(rotation, fusion.ranking[-1])
+    best = max((polished(fusion.ranking, basin, to_rank) for basin in ranked), key=fusion.rank)
     T_rotation = polished(fusion.settling, best)
     in_all = config.search.model_copy(update={"dof": POSE_DOF})
     # By two ways, as blurred edges can lead six degrees of freedom astray.

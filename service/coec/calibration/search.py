@@ -6,9 +6,9 @@ with a fresh quadratic model of its size. Deterministic: same objective, same ev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from math import radians
+from math import degrees, radians
 
 import nlopt
 import numpy as np
@@ -30,6 +30,10 @@ REFINE_BOX_M, REFINE_STEP_M = 0.10, 0.04
 
 POLISH_METRES_PER_RADIAN = 10.0
 """Step of a translation per step of a rotation when a basin is polished."""
+
+NEAR = 0.1
+"""Share of an objective's difference step within which a maximum is found that only ranks a basin, or leads to a finer
+level: the score there is half a percent of the hill below its maximum, and takes half as many evaluations."""
 
 AT_BOUND = 0.995
 """Share of the half-width of the box beyond which an optimum counts as lying on the bound."""
@@ -108,6 +112,25 @@ def polish(
     found, exhausted = _bobyqa(score, np.zeros(len(moved)), 4.0 * step, 4.0 * step, step, config)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
     return SearchResult(_pose(basin, placed(found)), evaluations, stop_reason)
+
+
+def near(config: SearchConfig, objective: Objective) -> SearchConfig:
+    """The configuration of a search that may end as soon as it is `NEAR` the maximum of `objective`."""
+    near_deg = NEAR * degrees(objective.step_rad)
+    return config.model_copy(update={"tolerance_deg": max(near_deg, config.tolerance_deg)})
+
+
+def polish_in_turn(
+    objectives: Sequence[Objective], basin: Matrix4, config: SearchConfig, progress: Progress
+) -> SearchResult:
+    """The maximum of the last objective next to `basin` (4, 4), to which the ones before it lead, one after the
+    other."""
+    *leading, last = objectives
+    evaluations = 0
+    for objective in leading:
+        found = polish(objective, basin, near(config, objective), progress, evaluations)
+        basin, evaluations = found.T_camera_lidar, found.evaluations
+    return polish(last, basin, config, progress, evaluations)
 
 
 def _bobyqa(
