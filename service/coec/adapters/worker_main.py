@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import logging
 import os
 import signal
@@ -50,7 +51,10 @@ def main(arguments: list[str]) -> int:
 
 
 def _serve(link: Link, config: Config) -> None:
-    # Imported here: numba and onnxruntime take seconds, and the ties to the parent come first.
+    # What is made before the first job stays: to look through it for garbage takes a tenth of the start, and again some
+    # of every solve.
+    gc.disable()
+    # Imported here: numba and onnxruntime take most of a second, and the ties to the parent come first.
     from coec.adapters.solver import Solver
 
     try:
@@ -59,6 +63,8 @@ def _serve(link: Link, config: Config) -> None:
     except CoecError as error:
         link.send({"kind": "unusable", "code": error.reply_code, "text": str(error)})
         return
+    gc.freeze()
+    gc.enable()
     link.send({"kind": "ready"})
     while True:
         link.send(_answer(solver, link.receive()))
