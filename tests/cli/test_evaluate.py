@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
+from coec.calibration import commissioning
 from coec.calibration.starts import perturbations
 from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, Options, configuration_of
 from coec.config import CalibrationConfig, SearchConfig
@@ -211,7 +212,9 @@ def test_starts_too_far_for_any_box_are_a_usage_error() -> None:
         configuration_of(Options(source="", depth="stereo", directions=1, rotation_deg=50.0), None)
 
 
-def test_detection_is_the_table_of_diagnose(coec: Coec) -> None:
+def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("LOOKS", "FAR_LOOKS", "HALVES"):
+        monkeypatch.setattr(commissioning, name, 3)
     arguments = (SMALL.replace("frames=6", "frames=9"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
     diagnosed = coec("diagnose", *arguments, "--json").document
