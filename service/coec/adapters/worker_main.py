@@ -51,20 +51,19 @@ def main(arguments: list[str]) -> int:
 
 
 def _serve(link: Link, config: Config) -> None:
-    # What is made before the first job stays: to look through it for garbage takes a tenth of the start, and again some
-    # of every solve.
+    # Imported here: numba and onnxruntime take most of a second, and the ties to the parent come first. All of that
+    # stays: to look through it for garbage took a tenth of the start.
     gc.disable()
-    # Imported here: numba and onnxruntime take most of a second, and the ties to the parent come first.
     from coec.adapters.solver import Solver
 
+    gc.freeze()
+    gc.enable()
     try:
         solver = Solver(config, DEPTH_MAPS_KEPT)
         solver.warm_up()
     except CoecError as error:
         link.send({"kind": "unusable", "code": error.reply_code, "text": str(error)})
         return
-    gc.freeze()
-    gc.enable()
     link.send({"kind": "ready"})
     while True:
         link.send(_answer(solver, link.receive()))
