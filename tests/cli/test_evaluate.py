@@ -12,6 +12,7 @@ import pytest
 from cli.conftest import SMALL, Coec
 from coec.calibration import commissioning
 from coec.calibration.starts import perturbations
+from coec.cli import evaluation_bench
 from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, Options, configuration_of
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
@@ -215,13 +216,14 @@ def test_starts_too_far_for_any_box_are_a_usage_error() -> None:
 def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("LOOKS", "FAR_LOOKS", "HALVES"):
         monkeypatch.setattr(commissioning, name, 3)
+    monkeypatch.setattr(evaluation_bench, "LOOKS", 2)
     arguments = (SMALL.replace("frames=6", "frames=9"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
-    diagnosed = coec("diagnose", *arguments, "--json").document
+    diagnosed = coec("diagnose", *arguments, "--looks", "2", "--json").document
     detection = report.document["detection"]
     assert detection == {key: diagnosed[key] for key in ("splits", "pairs", "moves")}
     assert [row["name"] for row in detection["moves"]][:4] == ["right", "0.5 deg", "1 deg", "3 deg"]
-    assert all(row["looks"] == 10 for row in detection["moves"])
+    assert all(row["looks"] == 2 for row in detection["moves"])
 
 
 def test_a_recording_too_short_for_detection_is_refused_before_the_work(coec: Coec) -> None:
