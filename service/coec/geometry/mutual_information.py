@@ -92,13 +92,17 @@ def _histograms_of_tasks(
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """The joint histogram of each task, with one more row for points on no value, and the first task of each frame."""
     T = np.ascontiguousarray(T_camera_lidar, np.float64)
-    bundles = int((-(-np.diff(frames.first_point) // BUNDLE)).sum())
-    in_view = np.ones(bundles, np.bool_) if frames.bundles is None else frames.bundles.at(T)
+    in_view = _every_bundle(frames.first_point) if frames.bundles is None else frames.bundles.at(T)
     single = filter_of(frames.camera)
     return _count(
         frames.camera, single.camera, single.at(T), T, frames.xyz_m, frames.range_bin, frames.first_point,
         frames.depth_bin, in_view, frames.depth_bins, frames.range_bins,
     )  # fmt: skip
+
+
+def _every_bundle(first_point: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """As `Bundles.at`, where nothing is left out."""
+    return np.ones(int((-(-np.diff(first_point) // BUNDLE)).sum()), np.bool_)
 
 
 @njit(cache=True, parallel=True)
