@@ -16,9 +16,6 @@ from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame
 from coec.config import PairConfig
 
 NS_PER_S = 1_000_000_000
-POLL_S = 0.05
-"""Between two looks for a subscriber: Zenoh tells a publisher in Python of none."""
-
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 
 Frame = CameraFrame | LidarFrame | EgoMotion
@@ -70,11 +67,17 @@ class Player:
     def wait_for_listener(self, timeout_s: float) -> list[str]:
         """Until somebody subscribes to every stream, at most so long; the keys that nobody listens to."""
         deadline_s = time.monotonic() + timeout_s
-        while True:
-            deaf = [str(p.key_expr) for p in self._publishers.values() if not _is_heard(p)]
-            if not deaf or time.monotonic() >= deadline_s:
-                return deaf
-            time.sleep(POLL_S)
+        changed = threading.Event()
+        listeners = [p.declare_matching_listener(lambda _: changed.set()) for p in self._publishers.values()]
+        try:
+            while True:
+                changed.clear()
+                deaf = [str(p.key_expr) for p in self._publishers.values() if not _is_heard(p)]
+                if not deaf or not changed.wait(max(deadline_s - time.monotonic(), 0.0)):
+                    return deaf
+        finally:
+            for listener in listeners:
+                listener.undeclare()
 
     def play(
         self,
