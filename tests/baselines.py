@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from coec.calibration.baseline import Accuracy, Baseline, MonitorLimits
-from coec.calibration.causes import BANDS, BLOCK_COLUMNS, BLOCK_ROWS, SECTORS, SceneBaseline
+from coec.calibration.commissioning.baseline import Accuracy, Baseline, MonitorLimits
+from coec.calibration.monitor.sensor_faults import BANDS, BLOCK_COLUMNS, BLOCK_ROWS, SECTORS, SceneBaseline
 from coec.geometry import se3
 
 

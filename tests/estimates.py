@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coec.calibration.values import Decision, Estimate, Metric, Optimum, Rig, StopReason, Verdict
+from coec.calibration.types import Decision, Estimate, Metric, Optimum, Rig, StopReason, Verdict
 from coec.geometry import se3
 from coec.geometry.cameras import build
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images import decode_bgr
-from coec.calibration.values import EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame, Window
+from coec.adapters.images.codec import decode_bgr
+from coec.calibration.types import EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame, Window
 from coec.config import LimitsConfig
 
 Pixels = NDArray[np.uint8]

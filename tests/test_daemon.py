@@ -19,15 +19,15 @@ from typing import Any
 import pytest
 import zenoh
 
-from coec.adapters.mcap_windows import read_result, read_window
-from coec.adapters.msgpack_frames import encode_camera, encode_ego, encode_lidar
-from coec.adapters.notify import Notifier
-from coec.adapters.pair_service import PairService
-from coec.adapters.rig import rig_to_json
-from coec.adapters.zenoh_bus import MSGPACK, open_session
-from coec.calibration.values import CameraFrame, LidarFrame
+from coec.adapters.files.rig import rig_to_json
+from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.adapters.mcap.windows import read_result, read_window
+from coec.adapters.system.notify import Notifier
+from coec.adapters.zenoh.bus import MSGPACK, open_session
+from coec.calibration.types import CameraFrame, LidarFrame
 from coec.config import Config, LimitsConfig, ZenohConfig
 from coec.daemon import EXIT_THREAD_DIED, Daemon, Signals
+from coec.runtime.pair import PairService
 from coec.schemas.keys import Keys
 from coec.sources import open_source
 from fakes import wait_until

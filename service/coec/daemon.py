@@ -20,20 +20,21 @@ from types import FrameType
 from typing import Literal
 
 from coec import __version__
-from coec.adapters import logs, metrics
-from coec.adapters.answers import VehicleAnswers
-from coec.adapters.intake import CAMERA, EGO, LIDAR
-from coec.adapters.notify import Notifier
-from coec.adapters.pair_service import Outside, PairService
-from coec.adapters.snapshots import Snapshot, reasons_of, worker_status_of
-from coec.adapters.state_store import StateStore
-from coec.adapters.threads import ServiceThread
-from coec.adapters.window_folder import WindowFolder
-from coec.adapters.worker import Solved, SolveJob, Worker, WorkerState
-from coec.adapters.zenoh_bus import Answer, Bus, open_session
-from coec.calibration.values import Reason
+from coec.adapters.system import logs
+from coec.adapters.system.notify import Notifier
+from coec.adapters.system.threads import ServiceThread
+from coec.adapters.zenoh.bus import Answer, Bus, open_session
+from coec.calibration.types import Reason
 from coec.config import Config, config_hash
 from coec.errors import CoecError, ConfigError
+from coec.runtime.api import metrics
+from coec.runtime.api.routes import VehicleAnswers
+from coec.runtime.api.snapshots import Snapshot, reasons_of, worker_status_of
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
+from coec.runtime.pair import Outside, PairService
+from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.worker.supervisor import Solved, SolveJob, Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
 

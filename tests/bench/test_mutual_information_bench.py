@@ -16,8 +16,8 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from coec.geometry.bundles import BUNDLE
 from coec.geometry.cameras import DoubleSphere, build
+from coec.geometry.culling import BUNDLE
 from coec.geometry.mutual_information import BinnedFrames, mutual_information
 from coec.geometry.pixel_lookup import moved
 from coec.geometry.plain_forms import by_numpy, by_scalar_loop

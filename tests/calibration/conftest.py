@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from coec.adapters.depth import open_depth
-from coec.adapters.images import GreyImages
-from coec.calibration.edges import EdgeWitness, build_edges
-from coec.calibration.motion import compensate
-from coec.calibration.pairing import Pairer
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.objective.edges import EdgeWitness, build_edges
 from coec.calibration.ports import DepthModel
-from coec.calibration.values import FramePair, Window
+from coec.calibration.types import FramePair, Window
 from coec.config import DepthConfig, LimitsConfig, PairingConfig
 from coec.sources import open_source
 

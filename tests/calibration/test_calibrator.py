@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.images import GreyImages
+from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import DepthModel, Silence
-from coec.calibration.values import CameraFrame, Decision, DepthMap, Estimate, StopReason, Window
+from coec.calibration.types import CameraFrame, Decision, DepthMap, Estimate, StopReason, Window
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3

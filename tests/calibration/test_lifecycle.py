@@ -7,7 +7,6 @@ from functools import partial, reduce
 import numpy as np
 import pytest
 
-from coec.calibration.causes import CAUSES
 from coec.calibration.lifecycle import (
     CommandRefusedError,
     HealthState,
@@ -29,8 +28,9 @@ from coec.calibration.lifecycle import (
     restored,
     rolled_back,
 )
-from coec.calibration.monitor import Observation, Outcome
-from coec.calibration.values import Decision, Estimate, Optimum, Reason, Rig, StopReason, Verdict
+from coec.calibration.monitor.change_detector import Observation, Outcome
+from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.calibration.types import Decision, Estimate, Optimum, Reason, Rig, StopReason, Verdict
 from coec.config import FusionConfig, PolicyConfig
 from coec.geometry import se3
 from coec.geometry.cameras import build

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.depth import CachedDepth, open_depth
-from coec.adapters.images import CachedGreys, GreyImages
+from coec.adapters.depth.maps import CachedDepth, open_depth
+from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import DepthModel, ImageReader, Silence
-from coec.calibration.values import Decision, Estimate, Window
-from coec.cli import windows
+from coec.calibration.types import Decision, Estimate, Window
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
+from coec.sources import windows
 from scenarios import SCENARIOS, torn_clusters_in_the_cloud
 
 CONFIGURATION = CalibrationConfig()

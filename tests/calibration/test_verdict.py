@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.calibration.confidence import Curvature
-from coec.calibration.objective import Evaluation
-from coec.calibration.values import Decision, Metric, StopReason, Verdict
+from coec.calibration.objective.curvature import Curvature
+from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.types import Decision, Metric, StopReason, Verdict
 from coec.calibration.verdict import judge, shape_metrics
 from coec.config import VerdictConfig
 

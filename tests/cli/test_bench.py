@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from cli.conftest import SMALL, Coec
-from coec.calibration.objective import SearchBox
+from coec.calibration.objective.mutual_information import SearchBox
 from coec.cli import bench
 from coec.cli.bench import live, rows, scene, worker
 from coec.cli.bench.process import ProcessReading

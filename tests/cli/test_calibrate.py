@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.depth import open_depth
+from coec.adapters.depth.maps import open_depth
 from coec.calibration.ports import DepthModel
 from coec.cli.calibrate import Options, configuration_of
-from coec.cli.windows import evenly, perturbation_of
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig
 from coec.errors import UsageError
+from coec.sources.windows import evenly, perturbation_of
 
 TOLERANCE_DEG = 0.35
 

@@ -9,8 +9,8 @@ from ruamel.yaml import YAML
 
 from cli.conftest import SMALL, Coec
 from coec.cli.check_config import example, template
-from coec.cli.commented_yaml import commented_yaml
 from coec.config import Config, config_hash, load_config
+from coec.reports.commented_yaml import commented_yaml
 from conftest import REPOSITORY
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 
 from cli.conftest import SMALL, Coec
-from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.sources import open_source
 
 

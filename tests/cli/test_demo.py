@@ -12,14 +12,14 @@ from typing import Literal
 import pytest
 from rich.console import Console
 
-from coec.adapters.timeline_plot import timeline
-from coec.calibration.values import EgoMotion
+from coec.calibration.types import EgoMotion
 from coec.cli.demo import report, story
 from coec.cli.demo.outcome import Outcome, outcome_of
 from coec.cli.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
 from coec.cli.demo.screen import BARS, curve
 from coec.cli.demo.vehicle import NS_PER_S, paced
 from coec.cli.demo.watch import Moment
+from coec.reports.timeline_plot import timeline
 from coec.schemas import replies
 
 KNOCK_S, MAX_ERROR_DEG = story.KNOCK_S, story.MAX_ERROR_DEG
@@ -157,7 +157,7 @@ def test_the_page_needs_no_other_file(tmp_path: Path) -> None:
 
 def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
-    monkeypatch.setattr("coec.cli.console.out", Console(file=stream, width=140))
+    monkeypatch.setattr("coec.reports.console.out", Console(file=stream, width=140))
     moments = [START, HEALTHY, KNOCKED, replace(SUSPECT, drive_s=ALARM.drive_s), ALARM, REPAIRED]
     report.show(moments, outcome(*moments), report.Left((), None))
     said = stream.getvalue()

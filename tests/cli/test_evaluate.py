@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.calibration import commissioning
-from coec.calibration.starts import perturbations
-from coec.cli import evaluation_bench
+from coec.calibration.commissioning import learning
 from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, Options, configuration_of
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
+from coec.evaluation import experiments
+from coec.evaluation.starts import perturbations
 from coec.schemas.evaluation import ComparisonReport, EvaluationReport
 
 CONTRACT = {
@@ -215,8 +215,8 @@ def test_starts_too_far_for_any_box_are_a_usage_error() -> None:
 
 def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("LOOKS", "FAR_LOOKS", "HALVES"):
-        monkeypatch.setattr(commissioning, name, 3)
-    monkeypatch.setattr(evaluation_bench, "LOOKS", 2)
+        monkeypatch.setattr(learning, name, 3)
+    monkeypatch.setattr(experiments, "LOOKS", 2)
     arguments = (SMALL.replace("frames=6", "frames=9"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
     diagnosed = coec("diagnose", *arguments, "--looks", "2", "--json").document

@@ -10,7 +10,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from cli.conftest import Coec
-from coec.calibration.values import CameraFrame, LidarFrame
+from coec.calibration.types import CameraFrame, LidarFrame
 from coec.sources import open_source
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")

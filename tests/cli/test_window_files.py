@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.depth import open_depth
-from coec.adapters.images import GreyImages
-from coec.adapters.mcap_windows import WindowWriter, read_result, read_window, write_result
-from coec.adapters.wire import result_of
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.files.conversions import result_of
+from coec.adapters.images.codec import GreyImages
+from coec.adapters.mcap.windows import WindowWriter, read_result, read_window, write_result
 from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import Silence
-from coec.cli import windows
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig
 from coec.errors import SourceError
 from coec.geometry import se3
+from coec.sources import windows
 
 LIMITS = LimitsConfig()
 CONFIGURATION = CalibrationConfig(

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coec.adapters.rig import mask_to_png
-from coec.cli.commented_yaml import commented_yaml
+from coec.adapters.files.rig import mask_to_png
 from coec.cli.convert import configuration_for
 from coec.config import CalibrationConfig, Config, StateConfig, ZenohConfig, load_config
 from coec.geometry.se3 import Array, perturb
+from coec.reports.commented_yaml import commented_yaml
 from coec.sources import open_source
 from conftest import REPOSITORY
 

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from coec.adapters.msgpack_frames import encode_camera, encode_ego, encode_lidar
-from coec.adapters.zenoh_bus import MSGPACK
-from coec.adapters.zenoh_client import ask_one, connected
-from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame
-from coec.cli.commented_yaml import commented_yaml
+from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.adapters.zenoh.bus import MSGPACK
+from coec.adapters.zenoh.client import ask_one, connected
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import CalibrationConfig, Config, MonitorConfig, PolicyConfig, WindowConfig, load_config
 from coec.geometry.se3 import inverse, rotation_angle_rad
+from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
 from coec.simulation.drive import SimulatedDrive
 from coec.sources import Recording, open_source

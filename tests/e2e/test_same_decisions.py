@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from coec.adapters.bag_writer import write_bag
+from coec.adapters.mcap.bag_writer import write_bag
 from coec.config import CalibrationConfig, DepthConfig
 from e2e.processes import coec
 from e2e.rides import SECONDS, Ride, between, configured, drive, error_deg, riding, without_depth

@@ -16,8 +16,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from coec.adapters.mcap_windows import read_result, read_window
-from coec.adapters.zenoh_bus import open_session
+from coec.adapters.mcap.windows import read_result, read_window
+from coec.adapters.zenoh.bus import open_session
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig, ZenohConfig
 from e2e.processes import ANSWER_S, Service, coec, free_port, service, write_configuration
 from fakes import wait_until

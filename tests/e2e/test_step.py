@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.zenoh_client import ask_one
+from coec.adapters.zenoh.client import ask_one
 from coec.config import CalibrationConfig, DepthConfig, PolicyConfig
 from e2e.rides import SECONDS, STEP_S, between, configured, drive, error_deg, riding
 from fakes import wait_until

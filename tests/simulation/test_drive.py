@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.adapters.images import decode_depth
-from coec.calibration.motion import compensate
-from coec.calibration.values import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.adapters.images.codec import decode_depth
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import UsageError
 from coec.geometry import cameras

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from coec.adapters.images import decode_bgr, decode_depth
-from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, SweepTiming
+from coec.adapters.images.codec import decode_bgr, decode_depth
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, SweepTiming
 from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import cameras, se3

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.errors import SourceError
 from coec.geometry import cameras
 from coec.sources import open_source

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from coec.adapters.images import decode_bgr, decode_depth
-from coec.calibration.values import CameraFrame, EgoMotion, ImageFormat, LidarFrame
+from coec.adapters.images.codec import decode_bgr, decode_depth
+from coec.calibration.types import CameraFrame, EgoMotion, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import cameras

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_humble as ros
 
-from coec.adapters.mcap_windows import WindowWriter, read_window
-from coec.calibration.pairing import Pairer
-from coec.calibration.values import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.adapters.mcap.windows import WindowWriter, read_window
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
 from coec.config import CalibrationConfig, PairingConfig, SearchConfig
 from coec.errors import SourceError, UsageError, WindowError
 from coec.geometry import cameras, se3

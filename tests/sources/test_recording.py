@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 import pytest
 
-from coec.calibration.values import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.errors import SourceError, UsageError
 from coec.geometry import cameras
 from coec.sources import open_source

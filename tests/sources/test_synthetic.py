@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.images import decode_bgr, decode_depth
-from coec.calibration.motion import compensate
-from coec.calibration.values import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.adapters.images.codec import decode_bgr, decode_depth
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import UsageError
 from coec.geometry import se3

@@ -6,12 +6,12 @@ from collections import Counter
 
 import numpy as np
 
-from coec.calibration.confidence import measure_curvature
 from coec.calibration.estimators import ESTIMATORS, look
-from coec.calibration.motion import compensation
-from coec.calibration.observability import unobservable, without
+from coec.calibration.frames.motion_compensation import compensation
+from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
-from coec.calibration.values import Compensation, Estimate, Optimum, Window
+from coec.calibration.search.observability import unobservable, without
+from coec.calibration.types import Compensation, Estimate, Optimum, Window
 from coec.calibration.verdict import judge, shape_metrics
 from coec.config import CalibrationConfig, config_hash
 from coec.errors import CalibrationError

@@ -11,12 +11,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.basins import at_rim, find_basins
-from coec.calibration.dead_regions import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
-from coec.calibration.edges import build_edges
-from coec.calibration.fused import Fusion
-from coec.calibration.motion import EVERY, Choice, compensate
-from coec.calibration.objective import (
+from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
+from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
+from coec.calibration.objective.edges import build_edges
+from coec.calibration.objective.fused import Fusion
+from coec.calibration.objective.mutual_information import (
     Features,
     MutualInformation,
     Objective,
@@ -25,12 +24,13 @@ from coec.calibration.objective import (
     distance_and_depth,
 )
 from coec.calibration.ports import DepthModel, ImageReader, Progress
-from coec.calibration.search import SearchResult, box_of, maximise, near, polish_in_turn
-from coec.calibration.values import DepthMap, Matrix4, Metric, StopReason, Window
+from coec.calibration.search.global_search import at_rim, find_basins
+from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
+from coec.calibration.types import DepthMap, Matrix4, Metric, StopReason, Window
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
-from coec.geometry.image_edges import halved
+from coec.geometry.edges.image_edges import halved
 
 Seen = TypeVar("Seen")
 

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.values import CameraFrame, DepthMap, ImageQuality
+from coec.calibration.types import CameraFrame, DepthMap, ImageQuality
 
 
 class DepthModel(Protocol):

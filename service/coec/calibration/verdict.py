@@ -13,9 +13,9 @@ from math import degrees, radians
 
 import numpy as np
 
-from coec.calibration.confidence import Curvature
-from coec.calibration.objective import Evaluation
-from coec.calibration.values import Decision, Metric, Reason, StopReason, Verdict
+from coec.calibration.objective.curvature import Curvature
+from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.types import Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)

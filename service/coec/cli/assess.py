@@ -10,22 +10,24 @@ from typing import cast
 
 import numpy as np
 
-from coec.adapters.depth import STEREO, CachedDepth, open_depth
-from coec.adapters.evaluation_report import number
-from coec.adapters.images import GreyImages, decode_bgr
-from coec.calibration import depth_quality
-from coec.calibration.depth_quality import DepthQuality
+from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
+from coec.adapters.files import output
+from coec.adapters.images.codec import GreyImages, decode_bgr
 from coec.calibration.estimators import Sight, look
 from coec.calibration.ports import DepthModel, Silence
-from coec.calibration.values import Window
+from coec.calibration.types import Window
 from coec.cli import calibrate as calibrate_command
-from coec.cli import console, files, windows
-from coec.cli.evaluation_bench import Stages
 from coec.config import LimitsConfig, WindowConfig
 from coec.errors import CalibrationError, DecodeError
+from coec.evaluation import depth_quality
+from coec.evaluation.depth_quality import DepthQuality
+from coec.evaluation.experiments import Stages
+from coec.reports import console
+from coec.reports.evaluation_documents import number
 from coec.schemas.base import to_json
 from coec.schemas.evaluation import DepthFrame, Maybe3, ModelAssessment
 from coec.schemas.replies import Vector3
+from coec.sources import windows
 
 STAGES = 3
 """Steps of which an assessment tells."""
@@ -69,7 +71,7 @@ def run(options: Options) -> int:
     timed_ms: list[float | None] = took_ms if options.model != STEREO else [None] * len(took_ms)
     report = _report(options, window, depth.identity, quality, timed_ms, elapsed_s)
     if options.output is not None:
-        files.write(options.output / "report.json", to_json(report))
+        output.write(options.output / "report.json", to_json(report))
     if options.as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
@@ -98,19 +100,19 @@ def _infer(window: Window, depth: DepthModel, stages: Stages) -> list[float | No
 
 def _write_pictures(folder: Path, options: Options, sight: Sight, quality: DepthQuality) -> None:
     # matplotlib takes a second to import.
-    from coec.adapters import depth_plots
+    from coec.reports import depth_plots
 
     name = f"{Path(options.model).name} on {sight.window.window_id}"
     _, sentence = depth_quality.suitability(quality)
-    files.write(folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames"))
-    files.write(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
+    output.write(folder / "joint.png", depth_plots.joint(quality.joint, f"{name}, {len(quality.pairings)} frames"))
+    output.write(folder / "curves.png", depth_plots.curves(quality, f"{name}\n{sentence}"))
     index = len(sight.window.pairs) // 2
     frame, pairing = sight.window.pairs[index].camera, quality.pairings[index]
     title = f"{name}, frame at {frame.stamp_ns} ns: rank correlation {pairing.rank_correlation:+.2f}"
     picture = depth_plots.frame(
         decode_bgr(frame.image, LimitsConfig()), sight.depth.infer(frame).values, pairing, title
     )
-    files.write(folder / "frame.png", picture)
+    output.write(folder / "frame.png", picture)
 
 
 def _report(

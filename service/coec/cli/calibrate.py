@@ -11,20 +11,22 @@ import numpy as np
 from pydantic import ValidationError
 from rich.progress import Progress, TaskID
 
-from coec.adapters.depth import open_depth
-from coec.adapters.images import GreyImages
-from coec.adapters.wire import result_of
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.files import output
+from coec.adapters.files.conversions import result_of
+from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
-from coec.calibration.time_offset import TimeOffset, estimate_time_offset
-from coec.calibration.values import Rig, Window
-from coec.cli import console, files, pictures, windows
+from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
+from coec.calibration.types import Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
 from coec.errors import UsageError
 from coec.geometry import se3
 from coec.geometry.cameras import name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
+from coec.reports import console, pictures
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationReport, CalibrationResult
+from coec.sources import windows
 
 FITTED = "double_sphere"
 """The one model that can be fitted to the others."""
@@ -191,7 +193,7 @@ def _write(
         "overlay_after": (T_found, f"{where}  {result.verdict.decision}, {moved_deg:.2f} deg from the start"),
     }
     pictures.write_overlays(folder, window, poses, configuration.motion_compensation)
-    files.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
+    output.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
 
 
 def _show(

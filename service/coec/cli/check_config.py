@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from coec.adapters.depth import open_depth
-from coec.adapters.rig import rig_of
-from coec.cli import console
-from coec.cli.commented_yaml import commented_yaml
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.files.rig import rig_of
 from coec.config import (
     CameraConfig,
     CameraIntrinsics,
@@ -21,6 +19,8 @@ from coec.config import (
     load_config,
 )
 from coec.errors import ConfigError, ModelError, UsageError
+from coec.reports import console
+from coec.reports.commented_yaml import commented_yaml
 
 TEMPLATE_HEAD = """\
 # Configuration of coec. Every key stands here with its default, except for what only you can know: the names, keys,

@@ -8,17 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from coec.adapters.baseline_file import baseline_hash, baseline_to_json, save_baseline
-from coec.adapters.depth import CachedDepth, open_depth
-from coec.adapters.images import CachedGreys, GreyImages
-from coec.calibration.baseline import Baseline
-from coec.calibration.commissioning import MAX_PAIRS, commission
+from coec.adapters.depth.maps import CachedDepth, open_depth
+from coec.adapters.files.baseline_file import baseline_hash, baseline_to_json, save_baseline
+from coec.adapters.images.codec import CachedGreys, GreyImages
+from coec.calibration.commissioning.baseline import Baseline
+from coec.calibration.commissioning.learning import MAX_PAIRS, commission
 from coec.calibration.ports import DepthModel, ImageReader
-from coec.calibration.values import Window
+from coec.calibration.types import Window
 from coec.cli import calibrate as calibrate_command
-from coec.cli import console, windows
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import UsageError
+from coec.reports import console
+from coec.sources import windows
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,12 @@ from typing import Literal
 
 import numpy as np
 
-from coec.adapters.bag_writer import write_bag
-from coec.adapters.depth import STEREO
-from coec.adapters.player import Streams
-from coec.adapters.rig import intrinsics_config, mask_to_png, matrix_rows
-from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
-from coec.cli import console
-from coec.cli.commented_yaml import commented_yaml
-from coec.cli.files import OutputError, write
+from coec.adapters.depth.maps import STEREO
+from coec.adapters.files.output import OutputError, write
+from coec.adapters.files.rig import intrinsics_config, mask_to_png, matrix_rows
+from coec.adapters.mcap.bag_writer import write_bag
+from coec.adapters.zenoh.player import Streams
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 from coec.config import (
     CalibrationConfig,
     CameraConfig,
@@ -30,6 +28,8 @@ from coec.config import (
     WindowConfig,
 )
 from coec.errors import UsageError
+from coec.reports import console
+from coec.reports.commented_yaml import commented_yaml
 from coec.sources import Recording, open_source
 
 

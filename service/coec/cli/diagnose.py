@@ -8,18 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from coec.adapters.baseline_file import load_baseline
-from coec.adapters.evaluation_report import detection_of
-from coec.adapters.wire import metric_of
-from coec.calibration.baseline import learned_hash, mismatch
-from coec.calibration.detection import try_detection
+from coec.adapters.files.baseline_file import load_baseline
+from coec.adapters.files.conversions import metric_of
+from coec.calibration.commissioning.baseline import learned_hash, mismatch
 from coec.calibration.estimators import look
-from coec.calibration.judging import observe
-from coec.calibration.looks import gather
+from coec.calibration.monitor.check import gather
+from coec.calibration.monitor.check_verdict import observe
 from coec.cli import calibrate as calibrate_command
-from coec.cli import commission, console, evaluation_text, windows
+from coec.cli import commission
 from coec.errors import UsageError
+from coec.evaluation.detection import try_detection
 from coec.geometry import se3
+from coec.reports import console, evaluation_tables
+from coec.reports.evaluation_documents import detection_of
+from coec.sources import windows
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,7 @@ def _tabulate(rigged: commission.Rigged, options: Options, times: calibrate_comm
     if options.as_json:
         console.print_json({"source": options.source, **report.model_dump(mode="json")})
     else:
-        evaluation_text.show_detection(report)
+        evaluation_tables.show_detection(report)
     return 0
 
 

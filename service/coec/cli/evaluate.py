@@ -10,9 +10,23 @@ from typing import Any, cast
 from pydantic import ValidationError
 from rich.progress import Progress
 
-from coec.adapters.depth import open_depth
-from coec.adapters.evaluation_report import (
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.files import output
+from coec.calibration.ports import DepthModel
+from coec.calibration.types import Window
+from coec.cli import calibrate as calibrate_command
+from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
+from coec.errors import CalibrationError, UsageError
+from coec.evaluation import experiments, statistics
+from coec.evaluation.detection import require_enough
+from coec.evaluation.experiments import Bench, Stages
+from coec.evaluation.split_halves import Halves
+from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
+from coec.geometry.cameras import name_of
+from coec.reports import console, evaluation_tables
+from coec.reports.evaluation_documents import (
     angle_spread_of,
+    detection_of,
     frames_point_of,
     halves_of,
     in_degrees,
@@ -20,21 +34,10 @@ from coec.adapters.evaluation_report import (
     spread_of,
     verdicts_of,
 )
-from coec.calibration import evaluation
-from coec.calibration.detection import require_enough
-from coec.calibration.evaluation import FramesPoint, Outcome, SlicePoint
-from coec.calibration.halves import Halves
-from coec.calibration.ports import DepthModel
-from coec.calibration.values import Window
-from coec.cli import calibrate as calibrate_command
-from coec.cli import console, evaluation_bench, evaluation_text, files, windows
-from coec.cli.evaluation_bench import Bench, Stages
-from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
-from coec.errors import CalibrationError, UsageError
-from coec.geometry.cameras import name_of
 from coec.schemas.base import to_json
 from coec.schemas.evaluation import ComparisonReport, DetectionReport, EvaluationReport
 from coec.schemas.replies import Vector6
+from coec.sources import windows
 
 MARGIN_DEG, MARGIN_M = 5.0, 0.2
 REACH_MARGIN_DEG, REACH_MARGIN_M = 3.0, 0.15
@@ -108,13 +111,13 @@ def run(options: Options) -> int:
         else:
             document, _ = _evaluate(options, subject, stages)
     if options.output is not None:
-        files.write(options.output / "report.json", to_json(document))
+        output.write(options.output / "report.json", to_json(document))
     if options.as_json:
         console.print_json(document.model_dump(mode="json"))
     elif isinstance(document, ComparisonReport):
-        evaluation_text.show_comparison(document)
+        evaluation_tables.show_comparison(document)
     else:
-        evaluation_text.show(document)
+        evaluation_tables.show(document)
     return 0
 
 
@@ -164,7 +167,7 @@ def _subject(options: Options, stages: Stages) -> _Subject:
     if options.camera_model is not None:
         window, _ = calibrate_command.refitted(window, options.camera_model)
     model = open_depth(configuration_of(_first_of(options), loaded.configuration).depth, LimitsConfig())
-    depth = evaluation_bench.inferred(window, model, stages.begin("depth", len(window.pairs)))
+    depth = experiments.inferred(window, model, stages.begin("depth", len(window.pairs)))
     return _Subject(window, model, depth, loaded.configuration, loaded.vehicle)
 
 
@@ -194,13 +197,13 @@ def _compare(options: Options, subject: _Subject, bars: Progress, stages: Stages
             not_evaluated[method] = str(error)
             continue
         if folder is not None:
-            files.write(folder / "report.json", to_json(reports[method]))
+            output.write(folder / "report.json", to_json(reports[method]))
         heard(1, "")
     if not reports:
         raise CalibrationError("; ".join(f"{method}: {reason}" for method, reason in not_evaluated.items()))
     if options.output is not None:
         # matplotlib takes a second to import.
-        from coec.cli import evaluation_pictures
+        from coec.reports import evaluation_pictures
 
         of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
         evaluation_pictures.write_comparison(options.output, subject.window.window_id, of_starts, outcomes)
@@ -216,17 +219,17 @@ def _evaluate(options: Options, subject: _Subject, stages: Stages) -> tuple[Eval
         CalibrationError: there is no result even from the source's calibration.
     """
     configuration = configuration_of(options, subject.recorded)
-    bench = Bench(subject.window, subject.depth, evaluation_bench.greys_of(subject.window), configuration)
+    bench = Bench(subject.window, subject.depth, experiments.greys_of(subject.window), configuration)
     done = _experiments(options, subject, bench, stages)
     if options.output is not None:
         # matplotlib takes a second to import.
-        from coec.cli import evaluation_pictures
+        from coec.reports import evaluation_pictures
 
         of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
         draw = stages.begin("draw", None)
         evaluation_pictures.write(options.output, bench, of_starts, done.outcomes, done.frames, done.slices, draw)
-        table = evaluation_text.csv_of(bench.reference, done.outcomes)
-        files.write(options.output / "starts.csv", table.encode())
+        table = evaluation_tables.csv_of(bench.reference, done.outcomes)
+        output.write(options.output / "starts.csv", table.encode())
     return _report(options, bench, subject.vehicle, done, stages.elapsed_s()), done.outcomes
 
 
@@ -237,25 +240,26 @@ def _experiments(options: Options, subject: _Subject, bench: Bench, stages: Stag
         # With the rig of the whole: it may have another camera model.
         return replace(loaded.window, rig=subject.window.rig)
 
-    poses = evaluation_bench.poses_of(bench, options.directions, options.rotation_deg, options.translation_m)
-    from_reference = evaluation_bench.from_reference(bench, stages)
-    outcomes = evaluation_bench.from_starts(bench, poses, stages)
-    frames = evaluation_bench.against_frames(bench, poses, stages) if options.against_frames else ()
-    slices = evaluation_bench.against_slice(bench, subject.model, cut, poses, stages) if options.against_slice else ()
+    poses = experiments.poses_of(bench, options.directions, options.rotation_deg, options.translation_m)
+    from_reference = experiments.from_reference(bench, stages)
+    outcomes = experiments.from_starts(bench, poses, stages)
+    frames = experiments.against_frames(bench, poses, stages) if options.against_frames else ()
+    slices = experiments.against_slice(bench, subject.model, cut, poses, stages) if options.against_slice else ()
     halves = None
     if options.halves:
         radii = (radians(options.rotation_deg), options.translation_m)
-        halves = evaluation_bench.in_halves(bench, options.halves, *radii, stages)
+        halves = experiments.in_halves(bench, options.halves, *radii, stages)
     detection = None
     if options.detection:
-        detection = evaluation_bench.detected(bench, options.detection, evaluation_bench.LOOKS, stages)
+        tried = experiments.detected(bench, options.detection, experiments.LOOKS, stages)
+        detection = detection_of(tried, options.detection, len(bench.window.pairs))
     return _Experiments(from_reference, outcomes, frames, slices, halves, detection)
 
 
 def _report(
     options: Options, bench: Bench, vehicle: str, done: _Experiments, elapsed_s: dict[str, float]
 ) -> EvaluationReport:
-    statistics = evaluation.summarise(done.outcomes)
+    summary = statistics.summarise(done.outcomes)
     search = bench.configuration.search
     solved = done.from_reference.trial.estimate
     if solved is None:
@@ -273,25 +277,25 @@ def _report(
         start_translation_m=options.translation_m,
         search_rotation_deg=search.rotation_deg,
         search_translation_m=search.translation_m if search.dof == 6 else 0.0,
-        hit_rotation_deg=degrees(evaluation.HIT_RAD),
-        hit_translation_m=evaluation.HIT_M if search.dof == 6 else None,
-        starts=statistics.starts,
-        hits=statistics.hits,
-        hit_rate=statistics.hit_rate,
-        rotation_deg=angle_spread_of(statistics.rotation_rad),
-        translation_m=spread_of(statistics.translation_m),
-        median=cast("Vector6", in_degrees(statistics.median)),
-        bias=in_degrees(statistics.bias),
-        std=in_degrees(statistics.std),
-        rms=in_degrees(statistics.rms),
-        sigma=in_degrees(statistics.sigma),
+        hit_rotation_deg=degrees(statistics.HIT_RAD),
+        hit_translation_m=statistics.HIT_M if search.dof == 6 else None,
+        starts=summary.starts,
+        hits=summary.hits,
+        hit_rate=summary.hit_rate,
+        rotation_deg=angle_spread_of(summary.rotation_rad),
+        translation_m=spread_of(summary.translation_m),
+        median=cast("Vector6", in_degrees(summary.median)),
+        bias=in_degrees(summary.bias),
+        std=in_degrees(summary.std),
+        rms=in_degrees(summary.rms),
+        sigma=in_degrees(summary.sigma),
         from_reference=cast("Vector6", in_degrees(done.from_reference.error)),
-        solve_s=spread_of(statistics.solve_s),
-        evaluations=spread_of(statistics.evaluations),
-        classified_correctly=statistics.classified_correctly,
-        verdicts=verdicts_of(statistics.verdicts),
-        stop_reasons=statistics.stop_reasons,
-        worst_start=evaluation.worst(done.outcomes),
+        solve_s=spread_of(summary.solve_s),
+        evaluations=spread_of(summary.evaluations),
+        classified_correctly=summary.classified_correctly,
+        verdicts=verdicts_of(summary.verdicts),
+        stop_reasons=summary.stop_reasons,
+        worst_start=statistics.worst(done.outcomes),
         frames=tuple(frames_point_of(point) for point in done.frames),
         slices=tuple(slice_point_of(point) for point in done.slices),
         halves=None if done.halves is None else halves_of(done.halves),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from coec.adapters.depth import models_folder
-from coec.adapters.model_cards import find_card, list_models
-from coec.adapters.onnx_depth import file_identity
-from coec.cli import console
+from coec.adapters.depth.maps import models_folder
+from coec.adapters.depth.model_cards import find_card, list_models
+from coec.adapters.depth.onnx_network import file_identity
 from coec.errors import ModelError
+from coec.reports import console
 
 
 def show(file: Path, *, as_json: bool) -> int:

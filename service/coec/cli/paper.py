@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from coec.adapters import paper_plots, plots
-from coec.adapters.depth import open_depth
-from coec.calibration import evaluation, paper, starts
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.files import output
 from coec.calibration.estimators import depth_features, look
-from coec.calibration.evaluation import Outcome
 from coec.calibration.ports import Silence
 from coec.cli import calibrate as calibrate_command
-from coec.cli import console, files, paper_published, windows
-from coec.cli.evaluation_bench import Bench, Stages, greys_of, inferred
-from coec.cli.paper_speed import run_times
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import SourceError
-from coec.sources import open_source
+from coec.evaluation import paper, paper_published, starts, statistics
+from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
+from coec.evaluation.paper_speed import run_times
+from coec.evaluation.statistics import Outcome
+from coec.reports import console, paper_plots, plots
+from coec.sources import open_source, windows
 
 FAR_DEG, DRIVE_DEG = 25.0, (5.0, 10.0)
 """Starts of the published experiments."""
@@ -80,7 +80,7 @@ def run(options: Options) -> int:
             "run_times": [asdict(row) for row in run_times(options.source, configuration, stages)],
             "published": paper_published.document(),
         }
-    written = files.write(options.output / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
+    written = output.write(options.output / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
     if options.as_json:
         console.print_json(document)
     else:
@@ -115,7 +115,7 @@ def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> dict[str
     title = (
         f"{bench.window.window_id}: equation (2), limits learned on the other half of the pairs; flagged at {shares}"
     )
-    files.write(options.output / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
+    output.write(options.output / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
     return {"limits": asdict(limits), "moves": rows}
 
 
@@ -126,13 +126,13 @@ def _bullseye(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
     for start in starts.starts(bench.reference, options.runs, radians(FAR_DEG), 0.0):
         outcomes.append(far.solve(start))
         heard(len(outcomes), f"{sum(outcome.hit for outcome in outcomes)} hits")
-    of = evaluation.summarise(outcomes)
+    of = statistics.summarise(outcomes)
     title = (
         f"{bench.window.window_id}: {options.objective}, {options.runs} runs from {FAR_DEG:g}°: {of.hits} hits, "
         f"{100 * of.classified_correctly:.0f} % classified correctly"
     )
     spheres = {"rotation vectors of the starts": starts.directions(options.runs)}
-    files.write(options.output / "bullseye.png", plots.bullseye(outcomes, spheres, title))
+    output.write(options.output / "bullseye.png", plots.bullseye(outcomes, spheres, title))
     return {"start_deg": FAR_DEG, **_figures(outcomes)}
 
 
@@ -171,7 +171,7 @@ def _drive(bench: Bench, options: Options, stages: Stages) -> list[dict[str, Any
     ]
     title = f"{bench.window.window_id}: {options.objective}, {count} windows"
     named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in found.items()}
-    files.write(options.output / "drive.png", paper_plots.drive(named, title))
+    output.write(options.output / "drive.png", paper_plots.drive(named, title))
     return rows
 
 
@@ -214,7 +214,7 @@ def _reaching(configuration: CalibrationConfig, radius_deg: float) -> Calibratio
 
 
 def _figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    of = evaluation.summarise(outcomes)
+    of = statistics.summarise(outcomes)
     errors = np.degrees([outcome.error[:3] for outcome in outcomes])
     return {
         "runs": of.starts,

@@ -14,12 +14,13 @@ from typing import Literal
 
 import numpy as np
 
-from coec.adapters.player import Frame, Played, Player, Streams, repeated
-from coec.adapters.zenoh_client import connected
-from coec.calibration.values import CameraFrame, LidarFrame
-from coec.cli import DEFAULT_CONNECT, console
+from coec.adapters.zenoh.client import connected
+from coec.adapters.zenoh.player import Frame, Played, Player, Streams, repeated
+from coec.calibration.types import CameraFrame, LidarFrame
+from coec.cli import DEFAULT_CONNECT
 from coec.config import Config, PairConfig, load_config
 from coec.errors import SourceError, UsageError
+from coec.reports import console
 from coec.sources import Recording, open_source
 
 CONNECT_S = 10.0

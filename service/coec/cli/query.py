@@ -11,10 +11,10 @@ from typing import Any
 
 import zenoh
 
-from coec.adapters.zenoh_client import RemoteError, Reply, ask, ask_one, connected, nobody
-from coec.cli import console, render
-from coec.cli.files import OutputError
+from coec.adapters.files.output import OutputError
+from coec.adapters.zenoh.client import RemoteError, Reply, ask, ask_one, connected, nobody
 from coec.errors import UsageError
+from coec.reports import console, replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import MAX_LENGTH, VERSION_CHUNK, Keys
 from coec.schemas.replies import StatusReply, WindowInfo, WindowsReply
@@ -134,7 +134,7 @@ def _value(reply: Reply) -> Any:
 
 
 def _render(reply: Reply, kind: str | None) -> None:
-    shown = render.BY_KIND.get(kind or "")
+    shown = replies.BY_KIND.get(kind or "")
     if shown is not None:
         shown(reply.payload)
     elif reply.encoding.startswith("application/json"):

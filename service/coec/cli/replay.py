@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from coec.adapters.depth import open_depth
-from coec.adapters.images import GreyImages
-from coec.adapters.mcap_windows import read_result, read_window
-from coec.adapters.wire import result_of
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.files.conversions import result_of
+from coec.adapters.images.codec import GreyImages
+from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.calibrator import calibrate
-from coec.cli import console
 from coec.cli.calibrate import StageTimes
 from coec.config import LimitsConfig
 from coec.errors import WindowError
+from coec.reports import console
 from coec.schemas.base import to_json
 
 

@@ -27,7 +27,7 @@ def run(path: Path, *, embedded_router: bool, state_dir: Path | None) -> int:
         os.environ.setdefault(name, "1")
     # After the configuration has been read, so that a mistake in it is told at once.
     from coec import daemon
-    from coec.adapters import allocator
+    from coec.adapters.system import allocator
 
     allocator.share_arenas()
     return daemon.run(config, read)

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coec.adapters import cdr
-from coec.adapters.bag_writer import Frame, write_bag
-from coec.calibration.values import CameraFrame
-from coec.cli import console
-from coec.cli.files import OutputError, write
+from coec.adapters.files.output import OutputError, write
+from coec.adapters.mcap.bag_writer import Frame, write_bag
+from coec.adapters.ros import cdr
+from coec.calibration.types import CameraFrame
 from coec.errors import UsageError
+from coec.reports import console
 from coec.simulation.source import open_sim
 
 if TYPE_CHECKING:

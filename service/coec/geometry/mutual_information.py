@@ -16,9 +16,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.bundles import BUNDLE, Bundles
 from coec.geometry.cameras import Camera
 from coec.geometry.compiler import njit, prange
+from coec.geometry.culling import BUNDLE, Bundles
 from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Limits, certain_pixels, exact_pixel, filter_of
 from coec.geometry.prefetch import prefetch
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera, project_point, unproject_point
 from coec.geometry.compiler import njit
-from coec.geometry.rows import rows_of
+from coec.geometry.vectors import rows_of
 
 
 @njit(cache=True, error_model="numpy")

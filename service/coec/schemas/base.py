@@ -72,7 +72,7 @@ def from_json(model: type[M], payload: bytes) -> M:
 
 def from_msgpack(model: type[M], payload: bytes) -> M:
     """The model that `to_msgpack` wrote, or a newer writer's. For replies, that is for senders one has asked;
-    frames come from anywhere and pass through `coec.adapters.msgpack_frames`, which is stricter.
+    frames come from anywhere and pass through `coec.adapters.frames.msgpack_frames`, which is stricter.
 
     Raises:
         DecodeError: not msgpack, or not this model.

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images import encode_depth_png, encode_jpeg
-from coec.calibration.values import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
+from coec.adapters.images.codec import encode_depth_png, encode_jpeg
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera, build
 from coec.geometry.se3 import inverse, perturb

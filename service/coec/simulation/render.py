@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.values import Matrix4
+from coec.calibration.types import Matrix4
 from coec.geometry.cameras import Camera
 from coec.geometry.compiler import njit, prange
 from coec.geometry.projection import unproject

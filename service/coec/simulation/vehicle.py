@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.values import Matrix4
+from coec.calibration.types import Matrix4
 from coec.geometry.se3 import rotation_exp, rotation_log
 from coec.simulation.mesh import Material, Mesh, join, quads
 from coec.simulation.road import Road

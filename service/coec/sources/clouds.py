@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coec.calibration.values import LidarFrame
+from coec.calibration.types import LidarFrame
 from coec.errors import SourceError
 from coec.sources.pcd import MAX_POINTS, Columns, PcdError, parse_pcd
 

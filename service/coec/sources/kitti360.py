@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from coec.calibration.values import EgoMotion, Matrix4, Rig, SweepTiming
+from coec.calibration.types import EgoMotion, Matrix4, Rig, SweepTiming
 from coec.errors import SourceError
 from coec.geometry import cameras, se3
 from coec.sources.clouds import load_cloud

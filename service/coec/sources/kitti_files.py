@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images import probe
-from coec.calibration.values import CameraFrame, EncodedImage
+from coec.adapters.images.codec import probe
+from coec.calibration.types import CameraFrame, EncodedImage
 from coec.config import LimitsConfig
 from coec.errors import DecodeError, SourceError
 

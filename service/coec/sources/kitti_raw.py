@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.values import EgoMotion, Matrix4, Rig, SweepTiming
+from coec.calibration.types import EgoMotion, Matrix4, Rig, SweepTiming
 from coec.errors import SourceError
 from coec.geometry import cameras
 from coec.sources.clouds import load_cloud

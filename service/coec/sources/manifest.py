@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coec.adapters.images import encode_depth_png, probe, raw_image
-from coec.adapters.rig import camera_of, load_mask, rigid_matrix
-from coec.calibration.values import CameraFrame, EgoMotion, EncodedImage, ImageFormat, Rig
+from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
+from coec.adapters.images.codec import encode_depth_png, probe, raw_image
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, Rig
 from coec.config import CameraIntrinsics, LimitsConfig, Matrix4x4, Name, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.sources.clouds import load_cloud

@@ -18,12 +18,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
-from coec.adapters import cdr
-from coec.adapters.mcap_files import Channel, McapDamaged, MessageReader, Schema, read_records
-from coec.adapters.mcap_files import Message as McapMessage
-from coec.adapters.mcap_windows import is_window, read_window
-from coec.adapters.rig import camera_of, load_mask, rigid_matrix
-from coec.calibration.values import CameraFrame, FramePair, Matrix4, Rig
+from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
+from coec.adapters.mcap.files import Channel, McapDamaged, MessageReader, Schema, read_records
+from coec.adapters.mcap.files import Message as McapMessage
+from coec.adapters.mcap.windows import is_window, read_window
+from coec.adapters.ros import cdr
+from coec.calibration.types import CameraFrame, FramePair, Matrix4, Rig
 from coec.config import CalibrationConfig, CameraIntrinsics, LimitsConfig, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.geometry import cameras

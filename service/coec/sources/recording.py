@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-from coec.calibration.values import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 from coec.config import CalibrationConfig
 from coec.errors import UsageError
 

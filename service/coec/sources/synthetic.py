@@ -14,8 +14,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images import encode_depth_png, encode_jpeg
-from coec.calibration.values import (
+from coec.adapters.images.codec import encode_depth_png, encode_jpeg
+from coec.calibration.types import (
     CameraFrame,
     EgoMotion,
     EncodedImage,

@@ -7,14 +7,14 @@ import pytest
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.adapters.depth import open_depth
-from coec.adapters.images import encode_jpeg
-from coec.adapters.model_cards import CARDS, find_card
-from coec.adapters.onnx_depth import file_identity
-from coec.calibration.depth_quality import spearman
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.depth.model_cards import CARDS, find_card
+from coec.adapters.depth.onnx_network import file_identity
+from coec.adapters.images.codec import encode_jpeg
 from coec.calibration.ports import DepthModel
-from coec.calibration.values import CameraFrame, EncodedImage, ImageFormat
+from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import DepthConfig, LimitsConfig
+from coec.evaluation.depth_quality import spearman
 from coec.simulation.drive import DriveConfig, SimulatedDrive
 from coec.simulation.training import recipe
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from coec.calibration import causes, monitor
-from coec.calibration.causes import BENT_MOUNT, CAUSES, Cause
 from coec.calibration.lifecycle.states import MEANING, STATES, HealthState, markdown
+from coec.calibration.monitor import change_detector, sensor_faults
+from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, Cause
 
 
 def page() -> str:
@@ -25,11 +25,11 @@ def page() -> str:
         f"{markdown()}\n"
         "## What the monitor needs\n\n"
         "Looks add up: a flagged look at pairs that were not counted yet adds 1, a clear one takes 1 off, a flagged\n"
-        f"one with faint edges adds {monitor.WEAK_SHARE:g}.\n"
-        f"`suspect` from {monitor.SUSPECT_AT:g} on, `miscalibrated` from {monitor.CONFIRMED_AT:g} on, clear again "
-        f"below {monitor.CLEAR_BELOW:g}; never more than {monitor.MOST:g}.\n"
-        f"A cause in the data is believed from {monitor.BLIND_AT:g} on; dirt is one after the same blocks of the\n"
-        f"image have shown no contrast for {causes.DIRTY_LOOKS:g} looks.\n\n"
+        f"one with faint edges adds {change_detector.WEAK_SHARE:g}.\n"
+        f"`suspect` from {change_detector.SUSPECT_AT:g} on, `miscalibrated` from {change_detector.CONFIRMED_AT:g} on, "
+        f"clear again below {change_detector.CLEAR_BELOW:g}; never more than {change_detector.MOST:g}.\n"
+        f"A cause in the data is believed from {change_detector.BLIND_AT:g} on; dirt is one after the same blocks\n"
+        f"of the image have shown no contrast for {sensor_faults.DIRTY_LOOKS:g} looks.\n\n"
         f"## Causes\n\n{told}"
     )
 

@@ -13,13 +13,13 @@ from math import degrees, fsum, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.causes import CAUSES
-from coec.calibration.fusion import Measurement, StepState, Track, absorb, prior_sigma
 from coec.calibration.lifecycle import policy
 from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
-from coec.calibration.monitor import MonitorState, Observation, Outcome, diagnose
-from coec.calibration.monitor import after_observation as look_taken
-from coec.calibration.values import Decision, Estimate, Matrix4, Reason, Rig
+from coec.calibration.monitor.change_detector import MonitorState, Observation, Outcome, diagnose
+from coec.calibration.monitor.change_detector import after_observation as look_taken
+from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
+from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
 from coec.config import FusionConfig, PolicyConfig
 from coec.errors import CoecError
 from coec.geometry import se3

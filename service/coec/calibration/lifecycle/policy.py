@@ -9,7 +9,7 @@ from math import degrees, fsum
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.values import Matrix4, Reason
+from coec.calibration.types import Matrix4, Reason
 from coec.config import PolicyConfig
 from coec.geometry import se3
 

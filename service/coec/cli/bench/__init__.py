@@ -20,19 +20,20 @@ import numba
 import numpy as np
 from rich.progress import Progress
 
-from coec.adapters.depth import open_depth
-from coec.adapters.images import GreyImages
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
-from coec.calibration.objective import MutualInformation, SearchBox
+from coec.calibration.objective.mutual_information import MutualInformation, SearchBox
 from coec.calibration.ports import Silence
-from coec.calibration.search import box_of, maximise
-from coec.cli import console, windows
+from coec.calibration.search.local_search import box_of, maximise
 from coec.cli.bench import live, rows, scene, worker
 from coec.cli.calibrate import StageTimes
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
 from coec.geometry import se3
 from coec.geometry.mutual_information import mutual_information
 from coec.geometry.plain_forms import by_numpy, by_scalar_loop
+from coec.reports import console
+from coec.sources import windows
 
 FRAMES = 25
 FRAME_COUNTS = (5, 25, 50, 200)

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from coec.adapters.rig import intrinsics_config
-from coec.adapters.worker import PACKAGE_ROOT
-from coec.adapters.zenoh_client import ConnectionFailedError, ask_one, connected
+from coec.adapters.files.rig import intrinsics_config
+from coec.adapters.zenoh.client import ConnectionFailedError, ask_one, connected
 from coec.cli.bench import load, scene
 from coec.cli.bench.process import ProcessReading
 from coec.config import (
@@ -36,6 +35,7 @@ from coec.config import (
     ZenohConfig,
 )
 from coec.errors import NotFoundError
+from coec.runtime.worker.supervisor import PACKAGE_ROOT
 from coec.schemas.keys import Keys
 
 VEHICLE, PAIR = "bench", "front"

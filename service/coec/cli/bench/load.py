@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import zenoh
 
-from coec.adapters.msgpack_frames import encode_camera, encode_ego, encode_lidar
-from coec.adapters.zenoh_client import connected
-from coec.calibration.values import EgoMotion
+from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.adapters.zenoh.client import connected
+from coec.calibration.types import EgoMotion
 from coec.cli.bench import scene
 
 CAMERA_HZ, SWEEP_EVERY = 30.0, 3

@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from coec.cli import console
+from coec.reports import console
 
 
 @dataclass(frozen=True, slots=True)

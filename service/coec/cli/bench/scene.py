@@ -10,9 +10,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images import encode_jpeg
-from coec.calibration.objective import Features, MutualInformation, SearchBox, build_mutual_information
-from coec.calibration.values import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Matrix4, Rig
+from coec.adapters.images.codec import encode_jpeg
+from coec.calibration.objective.mutual_information import (
+    Features,
+    MutualInformation,
+    SearchBox,
+    build_mutual_information,
+)
+from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.config import ObjectiveConfig
 from coec.geometry.cameras import Camera, build, name_of, scaled
 from coec.geometry.mutual_information import BinnedFrames

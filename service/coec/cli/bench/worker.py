@@ -9,11 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from coec.adapters.looks import pack_pairs, pack_pose
-from coec.adapters.mcap_windows import WindowWriter, read_window
-from coec.adapters.rig import intrinsics_config
-from coec.adapters.worker import Errand, Solved, SolveJob, Worker, WorkerState
-from coec.calibration.values import Reason
+from coec.adapters.files.rig import intrinsics_config
+from coec.adapters.mcap.windows import WindowWriter, read_window
+from coec.calibration.types import Reason
 from coec.cli.bench import scene
 from coec.cli.bench.process import ProcessReading
 from coec.config import (
@@ -27,6 +25,8 @@ from coec.config import (
     StateConfig,
 )
 from coec.errors import CalibrationError
+from coec.runtime.worker.messages import pack_pairs, pack_pose
+from coec.runtime.worker.supervisor import Errand, Solved, SolveJob, Worker, WorkerState
 
 CAMERA = "double_sphere"
 POLL_S, TIMEOUT_S = 0.005, 300.0

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coec.adapters.rig import mask_to_png
-from coec.adapters.zenoh_client import connected
-from coec.calibration.values import Matrix4
-from coec.cli import console, files
-from coec.cli.commented_yaml import commented_yaml
+from coec.adapters.files import output
+from coec.adapters.files.rig import mask_to_png
+from coec.adapters.zenoh.client import connected
+from coec.calibration.types import Matrix4
 from coec.cli.demo import report, story
 from coec.cli.demo.daemon import Daemon, DemoError, free_endpoint, running
 from coec.cli.demo.outcome import Outcome, outcome_of
@@ -29,6 +28,8 @@ from coec.cli.demo.vehicle import NS_PER_S, Vehicle
 from coec.cli.demo.watch import ASK_S, Seen, Watch
 from coec.cli.query import download_window
 from coec.config import Config
+from coec.reports import console
+from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
 
 if TYPE_CHECKING:
@@ -90,9 +91,9 @@ def _configure(drive: SimulatedDrive, folder: Path) -> Config:
     """Writes the configuration of the service, and what it names, into the folder."""
     rig = drive.rig
     mask = np.ones((rig.camera.height, rig.camera.width), bool) if rig.mask is None else rig.mask
-    files.write(folder / "mask.png", mask_to_png(mask))
+    output.write(folder / "mask.png", mask_to_png(mask))
     config = story.service_config(rig, Path("mask.png"), free_endpoint())
-    files.write(folder / "coec.yaml", commented_yaml(config).encode())
+    output.write(folder / "coec.yaml", commented_yaml(config).encode())
     return config
 
 

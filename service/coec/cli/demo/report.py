@@ -11,20 +11,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images import decode_bgr, encode_png
-from coec.adapters.mcap_windows import read_result, read_window
-from coec.adapters.overlay import draw
-from coec.adapters.timeline_plot import STATE_COLOURS, timeline
-from coec.calibration.motion import compensate
-from coec.calibration.values import Matrix4, Window
-from coec.cli import console, files, pictures, windows
+from coec.adapters.files.output import write as write_file
+from coec.adapters.images.codec import decode_bgr, encode_png
+from coec.adapters.mcap.windows import read_result, read_window
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.types import Matrix4, Window
 from coec.cli.demo import story
 from coec.cli.demo.outcome import ALARM, Outcome, is_repaired
 from coec.cli.demo.watch import Moment, Seen, Watch
 from coec.config import LimitsConfig
 from coec.geometry import cameras
+from coec.reports import console, pictures
+from coec.reports.overlay import draw
+from coec.reports.timeline_plot import STATE_COLOURS, timeline
 from coec.schemas import replies
 from coec.schemas.base import to_json
+from coec.sources import windows
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
@@ -54,7 +56,7 @@ def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen
         OutputError: a file cannot be written.
     """
     written = [] if window is None else [window]
-    plot = files.write(output / "timeline.png", timeline(watch.series, _marks(outcome), story.MAX_ERROR_DEG, _title()))
+    plot = write_file(output / "timeline.png", timeline(watch.series, _marks(outcome), story.MAX_ERROR_DEG, _title()))
     written.append(plot)
     shown = {"timeline": plot}
     result = None
@@ -64,9 +66,9 @@ def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen
         written += pictured.values()
         shown |= pictured
     if result is not None:
-        written.append(files.write(output / "result.json", to_json(result)))
+        written.append(write_file(output / "result.json", to_json(result)))
     document = page(shown, watch.timeline, outcome, result, window)
-    written.append(files.write(output / "report.html", document.encode()))
+    written.append(write_file(output / "report.html", document.encode()))
     return Left(tuple(written), result)
 
 
@@ -104,7 +106,7 @@ def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: See
     whole = pictures.write_overlays(output, window, poses, configuration.motion_compensation)
     cloud = compensate(pictures.middle(window), window.rig, enabled=configuration.motion_compensation)
     near = {
-        f"closeup_{name}": files.write(
+        f"closeup_{name}": write_file(
             output / f"closeup_{name}.png", _close_up(window, cloud, *poses[f"overlay_{name}"])
         )
         for name in ("before", "after")

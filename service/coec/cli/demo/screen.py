@@ -12,9 +12,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from coec.cli import console
 from coec.cli.demo import story
 from coec.cli.demo.watch import Seen, Watch
+from coec.reports import console
 
 BARS = "▁▂▃▄▅▆▇█"
 BAR_WIDTH = 48

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coec.adapters.player import Streams
-from coec.adapters.rig import intrinsics_config, matrix_rows
-from coec.calibration.values import Rig
+from coec.adapters.files.rig import intrinsics_config, matrix_rows
+from coec.adapters.zenoh.player import Streams
+from coec.calibration.types import Rig
 from coec.config import (
     CameraConfig,
     Config,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from coec.adapters.player import CAMERA, Frame, Played, Player, Streams
+from coec.adapters.zenoh.player import CAMERA, Frame, Played, Player, Streams
 
 if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive

@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import zenoh
 
-from coec.adapters.zenoh_client import RemoteError, ask, ask_one
-from coec.calibration.values import Matrix4
-from coec.cli import windows
+from coec.adapters.zenoh.client import RemoteError, ask, ask_one
+from coec.calibration.types import Matrix4
 from coec.cli.demo.pace import NS_PER_S, Pace, at_rest
 from coec.errors import NotFoundError
 from coec.geometry import se3
 from coec.schemas import replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import Keys
+from coec.sources import windows
 
 ASK_S = 10.0
 """For one answer, on a machine that also draws the street."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.cameras.dispatch import project_point
 from coec.geometry.cameras.registry import Camera
-from coec.geometry.rows import rows_of
+from coec.geometry.vectors import rows_of
 
 _STEP = 1e-3
 """Radians: within it every camera model is linear."""

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.values import Matrix4
+from coec.calibration.types import Matrix4
 from coec.geometry.se3 import rotation_exp
 from coec.simulation.mesh import Material, Mesh, box, join, quads
 from coec.simulation.props import car

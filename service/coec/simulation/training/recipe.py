@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.values import Matrix4
+from coec.calibration.types import Matrix4
 from coec.geometry.cameras import Camera, build
 from coec.geometry.se3 import rotation_exp
 from coec.simulation.exposure import Lens, dirt_cover, expose

@@ -1,0 +1,1 @@
+"""Depth maps: networks with their cards, and maps that came with the frames."""

@@ -1,0 +1,187 @@
+"""Estimates to wire models and back. The way there and back gives the same bytes, so that what one process
+solved and another serves, stores or replays is one result."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.lifecycle import PairState
+from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.types import (
+    Decision,
+    Estimate,
+    Matrix4,
+    Metric,
+    Optimum,
+    Reason,
+    Rig,
+    StopReason,
+    Verdict,
+)
+from coec.geometry.se3 import quaternion_xyzw_from_rotation
+from coec.schemas import replies
+
+
+def transform_of(T: Matrix4) -> replies.Transform:
+    """The wire form of a rigid (4, 4) transform; its matrix holds the same doubles."""
+    rows = tuple(tuple(float(v) for v in row) for row in T)
+    return replies.Transform(
+        matrix=cast("tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]", rows),
+        translation_m=cast("replies.Vector3", tuple(float(v) for v in T[:3, 3])),
+        quaternion_xyzw=cast("replies.Row4", tuple(float(v) for v in quaternion_xyzw_from_rotation(T[:3, :3]))),
+    )
+
+
+def matrix_of(transform: replies.Transform) -> Matrix4:
+    """(4, 4) float64, the same doubles."""
+    return np.array(transform.matrix, dtype=np.float64)
+
+
+def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.CalibrationResult:
+    """Everything of an estimate, for programs and people. NaN becomes null, infinity the largest double."""
+    optimum = estimate.optimum
+    return replies.CalibrationResult(
+        vehicle=vehicle,
+        pair=rig.pair,
+        camera_frame=rig.camera_frame,
+        lidar_frame=rig.lidar_frame,
+        window_id=estimate.window_id,
+        data_stamp_ns=estimate.data_stamp_ns,
+        pairs=estimate.pairs,
+        camera_from_lidar=transform_of(optimum.T_camera_lidar),
+        correction=cast("replies.Vector6", tuple(float(v) for v in _in_degrees(estimate.correction))),
+        sigma=degrees_or_null(estimate.sigma),
+        correction_rad_m=cast("replies.Vector6", tuple(float(v) for v in estimate.correction)),
+        sigma_rad_m=_maybe6(estimate.sigma),
+        solved=cast("replies.Flags6", tuple(bool(v) for v in estimate.solved)),
+        unobservable=cast("replies.Flags6", tuple(bool(v) for v in estimate.unobservable)),
+        status="accepted" if estimate.verdict.decision is Decision.ACCEPTED else "failed",
+        verdict=replies.Verdict(
+            decision=estimate.verdict.decision.value,
+            reasons=tuple(replies.Reason(code=r.code, text=r.text) for r in estimate.verdict.reasons),
+        ),
+        metrics={metric.name: metric_of(metric) for metric in estimate.verdict.metrics},
+        score=_number(optimum.score),
+        score_at_start=_number(optimum.score_at_start),
+        mi=_number(optimum.mi),
+        overlap=_number(optimum.overlap),
+        points_in_view=optimum.points_in_view,
+        evaluations=optimum.evaluations,
+        stop_reason=optimum.stop_reason.value,
+        first_derivative=_maybe6(optimum.first_derivative),
+        second_derivative=_maybe6(optimum.second_derivative),
+        compensation=dict(estimate.compensation),
+        depth_identity=estimate.depth_identity,
+        config_hash=estimate.config_hash,
+    )
+
+
+def estimate_of(result: replies.CalibrationResult) -> Estimate:
+    """The estimate that `result_of` wrote: every number the same double, metrics in order of their names."""
+    return Estimate(
+        window_id=result.window_id,
+        data_stamp_ns=result.data_stamp_ns,
+        pairs=result.pairs,
+        optimum=Optimum(
+            T_camera_lidar=matrix_of(result.camera_from_lidar),
+            score=_or_nan(result.score),
+            score_at_start=_or_nan(result.score_at_start),
+            mi=_or_nan(result.mi),
+            overlap=_or_nan(result.overlap),
+            points_in_view=result.points_in_view,
+            evaluations=result.evaluations,
+            stop_reason=StopReason(result.stop_reason),
+            first_derivative=_array(result.first_derivative),
+            second_derivative=_array(result.second_derivative),
+        ),
+        verdict=Verdict(
+            decision=Decision(result.verdict.decision),
+            metrics=tuple(
+                Metric(name, _or_nan(metric.value), _limit_of(metric), metric.at_least)
+                for name, metric in sorted(result.metrics.items())
+            ),
+            reasons=tuple(Reason(reason.code, reason.text) for reason in result.verdict.reasons),
+        ),
+        correction=_array(result.correction_rad_m),
+        sigma=_array(result.sigma_rad_m),
+        solved=np.array(result.solved, dtype=np.bool_),
+        unobservable=np.array(result.unobservable, dtype=np.bool_),
+        compensation=dict(result.compensation),
+        depth_identity=result.depth_identity,
+        config_hash=result.config_hash,
+    )
+
+
+def metric_of(metric: Metric) -> replies.MetricReply:
+    """A figure with its limit."""
+    return replies.MetricReply(
+        value=_number(metric.value),
+        limit=None if math.isinf(metric.limit) else _number(metric.limit),
+        at_least=metric.at_least,
+        passed=bool(metric.passed),
+    )
+
+
+def look_of(observation: Observation, after: PairState) -> replies.LookReply:
+    """A look, and the state of the pair after it."""
+    drift = observation.drift
+    return replies.LookReply(
+        stamp_ns=observation.stamp_ns,
+        pair_stamps_ns=observation.pair_stamps_ns,
+        flagged=observation.flagged,
+        weak=observation.weak,
+        flagged_by_paper=observation.flagged_by_paper,
+        causes=tuple(replies.Reason(code=cause.code, text=cause.text) for cause in observation.causes),
+        metrics={metric.name: metric_of(metric) for metric in observation.metrics},
+        first_derivative=_maybe6(observation.first_derivative),
+        second_derivative=_maybe6(observation.second_derivative),
+        offset=degrees_or_null(observation.offset),
+        sigma=degrees_or_null(observation.sigma),
+        drift=None if drift is None else degrees_or_null(drift.value),
+        drift_sigma=None if drift is None else degrees_or_null(drift.sigma),
+        outcome=after.monitor.outcome.value,
+        evidence=after.monitor.evidence,
+        state=after.health.value,
+    )
+
+
+def _limit_of(metric: replies.MetricReply) -> float:
+    """No limit is one that every figure keeps."""
+    if metric.limit is not None:
+        return metric.limit
+    return -math.inf if metric.at_least else math.inf
+
+
+def degrees_or_null(rad_m: NDArray[np.float64]) -> replies.Maybe6:
+    """(6,) in the units of the wire; NaN becomes null."""
+    return _maybe6(_in_degrees(rad_m))
+
+
+def _in_degrees(rad_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate([np.rad2deg(rad_m[:3]), rad_m[3:]])
+
+
+def _number(value: float) -> float | None:
+    """JSON has neither NaN nor infinity. The largest double stands on the same side of every limit as
+    infinity."""
+    if math.isnan(value):
+        return None
+    return float(min(max(value, -sys.float_info.max), sys.float_info.max))
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _maybe6(values: Iterable[float]) -> replies.Maybe6:
+    return cast("replies.Maybe6", tuple(_number(float(value)) for value in values))
+
+
+def _array(values: Iterable[float | None]) -> NDArray[np.float64]:
+    return np.array([_or_nan(value) for value in values], dtype=np.float64)

@@ -1,0 +1,188 @@
+"""The rig in its three forms: configuration, value, and JSON with a mask image (`rig.json`, `mask.png` of a window)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coec.adapters.images.codec import decode_bgr, encode_png, probe
+from coec.calibration.types import Matrix4, Rig, SweepTiming
+from coec.config import CameraIntrinsics, LimitsConfig, Matrix4x4, PairConfig, SweepConfig, describe
+from coec.errors import ConfigError, DecodeError, WindowError
+from coec.geometry import cameras, se3
+
+
+class SweepDocument(BaseModel):
+    """`SweepTiming` in radians as it is, so that it reads back to the same bits."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    period_s: float = Field(gt=0)
+    sign: Literal[-1, 1]
+    stamp_azimuth_rad: float
+
+
+class RigDocument(BaseModel):
+    """`rig.json`: everything of a `Rig` but its mask. Floats are written so that they read back to the same bits."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    pair: str
+    camera: CameraIntrinsics
+    camera_frame: str
+    lidar_frame: str
+    T_camera_lidar_nominal: Matrix4x4
+    T_lidar_ego: Matrix4x4
+    sweep: SweepDocument | None = None
+
+
+def rig_of(pair: PairConfig) -> Rig:
+    """The rig that a configuration describes; reads its mask.
+
+    Raises:
+        ConfigError: intrinsics that their model refuses, a matrix that is not rigid, a mask that is absent, not an
+            image, or not of the camera's size. Names the pair and the key.
+    """
+    camera = _camera(pair.camera.intrinsics, f"pair {pair.name}, camera.intrinsics")
+    ego = pair.ego
+    return Rig(
+        pair=pair.name,
+        camera=camera,
+        camera_frame=pair.camera.frame_id,
+        lidar_frame=pair.lidar.frame_id,
+        T_camera_lidar_nominal=rigid_matrix(pair.T_camera_lidar, f"pair {pair.name}, T_camera_lidar"),
+        T_lidar_ego=np.eye(4) if ego is None else rigid_matrix(ego.T_lidar_ego, f"pair {pair.name}, ego.T_lidar_ego"),
+        mask=None if pair.camera.mask is None else load_mask(pair.camera.mask, camera),
+        sweep=None if pair.lidar.sweep is None else _sweep(pair.lidar.sweep),
+    )
+
+
+def camera_of(intrinsics: CameraIntrinsics) -> cameras.Camera:
+    """The camera that intrinsics describe.
+
+    Raises:
+        ConfigError: a parameter is missing, not of this model, or out of range; names it.
+    """
+    return _camera(intrinsics, "camera")
+
+
+def rigid_matrix(rows: Matrix4x4, where: str) -> Matrix4:
+    """(4, 4) float64, certain to be a rotation and a translation.
+
+    Raises:
+        ConfigError: it is not; names `where`.
+    """
+    T = np.array(rows, dtype=np.float64)
+    if not se3.is_rigid(T):
+        raise ConfigError(f"{where} is not a rigid transform: rows of a rotation, a translation, then 0 0 0 1")
+    return T
+
+
+def load_mask(path: Path, camera: cameras.Camera) -> NDArray[np.bool_]:
+    """(height, width) bool from a PNG or JPEG: False where it is black in every channel.
+
+    Raises:
+        ConfigError: unreadable, not an image, or not of the camera's size.
+    """
+    try:
+        return mask_from_image(path.read_bytes(), camera)
+    except OSError as error:
+        raise ConfigError(f"cannot read mask {path}: {error.strerror}") from error
+    except DecodeError as error:
+        raise ConfigError(f"mask {path}: {error}") from error
+
+
+def mask_from_image(data: bytes, camera: cameras.Camera) -> NDArray[np.bool_]:
+    """(height, width) bool of an encoded image.
+
+    Raises:
+        DecodeError: not an image, or not of the camera's size.
+    """
+    limits = LimitsConfig()
+    image = probe(data, limits)
+    if (image.width, image.height) != (camera.width, camera.height):
+        raise DecodeError(
+            "image_size_mismatch",
+            f"the mask is {image.width} x {image.height} px, the camera {camera.width} x {camera.height} px",
+        )
+    return np.asarray(decode_bgr(image, limits).any(axis=2))
+
+
+def mask_to_png(mask: NDArray[np.bool_]) -> bytes:
+    """A grey PNG, 255 where the mask is True."""
+    return encode_png(np.where(mask, np.uint8(255), np.uint8(0)))
+
+
+def intrinsics_config(camera: cameras.Camera) -> CameraIntrinsics:
+    """The intrinsics as a configuration holds them."""
+    return CameraIntrinsics.model_validate({"model": cameras.name_of(camera), **cameras.intrinsics_of(camera)})
+
+
+def rig_to_json(rig: Rig) -> dict[str, Any]:
+    """The rig without its mask, as JSON values."""
+    document = RigDocument(
+        pair=rig.pair,
+        camera=intrinsics_config(rig.camera),
+        camera_frame=rig.camera_frame,
+        lidar_frame=rig.lidar_frame,
+        T_camera_lidar_nominal=matrix_rows(rig.T_camera_lidar_nominal),
+        T_lidar_ego=matrix_rows(rig.T_lidar_ego),
+        sweep=None
+        if rig.sweep is None
+        else SweepDocument(
+            period_s=rig.sweep.period_s,
+            sign=1 if rig.sweep.sign > 0 else -1,
+            stamp_azimuth_rad=rig.sweep.stamp_azimuth_rad,
+        ),
+    )
+    return document.model_dump(mode="json", exclude_none=True)
+
+
+def rig_from_json(document: object, mask_png: bytes | None) -> Rig:
+    """The exact inverse of `rig_to_json` and `mask_to_png`.
+
+    Raises:
+        WindowError: not such a document; says where.
+    """
+    try:
+        parsed = RigDocument.model_validate(document)
+        camera = camera_of(parsed.camera)
+        mask = None if mask_png is None else mask_from_image(mask_png, camera)
+        return Rig(
+            pair=parsed.pair,
+            camera=camera,
+            camera_frame=parsed.camera_frame,
+            lidar_frame=parsed.lidar_frame,
+            T_camera_lidar_nominal=rigid_matrix(parsed.T_camera_lidar_nominal, "T_camera_lidar_nominal"),
+            T_lidar_ego=rigid_matrix(parsed.T_lidar_ego, "T_lidar_ego"),
+            mask=mask,
+            sweep=None
+            if parsed.sweep is None
+            else SweepTiming(parsed.sweep.period_s, parsed.sweep.sign, parsed.sweep.stamp_azimuth_rad),
+        )
+    except ValidationError as error:
+        raise WindowError(f"the rig is damaged: {describe(error)}") from error
+    except (ConfigError, DecodeError) as error:
+        raise WindowError(f"the rig is damaged: {error}") from error
+
+
+def matrix_rows(T: Matrix4) -> Matrix4x4:
+    """(4, 4) as nested tuples of Python floats."""
+    a, b, c, d = ((float(w), float(x), float(y), float(z)) for w, x, y, z in T)
+    return a, b, c, d
+
+
+def _camera(intrinsics: CameraIntrinsics, where: str) -> cameras.Camera:
+    try:
+        return cameras.build(intrinsics.model, **intrinsics.parameters())
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def _sweep(sweep: SweepConfig) -> SweepTiming:
+    return SweepTiming(sweep.period_s, sweep.sign, math.radians(sweep.stamp_azimuth_deg))

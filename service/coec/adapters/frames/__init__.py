@@ -1,0 +1,1 @@
+"""Frames as msgpack, and what every frame is asked before it is believed."""

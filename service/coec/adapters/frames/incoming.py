@@ -1,0 +1,115 @@
+"""What both encodings of frames check alike before a value is made of a message."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import LidarFrame
+from coec.config import LimitsConfig
+from coec.errors import DecodeError
+
+MAX_FRAME_ID = 128
+"""Characters, as in config.CameraConfig.frame_id."""
+
+MAX_TIME_OFFSET_S = 10.0
+"""A point further than this from the stamp of its sweep was timed by another clock: the longest period of
+config.SweepConfig."""
+
+MAX_SPEED = 1000.0
+"""m/s and rad/s: beyond every vehicle and gyroscope (as in coec.schemas.frames)."""
+
+
+class Refusal(StrEnum):
+    """Every reason for which a frame is refused: the label under which the loss is counted."""
+
+    MESSAGE_TOO_LARGE = "message_too_large"
+    MESSAGE_MALFORMED = "message_malformed"
+    MESSAGE_FIELDS = "message_fields"
+    MESSAGE_TYPE = "message_type"
+    STAMP_INVALID = "stamp_invalid"
+    FRAME_ID_INVALID = "frame_id_invalid"
+    IMAGE_UNKNOWN_FORMAT = "image_unknown_format"
+    IMAGE_TRUNCATED = "image_truncated"
+    IMAGE_TOO_LARGE = "image_too_large"
+    IMAGE_CORRUPT = "image_corrupt"
+    IMAGE_SIZE_MISMATCH = "image_size_mismatch"
+    DEPTH_MISSING = "depth_missing"
+    DEPTH_NOT_GREY = "depth_not_grey"
+    CLOUD_EMPTY = "cloud_empty"
+    CLOUD_TOO_LARGE = "cloud_too_large"
+    CLOUD_SHAPE = "cloud_shape"
+    CLOUD_FIELDS = "cloud_fields"
+    CLOUD_BIG_ENDIAN = "cloud_big_endian"
+    CLOUD_TIME = "cloud_time"
+    MOTION_INVALID = "motion_invalid"
+
+
+def check_size(payload: bytes, limits: LimitsConfig) -> None:
+    """Raises:
+    DecodeError: `message_too_large`.
+    """
+    if len(payload) > limits.max_message_bytes:
+        raise DecodeError(
+            Refusal.MESSAGE_TOO_LARGE,
+            f"{len(payload)} bytes; limits.max_message_bytes is {limits.max_message_bytes}",
+        )
+
+
+def finite_rows(
+    xyz_m: NDArray[np.float32], time_offset_s: NDArray[np.float32] | None = None
+) -> NDArray[np.bool_] | None:
+    """(N,) mask of the points whose place and time are finite, or None when all are (the usual case)."""
+    finite: NDArray[np.bool_] = np.isfinite(xyz_m)
+    # First as a whole: seven times as fast as by column.
+    if finite.all() and (time_offset_s is None or bool(np.isfinite(time_offset_s).all())):
+        return None
+    keep: NDArray[np.bool_] = finite[:, 0] & finite[:, 1] & finite[:, 2]
+    if time_offset_s is not None:
+        keep &= np.isfinite(time_offset_s)
+    return keep
+
+
+def lidar_frame(
+    stamp_ns: int,
+    frame_id: str,
+    xyz_m: NDArray[np.float32],
+    intensity: NDArray[np.float32] | None,
+    ring: NDArray[np.uint16] | None,
+    time_offset_s: NDArray[np.float32] | None,
+    sequence: int | None = None,
+) -> LidarFrame:
+    """A sweep without its non-finite points; every column loses the same rows. Copies only when there is one.
+
+    Args:
+        xyz_m: (N, 3).
+        intensity, ring, time_offset_s: (N,) each, or None.
+
+    Raises:
+        DecodeError: `cloud_empty` when no finite point is left, `cloud_time` when a point is too far from the
+        stamp.
+    """
+    keep = finite_rows(xyz_m, time_offset_s)
+    if keep is not None:
+        xyz_m = xyz_m[keep]
+        intensity = None if intensity is None else intensity[keep]
+        ring = None if ring is None else ring[keep]
+        time_offset_s = None if time_offset_s is None else time_offset_s[keep]
+    if len(xyz_m) == 0:
+        raise DecodeError(Refusal.CLOUD_EMPTY, "the cloud has no finite point")
+    if time_offset_s is not None and np.abs(time_offset_s).max() > MAX_TIME_OFFSET_S:
+        raise DecodeError(
+            Refusal.CLOUD_TIME,
+            f"points more than {MAX_TIME_OFFSET_S:g} s from the stamp of their sweep: do both come from one clock?",
+        )
+    return LidarFrame(
+        stamp_ns=stamp_ns,
+        frame_id=frame_id,
+        xyz_m=xyz_m,
+        intensity=intensity,
+        ring=ring,
+        time_offset_s=time_offset_s,
+        sequence=sequence,
+    )

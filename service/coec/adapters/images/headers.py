@@ -1,0 +1,139 @@
+"""What a JPEG or PNG says of itself, read from its bytes with bounds, before a decoder believes it."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from coec.adapters.frames.incoming import Refusal
+from coec.calibration.types import ImageFormat
+from coec.errors import DecodeError
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_HEADER = 33  # bytes: signature and IHDR
+_JPEG_START = b"\xff\xd8"
+_JPEG_END = b"\xff\xd9"
+_JPEG_SCAN = b"\xff\xda"
+# Markers of ITU-T T.81, table B.1.
+_SOF = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; Huffman
+_OTHER_SOF = (0xC3, *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0))  # lossless, differential, arithmetic
+_STANDALONE = (0x01, *range(0xD0, 0xD9))  # TEM, RST0-7, SOI: markers without a length
+
+_MAX_SEGMENTS = 512
+"""Segments before the frame header of a JPEG. Cameras write about ten; EXIF and a colour profile may take
+64."""
+
+_MAX_SCANS = 100
+"""Scans of a progressive JPEG. Encoders write about ten. Each costs a pass over the whole image, however few
+bytes it has, so that a small file with many can occupy a decoder for hours."""
+
+_MAX_CHUNKS = 16_384
+"""Chunks of a PNG. Encoders write one for each 8 KiB of data: 4,096 in the largest message (32 MiB)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Format and size in pixels; `body` is the offset of the first byte behind the header."""
+
+    format: ImageFormat
+    width: int
+    height: int
+    body: int
+
+
+def read_header(data: bytes) -> Header:
+    """Format and size of a JPEG or PNG.
+
+    Raises:
+        DecodeError: `image_unknown_format`, `image_truncated` or `image_corrupt`.
+    """
+    if data.startswith(_JPEG_START):
+        return _jpeg_header(data)
+    if data.startswith(_PNG_SIGNATURE):
+        return _png_header(data)
+    if _PNG_SIGNATURE.startswith(data[:8]) or _JPEG_START.startswith(data[:2]):
+        raise DecodeError(Refusal.IMAGE_TRUNCATED, f"the image ends after {len(data)} bytes")
+    raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, "the image is neither JPEG nor PNG")
+
+
+def check_body(header: Header, data: bytes) -> None:
+    """Whether the file is whole, and nothing in it asks the decoder for more than it brings.
+
+    What a driver appends behind the end, such as padding to the size of its buffer, does no harm.
+
+    Raises:
+        DecodeError: `image_truncated`, `image_corrupt` or `image_unknown_format`.
+    """
+    if header.format is ImageFormat.PNG:
+        _check_png_chunks(data, header.body)
+        return
+    if _count_scans(data) > _MAX_SCANS:
+        raise DecodeError(Refusal.IMAGE_CORRUPT, f"the JPEG has more than {_MAX_SCANS} scans")
+    # Entropy-coded data cannot hold the end marker, and a thumbnail's stands before the frame header.
+    if data.rfind(_JPEG_END, header.body) < 0:
+        raise DecodeError(Refusal.IMAGE_TRUNCATED, "the JPEG has no end marker: it was cut off")
+
+
+def _count_scans(data: bytes) -> int:
+    """Occurrences of the marker of a scan. As `data.count`, at a sixth of its time: every image that comes is looked
+    at."""
+    code = np.frombuffer(data, np.uint8)
+    first, second = _JPEG_SCAN
+    return int(np.count_nonzero(code[np.flatnonzero(code[1:] == second)] == first))
+
+
+def _png_header(data: bytes) -> Header:
+    """IHDR, which the specification puts first (PNG, 3rd edition, 5.6)."""
+    if len(data) < _PNG_HEADER:
+        raise DecodeError(Refusal.IMAGE_TRUNCATED, "the PNG ends within its header")
+    length, kind, width, height = struct.unpack_from(">I4sII", data, 8)
+    if length != 13 or kind != b"IHDR":
+        raise DecodeError(Refusal.IMAGE_CORRUPT, "the PNG does not start with IHDR")
+    return Header(ImageFormat.PNG, width, height, _PNG_HEADER)
+
+
+def _check_png_chunks(data: bytes, at: int) -> None:
+    """OpenCV's reader reserves the length that a chunk claims (up to 2 GiB) before it looks for the bytes."""
+    for _ in range(_MAX_CHUNKS):
+        if at + 12 > len(data):
+            raise DecodeError(Refusal.IMAGE_TRUNCATED, "the PNG has no end: it was cut off")
+        length, kind = struct.unpack_from(">I4s", data, at)
+        at += 12 + length
+        if kind == bytes(4) or at > len(data):
+            raise DecodeError(Refusal.IMAGE_TRUNCATED, "the PNG has no end: it was cut off")
+        if kind == b"IEND":
+            return
+        if kind == b"acTL":
+            raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, "animated PNGs are not read")
+    raise DecodeError(Refusal.IMAGE_CORRUPT, f"the PNG has more than {_MAX_CHUNKS} chunks")
+
+
+def _jpeg_header(data: bytes) -> Header:
+    """The frame header, behind the segments before it (ITU-T T.81, B.1.1 and B.2.2)."""
+    at = 2
+    for _ in range(_MAX_SEGMENTS):
+        if at + 4 > len(data):
+            raise DecodeError(Refusal.IMAGE_TRUNCATED, "the JPEG ends before its frame header")
+        if data[at] != 0xFF:
+            raise DecodeError(Refusal.IMAGE_CORRUPT, "the JPEG has bytes between its segments")
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker in _STANDALONE:
+            at += 2
+            continue
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        if marker in _SOF:
+            if at + 9 > len(data):
+                raise DecodeError(Refusal.IMAGE_TRUNCATED, "the JPEG ends within its frame header")
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return Header(ImageFormat.JPEG, width, height, at + 2 + length)
+        if marker in _OTHER_SOF:
+            raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, "of JPEGs, only baseline and progressive ones are read")
+        if length < 2 or marker in (0x00, 0xD9, 0xDA):  # end of image or a scan without a frame
+            raise DecodeError(Refusal.IMAGE_CORRUPT, "the JPEG has no frame header")
+        at += 2 + length
+    raise DecodeError(Refusal.IMAGE_CORRUPT, f"the JPEG has no frame header within {_MAX_SEGMENTS} segments")

@@ -1,0 +1,1 @@
+"""MCAP files: windows, bags, what both have in common."""

@@ -1,0 +1,1 @@
+"""The operating system: logs, threads, memory, the service manager."""

@@ -1,0 +1,239 @@
+"""The Zenoh session: subscriptions that never block its receive thread, queries that are always answered, one exit.
+
+Callbacks run on Zenoh's own threads (`indirect=False`): they copy bytes into a bounded queue, or answer from what is
+already serialised. Everything slower goes to one thread of its own behind a bounded queue. No exception leaves a
+callback, and every query is finished, because an unfinished one makes its client wait for the whole timeout.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import zenoh
+
+from coec.adapters.system.threads import ServiceThread
+from coec.config import LimitsConfig, ZenohConfig
+from coec.errors import CoecError, ConfigError, UsageError
+from coec.schemas.base import to_json, to_msgpack
+from coec.schemas.replies import ErrorReply
+
+_log = logging.getLogger(__name__)
+
+MSGPACK = "application/msgpack"
+JSON = "application/json"
+
+SLOW_QUERIES_WAITING = 32
+"""Queries that may wait for the slow thread; the next is told `busy`."""
+
+DRAWING_QUERIES_WAITING = 8
+"""Queries for pictures that may wait."""
+
+MAX_COMMAND_BYTES = 65_536
+"""Largest payload of a query; commands are a few numbers."""
+
+POLL_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A query, as far as an answer depends on it. `key` is concrete; `attachment` tells who asks, in whatever form."""
+
+    key: str
+    parameters: str
+    payload: bytes
+    attachment: bytes | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Bytes and what they are."""
+
+    payload: bytes
+    encoding: str
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """Who answers a key. `quick` answers take microseconds and are given on Zenoh's thread. Those that `draws` may wait
+    for the worker, and keep nobody waiting but each other."""
+
+    key: str
+    answer: Callable[[Request], Answer]
+    quick: bool
+    draws: bool = False
+
+
+def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
+    """A peer that connects and reconnects to the router, or the router itself. What `config.file` says stands.
+
+    Raises:
+        ConfigError: the file, an endpoint or a port cannot be used.
+    """
+    zenoh.init_log_from_env_or("error")
+    try:
+        settings = zenoh.Config.from_file(config.file) if config.file else zenoh.Config()
+        listen = config.listen if config.embedded_router else ()
+        connect = tuple(endpoint for endpoint in config.connect if endpoint not in listen)
+        if config.file is None or json.loads(settings.get_json("mode")) is None:
+            settings.insert_json5("mode", json.dumps("router" if config.embedded_router else "peer"))
+            settings.insert_json5("listen/endpoints", json.dumps(listen))
+        if not json.loads(settings.get_json("connect/endpoints")):
+            settings.insert_json5("connect/endpoints", json.dumps(connect))
+        settings.insert_json5("scouting/multicast/enabled", "false")
+        settings.insert_json5("timestamping/enabled", "true")
+        settings.insert_json5("transport/link/rx/max_message_size", str(limits.max_message_bytes))
+        # Queries and replies through shared memory can vanish under load.
+        settings.insert_json5("transport/shared_memory/transport_optimization/messages", '["put"]')
+        return zenoh.open(settings)
+    except (zenoh.ZError, OSError, ValueError) as error:
+        where = f"zenoh.file {config.file}" if config.file else f"zenoh.listen {list(listen)}, connect {list(connect)}"
+        raise ConfigError(f"cannot open the Zenoh session ({where}): {error}") from error
+
+
+_Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route]]]
+
+
+class Bus:
+    """Everything the service declares in a session. Calls come from the daemon's threads."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._queryables: list[zenoh.Queryable[None]] = []
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._slow: _Waiting = queue.Queue(SLOW_QUERIES_WAITING)
+        self._drawing: _Waiting = queue.Queue(DRAWING_QUERIES_WAITING)
+        self.thread = ServiceThread("slow-queries", partial(_answer_from, self._slow, self._answer))
+        self.drawing_thread = ServiceThread("drawing-queries", partial(_answer_from, self._drawing, self._answer))
+
+    def subscribe(self, key: str, on_sample: Callable[[bytes, str], None]) -> None:
+        """Call `on_sample(payload, encoding)` for every put on `key`, on Zenoh's thread."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            try:
+                if sample.kind == zenoh.SampleKind.PUT:
+                    on_sample(sample.payload.to_bytes(), str(sample.encoding))
+            except Exception:
+                _log.exception("a subscription failed", extra={"fields": {"key": key}})
+
+        self._subscribers.append(self._session.declare_subscriber(key, _direct(receive)))
+
+    def serve(self, key: str, find: Callable[[str], Sequence[Route]], *, complete: bool = True) -> None:
+        """Answer queries that match `key`. `find` gets the query's key, which may hold wildcards, and returns who
+        answers (nobody: the query ends without a reply) or raises a `CoecError` for an error reply."""
+
+        def receive(query: zenoh.Query) -> None:
+            try:
+                self._receive(query, find)
+            except Exception:
+                _log.exception("a query failed", extra={"fields": {"key": key}})
+                query.drop()
+
+        self._queryables.append(self._session.declare_queryable(key, _direct(receive), complete=complete))
+
+    def publish(self, key: str, answer: Answer) -> None:
+        """Put a value; silently lost while no router is there."""
+        timestamp = self._session.new_timestamp()
+        try:
+            self._session.put(key, answer.payload, encoding=answer.encoding, express=True, timestamp=timestamp)
+        except zenoh.ZError:
+            _log.exception("a value could not be published", extra={"fields": {"key": key}})
+
+    def declare_alive(self, key: str) -> None:
+        """Hold a liveliness token."""
+        self._tokens.append(self._session.liveliness().declare_token(key))
+
+    def undeclare_inputs(self) -> None:
+        """Withdraw the tokens and take no more samples."""
+        for token in self._tokens:
+            token.undeclare()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._tokens.clear()
+        self._subscribers.clear()
+
+    def undeclare_queryables(self) -> None:
+        """Take no more queries, and finish those that wait."""
+        for queryable in self._queryables:
+            queryable.undeclare()
+        self._queryables.clear()
+        for waiting in (self._slow, self._drawing):
+            while not waiting.empty():
+                query, _ = waiting.get_nowait()
+                with query:
+                    _reply_error(query, "stopping", "the service is stopping; ask again when it is back")
+
+    def close(self, deadline_s: float) -> bool:
+        """Close the session; False when it did not close within `deadline_s` (under loss it can take 10 s)."""
+        closer = threading.Thread(target=self._session.close, name="zenoh-close", daemon=True)
+        closer.start()
+        closer.join(deadline_s)
+        return not closer.is_alive()
+
+    def _receive(self, query: zenoh.Query, find: Callable[[str], Sequence[Route]]) -> None:
+        try:
+            routes = find(str(query.key_expr))
+            if query.payload is not None and len(query.payload) > MAX_COMMAND_BYTES:
+                raise UsageError(f"the payload is larger than {MAX_COMMAND_BYTES} bytes")
+        except CoecError as error:
+            with query:
+                _reply_error(query, error.reply_code, str(error))
+            return
+        if all(route.quick for route in routes):
+            self._answer(query, routes)
+            return
+        try:
+            (self._drawing if any(route.draws for route in routes) else self._slow).put_nowait((query, routes))
+        except queue.Full:
+            with query:
+                _reply_error(query, "busy", "too many queries wait; ask again in a moment")
+
+    def _answer(self, query: zenoh.Query, routes: Sequence[Route]) -> None:
+        with query:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            attachment = query.attachment.to_bytes() if query.attachment is not None else None
+            for route in routes:
+                try:
+                    answer = route.answer(Request(route.key, str(query.parameters), payload, attachment))
+                except CoecError as error:
+                    _reply_error(query, error.reply_code, str(error))
+                except Exception:
+                    _log.exception("a query failed", extra={"fields": {"key": route.key}})
+                    _reply_error(query, "internal", "the service failed on this query; its log says why")
+                else:
+                    timestamp = self._session.new_timestamp()
+                    query.reply(route.key, answer.payload, encoding=answer.encoding, timestamp=timestamp)
+
+
+def _answer_from(
+    waiting: _Waiting, answer: Callable[[zenoh.Query, Sequence[Route]], None], thread: ServiceThread
+) -> None:
+    while not thread.stopping:
+        thread.beat()
+        try:
+            query, routes = waiting.get(timeout=POLL_S)
+        except queue.Empty:
+            continue
+        try:
+            answer(query, routes)
+        except zenoh.ZError:  # the client is gone
+            _log.debug("a reply found no receiver")
+
+
+def _direct(callback: Callable[..., None]) -> zenoh.handlers.Callback[object]:
+    return zenoh.handlers.Callback(callback, indirect=False)
+
+
+def _reply_error(query: zenoh.Query, code: str, message: str) -> None:
+    """An error reply in the format that was asked for, whatever else is wrong with the query."""
+    error = ErrorReply(code=code, message=message)
+    if "format=json" in str(query.parameters).split(";"):
+        query.reply_err(to_json(error), encoding=JSON)
+    else:
+        query.reply_err(to_msgpack(error), encoding=MSGPACK)

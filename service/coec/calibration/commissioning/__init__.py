@@ -1,0 +1,1 @@
+"""A rig's own baseline and limits, and how they are learned."""

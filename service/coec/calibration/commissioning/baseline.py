@@ -1,0 +1,222 @@
+"""What commissioning leaves behind: how the estimator and the sensors behave on one rig, and the limits that follow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import fsum, inf, radians, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.monitor.sensor_faults import SceneBaseline
+from coec.calibration.types import Matrix4, Rig
+from coec.config import CalibrationConfig, VerdictConfig, config_hash
+from coec.geometry import se3
+from coec.geometry.cameras import Camera, pixel_rad
+
+FLOOR = np.array([radians(0.02)] * 3 + [0.004] * 3)
+"""Standard deviation that no look is trusted to be below: what the interpolation of the edge maps leaves (rad, m)."""
+
+PRIOR_SPREAD_ROTATION = np.array([radians(0.08), radians(0.07), radians(0.15), np.nan, np.nan, np.nan])
+PRIOR_SPREAD_POSE = np.array([radians(0.20), radians(0.10), radians(0.25), 0.02, 0.04, 0.04])
+"""Spread of a look at one pair over three and six degrees of freedom, on the widest of the 64-beam recordings tried
+(rad, m)."""
+
+UNCOMMISSIONED_BIAS = np.array([radians(0.12)] * 3 + [0.03] * 3)
+"""Standard deviation of the estimator's unknown bias on a rig (rad, m): on the recordings tried up to 0.28° and 2 cm
+lie between the vendor's calibration and the edges."""
+
+
+PIXEL_SHARE = 0.3
+"""Share of a pixel that the local optimum may be off for the pixels alone, whatever the scenes of a commissioning say:
+edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
+
+PIXEL_RANGE_M = 8.0
+"""Range at which a pixel of rotation looks like one of translation, m: of the near edges, which tell translation."""
+
+
+FIGURES = "edges-kept"
+"""Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a look at
+the same pairs gives other figures: limits of the old ones would not fit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accuracy:
+    """How far the local optimum of a look lies from a right pose: `bias` (6,), known to `bias_sigma` (6,), and
+    `spread` (6,) of a look at one pair (rad, m). NaN on axes that the look does not search."""
+
+    bias: NDArray[np.float64]
+    bias_sigma: NDArray[np.float64]
+    spread: NDArray[np.float64]
+
+    @property
+    def expected(self) -> NDArray[np.float64]:
+        """(6,) the bias; zero on axes that are not searched."""
+        return np.nan_to_num(self.bias)
+
+    def sigma(self, pairs: int) -> NDArray[np.float64]:
+        """(6,) standard deviation of the offset of a look at so many pairs, less the bias."""
+        variance = self.spread**2 / max(pairs, 1) + self.bias_sigma**2 + FLOOR**2
+        return np.asarray(np.sqrt(variance))
+
+    def distance2(self, offset: NDArray[np.float64], pairs: int) -> float:
+        """Squared distance of an offset (6,) from the bias in standard deviations, over the axes that were searched."""
+        return fsum(self._squares(offset, pairs))
+
+    def farthest2(self, offset: NDArray[np.float64], pairs: int) -> float:
+        """The same along the one axis on which it is farthest: one axis that is off is not hidden by five that are
+        not."""
+        return max(self._squares(offset, pairs))
+
+    def _squares(self, offset: NDArray[np.float64], pairs: int) -> list[float]:
+        standard = (offset - self.bias) / self.sigma(pairs)
+        return [float(s) ** 2 for s in standard if np.isfinite(s)]
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorLimits:
+    """Where a look turns bad. The paper's three refuse nothing until they were learned.
+
+    Attributes:
+        max_distance2_rotation: of the local optimum over rotations, in standard deviations, squared.
+        max_farthest2_pose: the same over six degrees of freedom, of the axis that is farthest off.
+        min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
+        min_edges_kept: see `Look`; where fewer are kept, a quarter of the distance over rotations is too far.
+        max_agreement_rad: between the local optima of the two witnesses.
+        min_overlap: points in view over the most that any pose within reach sees.
+        min_mi, max_f1, min_f2: equation (2) of Borer et al. 2023: nats, per radian, per radian².
+    """
+
+    max_distance2_rotation: float
+    max_farthest2_pose: float
+    min_edges_per_pair: float
+    min_edges_kept: float = -inf
+    max_agreement_rad: float = inf
+    min_overlap: float = 0.5
+    min_mi: float = -inf
+    max_f1: float = inf
+    min_f2: float = -inf
+
+
+def pixel_floor(camera: Camera) -> NDArray[np.float64]:
+    """(6,) standard deviation that the pixels of a camera leave to any look, however many pairs it has (rad, m)."""
+    off_rad = PIXEL_SHARE * pixel_rad(camera)
+    return np.array([off_rad] * 3 + [off_rad * PIXEL_RANGE_M] * 3)
+
+
+def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:
+    """What to expect of looks over three and six degrees of freedom on a rig of which only its camera is known."""
+    bias_sigma = np.sqrt(UNCOMMISSIONED_BIAS**2 + pixel_floor(camera) ** 2)
+    rotation = Accuracy(np.array([0.0] * 3 + [np.nan] * 3), bias_sigma, PRIOR_SPREAD_ROTATION)
+    return rotation, Accuracy(np.zeros(6), bias_sigma, PRIOR_SPREAD_POSE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Baseline:
+    """A commissioned rig.
+
+    Attributes:
+        T_camera_lidar: (4, 4) the reference: workshop calibration, or what was current when it was commissioned.
+        rotation, pose: how looks over three and six degrees of freedom lie about the reference.
+        dof: of the calibrations of this rig; decides which of the two is `bias`.
+        limits: learned limits, by the names of `VerdictConfig`.
+        monitor: learned limits of a look.
+        false_alarm_rate: share of looks at a right pose that the limits were chosen to flag at most.
+        windows, pairs: from how many it was learned.
+        detected: share of looks that were flagged after the reference had been moved, by amount, as `0.5 deg`.
+        sensors: what identifies the sensors, by stream: serial numbers where known, else frame ids.
+        depth_identity, config_hash: of the calibrations that it holds for.
+    """
+
+    pair: str
+    T_camera_lidar: Matrix4
+    rotation: Accuracy
+    pose: Accuracy
+    dof: int
+    limits: dict[str, float]
+    monitor: MonitorLimits
+    scene: SceneBaseline
+    false_alarm_rate: float
+    windows: int
+    pairs: int
+    detected: dict[str, float]
+    sensors: dict[str, str]
+    depth_identity: str
+    config_hash: str
+
+    @property
+    def accuracy(self) -> Accuracy:
+        """Of the degrees of freedom that calibrations of this rig search."""
+        return self.rotation if self.dof == 3 else self.pose
+
+    @property
+    def bias(self) -> NDArray[np.float64]:
+        """(6,) the estimator's optimum less the reference (rad, m); zero on axes that are not searched."""
+        return self.accuracy.expected
+
+    @property
+    def bias_sigma(self) -> NDArray[np.float64]:
+        """(6,) how well it is known; NaN on axes that are not searched."""
+        return self.accuracy.bias_sigma
+
+    def verdict(self, config: VerdictConfig) -> VerdictConfig:
+        """The configuration with the limits that were learned."""
+        return config.model_copy(update=self.limits)
+
+    def unbiased(self, T_camera_lidar: Matrix4) -> Matrix4:
+        """An estimate (4, 4) without the bias of the estimator on this rig: what may be compared with the workshop
+        calibration, and served."""
+        return np.asarray(se3.inverse(se3.perturb(np.eye(4), self.bias)) @ T_camera_lidar)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """From the commissioned calibration: ξ (6,) and its standard deviation (6,), rad and m; NaN where not estimated."""
+
+    value: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
+def drift(T_camera_lidar: Matrix4, sigma: NDArray[np.float64], baseline: Baseline) -> Drift:
+    """How far an estimate (4, 4) with its standard deviations (6,) lies from the commissioned calibration. The
+    estimator's bias on the rig is removed, and its uncertainty counted."""
+    value = se3.difference(T_camera_lidar, baseline.T_camera_lidar) - baseline.bias
+    return Drift(value, np.asarray(np.sqrt(sigma**2 + np.nan_to_num(baseline.bias_sigma) ** 2)))
+
+
+def mismatch(baseline: Baseline, rig: Rig, depth_identity: str, config_hash: str) -> str | None:
+    """Why a baseline does not hold for a rig and its configuration, in one sentence; None if it does."""
+    if baseline.pair != rig.pair:
+        return f"It was made for the pair {baseline.pair}."
+    for stream, frame in (("camera", rig.camera_frame), ("lidar", rig.lidar_frame)):
+        if f"{stream}_frame" in baseline.sensors and baseline.sensors[f"{stream}_frame"] != frame:
+            return f"It was made with the {stream} {baseline.sensors[f'{stream}_frame']}."
+    if baseline.depth_identity != depth_identity:
+        return "It was made with another depth network."
+    if baseline.config_hash != config_hash:
+        return "It was made with another configuration of the calibration."
+    if unknown := sorted(set(baseline.limits) - set(VerdictConfig.model_fields)):
+        return f"It holds limits of figures that no longer exist: {', '.join(unknown)}."
+    return None
+
+
+def learned_hash(config: CalibrationConfig) -> str:
+    """Of the configuration that a baseline holds for: all that moves an optimum; the limits are what it replaces."""
+    return config_hash(config.objective, config.search, str(config.motion_compensation), FIGURES)
+
+
+def chi2_quantile(probability: float, dof: int) -> float:
+    """Of the χ² distribution, by the cube-root approximation of Wilson and Hilferty (1931): within 3 % from one degree
+    of freedom and 0.9 on."""
+    h = 2.0 / (9.0 * dof)
+    return dof * (1.0 - h + normal_quantile(probability) * sqrt(h)) ** 3
+
+
+def normal_quantile(probability: float) -> float:
+    """Of the standard normal distribution, within 5e-4 (Abramowitz and Stegun 1964, 26.2.23)."""
+    tail = min(probability, 1.0 - probability)
+    if not tail > 0.0:
+        raise ValueError(f"a quantile needs a probability between 0 and 1, got {probability}")
+    t = sqrt(-2.0 * float(np.log(tail)))
+    upper = t - (2.515517 + 0.802853 * t + 0.010328 * t * t) / (1.0 + 1.432788 * t + 0.189269 * t * t + 0.001308 * t**3)
+    return upper if probability > 0.5 else -upper

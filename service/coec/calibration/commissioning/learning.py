@@ -1,0 +1,325 @@
+"""From good windows to the baseline of a rig: the estimator's bias and spread on it, and every limit.
+
+Nothing is set by hand: the same windows are looked at where they are right and after they were moved by known amounts,
+and each limit is put where it flags no more of the right ones than the stated rate, and as many of the moved ones as
+that leaves. Moves are seeded: the same windows give the same baseline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import radians, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.commissioning.baseline import (
+    FLOOR,
+    PRIOR_SPREAD_POSE,
+    PRIOR_SPREAD_ROTATION,
+    Accuracy,
+    Baseline,
+    MonitorLimits,
+    chi2_quantile,
+    learned_hash,
+    normal_quantile,
+    pixel_floor,
+)
+from coec.calibration.commissioning.verdict_limits import verdict_limits
+from coec.calibration.estimators import look
+from coec.calibration.monitor.check import POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, edges_per_pair, over_limits
+from coec.calibration.monitor.sensor_faults import scene_baseline
+from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
+from coec.calibration.types import Matrix4, Window
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+
+MAX_PAIRS = 48
+"""Pairs that are looked at, evenly chosen from all windows: two windows of the default size."""
+
+BLOCKS = 10
+"""Blocks of neighbouring pairs, of which half are left out at a time: neighbours are not independent."""
+
+HALVES = 10
+"""Draws of the half that is kept."""
+
+PRIOR_BLOCKS = 6
+"""Blocks that the spread known from other rigs counts for."""
+
+OUTLIER = 4.0
+"""Times the median deviation beyond which the look at a half counts for no more (2.7 standard deviations)."""
+
+LOOK_PAIRS = 6
+"""Pairs of a look from which limits are learned: about as many as the monitor takes."""
+
+LOOKS, FAR_LOOKS = 12, 5
+"""Looks at the right pose and after every move, and far off."""
+
+SMALL_RAD, SMALL_M = radians(0.5), 0.10
+"""The smallest moves that have to be seen."""
+
+FAR_RAD = radians(12.0)
+"""A move beyond the reach of a look: what is found there is no optimum."""
+
+MOVES = (
+    ("0.5 deg", SMALL_RAD, 0.0),
+    ("1 deg", radians(1.0), 0.0),
+    ("3 deg", radians(3.0), 0.0),
+    ("10 cm", 0.0, SMALL_M),
+)
+"""By name: rotations about random axes (rad) and translations in random directions (m)."""
+
+SEED = 20_230_617
+
+MOST_KEPT = 0.88
+"""Limit of the edges that a look keeps, at most. Right looks kept 0.91 and more on other pairs than those that the bias
+was learned from; after half a degree they kept 0.2 to 0.8."""
+
+AGREEMENT_RAD = radians(0.5)
+"""Least limit of the witnesses' disagreement: a quarter of the hill of the depth witness."""
+
+
+def commission(
+    windows: Sequence[Window],
+    depth: DepthModel,
+    images: ImageReader,
+    config: CalibrationConfig,
+    *,
+    sensors: dict[str, str],
+    reference: Matrix4 | None = None,
+    false_alarm_rate: float = FALSE_ALARM_RATE,
+    progress: Progress | None = None,
+) -> Baseline:
+    """The baseline of the rig of `windows`.
+
+    Args:
+        windows: of one rig, in which the extrinsic is right.
+        sensors: what identifies the sensors, by stream; the frame ids are added.
+        reference: (4, 4) the right extrinsic; None = the workshop calibration of the rig.
+        false_alarm_rate: share of looks at a right pose that may be flagged.
+
+    Raises:
+        CalibrationError: too few pairs, or the windows do not show the reference: nothing is learned from a rig that is
+            not right.
+    """
+    heard = progress or Silence()
+    whole = _merged(windows)
+    rig = whole.rig
+    right = rig.T_camera_lidar_nominal if reference is None else reference
+    evidence = gather(look(replace(whole, T_camera_lidar_start=right), depth, images, config, heard))
+    rotation, pose = _accuracies(evidence, right, config, heard)
+    _check(rotation)
+    looks = _Looks(evidence, right, config, rotation.expected, heard)
+    clean = looks.moved(0.0, 0.0, "right", LOOKS)
+    moved = {name: looks.moved(turn_rad, shift_m, name, LOOKS) for name, turn_rad, shift_m in MOVES}
+    far = looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS)
+    monitor = _monitor_limits(clean, moved, far, rotation, pose, false_alarm_rate)
+    accuracy = rotation if config.search.dof == ROTATION_DOF else pose
+    expected = se3.perturb(right, accuracy.expected)
+    limits = verdict_limits(whole, right, expected, depth, images, config, heard)
+    return Baseline(
+        pair=rig.pair,
+        T_camera_lidar=right,
+        rotation=rotation,
+        pose=pose,
+        dof=config.search.dof,
+        limits=limits,
+        monitor=monitor,
+        scene=scene_baseline(evidence.scenes),
+        false_alarm_rate=false_alarm_rate,
+        windows=len(windows),
+        pairs=len(evidence.pairs),
+        detected={
+            name: float(np.mean([is_flagged(seen, rotation, pose, monitor) for seen in seen_after]))
+            for name, seen_after in moved.items()
+        },
+        sensors={**sensors, "camera_frame": rig.camera_frame, "lidar_frame": rig.lidar_frame},
+        depth_identity=depth.identity,
+        config_hash=learned_hash(config),
+    )
+
+
+def is_flagged(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> bool:
+    """Whether a look puts the local optimum too far from where it should be."""
+    return max(over_limits(seen, rotation, pose, limits)) > 1.0
+
+
+def learn_accuracy(evidence: Evidence, right: Matrix4, config: CalibrationConfig) -> tuple[Accuracy, Accuracy]:
+    """How looks over three and over six degrees of freedom lie about the right pose (4, 4)."""
+    return _accuracies(evidence, right, config, Silence())
+
+
+def learn_limits(
+    evidence: Evidence, right: Matrix4, config: CalibrationConfig, accuracies: tuple[Accuracy, Accuracy], rate: float
+) -> MonitorLimits:
+    """The limits of looks, at a false-alarm rate."""
+    rotation, pose = accuracies
+    looks = _Looks(evidence, right, config, rotation.expected, Silence())
+    moved = {name: looks.moved(turn_rad, shift_m, name, LOOKS) for name, turn_rad, shift_m in MOVES[::3]}
+    return _monitor_limits(
+        looks.moved(0.0, 0.0, "right", LOOKS), moved, looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS), rotation, pose, rate
+    )
+
+
+def _merged(windows: Sequence[Window]) -> Window:
+    pairs = sorted((pair for window in windows for pair in window.pairs), key=lambda pair: pair.stamp_ns)
+    if len(pairs) <= MIN_PAIRS:
+        raise CalibrationError(
+            f"commissioning needs more than {MIN_PAIRS} pairs of a camera frame and a sweep, there are {len(pairs)}"
+        )
+    if any(window.rig.pair != windows[0].rig.pair for window in windows):
+        raise CalibrationError("the windows are of several camera-LiDAR pairs: commission one at a time")
+    if len(pairs) > MAX_PAIRS:
+        pairs = [pairs[round(index)] for index in np.linspace(0, len(pairs) - 1, MAX_PAIRS)]
+    return replace(windows[0], pairs=tuple(pairs))
+
+
+def _accuracies(
+    evidence: Evidence, right: Matrix4, config: CalibrationConfig, heard: Progress
+) -> tuple[Accuracy, Accuracy]:
+    """The bias from all pairs, the spread of one pair from looks at halves of them."""
+    count = len(evidence.pairs)
+    whole = look_at(evidence, right, config)
+    halves = _halves(count)
+    of_halves = []
+    for number, half in enumerate(halves, start=1):
+        of_halves.append(look_at(evidence.of(half), right, config))
+        heard.step("spread", number, len(halves))
+    at_rotation = np.array([seen.offset_rotation for seen in of_halves])
+    at_pose = np.array([seen.offset_pose for seen in of_halves])
+    # The mean of k of n pairs varies about that of all by 1/k - 1/n of the variance of one.
+    share = np.array([1.0 / len(half) - 1.0 / count for half in halves])
+    not_searched = np.array([0.0] * 3 + [np.nan] * 3)
+    # Translations are told by near edges, where a pixel is little: their floor is that of every rig.
+    pixels = np.where(np.arange(6) < ROTATION_DOF, pixel_floor(evidence.rig.camera), 0.0)
+    return (
+        _accuracy(whole.offset_rotation + not_searched, at_rotation, share, PRIOR_SPREAD_ROTATION, count, pixels),
+        _accuracy(whole.offset_pose, at_pose, share, PRIOR_SPREAD_POSE, count, pixels),
+    )
+
+
+def _halves(count: int) -> list[list[int]]:
+    """Indices of the pairs that each draw keeps: half of the blocks, seeded.
+
+    Half of them at a time instead of one (Shao and Wu 1989, the delete-d jackknife): a local optimum jumps when a pair
+    is left out, and the jackknife of one block takes every jump for a spread of the whole.
+    """
+    blocks = np.array_split(np.arange(count), min(count, BLOCKS))
+    rng = np.random.default_rng([SEED, count])
+    drawn = (rng.permutation(len(blocks))[: (len(blocks) + 1) // 2] for _ in range(HALVES))
+    return [[int(index) for block in sorted(half) for index in blocks[block]] for half in drawn]
+
+
+def _accuracy(
+    whole: NDArray[np.float64],
+    of_halves: NDArray[np.float64],
+    share: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    count: int,
+    pixels: NDArray[np.float64],
+) -> Accuracy:
+    """From a look at all pairs (6,) and at halves of them (H, 6), which vary about it by `share` (H,) of the variance
+    of one pair, and what is known of other rigs: the variance of few blocks is uncertain itself (the posterior mean
+    under an inverse gamma prior of `PRIOR_BLOCKS` degrees of freedom). The bias is that of the streets that were
+    driven; on others it is another share of a pixel (`pixels`, (6,))."""
+    free = min(count, BLOCKS) - 1
+    apart = np.abs(of_halves - whole)
+    # One look that ended in another basin must not make the rig look blind.
+    apart = np.minimum(apart, OUTLIER * np.median(apart, axis=0) + FLOOR)
+    variance = (apart**2 / share[:, None]).mean(axis=0)
+    spread = np.sqrt((PRIOR_BLOCKS * prior**2 + free * variance) / (PRIOR_BLOCKS + free))
+    return Accuracy(bias=whole, bias_sigma=np.sqrt(spread**2 / count + pixels**2), spread=spread)
+
+
+def _check(rotation: Accuracy) -> None:
+    if float(np.max(np.abs(rotation.bias[:3]))) > MAX_BIAS_RAD:
+        turned = ", ".join(f"{value:+.2f}" for value in np.degrees(rotation.bias[:3]))
+        raise CalibrationError(
+            f"the windows put the camera ({turned}) deg about x, y, z away from the reference: "
+            "calibrate first, or give the calibration that is right"
+        )
+
+
+MAX_BIAS_RAD = radians(1.0)
+"""More than this is no bias of the estimator, but a wrong reference."""
+
+
+class _Looks:
+    """Looks at seeded subsets of the pairs, near the right pose moved by a known amount in seeded directions."""
+
+    def __init__(
+        self,
+        evidence: Evidence,
+        right: Matrix4,
+        config: CalibrationConfig,
+        bias: NDArray[np.float64],
+        heard: Progress,
+    ) -> None:
+        self._evidence = evidence
+        self._right = right
+        self._config = config
+        self._bias = bias
+        self._heard = heard
+
+    def moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[Look]:
+        """`count` looks after a turn and a shift."""
+        rng = np.random.default_rng([SEED, round(turn_rad * 1e6), round(shift_m * 1e6)])
+        pairs = len(self._evidence.pairs)
+        size = min(LOOK_PAIRS, pairs - 1)
+        seen = []
+        for number in range(1, count + 1):
+            # Neighbours, as the monitor sees them.
+            first = int(rng.integers(0, pairs))
+            indices = sorted((first + step) % pairs for step in range(size))
+            xi = np.concatenate([turn_rad * _direction(rng), shift_m * _direction(rng)])
+            moved = se3.perturb(self._right, xi)
+            seen.append(look_at(self._evidence.of(indices), moved, self._config, self._bias))
+            self._heard.step(name, number, count)
+        return seen
+
+
+def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
+    drawn = rng.normal(size=3)
+    return np.asarray(drawn / np.sqrt((drawn**2).sum()))
+
+
+def _monitor_limits(
+    clean: Sequence[Look],
+    moved: dict[str, list[Look]],
+    far: Sequence[Look],
+    rotation: Accuracy,
+    pose: Accuracy,
+    rate: float,
+) -> MonitorLimits:
+    turned = [rotation.distance2(seen.offset_rotation, seen.pairs) for seen in moved["0.5 deg"]]
+    shifted = [pose.farthest2(seen.offset_pose, seen.pairs) for seen in moved["10 cm"]]
+    edges = float(np.min([edges_per_pair(seen) for seen in clean]))
+    lost = float(np.median([edges_per_pair(seen) for seen in far]))
+    kept = float(np.min([seen.edges_kept for seen in clean]))
+    z = normal_quantile(1.0 - rate / 3.0)
+    agreement = _beyond([seen.agreement_rad for seen in clean], z)
+    return MonitorLimits(
+        max_distance2_rotation=_between(chi2_quantile(1.0 - rate / 2.0, ROTATION_DOF), min(turned)),
+        max_farthest2_pose=_between(chi2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1), min(shifted)),
+        min_edges_per_pair=min(sqrt(edges * max(lost, 0.25 * edges)), 0.8 * edges),
+        min_edges_kept=min(1.0 - 2.0 * (1.0 - kept), MOST_KEPT),
+        max_agreement_rad=max(agreement, AGREEMENT_RAD),
+        min_overlap=0.8 * float(np.min([seen.overlap for seen in clean])),
+        min_mi=_beyond([seen.mi for seen in clean], -z),
+        max_f1=_beyond([seen.f1 for seen in clean], z),
+        min_f2=_beyond([seen.f2 for seen in clean], -z),
+    )
+
+
+def _between(right: float, wrong: float) -> float:
+    """Half-way, in ratio, from what right looks do not exceed to the least of the moved ones, and no nearer to these
+    than at a quarter of it; where the two come close the false-alarm rate decides."""
+    return max(right, min(sqrt(right * wrong), 0.25 * wrong))
+
+
+def _beyond(values: Sequence[float], z: float) -> float:
+    """So many standard deviations from the mean."""
+    return float(np.mean(values) + z * np.std(values, ddof=1))

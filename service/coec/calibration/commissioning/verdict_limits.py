@@ -1,0 +1,105 @@
+"""The limits of equation (2) for full calibrations of one rig, learned from calibrations that find the right pose and
+calibrations that cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import degrees, inf, radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.calibrator import calibrate
+from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
+from coec.calibration.types import Estimate, Matrix4, Window
+from coec.config import CalibrationConfig, VerdictConfig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+
+SOLVES = 6
+"""Calibrations of each kind, each on a random half of the pairs."""
+
+MIN_PAIRS = 5
+"""Pairs of such a half at least."""
+
+NEAR_RAD, LOST_RAD, LOST_REACH_RAD = radians(5.0), radians(20.0), radians(8.0)
+"""Where they start; a lost one may not search as far as the right pose."""
+
+RIGHT_RAD = radians(0.5)
+"""A calibration that ends nearer than this to where the estimator puts this rig is right."""
+
+OF_NOISE = ("sigma", "newton_step")
+"""Figures that tell how precise a result is, and not whether it is the right one: their limits are a matter of what the
+result is for, and stay as configured."""
+
+SEED = 20_230_617
+
+
+def verdict_limits(
+    window: Window,
+    right: Matrix4,
+    expected: Matrix4,
+    depth: DepthModel,
+    images: ImageReader,
+    config: CalibrationConfig,
+    heard: Progress,
+) -> dict[str, float]:
+    """Learned limits, by the names of `VerdictConfig`; those that nothing was learned about are absent.
+
+    Args:
+        window: all pairs.
+        right: (4, 4) the right extrinsic, about which the starts lie.
+        expected: (4, 4) where the estimator puts it.
+    """
+    rng = np.random.default_rng(SEED)
+    near: list[Estimate] = []
+    lost: list[Estimate] = []
+    count = len(window.pairs)
+    for number in range(1, 2 * SOLVES + 1):
+        astray = number % 2 == 0
+        chosen = sorted(rng.permutation(count)[: max(count // 2, min(MIN_PAIRS, count))].tolist())
+        drawn = rng.normal(size=3)
+        xi = np.zeros(6)
+        xi[:3] = (LOST_RAD if astray else NEAR_RAD) * drawn / np.sqrt((drawn**2).sum())
+        tried = replace(
+            window, T_camera_lidar_start=se3.perturb(right, xi), pairs=tuple(window.pairs[i] for i in chosen)
+        )
+        try:
+            estimate = calibrate(tried, depth, images, _astray(config) if astray else config, Silence())
+        except CalibrationError:
+            continue
+        apart_rad = se3.rotation_angle_rad(estimate.optimum.T_camera_lidar @ se3.inverse(expected))
+        (near if apart_rad < RIGHT_RAD else lost).append(estimate)
+        heard.step("verdicts", number, 2 * SOLVES)
+    return learned(near, lost) if near and lost else {}
+
+
+def learned(near: Sequence[Estimate], lost: Sequence[Estimate]) -> dict[str, float]:
+    """Half-way, in ratio, between the right and the wrong calibrations, of every figure that tells all of them
+    apart."""
+    limits = {}
+    for metric in near[0].verdict.metrics:
+        name = f"{'min' if metric.at_least else 'max'}_{metric.name}"
+        if name not in VerdictConfig.model_fields or metric.name.startswith(OF_NOISE):
+            continue
+        sign = 1.0 if metric.at_least else -1.0
+        # Logarithms, the good side upwards.
+        worst = float((sign * _log(near, metric.name)).min(initial=inf))
+        best = float((sign * _log(lost, metric.name)).max(initial=-inf))
+        if np.isfinite(worst) and np.isfinite(best) and worst > best:
+            limits[name] = float(np.exp(sign * 0.5 * (worst + best)))
+    return limits
+
+
+def _astray(config: CalibrationConfig) -> CalibrationConfig:
+    """A search that cannot reach the right pose."""
+    reach_deg = degrees(LOST_REACH_RAD)
+    reach = {"reach_deg": reach_deg, "rotation_deg": min(reach_deg, config.search.rotation_deg)}
+    return config.model_copy(update={"search": config.search.model_copy(update=reach)})
+
+
+def _log(estimates: Sequence[Estimate], name: str) -> NDArray[np.float64]:
+    """Of one metric over the estimates, where it is positive."""
+    values = [m.value for estimate in estimates for m in estimate.verdict.metrics if m.name == name and m.value > 0.0]
+    return np.log(np.array(values, dtype=np.float64))

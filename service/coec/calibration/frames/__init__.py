@@ -1,0 +1,1 @@
+"""From frames to a window: pairing, motion compensation, sampling, ego mask, timing."""

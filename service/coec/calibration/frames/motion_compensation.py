@@ -1,0 +1,67 @@
+"""Motion compensation of a pair: the sweep as it would have been measured at the instant of the exposure."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import Compensation, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, SweepTiming
+from coec.geometry import se3
+from coec.geometry.deskew import deskew
+
+Choice = NDArray[np.int64] | slice
+"""Of the points of a sweep."""
+
+EVERY = slice(None)
+
+
+def compensate(pair: FramePair, rig: Rig, *, enabled: bool, chosen: Choice = EVERY) -> NDArray[np.float32]:
+    """(N, 3) float32: the chosen points of the sweep in the LiDAR frame at the camera stamp.
+
+    Per-point time comes with the cloud, or follows from azimuth (`rig.sweep`). Without either, the sweep is moved as a
+    whole from its stamp to the camera's. Without ego-motion nothing is moved.
+    """
+    xyz_m = np.ascontiguousarray(pair.lidar.xyz_m[chosen])
+    if not enabled or pair.motion is None:
+        return xyz_m
+    dt_s = _point_offsets_s(pair.lidar, xyz_m, rig.sweep, chosen)
+    dt_s += (pair.lidar.stamp_ns - pair.camera.stamp_ns) * 1e-9
+    angular, linear = sensor_twist(pair.motion, rig.T_lidar_ego)
+    return deskew(xyz_m, dt_s, angular, linear)
+
+
+def compensation(pair: FramePair, rig: Rig, *, enabled: bool) -> Compensation:
+    """What `compensate` does to the sweep of a pair."""
+    if not enabled:
+        return Compensation.DISABLED
+    if pair.motion is None:
+        return Compensation.NO_EGO_MOTION
+    if pair.lidar.time_offset_s is None and rig.sweep is None:
+        return Compensation.NO_POINT_TIME
+    return Compensation.DONE
+
+
+def azimuth_offsets_s(xyz_m: NDArray[np.float32], sweep: SweepTiming) -> NDArray[np.float64]:
+    """(N,) seconds after the sweep's stamp at which each point was measured, from its azimuth (see `SweepTiming`)."""
+    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0]).astype(np.float64) - sweep.stamp_azimuth_rad
+    revolutions = azimuth / (2.0 * np.pi)
+    revolutions -= np.rint(revolutions)
+    return sweep.sign * sweep.period_s * revolutions
+
+
+def sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Angular (3,) rad/s and linear velocity (3,) m/s of the LiDAR in its own frame; the lever arm turns rotation into
+    velocity."""
+    rotation = T_lidar_ego[:3, :3]
+    lidar_in_ego_m = se3.inverse(T_lidar_ego)[:3, 3]
+    angular = np.asarray(motion.angular_radps)
+    linear = np.asarray(motion.linear_mps) + np.cross(angular, lidar_in_ego_m)
+    return rotation @ angular, rotation @ linear
+
+
+def _point_offsets_s(
+    lidar: LidarFrame, xyz_m: NDArray[np.float32], sweep: SweepTiming | None, chosen: Choice
+) -> NDArray[np.float64]:
+    if lidar.time_offset_s is not None:
+        return lidar.time_offset_s[chosen].astype(np.float64)
+    return np.zeros(len(xyz_m)) if sweep is None else azimuth_offsets_s(xyz_m, sweep)

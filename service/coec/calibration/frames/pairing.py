@@ -1,0 +1,174 @@
+"""Which camera frame belongs to which sweep, and how the vehicle moved then: decided by sensor stamps alone.
+
+Nothing here depends on when or in which interleaving messages arrive, as long as each stream arrives in its own order:
+a pair is formed only when later messages can no longer change it. So a replay at any rate forms the same pairs.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter, deque
+from typing import TypeVar
+
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.config import PairingConfig
+
+NS_PER_S = 1_000_000_000
+AGREEING_STAMPS = 5
+"""Consecutive frames that must agree on a new time line before it is believed: half a second at 10 Hz."""
+
+MOTION_SAMPLES = 512
+"""Ego-motion samples kept: more than two seconds at 200 Hz, against pairs that wait at most a few frames."""
+
+Frame = TypeVar("Frame", CameraFrame, LidarFrame, EgoMotion)
+
+
+class _TimeLine:
+    """Refuses single stamps that leave the order of their stream; follows a step that lasts."""
+
+    def __init__(self, max_jump_ns: int) -> None:
+        self._max_jump_ns = max_jump_ns
+        self._refused: list[int] = []
+        self.latest_ns: int | None = None
+
+    def refusal(self, stamp_ns: int) -> str | None:
+        """None when the stamp is accepted, else the reason it was refused."""
+        if self.latest_ns is None or 0 < stamp_ns - self.latest_ns <= self._max_jump_ns:
+            self.latest_ns = stamp_ns
+            self._refused.clear()
+            return None
+        reason = "stamp_back" if stamp_ns <= self.latest_ns else "stamp_ahead"
+        if self._refused and not 0 < stamp_ns - self._refused[-1] <= self._max_jump_ns:
+            self._refused.clear()
+        self._refused.append(stamp_ns)
+        if len(self._refused) < AGREEING_STAMPS:
+            return reason
+        self.latest_ns = stamp_ns
+        self._refused.clear()
+        return None
+
+
+class Pairer:
+    """Joins the three streams of one camera-LiDAR pair.
+
+    A sweep and a camera frame are a pair when each is the other's nearest in sensor time, within the tolerance.
+
+    Attributes:
+        losses: frames that ended in no pair, by reason.
+    """
+
+    def __init__(self, config: PairingConfig, *, expects_motion: bool) -> None:
+        self._tolerance_ns = round(config.tolerance_s * NS_PER_S)
+        self._motion_tolerance_ns = round(config.motion_tolerance_s * NS_PER_S)
+        self._queue_frames = config.queue_frames
+        self._expects_motion = expects_motion
+        jump_ns = round(config.max_stamp_jump_s * NS_PER_S)
+        self._camera_time, self._lidar_time, self._motion_time = (_TimeLine(jump_ns) for _ in range(3))
+        self._cameras: deque[CameraFrame] = deque()
+        self._sweeps: deque[LidarFrame] = deque()
+        self._motions: deque[EgoMotion] = deque(maxlen=MOTION_SAMPLES)
+        self._waiting: deque[FramePair] = deque()
+        self.losses: Counter[str] = Counter()
+
+    def push(self, frame: CameraFrame | LidarFrame | EgoMotion) -> list[FramePair]:
+        """Takes the next frame of its stream; returns the pairs that became certain, in order of their stamps."""
+        match frame:
+            case CameraFrame():
+                self._enqueue(frame, self._camera_time, self._cameras, "camera")
+            case LidarFrame():
+                self._enqueue(frame, self._lidar_time, self._sweeps, "lidar")
+            case EgoMotion():
+                self._enqueue(frame, self._motion_time, self._motions, "motion")
+        self._match(final=False)
+        return self._release(final=False)
+
+    def flush(self) -> list[FramePair]:
+        """The pairs that were still waiting, decided as if the streams had ended here."""
+        self._match(final=True)
+        return self._release(final=True)
+
+    def _enqueue(self, frame: Frame, time_line: _TimeLine, queue: deque[Frame], stream: str) -> None:
+        reason = time_line.refusal(frame.stamp_ns)
+        if reason is not None:
+            self.losses[f"{stream}_{reason}"] += 1
+            return
+        if queue and queue[-1].stamp_ns >= frame.stamp_ns:  # the time line stepped back: what waits is of the old one
+            self._lose(stream, len(queue))
+            queue.clear()
+        queue.append(frame)
+        if len(queue) > self._queue_frames and stream != "motion":
+            queue.popleft()
+            self._lose(stream, 1)
+
+    def _lose(self, stream: str, count: int) -> None:
+        self.losses[f"{stream}_unpaired"] += count
+
+    def _match(self, *, final: bool) -> None:
+        """Pairs or drops sweeps from the oldest on, until one has to wait for frames that may still be nearer."""
+        while self._sweeps:
+            sweep = self._sweeps[0]
+            newest_camera = self._camera_time.latest_ns
+            if not final and (newest_camera is None or newest_camera < sweep.stamp_ns):
+                return
+            camera = min(self._cameras, key=lambda frame: abs(frame.stamp_ns - sweep.stamp_ns), default=None)
+            if camera is None or abs(camera.stamp_ns - sweep.stamp_ns) > self._tolerance_ns:
+                self._sweeps.popleft()
+                self._lose("lidar", 1)
+                continue
+            newest_sweep = self._sweeps[-1].stamp_ns
+            if not final and newest_sweep < camera.stamp_ns:
+                return
+            self._sweeps.popleft()
+            if any(abs(s.stamp_ns - camera.stamp_ns) < abs(sweep.stamp_ns - camera.stamp_ns) for s in self._sweeps):
+                self._lose("lidar", 1)
+                continue
+            while self._cameras and self._cameras[0].stamp_ns <= camera.stamp_ns:
+                self._cameras.popleft()
+            self._waiting.append(FramePair(camera, sweep))
+
+    def _release(self, *, final: bool) -> list[FramePair]:
+        """Hands out the pairs whose ego-motion is known, or will not become known."""
+        released = []
+        while self._waiting:
+            pair = self._waiting[0]
+            if self._expects_motion and not final and not self._motion_is_settled(pair.stamp_ns):
+                break
+            self._waiting.popleft()
+            released.append(FramePair(pair.camera, pair.lidar, self._motion_at(pair.stamp_ns)))
+        return released
+
+    def _motion_is_settled(self, stamp_ns: int) -> bool:
+        newest_motion, newest_camera = self._motion_time.latest_ns, self._camera_time.latest_ns
+        if newest_motion is not None and newest_motion >= stamp_ns:
+            return True
+        return (newest_camera is not None and newest_camera - stamp_ns > self._motion_tolerance_ns) or len(
+            self._waiting
+        ) > self._queue_frames
+
+    def _motion_at(self, stamp_ns: int) -> EgoMotion | None:
+        """Ego-motion at the stamp: a sample with exactly this stamp as it is, else interpolated between its neighbours,
+        else the nearest within the tolerance."""
+        samples = list(self._motions)
+        after = bisect_left(samples, stamp_ns, key=lambda sample: sample.stamp_ns)
+        near = [
+            s for s in samples[max(after - 1, 0) : after + 1] if abs(s.stamp_ns - stamp_ns) <= self._motion_tolerance_ns
+        ]
+        if not near:
+            return None
+        if near[-1].stamp_ns == stamp_ns:
+            return near[-1]
+        if len(near) == 1:
+            return EgoMotion(stamp_ns, near[0].frame_id, near[0].linear_mps, near[0].angular_radps)
+        before, behind = near
+        weight = (stamp_ns - before.stamp_ns) / (behind.stamp_ns - before.stamp_ns)
+        return EgoMotion(
+            stamp_ns,
+            before.frame_id,
+            _blend(before.linear_mps, behind.linear_mps, weight),
+            _blend(before.angular_radps, behind.angular_radps, weight),
+        )
+
+
+def _blend(a: tuple[float, float, float], b: tuple[float, float, float], weight: float) -> tuple[float, float, float]:
+    x, y, z = ((1.0 - weight) * p + weight * q for p, q in zip(a, b, strict=True))
+    return x, y, z

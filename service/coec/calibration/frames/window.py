@@ -1,0 +1,182 @@
+"""Choosing the pairs of a window while the stream passes: evenly over the slice, each sharp, in view, taken in motion.
+
+The slice is divided into as many bins as pairs are wanted; the first good pair of a bin is taken, and the rest of the
+bin is not even decoded. Bins and slices are cut by sensor time, so a replay at any rate chooses the same pairs.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.ports import ImageInspector
+from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
+from coec.config import WindowConfig
+from coec.errors import DecodeError
+from coec.geometry.cameras import Camera, in_image, project_point
+
+NS_PER_S = 1_000_000_000
+
+CELLS = 180
+"""Of the table of directions that are in view, from the optical axis to its opposite and all around it: 1° and 2°."""
+
+LOOKS_PER_BIN = 16
+"""Pairs of a bin that are looked at before it stays empty: a look decodes an image, and a camera that is dirty, dark or
+standing for an hour must not cost a decode of every frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairSelected:
+    """A pair that belongs to the window; `first` opens it."""
+
+    window_id: str
+    pair: FramePair
+    first: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SliceEnded:
+    """The end of a slice that had at least one pair; `complete` when there are enough of them for a window."""
+
+    window_id: str
+    pairs: int
+    complete: bool
+
+
+@dataclass(slots=True)
+class _Slice:
+    window_id: str
+    start_ns: int
+    length_ns: int
+    filled: set[int]
+    next_look_ns: int
+
+
+class WindowCutter:
+    """Cuts the stream of one camera-LiDAR pair into slices and picks the pairs of each.
+
+    Attributes:
+        rejections: pairs that were looked at and refused, by reason.
+        last_quality: what the last look at an image told.
+    """
+
+    def __init__(self, config: WindowConfig, rig: Rig, inspector: ImageInspector) -> None:
+        self._config = config
+        self._rig = rig
+        self._inspector = inspector
+        self._in_view = _directions_in_view(rig.camera)
+        self._next_length_ns = round(config.slice_s * NS_PER_S)
+        self._open: _Slice | None = None
+        self.rejections: Counter[str] = Counter()
+        self.last_quality: ImageQuality | None = None
+
+    @property
+    def selected(self) -> int:
+        """Pairs chosen so far in the open slice."""
+        return len(self._open.filled) if self._open else 0
+
+    @property
+    def slice_end_ns(self) -> int | None:
+        """Sensor time at which the open slice ends; None when none is open."""
+        return self._open.start_ns + self._open.length_ns if self._open else None
+
+    @property
+    def slice_start_ns(self) -> int | None:
+        """Stamp of the pair that opened the slice; None when none is open."""
+        return self._open.start_ns if self._open else None
+
+    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[PairSelected | SliceEnded]:
+        """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, by which it must be in view."""
+        events: list[PairSelected | SliceEnded] = [*self._end_before(pair.stamp_ns)]
+        if self._open is None:
+            window_id = f"{self._rig.pair}-{pair.stamp_ns}"
+            self._open = _Slice(window_id, pair.stamp_ns, self._next_length_ns, set(), pair.stamp_ns)
+            self._next_length_ns = round(self._config.slice_s * NS_PER_S)
+        if self._select(self._open, pair, T_camera_lidar):
+            events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
+        return events
+
+    def advance(self, stamp_ns: int) -> list[SliceEnded]:
+        """Sensor time has passed `stamp_ns` though no pair came."""
+        return self._end_before(stamp_ns) if self.slice_end_ns and stamp_ns >= self.slice_end_ns else []
+
+    def hurry(self, slice_s: float) -> None:
+        """The next slice is to be `slice_s` long: a window is wanted soon. The one after it is an ordinary one."""
+        self._next_length_ns = round(slice_s * NS_PER_S)
+
+    def finish(self) -> list[SliceEnded]:
+        """Ends the open slice here and now."""
+        ended, self._open = self._open, None
+        if ended is None or not ended.filled:
+            return []
+        return [SliceEnded(ended.window_id, len(ended.filled), len(ended.filled) >= self._config.min_pairs)]
+
+    def _end_before(self, stamp_ns: int) -> list[SliceEnded]:
+        """Ends the open slice if the stamp lies outside it; sensor time that stepped back is outside, too."""
+        if self._open is None or 0 <= stamp_ns - self._open.start_ns < self._open.length_ns:
+            return []
+        return self.finish()
+
+    def _select(self, current: _Slice, pair: FramePair, T_camera_lidar: Matrix4) -> bool:
+        bin_ns = current.length_ns // self._config.pairs
+        index = min((pair.stamp_ns - current.start_ns) // bin_ns, self._config.pairs - 1)
+        if index in current.filled or pair.stamp_ns < current.next_look_ns:
+            return False
+        reason = self._objection(pair, T_camera_lidar)
+        if reason is not None:
+            self.rejections[reason] += 1
+            current.next_look_ns = pair.stamp_ns + bin_ns // LOOKS_PER_BIN
+            return False
+        current.filled.add(index)
+        current.next_look_ns = pair.stamp_ns + bin_ns // 2
+        return True
+
+    def _objection(self, pair: FramePair, T_camera_lidar: Matrix4) -> str | None:
+        """Why the pair is not fit for a window, cheapest question first; None when it is fit."""
+        config = self._config
+        stands = pair.motion is not None and pair.motion.speed_mps < config.min_speed_mps
+        if config.require_motion and stands:
+            return "standing"
+        if self._points_in_view(pair, T_camera_lidar) < config.min_points_in_view:
+            return "out_of_view"
+        previous = self.last_quality
+        try:
+            quality = self._inspector.inspect(pair.camera)
+        except DecodeError as error:
+            return error.reason
+        self.last_quality = quality
+        if quality.mean_level < config.min_mean_level:
+            return "too_dark"
+        if quality.clipped > config.max_clipped:
+            return "clipped"
+        if quality.sharpness < config.min_sharpness:
+            return "blurred"
+        if previous is not None and previous.digest == quality.digest and not stands:
+            return "frozen"
+        return None
+
+    def _points_in_view(self, pair: FramePair, T_camera_lidar: Matrix4) -> int:
+        """By direction: the border of the view is a degree wide, which matters little to a limit for the whole. Without
+        a kernel, as the process that cuts windows loads no compiler, and without BLAS, whose threads spin."""
+        x_m, y_m, z_m = pair.lidar.xyz_m.T
+        T = T_camera_lidar.astype(np.float32)
+        x, y, z = (T[i, 0] * x_m + T[i, 1] * y_m + T[i, 2] * z_m + T[i, 3] for i in range(3))
+        across = np.arctan2(np.hypot(x, y), z) * (CELLS / np.pi)
+        around = (np.arctan2(y, x) + np.pi) * (0.5 * CELLS / np.pi)
+        cells = tuple(np.minimum(value.astype(np.int64), CELLS - 1) for value in (across, around))
+        return int(np.count_nonzero(self._in_view[cells]))
+
+
+def _directions_in_view(camera: Camera) -> NDArray[np.bool_]:
+    """(`CELLS`, `CELLS`): whether the middle of a cell of directions, camera frame, has a pixel in the image. Every
+    model is central, so the distance does not matter."""
+    across = (np.arange(CELLS) + 0.5) * (np.pi / CELLS)
+    around = (np.arange(CELLS) + 0.5) * (2.0 * np.pi / CELLS) - np.pi
+    angle, turn = (grid.ravel() for grid in np.meshgrid(across, around, indexing="ij"))
+    rays = np.column_stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
+    pixels = np.array([project_point(camera, *ray) for ray in rays.tolist()])
+    seen = (pixels[:, 2] != 0.0) & in_image(camera, pixels[:, :2])
+    return np.asarray(seen.reshape(CELLS, CELLS))

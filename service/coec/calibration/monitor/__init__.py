@@ -1,0 +1,1 @@
+"""Is what is served still right? One check, its verdict, the change detector, sensor faults."""

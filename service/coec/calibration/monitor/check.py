@@ -1,0 +1,235 @@
+"""A short look at a few pairs: where both witnesses put the extrinsic near a pose, and how good the pose itself is.
+
+What a full calibration does within tens of degrees, a look does within `REACH_RAD` of the pose it is asked about, and
+in all six degrees of freedom whatever the calibration searches: a shifted mount must be seen even where only rotations
+are estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
+from coec.calibration.monitor.sensor_faults import SceneFacts, scene_facts
+from coec.calibration.objective.curvature import axis_derivatives
+from coec.calibration.objective.edges import THINNED_POINTS, EdgeWitness, build_edges, evenly
+from coec.calibration.objective.fused import Fusion
+from coec.calibration.objective.mutual_information import (
+    Evaluation,
+    Features,
+    Objective,
+    SearchBox,
+    build_mutual_information,
+)
+from coec.calibration.ports import Silence
+from coec.calibration.search.global_search import find_basins
+from coec.calibration.search.local_search import near, polish_in_turn
+from coec.calibration.types import FramePair, Matrix4, Rig
+from coec.config import CalibrationConfig, SearchConfig
+from coec.geometry import se3
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.charts import EdgeCharts
+
+REACH_RAD = radians(4.0)
+"""How far about the pose a look searches. A pose further off leaves the local optimum at the rim, or nowhere: both are
+far beyond any limit."""
+
+BASINS = 2
+"""Maxima that both witnesses judge: what a few pairs have two of, all blurs together have one of."""
+
+ROTATION_DOF, POSE_DOF = 3, 6
+
+NO_BIAS = np.zeros(6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Some pairs with everything decoded and inferred that looks at any pose need. Entries are per pair, in order."""
+
+    rig: Rig
+    pairs: tuple[FramePair, ...]
+    features: tuple[Features, ...]
+    edges: EdgeWitness
+    scenes: tuple[SceneFacts, ...]
+
+    def of(self, indices: Sequence[int]) -> Evidence:
+        """The same of some of the pairs."""
+        return Evidence(
+            self.rig,
+            tuple(self.pairs[i] for i in indices),
+            tuple(self.features[i] for i in indices),
+            _witness_of(self.edges, indices),
+            tuple(self.scenes[i] for i in indices),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """What a look at a pose tells. Derivatives are those of mutual information (Borer et al. 2023), at the pose, over
+    rx ry rz tx ty tz; equation (2) looks at the rotations.
+
+    Attributes:
+        T_rotation: (4, 4) local optimum of both witnesses over rotations, the translation being that of the pose.
+        T_pose: (4, 4) local optimum over all six degrees of freedom.
+        offset_rotation, offset_pose: (6,) ξ from the pose to these (rad, m).
+        mi: equation (1), nats.
+        first_derivative: (6,) ∂MI/∂ξ, nats per radian or metre.
+        second_derivative: (6,) -∂²MI/∂ξ², nats per radian² or metre²; positive at a maximum.
+        edges: significance of the edges at the pose.
+        edges_at_best: that at the local optimum over rotations.
+        edges_kept: that of the finest band where the optimum is expected, over that where it is.
+        contrast: how far the edges at the local optimum stand above other poses within reach, standard deviations.
+        agreement_rad: angle between the local optima of the two witnesses.
+        overlap: points in view over the most that any pose within reach sees.
+        deficit: score of the local optimum less that of the pose, in standard deviations of the score.
+    """
+
+    pairs: int
+    T_rotation: Matrix4
+    T_pose: Matrix4
+    offset_rotation: NDArray[np.float64]
+    offset_pose: NDArray[np.float64]
+    mi: float
+    first_derivative: NDArray[np.float64]
+    second_derivative: NDArray[np.float64]
+    edges: float
+    edges_at_best: float
+    edges_kept: float
+    contrast: float
+    agreement_rad: float
+    overlap: float
+    deficit: float
+
+    @property
+    def f1(self) -> float:
+        """Largest slope of the rotations, nats per radian."""
+        return float(np.max(np.abs(self.first_derivative[:ROTATION_DOF])))
+
+    @property
+    def f2(self) -> float:
+        """Least peakedness of the rotations, nats per radian²."""
+        return float(np.min(self.second_derivative[:ROTATION_DOF]))
+
+
+def gather(sight: Sight) -> Evidence:
+    """Decodes and infers everything that looks at the pairs of `sight` need.
+
+    Raises:
+        CalibrationError: an image cannot be decoded, a frame has no depth, no sweep has a range edge.
+    """
+    window, greys = sight.window, list(sight.greys())
+    # Edges first: depth may be inferred meanwhile.
+    edges = build_edges(window.pairs, sight.points, greys, window.rig)
+    features = depth_features(sight, window.T_camera_lidar_start, DEPTH_POINTS)
+    counts = np.diff(edges.whole.first_point)
+    scenes = [
+        scene_facts(pair, grey, int(count)) for pair, grey, count in zip(window.pairs, greys, counts, strict=True)
+    ]
+    return Evidence(window.rig, window.pairs, tuple(features), edges, tuple(scenes))
+
+
+def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig, bias: NDArray[np.float64] = NO_BIAS) -> Look:
+    """A look at `pose` (4, 4), from which the optimum over rotations is expected at ξ = `bias` (6,).
+
+    Raises:
+        CalibrationError: no point can come into view.
+    """
+    reach = SearchBox(REACH_RAD, 0.0)
+    depth = build_mutual_information(evidence.features, evidence.rig, pose, reach, config.objective)
+    fusion = Fusion(evidence.edges, depth, pose, reach)
+    rotation = config.search.model_copy(update={"dof": ROTATION_DOF})
+
+    def polished(objectives: Sequence[Objective], start: Matrix4, search: SearchConfig = rotation) -> Matrix4:
+        return polish_in_turn(objectives, start, search, Silence()).T_camera_lidar
+
+    basins = [basin.T_camera_lidar for basin in find_basins(evidence.edges, pose, reach)]
+    ranked = sorted(basins, key=fusion.rank, reverse=True)[:BASINS]
+    to_rank = near(rotation, fusion.ranking[-1])
+    best = max((polished(fusion.ranking, basin, to_rank) for basin in ranked), key=fusion.rank)
+    T_rotation = polished(fusion.settling, best)
+    in_all = config.search.model_copy(update={"dof": POSE_DOF})
+    # By two ways, as blurred edges can lead six degrees of freedom astray.
+    ways = (fusion.settling, (fusion.ranking[-1], *fusion.settling[1:]))
+    ends = [polished(way, T_rotation, in_all) for way in ways]
+    T_pose = max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score)
+    of_edges = _EdgesAlone(evidence.edges)
+    T_edges, T_depth = polished([of_edges], T_rotation), polished([depth], T_rotation)
+    at_pose = fusion.settling[0].evaluate(pose)
+    first_derivative, second_derivative = axis_derivatives(depth, pose)
+    return Look(
+        pairs=len(evidence.pairs),
+        T_rotation=T_rotation,
+        T_pose=T_pose,
+        offset_rotation=se3.difference(T_rotation, pose),
+        offset_pose=se3.difference(T_pose, pose),
+        mi=at_pose.mi,
+        first_derivative=first_derivative,
+        second_derivative=second_derivative,
+        edges=of_edges.evaluate(pose).score,
+        edges_at_best=of_edges.evaluate(T_rotation).score,
+        edges_kept=_kept(evidence.edges.bands[0], se3.perturb(pose, bias), T_rotation),
+        contrast=fusion.edge_contrast(T_rotation),
+        agreement_rad=se3.rotation_angle_rad(T_edges @ se3.inverse(T_depth)),
+        overlap=at_pose.overlap,
+        deficit=fusion.settling[0].evaluate(T_rotation).score - at_pose.score,
+    )
+
+
+def _kept(band: EdgeFrames, T_expected: Matrix4, T_best: Matrix4) -> float:
+    expected, best = significances(band, np.stack([T_expected, T_best])).tolist()
+    return float(expected / max(best, 1e-9))
+
+
+class _EdgesAlone:
+    """The edge witness as an objective."""
+
+    def __init__(self, edges: EdgeWitness) -> None:
+        self._edges = edges
+
+    @property
+    def step_rad(self) -> float:
+        """The blur of the edges."""
+        return self._edges.blur_rad
+
+    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
+        """Significance; depth and overlap are not looked at."""
+        strength, square = frame_alignment(self._edges.whole, T_camera_lidar)
+        of_frames = len(strength) * strength / np.sqrt(max(float(square.sum()), 1e-9))
+        return Evaluation(float(of_frames.mean()), of_frames, mi=float("nan"), overlap=float("nan"), points_in_view=0)
+
+
+def _witness_of(edges: EdgeWitness, indices: Sequence[int]) -> EdgeWitness:
+    coarse, fine = (_charts_of(charts, indices) for charts in edges.charts)
+    count = len(coarse.weight)
+    kept = evenly(count, THINNED_POINTS)
+    return replace(
+        edges,
+        sharp=_frames_of(edges.sharp, indices),
+        whole=_frames_of(edges.whole, indices),
+        bands=tuple(_frames_of(band, indices) for band in edges.bands),
+        charts=(coarse, fine),
+        thinned=(coarse.of_points(kept), fine.of_points(kept)),
+    )
+
+
+def _charts_of(charts: EdgeCharts, indices: Sequence[int]) -> EdgeCharts:
+    """The range edges of some frames; the charts of the others stay where they are."""
+    return charts.of_points(np.flatnonzero(np.isin(charts.frame, np.asarray(indices))))
+
+
+def _frames_of(frames: EdgeFrames, indices: Sequence[int]) -> EdgeFrames:
+    first = frames.first_point
+    rows = np.concatenate([np.arange(first[i], first[i + 1]) for i in indices])
+    counts = [first[i + 1] - first[i] for i in indices]
+    return replace(
+        frames,
+        xyz_m=np.ascontiguousarray(frames.xyz_m[:, rows]),
+        weight=frames.weight[rows],
+        first_point=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        maps=np.ascontiguousarray(frames.maps[list(indices)]),
+    )

@@ -1,0 +1,145 @@
+"""A look, judged: its figures against the limits of the rig, and what is wrong with its data.
+
+The figures are the paper's three, equation (2), and next to them a sharper question: how many standard deviations lie
+between the pose and the local optimum of both witnesses.
+"""
+
+from __future__ import annotations
+
+from math import degrees, inf
+
+import numpy as np
+
+from coec.calibration.commissioning.baseline import (
+    Accuracy,
+    Baseline,
+    Drift,
+    MonitorLimits,
+    chi2_quantile,
+    uncommissioned,
+)
+from coec.calibration.estimators import look
+from coec.calibration.frames.timing import explained_by_motion
+from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.monitor.check import NO_BIAS, POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
+from coec.calibration.monitor.sensor_faults import data_causes, dirty_blocks
+from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.types import Matrix4, Metric, Window
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+
+FALSE_ALARM_RATE = 0.01
+"""Share of looks at a right pose that may be flagged: the limit of an uncommissioned rig, and what commissioning aims
+at unless told otherwise."""
+
+MIN_PAIRS = 4
+"""With fewer, a lamp post decides."""
+
+LOST_EDGES_SHARE = 0.25
+"""Of the limit of the squared distance over rotations, where the edges are lost at the pose. Standard deviations are
+those of a rig's looks at large; how sharply this scene tells the pose, its edges know."""
+
+UNCOMMISSIONED = MonitorLimits(
+    max_distance2_rotation=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0, ROTATION_DOF),
+    max_farthest2_pose=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0 / POSE_DOF, 1),
+    min_edges_per_pair=4.0,
+)
+"""Of an uncommissioned rig. Edges at the right pose are at 10 to 24 on every recording tried."""
+
+
+def observe(
+    window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
+) -> Observation:
+    """A look at the extrinsic at which `window` starts, with all its pairs: five to ten of the latest, in motion.
+
+    Raises:
+        CalibrationError: fewer than `MIN_PAIRS` pairs, or an image or its depth cannot be decoded.
+    """
+    if len(window.pairs) < MIN_PAIRS:
+        raise CalibrationError(f"a look needs {MIN_PAIRS} pairs, there are {len(window.pairs)}")
+    evidence = gather(look(window, depth, images, config, Silence()))
+    pose = window.T_camera_lidar_start
+    bias = NO_BIAS if baseline is None else baseline.rotation.expected
+    return judge_look(evidence, look_at(evidence, pose, config, bias), pose, baseline)
+
+
+def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline | None) -> Observation:
+    """A look at `pose` (4, 4) against the limits of the rig, and the causes of what is wrong with it."""
+    limits = UNCOMMISSIONED if baseline is None else baseline.monitor
+    camera = evidence.rig.camera
+    rotation, accuracy = uncommissioned(camera) if baseline is None else (baseline.rotation, baseline.pose)
+    of_rotation, of_pose = over_limits(seen, rotation, accuracy, limits)
+    metrics = _metrics(seen, of_rotation, of_pose, limits)
+    flagged, weak = max(of_rotation, of_pose) > 1.0, edges_per_pair(seen) < limits.min_edges_per_pair
+    causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
+    dirty, textured = ((), 0) if baseline is None or causes else dirty_blocks(evidence.scenes, baseline.scene)
+    if not causes:
+        explained = explained_by_motion(
+            evidence.pairs,
+            evidence.rig,
+            evidence.edges.whole,
+            se3.perturb(pose, rotation.expected),
+            seen.T_rotation,
+            limits.min_edges_per_pair * float(np.sqrt(seen.pairs)),
+        )
+        causes = () if explained is None else (explained,)
+    stamps_ns = tuple(pair.stamp_ns for pair in evidence.pairs)
+    return Observation(
+        stamp_ns=stamps_ns[-1],
+        pair_stamps_ns=stamps_ns,
+        metrics=metrics,
+        offset=seen.offset_pose - accuracy.bias,
+        sigma=accuracy.sigma(seen.pairs),
+        distance2=max(of_rotation, of_pose),
+        flagged=flagged,
+        weak=weak,
+        flagged_by_paper=None if baseline is None else by_equation_2(seen, limits),
+        causes=causes,
+        first_derivative=seen.first_derivative,
+        second_derivative=seen.second_derivative,
+        drift=None if baseline is None else _drift(seen, baseline),
+        dirty=dirty,
+        textured=textured,
+    )
+
+
+def over_limits(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> tuple[float, float]:
+    """Squared distances of the local optima over three and six degrees of freedom, over their limits: a look is flagged
+    above 1."""
+    within = limits.max_distance2_rotation * (LOST_EDGES_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0)
+    return (
+        rotation.distance2(seen.offset_rotation, seen.pairs) / within,
+        pose.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose,
+    )
+
+
+def by_equation_2(seen: Look, limits: MonitorLimits) -> bool:
+    """Equation (2) of Borer et al. 2023: failed if MI < MI_lim or f' > f'_lim or f'' < f''_lim."""
+    return seen.mi < limits.min_mi or seen.f1 > limits.max_f1 or seen.f2 < limits.min_f2
+
+
+def edges_per_pair(seen: Look) -> float:
+    """Significance of the edges at the local optimum over the root of the number of pairs."""
+    return seen.edges_at_best / float(np.sqrt(max(seen.pairs, 1)))
+
+
+def _drift(seen: Look, baseline: Baseline) -> Drift:
+    """How far the local optimum of a look lies from the commissioned calibration, over six degrees of freedom."""
+    value = se3.difference(seen.T_pose, baseline.T_camera_lidar) - baseline.pose.bias
+    return Drift(value, baseline.pose.sigma(seen.pairs))
+
+
+def _metrics(seen: Look, of_rotation: float, of_pose: float, limits: MonitorLimits) -> tuple[Metric, ...]:
+    return (
+        Metric("mi", seen.mi, limits.min_mi, at_least=True),
+        Metric("f1", seen.f1, limits.max_f1, at_least=False),
+        Metric("f2", seen.f2, limits.min_f2, at_least=True),
+        Metric("distance_rotation", of_rotation, 1.0, at_least=False),
+        Metric("distance_pose", of_pose, 1.0, at_least=False),
+        Metric("edge_score", seen.edges, -inf, at_least=True),
+        Metric("edges_per_pair", edges_per_pair(seen), limits.min_edges_per_pair, at_least=True),
+        Metric("edges_kept", seen.edges_kept, limits.min_edges_kept, at_least=True),
+        Metric("agreement_deg", degrees(seen.agreement_rad), degrees(limits.max_agreement_rad), at_least=False),
+        Metric("overlap", seen.overlap, limits.min_overlap, at_least=True),
+    )

@@ -1,0 +1,258 @@
+"""Why a look at the extrinsic went wrong: a bent mount, or data that cannot tell.
+
+Only a bent mount is a wrong calibration. Everything else is told apart from it by what it does to the frames
+themselves: a covered lens has no gradients, a lost beam no points, a wrong clock moves every sweep along the motion of
+the vehicle. Each cause needs most pairs of a look, so that one bad frame is none.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.ego_mask import cell_means
+from coec.calibration.types import FramePair, Reason
+from coec.geometry.vectors import lengths
+
+BLOCK_ROWS, BLOCK_COLUMNS = 18, 32
+"""The image is judged in blocks: dirt covers some of them, a covered lens all."""
+
+DARK_LEVEL = 40.0
+"""Grey value that nine pixels in ten stay below in the dark, of 255."""
+
+FLAT_GRADIENT = 1.0
+"""Mean difference of neighbouring grey values below which a block shows nothing: sensor noise and JPEG leave less."""
+
+COVERED_SHARE = 0.7
+"""Share of flat blocks by which a lens is covered: sky and road leave more than half of an outdoor picture textured."""
+
+TEXTURED_GRADIENT = 2.0
+"""Blocks with a smaller gradient when the rig was commissioned cannot show dirt."""
+
+DIRTY_RATIO, DIRTY_SHARE = 0.4, 0.012
+"""A block looks dirty when its sharpest exposure has less than this share of the gradient that it had when the rig was
+commissioned; so many of the textured blocks make a dirty lens, if it is the same blocks in `DIRTY_LOOKS` looks running.
+Another street does the same to 6 % of them for 5 s, and to less than 0.6 % for 20 s: dirt stays where it is."""
+
+DIRTY_LOOKS = 3.5
+"""Independent looks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
+
+THUMBNAIL_CELL_PX = 8
+"""Pixels a side that are one of the thumbnail by which pictures are compared."""
+
+SAME_PICTURE = 0.01
+"""Mean absolute difference of two exposures over the standard deviation of their grey values below which they are the
+same picture: noise of a frozen image that was compressed anew."""
+
+MOVED_M = 1.0
+"""A vehicle that drove so far must see another picture."""
+
+BANDS, BAND_RANGE_RAD = 40, (-0.45, -0.05)
+"""Bands of elevation of 0.57°, of -26° to -3°, in which points are counted: each holds a beam of a 64-beam sensor, and
+each beam finds the ground. Beams above may go astray for want of anything to hit."""
+
+SECTORS = 36
+"""Sectors of azimuth of 10°, of the same points."""
+
+LOST_RATIO, LOST_SHARE = 0.2, 0.08
+"""A band or sector is lost when no sweep of a look has this share of the points it had when the rig was commissioned;
+so many of them make a sensor that lost beams: five of 64."""
+
+FEW_POINTS = 30
+"""Bands and sectors with fewer points when commissioned are not counted."""
+
+OPEN_FIELD_RATIO, OPEN_FIELD_EDGES = 0.2, 60
+"""Range edges of a sweep, against the commissioned rig and at least: with fewer there is nothing to lay on an image."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """A machine-readable code and one sentence."""
+
+    code: str
+    text: str
+
+    def as_reason(self) -> Reason:
+        """As a reason of a verdict or a state of health."""
+        return Reason(self.code, self.text)
+
+
+BENT_MOUNT = Cause("bent_mount", "The camera and the LiDAR have moved against each other.")
+LENS_DIRTY = Cause("lens_dirty", "Parts of the image have lost their contrast in every exposure.")
+LENS_COVERED = Cause("lens_covered", "Most of the image shows nothing.")
+CAMERA_FROZEN = Cause("camera_frozen", "The camera repeats the same picture while the vehicle drives.")
+BEAMS_LOST = Cause("lidar_beams_lost", "Some directions of the LiDAR return far fewer points than when commissioned.")
+EGO_MOTION_WRONG = Cause("ego_motion_wrong", "The sweeps fit the images better with another ego-motion.")
+TIME_OFFSET = Cause("time_offset", "The sweeps fit the images better with another time between the sensors.")
+DARK = Cause("dark", "It is too dark for the camera.")
+OPEN_FIELD = Cause("open_field", "There is too little structure in reach of the LiDAR.")
+
+CAUSES = {
+    cause.code: cause
+    for cause in (
+        BENT_MOUNT,
+        LENS_COVERED,
+        DARK,
+        CAMERA_FROZEN,
+        LENS_DIRTY,
+        BEAMS_LOST,
+        OPEN_FIELD,
+        EGO_MOTION_WRONG,
+        TIME_OFFSET,
+    )
+}
+"""By code, those that hide the others first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneFacts:
+    """What one pair shows of the sensors themselves.
+
+    Attributes:
+        gradient: (BLOCK_ROWS, BLOCK_COLUMNS) mean absolute difference of neighbouring grey values.
+        bright: grey value below which nine pixels in ten lie.
+        thumbnail: float32, mean grey values of cells of `THUMBNAIL_CELL_PX`.
+        digest: of the pixels.
+        bands: (BANDS,) points by elevation.
+        sectors: (SECTORS,) the same points by azimuth.
+        range_edges: range edges of the sweep.
+        speed_mps: of the vehicle; None = unknown.
+    """
+
+    stamp_ns: int
+    gradient: NDArray[np.float64]
+    bright: float
+    thumbnail: NDArray[np.float32]
+    digest: int
+    bands: NDArray[np.int64]
+    sectors: NDArray[np.int64]
+    range_edges: int
+    speed_mps: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneBaseline:
+    """What the pairs of a commissioned rig show, medians: see `SceneFacts`."""
+
+    gradient: NDArray[np.float64]
+    bands: NDArray[np.float64]
+    sectors: NDArray[np.float64]
+    range_edges: float
+
+
+def scene_facts(pair: FramePair, grey: NDArray[np.uint8], range_edges: int) -> SceneFacts:
+    """The facts of a pair whose image is `grey` (h, w) and whose sweep has so many range edges."""
+    xyz_m = pair.lidar.xyz_m
+    range_m = np.maximum(lengths(xyz_m), 1e-6)
+    elevation = np.arcsin(np.clip(xyz_m[:, 2] / range_m, -1.0, 1.0))
+    downwards = (elevation >= BAND_RANGE_RAD[0]) & (elevation <= BAND_RANGE_RAD[1])
+    azimuth = np.arctan2(xyz_m[downwards, 1], xyz_m[downwards, 0])
+    return SceneFacts(
+        stamp_ns=pair.stamp_ns,
+        gradient=_block_gradients(grey),
+        bright=float(np.quantile(grey[::4, ::4], 0.9)),
+        thumbnail=cell_means(grey, THUMBNAIL_CELL_PX).astype(np.float32),
+        digest=zlib.crc32(np.ascontiguousarray(grey).data),
+        bands=np.histogram(elevation, BANDS, BAND_RANGE_RAD)[0].astype(np.int64),
+        sectors=np.histogram(azimuth, SECTORS, (-pi, pi))[0].astype(np.int64),
+        range_edges=range_edges,
+        speed_mps=None if pair.motion is None else pair.motion.speed_mps,
+    )
+
+
+def scene_baseline(scenes: Sequence[SceneFacts]) -> SceneBaseline:
+    """Medians over the pairs that commissioned a rig."""
+    return SceneBaseline(
+        gradient=np.median([scene.gradient for scene in scenes], axis=0),
+        bands=np.median([scene.bands for scene in scenes], axis=0),
+        sectors=np.median([scene.sectors for scene in scenes], axis=0),
+        range_edges=float(np.median([scene.range_edges for scene in scenes])),
+    )
+
+
+def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) -> tuple[Cause, ...]:
+    """Every reason in the frames themselves not to believe a look at them, those that hide others first. Lost beams are
+    seen against a commissioned rig only, dirt only over several looks."""
+    gradient = np.array([scene.gradient for scene in scenes])
+    causes = []
+    dark = float(np.median([scene.bright for scene in scenes])) < DARK_LEVEL
+    if dark:
+        causes.append(DARK)
+    elif float((gradient.max(axis=0) < FLAT_GRADIENT).mean()) > COVERED_SHARE:
+        causes.append(LENS_COVERED)
+    if _is_frozen(scenes):
+        causes.append(CAMERA_FROZEN)
+    if (
+        baseline is not None
+        and max(
+            _lost(np.array([scene.bands for scene in scenes]), baseline.bands),
+            _lost(np.array([scene.sectors for scene in scenes]), baseline.sectors),
+        )
+        > LOST_SHARE
+    ):
+        causes.append(BEAMS_LOST)
+    edges = float(np.median([scene.range_edges for scene in scenes]))
+    few = OPEN_FIELD_EDGES if baseline is None else max(OPEN_FIELD_EDGES, OPEN_FIELD_RATIO * baseline.range_edges)
+    if edges < few and not causes:
+        causes.append(OPEN_FIELD)
+    return tuple(causes)
+
+
+def dirty_blocks(scenes: Sequence[SceneFacts], baseline: SceneBaseline) -> tuple[tuple[int, ...], int]:
+    """Blocks of the image, by their number, that are dirty for all that these pairs show, and of how many that can
+    be."""
+    textured = baseline.gradient >= TEXTURED_GRADIENT
+    sharpest = np.max([scene.gradient for scene in scenes], axis=0)
+    dirty = textured & (sharpest < DIRTY_RATIO * baseline.gradient)
+    return tuple(int(block) for block in np.flatnonzero(dirty)), int(textured.sum())
+
+
+def _lost(counts: NDArray[np.int64], usual: NDArray[np.float64]) -> float:
+    """Share of the usual directions in which no sweep has what it usually has."""
+    counted = usual >= FEW_POINTS
+    if not counted.any():
+        return 0.0
+    return float((counts.max(axis=0) < LOST_RATIO * usual)[counted].mean())
+
+
+def _is_frozen(scenes: Sequence[SceneFacts]) -> bool:
+    """Whether most neighbours in time that the vehicle drove between show the same picture."""
+    pairs = [(a, b) for a, b in pairwise(scenes) if _moved(a, b)]
+    same = sum(_same_picture(a, b) for a, b in pairs)
+    return len(pairs) > 0 and 2 * same > len(pairs)
+
+
+def _moved(a: SceneFacts, b: SceneFacts) -> bool:
+    """Unknown motion counts as driving: a camera that stands still still has noise."""
+    if a.speed_mps is None or b.speed_mps is None:
+        return True
+    return min(a.speed_mps, b.speed_mps) * (b.stamp_ns - a.stamp_ns) * 1e-9 > MOVED_M
+
+
+def _same_picture(a: SceneFacts, b: SceneFacts) -> bool:
+    if a.digest == b.digest:
+        return True
+    if a.thumbnail.shape != b.thumbnail.shape or a.speed_mps is None:
+        return False
+    contrast = max(float(a.thumbnail.std()), 1.0)
+    return float(np.abs(a.thumbnail - b.thumbnail).mean()) < SAME_PICTURE * contrast
+
+
+def _block_gradients(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
+    rows, columns = grey.shape[0] // BLOCK_ROWS, grey.shape[1] // BLOCK_COLUMNS
+    whole = grey[: rows * BLOCK_ROWS, : columns * BLOCK_COLUMNS]
+    sums = np.empty((BLOCK_ROWS, BLOCK_COLUMNS), np.int64)
+    # A row of blocks at a time stays in the cache; the first pixels of the next belong to its last differences.
+    for block in range(BLOCK_ROWS):
+        values = whole[block * rows : (block + 1) * rows + 1].astype(np.int16)
+        across, down = np.abs(np.diff(values[:rows], axis=1)), np.abs(np.diff(values, axis=0))
+        of_columns = down.sum(axis=0, dtype=np.int64)
+        of_columns[:-1] += across.sum(axis=0, dtype=np.int64)
+        sums[block] = of_columns.reshape(BLOCK_COLUMNS, columns).sum(axis=1)
+    return np.asarray(sums / (rows * columns))

@@ -1,0 +1,81 @@
+"""When a window is wanted soon: the monitor suspects, and only a window can tell.
+
+An open slice that began before the mount moved mixes two extrinsics and is ended, whatever it holds. One that began
+later is ended as soon as it is enough for a window, or given up for a short dense one if that is sooner.
+"""
+
+from __future__ import annotations
+
+from coec.calibration.frames.window import SliceEnded, WindowCutter
+from coec.config import MonitorConfig, WindowConfig
+
+TRIES = 3
+"""Urgent windows per suspicion: where these do not help, more of them will not."""
+
+MARGIN = 1.2
+"""By which a slice is longer than its pairs need at the rate at which they come."""
+
+NS_PER_S = 1_000_000_000
+
+
+class Urgency:
+    """Hurries the `WindowCutter` of one pair while there is an alarm. Sensor time alone decides."""
+
+    def __init__(self, monitor: MonitorConfig, window: WindowConfig) -> None:
+        self._monitor = monitor
+        self._window = window
+        self._since_ns: int | None = None
+        self._tries = 0
+        self._hurried = False
+
+    def alarm(self, since_ns: int) -> None:
+        """A window is wanted of pairs since `since_ns`."""
+        if self._since_ns is None and self._tries < TRIES:
+            self._since_ns, self._hurried = since_ns, False
+            self._tries += 1
+
+    def calm(self) -> None:
+        """The suspicion is over."""
+        self._since_ns, self._tries = None, 0
+
+    def heed(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
+        """Before a pair is offered to the cutter: ends its slice if that is called for.
+
+        Args:
+            rate_hz: at which pairs come; None while unknown.
+        """
+        if self._since_ns is None:
+            return []
+        start_ns, enough = cutter.slice_start_ns, cutter.selected >= self._window.min_pairs
+        if start_ns is None:
+            return self._hurry(cutter, rate_hz)
+        if start_ns < self._since_ns:
+            return self._hurry(cutter, rate_hz)
+        if self._hurried:
+            return []
+        if enough:
+            self._since_ns = None
+            return cutter.finish()
+        lacking = self._window.min_pairs - cutter.selected
+        waits_s = lacking * self._window.slice_s / self._window.pairs
+        return [] if waits_s <= self._length_s(rate_hz) else self._hurry(cutter, rate_hz)
+
+    def ended(self, event: SliceEnded, cutter: WindowCutter, rate_hz: float | None) -> None:
+        """A slice ended by itself: with enough pairs it is the window that was wanted, else the next one is."""
+        if self._since_ns is None or not self._hurried:
+            return
+        if event.complete:
+            self._since_ns = None
+        else:
+            cutter.hurry(self._length_s(rate_hz))
+
+    def _hurry(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
+        ended = cutter.finish()
+        cutter.hurry(self._length_s(rate_hz))
+        self._hurried = True
+        return ended
+
+    def _length_s(self, rate_hz: float | None) -> float:
+        """Of an urgent slice: as configured, or longer where pairs come slowly, but no longer than any other."""
+        needed_s = MARGIN * self._window.pairs / rate_hz if rate_hz else 0.0
+        return min(max(self._monitor.urgent_slice_s, needed_s), self._window.slice_s)

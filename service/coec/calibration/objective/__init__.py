@@ -1,0 +1,1 @@
+"""What is maximised: mutual information, edges, both fused, and the curvature at the optimum."""

@@ -1,0 +1,157 @@
+"""The second witness: range edges of the sweeps on edges of the images, at several scales."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import FramePair, Rig
+from coec.errors import CalibrationError
+from coec.geometry.cameras import Camera, pixel_rad, scaled
+from coec.geometry.edges.alignment import EdgeFrames
+from coec.geometry.edges.charts import EdgeCharts, edge_charts
+from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
+from coec.geometry.edges.range_edges import range_edges
+
+BANDS = 3
+"""Bands of about 0.8, 0.4 and 0.2 degrees: the coarsest feels a pose 0.9 degrees away, the finest is sharp enough to
+tell a true basin from a layout that happens to fit."""
+
+MAX_PIXELS = 2_500_000
+"""Images are halved until they have no more before the last search on them: bounded time, whatever the camera."""
+
+COARSEST_BLUR_RAD = radians(0.6)
+"""Least blur of the coarsest level, an angle about the optical axis and so the same for any lens; the levels double, so
+it is below twice that. Wider, the layout of a scene hides the true pose (measured: in a garage the true pose comes 80th
+of the cover at 1.9° and first to tenth at 0.9°); narrower, the cover of the global stage has to be finer."""
+
+RANKED_POINTS = 60_000
+"""Range edges of the window that rank basins, at most: bounded time for a window of many frames."""
+
+THINNED_POINTS = 3_000
+"""Range edges of the window that the cover visits; significance falls with the square root of their number only."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeWitness:
+    """One witness in four forms.
+
+    Attributes:
+        sharp: every range edge on the sharpest image edges, through the model of the lens: settles a pose.
+        whole: the same on blurred edges, layout and all: leads there. It is drawn to where edges are dense, but its
+            hills are wide; those of a band as fine are not. Half as many pixels a side: the blur is a pixel wide.
+        blur_rad: the blur of `whole`, an angle about the optical axis.
+        bands: from fine to coarse, `RANKED_POINTS` evenly chosen range edges on one band each, through the model of the
+            lens: ranks basins.
+        band_blur_rad: the blur of each, an angle likewise.
+        charts: the coarsest and the next finer band with the same range edges: fast.
+        thinned: the same with `THINNED_POINTS` evenly chosen range edges: faster.
+    """
+
+    sharp: EdgeFrames
+    whole: EdgeFrames
+    blur_rad: float
+    bands: tuple[EdgeFrames, ...]
+    band_blur_rad: tuple[float, ...]
+    charts: tuple[EdgeCharts, EdgeCharts]
+    thinned: tuple[EdgeCharts, EdgeCharts]
+
+
+Points = Callable[[int, NDArray[np.int64]], NDArray[np.float32]]
+
+
+def build_edges(
+    pairs: Sequence[FramePair], points: Points, greys: Iterable[NDArray[np.uint8]], rig: Rig
+) -> EdgeWitness:
+    """Range edges of the sweeps (found as measured, placed motion-compensated) and edge maps of the images.
+
+    Args:
+        pairs: the window's.
+        points: places the chosen points of the sweep of a pair: motion-compensated, (N, 3) float32.
+        greys: (height, width) uint8, the images of the pairs.
+
+    Raises:
+        CalibrationError: no sweep has a range edge, or an image is not of the camera's size.
+    """
+    found = [range_edges(pair.lidar.xyz_m, pair.lidar.ring) for pair in pairs]
+    first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in found])]).astype(np.int64)
+    if first_point[-1] == 0:
+        raise CalibrationError("no sweep has a jump in range: there is nothing to lay onto the edges of the images")
+    xyz_m = np.concatenate([points(frame, edges.index) for frame, edges in enumerate(found)])
+    lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
+    weight = np.concatenate([edges.weight for edges in found])
+    finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
+    finest = min(finest, coarsest + 1 - BANDS)
+    sharp, whole, *of_bands = _maps(EdgeScales(lit, finest, coarsest), greys, len(pairs))
+    points_m = np.ascontiguousarray(xyz_m.T)
+
+    def frames(level: int, maps: NDArray[np.int8], chosen: NDArray[np.int64]) -> EdgeFrames:
+        # Halving leaves out a last odd row or column: the scale is a half all the same.
+        _, height, width = maps.shape
+        camera = scaled(rig.camera, 0.5**level, 0.5**level)._replace(width=width, height=height)
+        first_chosen = np.searchsorted(chosen, first_point)
+        return EdgeFrames(camera, np.ascontiguousarray(points_m[:, chosen]), weight[chosen], first_chosen, maps)
+
+    every, ranked = np.arange(len(weight)), evenly(len(weight), RANKED_POINTS)
+    levels = range(coarsest + 1 - BANDS, coarsest + 1)
+    bands = tuple(frames(level, maps, ranked) for level, maps in zip(levels, of_bands, strict=True))
+    blur_rad = tuple(_blur_rad(rig.camera, level) for level in levels)
+    of_points = np.repeat(np.arange(len(pairs)), np.diff(first_point))[ranked]
+    coarse, fine = (
+        edge_charts(bands[k].camera, bands[k].maps, blur_rad[k], points_m[:, ranked], weight[ranked], of_points)
+        for k in (-1, -2)
+    )
+    kept = evenly(len(ranked), THINNED_POINTS)
+    return EdgeWitness(
+        sharp=frames(finest, sharp, every),
+        whole=frames(finest + 1, whole, every),
+        blur_rad=_blur_rad(rig.camera, finest),
+        bands=bands,
+        band_blur_rad=blur_rad,
+        charts=(coarse, fine),
+        thinned=(coarse.of_points(kept), fine.of_points(kept)),
+    )
+
+
+def _maps(scales: EdgeScales, greys: Iterable[NDArray[np.uint8]], frames: int) -> list[NDArray[np.int8]]:
+    """The sharpest map, the whole one and the last `BANDS` bands of all images, each (F, h, w).
+
+    An image at a time: none is in memory twice, nor longer than its turn where `greys` are decoded as they are asked
+    for.
+    """
+    stacks: list[NDArray[np.int8]] = []
+    for frame, grey in enumerate(greys):
+        if grey.shape != scales.shape:
+            (height, width), (rows, columns) = grey.shape, scales.shape
+            raise CalibrationError(f"an image has {width} x {height} px, the camera model {columns} x {rows} px")
+        pyramid = scales.pyramid(grey)
+        maps = (pyramid.sharp, pyramid.whole, *pyramid.bands[-BANDS:])
+        stacks = stacks or [np.empty((frames, *level.shape), np.int8) for level in maps]
+        for stack, level in zip(stacks, maps, strict=True):
+            stack[frame] = level
+    return stacks
+
+
+def evenly(count: int, at_most: int) -> NDArray[np.int64]:
+    """Indices of so many of `count` things, evenly chosen; of all where there are no more."""
+    return np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(np.int64))
+
+
+def _finest_level(camera: Camera) -> int:
+    """The first level of the pyramid that has no more than `MAX_PIXELS`."""
+    return math.ceil(math.log2(max(1.0, camera.width * camera.height / MAX_PIXELS)) / 2.0)
+
+
+def _coarsest_level(camera: Camera) -> int:
+    """The first level of the pyramid that is blurred by `COARSEST_BLUR_RAD`, and no less than `BANDS` - 1."""
+    return max(BANDS - 1, math.ceil(math.log2(COARSEST_BLUR_RAD / _blur_rad(camera, 0))))
+
+
+def _blur_rad(camera: Camera, level: int) -> float:
+    """Blur of a level, an angle about the optical axis."""
+    return 2.0**level * BLUR_SIGMA_PX * pixel_rad(camera)

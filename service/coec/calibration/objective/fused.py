@@ -1,0 +1,120 @@
+"""Two independent witnesses in one objective: edges, sharp and unbiased, and depth, broad and blind to texture.
+
+Each is counted in standard deviations of its own score over other poses within reach, so that neither needs a weight: a
+network that tells nothing adds noise of one unit, a scene without edges likewise (METHOD, section 3, "complement").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import hypot, radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.objective.edges import EdgeWitness
+from coec.calibration.objective.mutual_information import Evaluation, MutualInformation, SearchBox
+from coec.calibration.search.global_search import sample_reach
+from coec.calibration.types import Matrix4
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.charts import significances as charted_significances
+
+OTHER_POSES = 64
+"""Poses within reach from which the mean and the standard deviation of a score are taken: known to an eighth."""
+
+OTHER_POSES_RAD = radians(28.0)
+"""The reach from which those of the edges are taken at least, whatever the search may reach: nearer to the truth, poses
+share too much of the layout of the scene with it to stand for wrong ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Mean and standard deviation of a score over other poses."""
+
+    mean: float
+    deviation: float
+
+    @classmethod
+    def of(cls, scores: NDArray[np.float64]) -> Scale:
+        # A score that does not vary at all tells nothing; it must not divide by zero either.
+        return cls(float(scores.mean()), max(float(scores.std()), 1e-9))
+
+    def standard(self, score: float) -> float:
+        return (score - self.mean) / self.deviation
+
+
+class FusedObjective:
+    """Standardised edge significance at one blur plus standardised mutual information, per frame and in sum."""
+
+    def __init__(self, edges: EdgeFrames, step_rad: float, depth: MutualInformation, of_edges: Scale, of_depth: Scale):
+        self._edges, self._depth = edges, depth
+        self._of_edges, self._of_depth = of_edges, of_depth
+        self._step_rad = step_rad
+
+    @property
+    def step_rad(self) -> float:
+        """The blur of the edges, or more: the hill of the sharpest has ripples a pixel wide."""
+        return self._step_rad
+
+    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
+        """The objective at `T_camera_lidar` (4, 4), in standard deviations."""
+        depth = self._depth.evaluate(T_camera_lidar)
+        strength, square = frame_alignment(self._edges, T_camera_lidar)
+        # Σ w·e of a frame over the root of all frames' Σ w²: the sum over the frames is the significance of the window.
+        of_frames = len(strength) * strength / np.sqrt(max(float(square.sum()), 1e-9))
+        frame_scores = (of_frames - self._of_edges.mean) / self._of_edges.deviation
+        frame_scores = frame_scores + (depth.frame_scores - self._of_depth.mean) / self._of_depth.deviation
+        return Evaluation(
+            score=float(frame_scores.mean()),
+            frame_scores=frame_scores,
+            mi=depth.mi,
+            overlap=depth.overlap,
+            points_in_view=depth.points_in_view,
+        )
+
+
+class Fusion:
+    """Both witnesses of a window, with their scales frozen from poses within reach.
+
+    Attributes:
+        ranking: what a basin is polished on before it is ranked, one after the other; the coarsest band the charts have
+            settled.
+        settling: what the best basin is polished on in the end, one after the other.
+    """
+
+    ranking: tuple[FusedObjective, ...]
+    settling: tuple[FusedObjective, FusedObjective]
+
+    def __init__(self, edges: EdgeWitness, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
+        self._edges, self._depth = edges, depth
+        poses = sample_reach(start, reach, OTHER_POSES)
+        self._of_depth = Scale.of(np.array([depth.evaluate(pose).score for pose in poses]))
+        poses = sample_reach(start, replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD)), OTHER_POSES)
+        self._of_bands = Scale.of(np.mean([charted_significances(chart, poses) for chart in edges.charts], axis=0))
+        self.ranking = tuple(
+            FusedObjective(band, blur_rad, depth, self._of_bands, self._of_depth)
+            for band, blur_rad in reversed(list(zip(edges.bands[:-1], edges.band_blur_rad[:-1], strict=True)))
+        )
+        of_whole, of_sharp = (Scale.of(significances(level, poses)) for level in (edges.whole, edges.sharp))
+        self.settling = (
+            FusedObjective(edges.whole, edges.blur_rad, depth, of_whole, self._of_depth),
+            FusedObjective(edges.sharp, edges.blur_rad, depth, of_sharp, self._of_depth),
+        )
+
+    def edge_contrast(self, T_camera_lidar: Matrix4) -> float:
+        """How far the edge witness, averaged over its bands, stands above other poses; standard deviations."""
+        z = [float(significances(band, T_camera_lidar[None])[0]) for band in self._edges.bands]
+        return self._of_bands.standard(float(np.mean(z)))
+
+    def depth_contrast(self, T_camera_lidar: Matrix4) -> float:
+        """How far the depth witness stands above other poses; standard deviations."""
+        return self._of_depth.standard(self._depth.evaluate(T_camera_lidar).score)
+
+    def rank(self, T_camera_lidar: Matrix4) -> float:
+        """How outstanding a pose is to both witnesses, standard deviations.
+
+        The root of the sum of squares, as improbabilities combine (Fisher 1925: the logarithm of a normal tail falls
+        with the square). A plain sum would let two poor showings outdo one that cannot be chance.
+        """
+        edges, depth = self.edge_contrast(T_camera_lidar), self.depth_contrast(T_camera_lidar)
+        return hypot(max(edges, 0.0), max(depth, 0.0))

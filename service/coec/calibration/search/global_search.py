@@ -1,0 +1,191 @@
+"""The global stage: every basin of the edge witness within reach of the start, from coarse to fine, in bounded time.
+
+A low-discrepancy cover of the reach is scored on the coarsest level with few edges; the best, kept apart, climb on ever
+finer levels with ever more edges. Nothing is drawn at random: same input, same basins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, pi, radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.objective.edges import EdgeWitness
+from coec.calibration.objective.mutual_information import SearchBox
+from coec.calibration.types import Matrix4
+from coec.geometry import se3
+from coec.geometry.edges.charts import EdgeCharts, climb, keep_apart, significances
+from coec.geometry.vectors import lengths
+
+COVER_RAD = radians(0.9)
+"""Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
+
+MIN_COVER, MAX_COVER = 10_000, 150_000
+"""Poses of the cover, whatever the reach: enough for the translations of a small one, bounded time for a large one."""
+
+BLOCK = 10_000
+"""Poses that are made at once: what is needed between is many times as large as they are."""
+
+CANDIDATES = 30_000
+"""Poses of the cover among which those that begin are looked for: most neighbours of a good pose are good, too."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """One round of climbing: how many poses begin it, the best on its chart, how far apart (rad); on the coarse or the
+    fine chart, thinned or not; first step (rad) and halvings of it."""
+
+    poses: int
+    apart_rad: float
+    chart: int
+    thinned: bool
+    step_rad: float
+    halvings: int
+
+
+COARSE, FINE = 0, 1
+
+ROUNDS = (
+    _Round(1500, radians(0.9), COARSE, thinned=True, step_rad=radians(0.45), halvings=1),
+    _Round(150, radians(0.7), FINE, thinned=True, step_rad=radians(0.3), halvings=1),
+    _Round(24, radians(0.4), FINE, thinned=False, step_rad=radians(0.15), halvings=1),
+)
+"""Each round's steps begin at the width of its blur and end at the next one's. That each chooses by its own chart is
+what finds the true pose: on a coarse one, hundreds of layouts that happen to fit may stand above it (the 855th of the
+first round in a simulated street, six degrees of freedom; by the fine chart, the first to eleventh)."""
+
+SHIFTED_POSES, SHIFT_M = 4, 0.25
+"""Where translation is searched, six more poses climb once more for so many of the best, shifted by so much along each
+axis: poses of one rotation do not lie apart, so that the translation was chosen on the coarse chart, which hardly tells
+it (one start of 24, half a metre away, had ended 36 cm aside)."""
+
+METRES_PER_RADIAN = 7.0
+"""Translation step per rotation step: what moves a point 7 m away as far."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Basin:
+    """A local maximum of the edge witness: its pose (4, 4) and its significance on the fine chart."""
+
+    T_camera_lidar: Matrix4
+    significance: float
+
+
+AT_RIM = 0.98
+"""Share of the reach beyond which a pose counts as lying on its rim: the maximum may lie outside."""
+
+
+def at_rim(pose: Matrix4, start: Matrix4, reach: SearchBox) -> bool:
+    """Whether a pose (4, 4) lies on or outside the rim of the ball of poses about `start` that was searched."""
+    apart = se3.difference(pose, start)
+    turn_rad, shift_m = float(np.linalg.norm(apart[:3])), float(np.linalg.norm(apart[3:]))
+    return turn_rad > AT_RIM * reach.rotation_rad or (
+        reach.translation_m > 0.0 and shift_m > AT_RIM * reach.translation_m
+    )
+
+
+def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Basin]:
+    """The most significant basins whose poses lie within `reach` of `start` (4, 4), best first.
+
+    The reach is a ball: so many radians about any axis, and so many metres in any direction (0: rotation only).
+    """
+    poses = _promising(edges.thinned[ROUNDS[0].chart], start, reach)
+    for number in ROUNDS:
+        charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
+        poses = poses[_apart(poses, significances(charts, poses), number.poses, number.apart_rad)]
+        poses, z = _climbed(charts, poses, number, start, reach)
+    if reach.translation_m > 0.0:
+        more = _shifted(poses[np.argsort(-z, kind="stable")[:SHIFTED_POSES]])
+        more, z_more = _climbed(edges.charts[FINE], more, ROUNDS[-1], start, reach)
+        poses, z = np.concatenate([poses, more]), np.concatenate([z, z_more])
+    return [Basin(poses[k], float(z[k])) for k in _apart(poses, z, len(poses), ROUNDS[-1].apart_rad)]
+
+
+def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.float64]:
+    """(count, 4, 4) poses that cover the reach evenly."""
+    return _Cover(start, reach, count).poses(np.arange(count))
+
+
+class _Cover:
+    """So many poses that cover the reach evenly, made as they are asked for: all at once they would take more memory
+    than the edges of a window."""
+
+    def __init__(self, start: Matrix4, reach: SearchBox, count: int) -> None:
+        self._start, self._reach, self._ball = start, reach, _ball(count)
+
+    def poses(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(n, 4, 4) those with the given numbers."""
+        start, count = self._start, len(self._ball)
+        poses = np.tile(np.eye(4), (len(index), 1, 1))
+        for begin in range(0, len(index), BLOCK):
+            block, made = index[begin : begin + BLOCK], poses[begin : begin + BLOCK]
+            turn = _rotations(self._ball[block] * self._reach.rotation_rad)
+            # Translations in another order, so that they do not go along with the rotations.
+            shift = self._ball[(block * 7919) % count] * self._reach.translation_m
+            # einsum and not @: the last bit of a BLAS product may differ between two processes.
+            made[:, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
+            made[:, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
+        return poses
+
+
+def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
+    """The poses of the cover, and the start, that begin the first round."""
+    volume = 4.0 / 3.0 * pi * (reach.rotation_rad / COVER_RAD) ** 3
+    count = int(min(max(volume, MIN_COVER), MAX_COVER))
+    cover = _Cover(start, reach, count)
+    blocks = np.array_split(np.arange(count), -(-count // BLOCK))
+    z = np.concatenate([significances(charts, cover.poses(block)) for block in blocks])
+    best = np.argsort(-z, kind="stable")[:CANDIDATES]
+    poses = np.concatenate([start[None], cover.poses(best)])
+    z = np.concatenate([significances(charts, start[None]), z[best]])
+    return poses[_apart(poses, z, ROUNDS[0].poses, ROUNDS[0].apart_rad)]
+
+
+def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6·K, 4, 4) poses (K, 4, 4) shifted either way along each camera axis."""
+    shifts = SHIFT_M * np.concatenate([np.eye(3), -np.eye(3)])
+    shifted = np.repeat(poses, len(shifts), axis=0)
+    shifted[:, :3, 3] += np.tile(shifts, (len(poses), 1))
+    return shifted
+
+
+def _climbed(
+    charts: EdgeCharts, poses: NDArray[np.float64], number: _Round, start: Matrix4, reach: SearchBox
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    shift_m = number.step_rad * METRES_PER_RADIAN if reach.translation_m > 0.0 else 0.0
+    steps = np.array([number.step_rad] * 3 + [shift_m] * 3)
+    return climb(charts, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m]))
+
+
+def _apart(poses: NDArray[np.float64], z: NDArray[np.float64], count: int, apart_rad: float) -> NDArray[np.int64]:
+    """Indices of the best poses, best first, no two closer in rotation than `apart_rad`."""
+    return np.asarray(keep_apart(poses, np.argsort(-z, kind="stable"), count, 1.0 + 2.0 * cos(apart_rad)))
+
+
+def _ball(count: int) -> NDArray[np.float64]:
+    """(count, 3) points of the unit ball from the R₃ sequence (Roberts 2018, "The unreasonable effectiveness of
+    quasirandom sequences"), rejected from its cube."""
+    ratio = 1.2207440846057596  # the real root of x⁴ = x + 1
+    steps = (1.0 / ratio) ** np.arange(1, 4)
+    cube = np.outer(np.arange(1, int(count * 6.0 / pi * 1.02) + 100), steps)
+    cube += 0.5
+    np.remainder(cube, 1.0, out=cube)
+    cube *= 2.0
+    cube -= 1.0
+    ball: NDArray[np.float64] = cube[np.einsum("ij,ij->i", cube, cube) <= 1.0][:count]
+    return ball
+
+
+def _rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3, 3) of rotation vectors (N, 3), radians (Rodrigues, all at once)."""
+    angle = lengths(vectors)
+    axis = vectors / np.maximum(angle, 1e-12)[:, None]
+    cross = np.zeros((len(vectors), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
+    cross -= np.swapaxes(cross, 1, 2)
+    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    along = axis[:, :, None] * axis[:, None, :]
+    turns: NDArray[np.float64] = cosine * np.eye(3) + sine * cross + (1.0 - cosine) * along
+    return turns

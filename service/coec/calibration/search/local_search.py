@@ -1,0 +1,167 @@
+"""Maximising an objective over a box of perturbations with BOBYQA (Powell 2009, NLopt): bounded, derivative-free.
+
+Two stages on one objective: the first finds the basin with a trust region of degrees, the second starts again in it
+with a fresh quadratic model of its size. Deterministic: same objective, same evaluations, same optimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from math import degrees, radians
+
+import nlopt
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.objective.mutual_information import Objective, SearchBox
+from coec.calibration.ports import Progress
+from coec.calibration.types import Matrix4, StopReason
+from coec.config import SearchConfig
+from coec.geometry import se3
+
+REFINE_BOX_RAD, REFINE_STEP_RAD = radians(1.5), radians(0.6)
+"""Second stage, rotation. The box holds the widest ripple of pixels and scan lines around the end of the first stage;
+the step spans several of those ripples (cells of a depth map, rings of a sweep: 0.1 to 0.4 degrees), so that the first
+quadratic model sees the hill and not the ripple."""
+
+REFINE_BOX_M, REFINE_STEP_M = 0.10, 0.04
+"""Second stage, translation: the shifts that move a point 4 m away as far as the rotations above."""
+
+POLISH_METRES_PER_RADIAN = 10.0
+"""Step of a translation per step of a rotation when a basin is polished."""
+
+NEAR = 0.1
+"""Share of an objective's difference step within which a maximum is found that only ranks a basin, or leads to a finer
+level: the score there is half a percent of the hill below its maximum, and takes half as many evaluations."""
+
+AT_BOUND = 0.995
+"""Share of the half-width of the box beyond which an optimum counts as lying on the bound."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchResult:
+    """Where the search ended: pose (4, 4), its effort, and why it ended."""
+
+    T_camera_lidar: Matrix4
+    evaluations: int
+    stop_reason: StopReason
+
+
+def box_of(config: SearchConfig) -> SearchBox:
+    """The reach of the search, from the configuration."""
+    return SearchBox(radians(config.rotation_deg), config.translation_m if config.dof == 6 else 0.0)
+
+
+def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progress: Progress) -> SearchResult:
+    """The pose of the highest score in the box about `start` (4, 4).
+
+    Coordinates are the perturbation ξ = [rx ry rz tx ty tz] on the left of the start, about the camera axes; with three
+    degrees of freedom the translation is not searched.
+    """
+    evaluations = 0
+
+    def score(coordinates: NDArray[np.float64]) -> float:
+        nonlocal evaluations
+        evaluations += 1
+        progress.step("search", evaluations, config.max_evaluations)
+        return objective.evaluate(_pose(start, coordinates)).score
+
+    half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
+    found, exhausted = _bobyqa(
+        score, np.zeros(config.dof), half_width, half_width,
+        _per_axis(config.dof, radians(config.step_deg), config.step_m), config,
+    )  # fmt: skip
+    near = _per_axis(config.dof, REFINE_BOX_RAD, REFINE_BOX_M)
+    found, exhausted_again = _bobyqa(
+        score, found, near, half_width, _per_axis(config.dof, REFINE_STEP_RAD, REFINE_STEP_M), config
+    )
+    stop_reason = StopReason.TOLERANCE
+    if exhausted or exhausted_again:
+        stop_reason = StopReason.EVALUATIONS
+    elif (np.abs(found) >= AT_BOUND * half_width).any():
+        stop_reason = StopReason.AT_BOUND
+    return SearchResult(_pose(start, found), evaluations, stop_reason)
+
+
+def polish(
+    objective: Objective,
+    basin: Matrix4,
+    config: SearchConfig,
+    progress: Progress,
+    evaluations: int = 0,
+    kept: Collection[int] = (),
+) -> SearchResult:
+    """The maximum next to `basin` (4, 4), which lies within a few of the objective's difference steps of it;
+    `evaluations` were made before. The axes in `kept` stay as they are."""
+
+    def score(coordinates: NDArray[np.float64]) -> float:
+        nonlocal evaluations
+        evaluations += 1
+        progress.step("search", evaluations, config.max_evaluations)
+        return objective.evaluate(_pose(basin, placed(coordinates))).score
+
+    moved = [axis for axis in range(config.dof) if axis not in kept]
+
+    def placed(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+        perturbation = np.zeros(6)
+        perturbation[moved] = coordinates
+        return perturbation
+
+    step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)[moved]
+    found, exhausted = _bobyqa(score, np.zeros(len(moved)), 4.0 * step, 4.0 * step, step, config)
+    stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
+    return SearchResult(_pose(basin, placed(found)), evaluations, stop_reason)
+
+
+def near(config: SearchConfig, objective: Objective) -> SearchConfig:
+    """The configuration of a search that may end as soon as it is `NEAR` the maximum of `objective`."""
+    near_deg = NEAR * degrees(objective.step_rad)
+    return config.model_copy(update={"tolerance_deg": max(near_deg, config.tolerance_deg)})
+
+
+def polish_in_turn(
+    objectives: Sequence[Objective], basin: Matrix4, config: SearchConfig, progress: Progress
+) -> SearchResult:
+    """The maximum of the last objective next to `basin` (4, 4), to which the ones before it lead, one after the
+    other."""
+    *leading, last = objectives
+    evaluations = 0
+    for objective in leading:
+        found = polish(objective, basin, near(config, objective), progress, evaluations)
+        basin, evaluations = found.T_camera_lidar, found.evaluations
+    return polish(last, basin, config, progress, evaluations)
+
+
+def _bobyqa(
+    score: Callable[[NDArray[np.float64]], float],
+    centre: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    half_width: NDArray[np.float64],
+    step: NDArray[np.float64],
+    config: SearchConfig,
+) -> tuple[NDArray[np.float64], bool]:
+    """The best coordinates within `reach` of `centre` and inside the box, and whether the evaluations ran out."""
+    optimiser = nlopt.opt(nlopt.LN_BOBYQA, len(centre))
+    lower, upper = np.maximum(centre - reach, -half_width), np.minimum(centre + reach, half_width)
+    # The first quadratic model needs two steps of room between the bounds.
+    step = np.minimum(step, (upper - lower) / 2.0)
+    optimiser.set_lower_bounds(lower)
+    optimiser.set_upper_bounds(upper)
+    optimiser.set_initial_step(step)
+    # NLopt scales the axes by their steps; this is the radius of the last trust region on each of them.
+    optimiser.set_xtol_abs(step * radians(config.tolerance_deg) / step[0])
+    optimiser.set_maxeval(config.max_evaluations)
+    optimiser.set_max_objective(lambda x, _gradient: score(x))
+    found = np.asarray(optimiser.optimize(centre))
+    return found, optimiser.last_optimize_result() == nlopt.MAXEVAL_REACHED
+
+
+def _per_axis(dof: int, rotation: float, translation: float) -> NDArray[np.float64]:
+    return np.array([rotation] * 3 + [translation] * 3)[:dof]
+
+
+def _pose(start: Matrix4, coordinates: NDArray[np.float64]) -> Matrix4:
+    perturbation = np.zeros(6)
+    perturbation[: len(coordinates)] = coordinates
+    return se3.perturb(start, perturbation)

@@ -1,0 +1,307 @@
+"""Successive windows combined into one extrinsic: a slow track that averages noise away, and a fast one that notices a
+step at once.
+
+The slow track is an information filter on SE(3): its state is a pose and the covariance of the perturbation on its left
+(Barfoot, Furgale, "Associating uncertainty with three-dimensional poses", 2014), its update the Kalman update of that
+perturbation, and between windows the covariance grows with time so that a mount that creeps is followed.
+
+A window is first asked whether it can come from the same mount: the squared Mahalanobis distance of its innovation is
+chi-square distributed if it does (Bar-Shalom, Li, Kirubarajan 2001, section 5.4). One that does not opens a fast track
+and moves nothing. If the next one agrees with the fast track and not with the slow, the mount has moved, and the slow
+track starts again from those two.
+
+All in plain floats (`linear`): the track survives restarts, and replays, to the byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from math import erfc, exp, fsum, pi, radians, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import Estimate, Matrix4
+from coec.config import FusionConfig
+from coec.geometry import se3
+from coec.geometry.linear import congruent, solved
+
+Matrix6 = NDArray[np.float64]
+
+NS_PER_H = 3_600_000_000_000
+
+
+class StepState(StrEnum):
+    """What the last window said about a step of the mount. `confirmed` lasts for the one window that confirms."""
+
+    NONE = "none"
+    SUSPECTED = "suspected"
+    CONFIRMED = "confirmed"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """What one accepted window says.
+
+    Attributes:
+        T_camera_lidar: (4, 4).
+        covariance: (6, 6) of the perturbation about the camera axes, radians and metres; the diagonal is NaN on axes
+            that were not solved or could not be observed.
+        stamp_ns: sensor time of its last pair.
+    """
+
+    T_camera_lidar: Matrix4
+    covariance: Matrix6
+    stamp_ns: int
+
+    @classmethod
+    def independent(cls, T_camera_lidar: Matrix4, sigma: NDArray[np.float64], stamp_ns: int) -> Measurement:
+        """With axes whose errors are independent; `sigma` (6,), NaN where an axis tells nothing."""
+        return cls(T_camera_lidar, np.diag(np.asarray(sigma, np.float64) ** 2), stamp_ns)
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> Measurement:
+        """What an estimate tells about the axes that it solved."""
+        sigma = np.where(estimate.solved, estimate.sigma, np.nan)
+        return cls.independent(estimate.optimum.T_camera_lidar, sigma, estimate.data_stamp_ns)
+
+    def told_axes(self) -> list[int]:
+        """Axes with a finite variance above zero."""
+        variances = self.covariance.diagonal()
+        return [axis for axis in range(6) if np.isfinite(variances[axis]) and variances[axis] > 0.0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Belief:
+    """A pose (4, 4), the covariance (6, 6) of the perturbation on its left, the axes (6,) that any window told, and the
+    number of windows in it."""
+
+    T_camera_lidar: Matrix4
+    covariance: Matrix6
+    observed: NDArray[np.bool_]
+    windows: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """The combined extrinsic of a pair.
+
+    Attributes:
+        slow: what is served.
+        prior_sigma: (6,) spread of the first pose, radians and metres: what an axis falls back to after a step.
+        stamp_ns: sensor time of the newest window.
+        step: what the last window said.
+        candidate: the fast track while a step is suspected.
+        innovation: squared Mahalanobis distance of the last window from the slow track; 0 before the first.
+        chance: how probable a distance at least as large is without a step; 1 before the first.
+    """
+
+    slow: Belief
+    prior_sigma: NDArray[np.float64]
+    stamp_ns: int
+    step: StepState = StepState.NONE
+    candidate: Belief | None = None
+    innovation: float = 0.0
+    chance: float = 1.0
+
+    @classmethod
+    def initial(cls, T_camera_lidar: Matrix4, prior_sigma: NDArray[np.float64], stamp_ns: int = 0) -> Track:
+        """A track without windows, at a pose that is trusted to `prior_sigma` (6,).
+
+        Raises:
+            ValueError: the pose is not rigid, or a standard deviation is not a positive number.
+        """
+        sigma = np.asarray(prior_sigma, np.float64)
+        if not se3.is_rigid(T_camera_lidar):
+            raise ValueError("T_camera_lidar of a track must be a rigid transform (4, 4)")
+        if sigma.shape != (6,) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+            raise ValueError(f"prior_sigma of a track must be six positive numbers, got {sigma.tolist()}")
+        return cls(Belief(T_camera_lidar, np.diag(sigma**2), np.zeros(6, np.bool_), 0), sigma, stamp_ns)
+
+    @property
+    def T_camera_lidar(self) -> Matrix4:
+        """(4, 4) of the slow track."""
+        return self.slow.T_camera_lidar
+
+    @property
+    def covariance(self) -> Matrix6:
+        """(6, 6) of the slow track: noise alone, without what all windows have in common."""
+        return self.slow.covariance
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """(6,) axes that any window of the slow track told; the others are as they were at first."""
+        return self.slow.observed
+
+    @property
+    def windows(self) -> int:
+        """Windows in the slow track since it started or started again."""
+        return self.slow.windows
+
+    def sigma(self, config: FusionConfig) -> NDArray[np.float64]:
+        """(6,) standard deviations to report, radians and metres: noise, and the error that averaging cannot remove."""
+        return np.array(
+            [sqrt(v + f * f) for v, f in zip(self.covariance.diagonal().tolist(), _floor(config), strict=True)]
+        )
+
+
+def prior_sigma(config: FusionConfig) -> NDArray[np.float64]:
+    """(6,) how far the nominal calibration may be off, radians and metres."""
+    return np.array([radians(config.prior_deg)] * 3 + [config.prior_m] * 3)
+
+
+def absorb(track: Track, measurement: Measurement, config: FusionConfig) -> Track:
+    """The track after another accepted window; a window that tells no axis leaves it as it is."""
+    axes = measurement.told_axes()
+    if not axes:
+        return track
+    elapsed_h = max(0, measurement.stamp_ns - track.stamp_ns) / NS_PER_H
+    slow = _drifted(track.slow, elapsed_h, config)
+    distance, chance = _disagreement(slow, measurement, axes, config)
+    stamp_ns = max(track.stamp_ns, measurement.stamp_ns)
+    heard = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
+    if chance >= config.step_false_alarm:
+        return replace(heard, slow=_updated(slow, measurement, axes), step=StepState.NONE, candidate=None)
+    alone = _restarted(track, measurement, axes)
+    if chance < config.overwhelming_false_alarm:
+        return replace(heard, slow=alone, step=StepState.CONFIRMED, candidate=None)
+    if track.candidate is not None:
+        fast = _drifted(track.candidate, elapsed_h, config)
+        _, chance_of_fast = _disagreement(fast, measurement, axes, config)
+        if chance_of_fast >= config.step_false_alarm:
+            return replace(heard, slow=_updated(fast, measurement, axes), step=StepState.CONFIRMED, candidate=None)
+    return replace(heard, step=StepState.SUSPECTED, candidate=alone)
+
+
+def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belief:
+    """A belief in one window alone; axes that it does not tell keep their place, but after a step nothing vouches for
+    them beyond the prior."""
+    away = se3.difference(measurement.T_camera_lidar, track.T_camera_lidar)
+    covariance = np.diag(track.prior_sigma**2)
+    covariance[np.ix_(axes, axes)] = measurement.covariance[np.ix_(axes, axes)]
+    told = np.isin(np.arange(6), axes)
+    pose = se3.perturb(track.T_camera_lidar, np.where(told, away, 0.0))
+    return Belief(pose, covariance, told, 1)
+
+
+def _drifted(belief: Belief, elapsed_h: float, config: FusionConfig) -> Belief:
+    """A mount creeps: a random walk on every axis."""
+    walk = [radians(config.drift_deg_per_sqrt_h) ** 2] * 3 + [config.drift_m_per_sqrt_h**2] * 3
+    return replace(belief, covariance=belief.covariance + np.diag([elapsed_h * q for q in walk]))
+
+
+def _disagreement(
+    belief: Belief, measurement: Measurement, axes: list[int], config: FusionConfig
+) -> tuple[float, float]:
+    """Squared Mahalanobis distance on the axes told, and its probability. Windows of different scenes differ by what
+    windows of one scene have in common, so the floor counts as noise here."""
+    away = se3.difference(measurement.T_camera_lidar, belief.T_camera_lidar).tolist()
+    floor = _floor(config)
+    spread = (belief.covariance + measurement.covariance).tolist()
+    s = [[spread[i][j] + (floor[i] ** 2 if i == j else 0.0) for j in axes] for i in axes]
+    y = [away[i] for i in axes]
+    distance = fsum(a * b for a, b in zip(y, solved(s, y), strict=True))
+    return distance, chi_square_tail(distance, len(axes))
+
+
+def _updated(belief: Belief, measurement: Measurement, axes: list[int]) -> Belief:
+    """The Kalman update with the window's perturbation from the belief, on the axes that it tells.
+
+    K = P Hᵀ (H P Hᵀ + R)⁻¹, ξ = K y, P ← (1 - K H) P (1 - K H)ᵀ + K R Kᵀ (Joseph's form: stays positive definite).
+    """
+    p, r = belief.covariance.tolist(), measurement.covariance.tolist()
+    away = se3.difference(measurement.T_camera_lidar, belief.T_camera_lidar).tolist()
+    s = [[p[i][j] + r[i][j] for j in axes] for i in axes]
+    gain = [solved(s, [p[row][j] for j in axes]) for row in range(6)]  # S is symmetric: K's rows solve S·k = P's
+    xi = np.array([fsum(k * away[j] for k, j in zip(row, axes, strict=True)) for row in gain])
+    told = {axis: place for place, axis in enumerate(axes)}
+    keep = [[float(i == j) - (gain[i][told[j]] if j in told else 0.0) for j in range(6)] for i in range(6)]
+    noise = [[r[i][j] for j in axes] for i in axes]
+    covariance = np.array(congruent(keep, p)) + np.array(congruent(gain, noise))
+    observed = belief.observed | np.isin(np.arange(6), axes)
+    return Belief(
+        se3.perturb(belief.T_camera_lidar, xi), 0.5 * (covariance + covariance.T), observed, belief.windows + 1
+    )
+
+
+def _floor(config: FusionConfig) -> list[float]:
+    return [radians(config.floor_deg)] * 3 + [config.floor_m] * 3
+
+
+def chi_square_tail(x: float, degrees_of_freedom: int) -> float:
+    """Probability that a chi-square variable exceeds `x` (Abramowitz, Stegun 1964, 26.4.4 and 26.4.5)."""
+    if x <= 0.0:
+        return 1.0
+    half = 0.5 * x
+    odd = degrees_of_freedom % 2 == 1
+    total = erfc(sqrt(half)) if odd else 0.0
+    # Terms half^a / Γ(a + 1), a from 0 or from a half on in steps of one.
+    power = 0.5 if odd else 0.0
+    term = exp(-half) * (2.0 * sqrt(half / pi) if odd else 1.0)
+    for _ in range(degrees_of_freedom // 2):
+        total += term
+        power += 1.0
+        term *= half / power
+    return total
+
+
+def track_to_dict(track: Track) -> dict[str, Any]:
+    """Plain values for JSON; floats survive it to the last bit."""
+    return {
+        "slow": _belief_to_dict(track.slow),
+        "candidate": None if track.candidate is None else _belief_to_dict(track.candidate),
+        "prior_sigma": track.prior_sigma.tolist(),
+        "stamp_ns": track.stamp_ns,
+        "step": track.step.value,
+        "innovation": track.innovation,
+        "chance": track.chance,
+    }
+
+
+def track_from_dict(document: Mapping[str, Any]) -> Track:
+    """What `track_to_dict` wrote.
+
+    Raises:
+        ValueError: something is missing, of another type or of another shape.
+    """
+    try:
+        candidate = document["candidate"]
+        return Track(
+            slow=_belief_from_dict(document["slow"]),
+            prior_sigma=_array(document["prior_sigma"], (6,)),
+            stamp_ns=int(document["stamp_ns"]),
+            step=StepState(document["step"]),
+            candidate=None if candidate is None else _belief_from_dict(candidate),
+            innovation=float(document["innovation"]),
+            chance=float(document["chance"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"not a track: {error}") from error
+
+
+def _belief_to_dict(belief: Belief) -> dict[str, Any]:
+    return {
+        "T_camera_lidar": belief.T_camera_lidar.tolist(),
+        "covariance": belief.covariance.tolist(),
+        "observed": belief.observed.tolist(),
+        "windows": belief.windows,
+    }
+
+
+def _belief_from_dict(document: Mapping[str, Any]) -> Belief:
+    return Belief(
+        _array(document["T_camera_lidar"], (4, 4)),
+        _array(document["covariance"], (6, 6)),
+        _array(document["observed"], (6,)).astype(np.bool_),
+        int(document["windows"]),
+    )
+
+
+def _array(values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    array = np.asarray(values, np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"not a track: expected finite numbers of shape {shape}, got {array.shape}")
+    return array

@@ -1,0 +1,131 @@
+"""How well a wrong extrinsic is seen: limits learned on some pairs of a recording, tried on the others.
+
+Both classifiers are tried on the same looks: the paper's, equation (2), and the distance of the local optimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.commissioning.learning import is_flagged, learn_accuracy, learn_limits
+from coec.calibration.monitor.check import Evidence, Look, look_at
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, by_equation_2
+from coec.calibration.types import Matrix4
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+
+MOVES = (
+    ("right", 0.0, 0.0),
+    ("0.5 deg", radians(0.5), 0.0),
+    ("1 deg", radians(1.0), 0.0),
+    ("3 deg", radians(3.0), 0.0),
+    ("10 cm", 0.0, 0.10),
+)
+"""By name: rotation about a random axis (rad), translation along a camera axis (m)."""
+
+OBSERVABLE_M = 0.02
+"""An axis of translation is observable where a look knows it to this: 10 cm are five of them."""
+
+MIN_RECORDED = 2 * MIN_PAIRS + 1
+"""Pairs of a recording that can be split: a look needs `MIN_PAIRS`, commissioning one more."""
+
+SEED = 20_230_617
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """Looks at one kind of move: how many, and the share that each classifier flagged. Of the right pose these are the
+    false alarms."""
+
+    name: str
+    looks: int
+    flagged: float
+    flagged_by_paper: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tried:
+    """One look: the move it was after, and what both classifiers said."""
+
+    name: str
+    flagged: bool
+    flagged_by_paper: bool
+    look: Look
+
+
+def require_enough(pairs: int) -> None:
+    """Whether so many pairs can be split.
+
+    Raises:
+        CalibrationError: they are fewer than `MIN_RECORDED`.
+    """
+    if pairs < MIN_RECORDED:
+        raise CalibrationError(
+            f"learning limits on half of the pairs and trying them on the others needs {MIN_RECORDED} pairs, "
+            f"there are {pairs}"
+        )
+
+
+def try_detection(
+    evidence: Evidence,
+    right: Matrix4,
+    config: CalibrationConfig,
+    splits: int,
+    looks: int,
+    heard: Callable[[int, int], None],
+) -> list[Tried]:
+    """Splits the pairs in two `splits` times (seeded), learns on one half, and tries `looks` looks after every move on
+    the other; `heard(done, total)` counts the splits.
+
+    Raises:
+        CalibrationError: fewer than `MIN_RECORDED` pairs.
+    """
+    count = len(evidence.pairs)
+    require_enough(count)
+    tried = []
+    for split in range(splits):
+        rng = np.random.default_rng([SEED, split])
+        order = rng.permutation(count)
+        learned, kept = sorted(order[: (count + 1) // 2].tolist()), order[(count + 1) // 2 :].tolist()
+        of_learned = evidence.of(learned)
+        accuracies = learn_accuracy(of_learned, right, config)
+        limits = learn_limits(of_learned, right, config, accuracies, FALSE_ALARM_RATE)
+        known = [axis for axis in range(3, 6) if accuracies[1].sigma(len(kept))[axis] <= OBSERVABLE_M]
+        for name, turn_rad, shift_m in MOVES:
+            if shift_m > 0.0 and not known:
+                continue
+            for _ in range(looks):
+                size = int(rng.integers(MIN_PAIRS, len(kept) + 1))
+                indices = sorted(rng.permutation(kept)[:size].tolist())
+                xi = _move(rng, turn_rad, shift_m, known)
+                seen = look_at(evidence.of(indices), se3.perturb(right, xi), config, accuracies[0].expected)
+                tried.append(Tried(name, is_flagged(seen, *accuracies, limits), by_equation_2(seen, limits), seen))
+        heard(split + 1, splits)
+    return tried
+
+
+def table(tried: Sequence[Tried]) -> tuple[Detection, ...]:
+    """The shares by move, in the order of `MOVES`."""
+    rows = []
+    for name, _, _ in MOVES:
+        of = [one for one in tried if one.name == name]
+        if of:
+            flagged = sum(one.flagged for one in of) / len(of)
+            by_paper = sum(one.flagged_by_paper for one in of) / len(of)
+            rows.append(Detection(name, len(of), flagged, by_paper))
+    return tuple(rows)
+
+
+def _move(rng: np.random.Generator, turn_rad: float, shift_m: float, axes: Sequence[int]) -> NDArray[np.float64]:
+    drawn = rng.normal(size=3)
+    xi = np.zeros(6)
+    xi[:3] = turn_rad * drawn / np.sqrt((drawn**2).sum())
+    if shift_m > 0.0:
+        xi[axes[int(rng.integers(len(axes)))]] = shift_m * float(rng.choice([-1.0, 1.0]))
+    return xi

@@ -1,0 +1,241 @@
+"""What every experiment of `coec evaluate` does: many solves on one recording whose pose is known."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import radians
+
+from rich.progress import Progress
+
+from coec.adapters.depth.maps import CachedDepth
+from coec.adapters.images.codec import CachedGreys, GreyImages
+from coec.calibration.calibrator import calibrate
+from coec.calibration.estimators import look
+from coec.calibration.monitor.check import gather
+from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.types import Matrix4, Window
+from coec.config import CalibrationConfig, LimitsConfig
+from coec.errors import CalibrationError, DecodeError, SourceError
+from coec.evaluation import split_halves, starts, statistics
+from coec.evaluation.detection import Tried, try_detection
+from coec.evaluation.split_halves import Halves
+from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint, Trial
+
+SUBSETS = 20
+"""Solves for every number of frames and every length of a slice, each with a start of its own."""
+
+SLICE_SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+"""Lengths of the slices, of the whole recording: even on a logarithmic axis."""
+
+SLICES = 5
+"""Places in a recording from which slices of one length are taken, at most; they do not overlap."""
+
+LOOKS = 10
+"""Looks per split and move at which detection is tried, unless told otherwise."""
+
+
+class Stages:
+    """A progress bar per stage, and the seconds that each took."""
+
+    def __init__(self, bars: Progress, prefix: str = "") -> None:
+        """`prefix` stands before the names of the stages on the bars, not in the seconds."""
+        self._bars = bars
+        self._prefix = prefix
+        self._began_s = self._mark_s = time.perf_counter()
+        self._elapsed_s: dict[str, float] = {}
+
+    def begin(self, stage: str, total: int | None) -> Callable[[int, str], None]:
+        """What is to be called with the number of parts done and a note."""
+        task = self._bars.add_task(self._prefix + stage, total=total, note="")
+
+        def heard(done: int, note: str = "") -> None:
+            now_s = time.perf_counter()
+            self._elapsed_s[stage] = self._elapsed_s.get(stage, 0.0) + now_s - self._mark_s
+            self._mark_s = now_s
+            self._bars.update(task, completed=done, note=note)
+
+        return heard
+
+    def elapsed_s(self) -> dict[str, float]:
+        """By stage, and `total`."""
+        return {**self._elapsed_s, "total": time.perf_counter() - self._began_s}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bench:
+    """What every solve of an evaluation shares; depth is inferred already."""
+
+    window: Window
+    depth: DepthModel
+    images: ImageReader
+    configuration: CalibrationConfig
+
+    @property
+    def reference(self) -> Matrix4:
+        """The source's calibration, (4, 4)."""
+        return self.window.rig.T_camera_lidar_nominal
+
+    def solve(self, start: Matrix4, frames: Sequence[int] | None = None) -> Outcome:
+        """From one start, on all frames or on those with the given indices."""
+        pairs = self.window.pairs if frames is None else tuple(self.window.pairs[index] for index in frames)
+        window = replace(self.window, T_camera_lidar_start=start, pairs=pairs)
+        began_s = time.perf_counter()
+        try:
+            estimate = calibrate(window, self.depth, self.images, self.configuration, Silence())
+        except CalibrationError:
+            estimate = None
+        trial = Trial(start, estimate, time.perf_counter() - began_s)
+        return statistics.judge(trial, self.reference, self.configuration.search.dof)
+
+
+def inferred(window: Window, model: DepthModel, heard: Callable[[int, str], None]) -> DepthModel:
+    """Depth of every frame, once for all solves.
+
+    Raises:
+        CalibrationError: a frame has no depth.
+    """
+    depth = CachedDepth(model, len(window.pairs))
+    for done, pair in enumerate(window.pairs, start=1):
+        try:
+            depth.infer(pair.camera)
+        except DecodeError as error:
+            raise CalibrationError(f"no depth for the camera frame at {pair.stamp_ns} ns: {error}") from error
+        heard(done, "")
+    return depth
+
+
+def greys_of(window: Window) -> ImageReader:
+    """The images of a window, decoded once for all solves."""
+    return CachedGreys(GreyImages(LimitsConfig()), len(window.pairs))
+
+
+def from_reference(bench: Bench, stages: Stages) -> Outcome:
+    """The solve that starts at the reference: what no start can do better than. It also compiles the kernels, so that
+    the times of the others are those of solving.
+
+    Raises:
+        CalibrationError: from no start there would be an estimate.
+    """
+    heard = stages.begin("reference", 1)
+    window = replace(bench.window, T_camera_lidar_start=bench.reference)
+    calibrate(window, bench.depth, bench.images, bench.configuration, Silence())
+    outcome = bench.solve(bench.reference)
+    heard(1, "")
+    return outcome
+
+
+def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> list[Outcome]:
+    """One solve from each of the poses (4, 4)."""
+    heard = stages.begin("starts", len(poses))
+    outcomes: list[Outcome] = []
+    for pose in poses:
+        outcomes.append(bench.solve(pose))
+        hits = sum(outcome.hit for outcome in outcomes)
+        heard(len(outcomes), f"{hits} hits, {100 * hits / len(outcomes):.1f} %")
+    return outcomes
+
+
+def against_frames(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> tuple[FramesPoint, ...]:
+    """The same starts for every number of frames, spread over all of them, so that numbers of frames are compared and
+    nothing else."""
+    available = len(bench.window.pairs)
+    counts = starts.frame_counts(available)
+    heard = stages.begin("frames", len(counts) * SUBSETS)
+    points = []
+    for row, frames in enumerate(counts):
+        outcomes = []
+        for trial in range(SUBSETS):
+            outcomes.append(bench.solve(_spread(poses, trial), starts.subset(available, frames, trial)))
+            heard(row * SUBSETS + trial + 1, f"{frames} of {available}")
+        points.append(statistics.frames_point(frames, outcomes))
+    return tuple(points)
+
+
+def against_slice(
+    bench: Bench,
+    model: DepthModel,
+    cut: Callable[[float, float], Window],
+    poses: Sequence[Matrix4],
+    stages: Stages,
+) -> tuple[SlicePoint, ...]:
+    """Slices of several lengths: for each the same starts, shared by slices at several places of the recording, the
+    first of them at its beginning.
+
+    Args:
+        bench: on the whole recording, from which slices are cut.
+        model: infers the depth of frames that the bench does not hold.
+        cut: the window of the frames between two times, seconds after the first frame.
+        poses: starts, (4, 4).
+        stages: hears of every solve.
+    """
+    pairs = bench.window.pairs
+    whole_s = (pairs[-1].stamp_ns - pairs[0].stamp_ns) * 1e-9
+    heard = stages.begin("slices", len(SLICE_SHARES) * SUBSETS)
+    points = []
+    for row, share in enumerate(SLICE_SHARES):
+        length_s = share * whole_s
+        slices = []
+        for begin_s in _places(length_s, whole_s):
+            try:
+                window = cut(begin_s, begin_s + length_s)
+            except SourceError:
+                # No camera frame was taken in this slice: it is no window.
+                continue
+            slices.append(window)
+        outcomes: list[tuple[int, list[Outcome]]] = []
+        for place, window in enumerate(slices):
+            of_slice = replace(
+                bench, window=window, depth=inferred(window, model, lambda *_: None), images=greys_of(window)
+            )
+            trials = range(place, SUBSETS, len(slices))
+            solved = []
+            for trial in trials:
+                solved.append(of_slice.solve(_spread(poses, trial)))
+                done = sum(len(of_place) for _, of_place in outcomes) + len(solved)
+                heard(row * SUBSETS + done, f"{length_s:.1f} s")
+            outcomes.append((len(window.pairs), solved))
+        if outcomes:
+            points.append(statistics.slice_point(length_s, outcomes))
+    return tuple(points)
+
+
+def in_halves(bench: Bench, splits: int, rotation_rad: float, translation_m: float, stages: Stages) -> Halves:
+    """Disjoint halves of the frames, each solved from a start of its own, this far from the reference."""
+    available = len(bench.window.pairs)
+    poses = starts.starts(bench.reference, 2 * splits, rotation_rad, translation_m)
+    heard = stages.begin("halves", splits)
+    outcomes = []
+    for trial in range(splits):
+        one, other = split_halves.split(available, trial)
+        outcomes.append((bench.solve(poses[2 * trial], one), bench.solve(poses[2 * trial + 1], other)))
+        heard(trial + 1, "")
+    return split_halves.compare(outcomes, available // 2, bench.configuration.search.dof)
+
+
+def detected(bench: Bench, splits: int, looks: int, stages: Stages) -> list[Tried]:
+    """How well the monitor sees a wrong extrinsic: limits learned on some pairs, `looks` looks per split and move at
+    the others."""
+    decode, heard = stages.begin("looks", None), stages.begin("detection", splits)
+    window = replace(bench.window, T_camera_lidar_start=bench.reference)
+    evidence = gather(look(window, bench.depth, bench.images, bench.configuration, Silence()))
+    decode(1, "")
+    return try_detection(evidence, bench.reference, bench.configuration, splits, looks, lambda done, _: heard(done, ""))
+
+
+def poses_of(bench: Bench, directions: int, rotation_deg: float, translation_m: float) -> list[Matrix4]:
+    """The starts of the protocol about the reference, (4, 4) each."""
+    return starts.starts(bench.reference, directions, radians(rotation_deg), translation_m)
+
+
+def _spread(poses: Sequence[Matrix4], trial: int) -> Matrix4:
+    return poses[trial * len(poses) // SUBSETS]
+
+
+def _places(length_s: float, whole_s: float) -> list[float]:
+    """Where slices of a length begin, seconds: the beginning, and evenly on to the last that does not overlap."""
+    # A hair of grace: a slice as long as the recording fits into it once.
+    fits = int(whole_s / length_s + 1e-9) if length_s > 0 else 1
+    chosen = {round(index * (fits - 1) / max(min(fits, SLICES) - 1, 1)) for index in range(min(fits, SLICES))}
+    return [index * length_s for index in sorted(chosen)]

@@ -1,0 +1,79 @@
+"""Run time against the number of frames, as in table 2 of Borer et al. 2023: one averaged MI, and a whole search."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import radians
+
+import numpy as np
+
+from coec.adapters.depth.maps import open_depth
+from coec.calibration.estimators import depth_features, look
+from coec.calibration.objective.mutual_information import build_mutual_information
+from coec.calibration.ports import Silence
+from coec.calibration.search.local_search import box_of
+from coec.config import CalibrationConfig, LimitsConfig
+from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
+from coec.geometry import se3
+from coec.sources import windows
+
+FRAME_COUNTS = (5, 25, 50)
+
+REPEATS, SOLVES = 20, 3
+"""Runs of which the fastest counts: what else the machine does only ever adds."""
+
+START = np.array([radians(3.0), radians(-3.0), radians(2.6), 0.0, 0.0, 0.0])
+"""5.0° from the source's calibration, about all three axes."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunTime:
+    """Of one number of frames: milliseconds of one evaluation and of one solve, depth being inferred already."""
+
+    frames: int
+    mi_ms: float
+    solve_ms: float
+
+
+def run_times(source: str, configuration: CalibrationConfig, stages: Stages) -> list[RunTime]:
+    """Of every number of frames that the source has; of all it has, where it has fewer than the least.
+
+    Raises:
+        CoecError: the source cannot be read, or cannot be solved.
+    """
+    load = stages.begin("load 50", None)
+    window = windows.load(source, None, FRAME_COUNTS[-1], lambda done, _: load(done, "")).window
+    depth = inferred(window, open_depth(configuration.depth, LimitsConfig()), stages.begin("depth", len(window.pairs)))
+    bench = Bench(window, depth, greys_of(window), configuration)
+    heard = stages.begin("run time", len(FRAME_COUNTS))
+    found = []
+    for count in sorted({min(count, len(window.pairs)) for count in FRAME_COUNTS}):
+        found.append(_run_time(bench, windows.evenly(len(window.pairs), count)))
+        heard(len(found), f"{count} frames")
+    return found
+
+
+def _run_time(bench: Bench, chosen: list[int]) -> RunTime:
+    window = replace(bench.window, pairs=tuple(bench.window.pairs[index] for index in chosen))
+    sight = look(window, bench.depth, bench.images, bench.configuration, Silence())
+    features = depth_features(sight, bench.reference)
+    box = box_of(bench.configuration.search)
+    mutual = build_mutual_information(features, window.rig, bench.reference, box, bench.configuration.objective)
+    start = se3.perturb(bench.reference, START)
+    return RunTime(
+        frames=len(chosen),
+        mi_ms=_fastest_ms(lambda: mutual.evaluate(start), REPEATS),
+        solve_ms=_fastest_ms(lambda: bench.solve(start, chosen), SOLVES),
+    )
+
+
+def _fastest_ms(work: Callable[[], object], repeats: int) -> float:
+    work()  # compiles, and fills the caches of decoded pictures
+    fastest_s = float("inf")
+    for _ in range(repeats):
+        began_s = time.perf_counter()
+        work()
+        fastest_s = min(fastest_s, time.perf_counter() - began_s)
+    return 1000.0 * fastest_s

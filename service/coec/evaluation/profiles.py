@@ -1,0 +1,131 @@
+"""Objectives along each axis about a pose: what a search sees of them, from afar and from near."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import radians
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.estimators import ESTIMATORS, Sight
+from coec.calibration.objective.edges import build_edges
+from coec.calibration.objective.mutual_information import Objective
+from coec.calibration.types import Matrix4
+from coec.config import CalibrationConfig
+from coec.geometry import se3
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
+
+CROWDING = 1.5
+"""Power by which the points of a scan crowd about the middle: a peak of 0.2 degrees is not stepped over."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Half-widths of a scan, radians and metres, and how many values are taken per axis (an odd number: the pose itself
+    is among them)."""
+
+    rotation_rad: float
+    translation_m: float
+    points: int
+
+
+WIDE = Span(radians(25.0), 0.6, 121)
+"""What a search from the far end of the protocol (METHOD, section 2) has to cross."""
+
+NARROW = Span(radians(2.0), 0.1, 81)
+"""The peaks: that of mutual information is degrees wide, that of the edges a fraction of one."""
+
+
+class Landscape(Protocol):
+    """An objective that is maximised."""
+
+    def score(self, T_camera_lidar: Matrix4) -> float:
+        """Its value at a pose (4, 4)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """An objective along one axis of the perturbation, 0 (rx) to 5 (tz): offsets (n,), radians or metres, and scores
+    (n,)."""
+
+    axis: int
+    offsets: NDArray[np.float64]
+    scores: NDArray[np.float64]
+
+    @property
+    def best_offset(self) -> float:
+        """Where the highest score is."""
+        return float(self.offsets[np.argmax(self.scores)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """Scans of one objective from afar and from near, one per axis each."""
+
+    wide: tuple[Scan, ...]
+    narrow: tuple[Scan, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectiveLandscape:
+    """The score of an objective."""
+
+    objective: Objective
+
+    def score(self, T_camera_lidar: Matrix4) -> float:
+        """See `Landscape.score`."""
+        return self.objective.evaluate(T_camera_lidar).score
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeLandscape:
+    """The significance of the edge witness alone, at one blur: Σ w·e / √Σ w²."""
+
+    frames: EdgeFrames
+
+    def score(self, T_camera_lidar: Matrix4) -> float:
+        """See `Landscape.score`; 0 where nothing is in view."""
+        strength, square = frame_alignment(self.frames, T_camera_lidar)
+        return float(strength.sum() / np.sqrt(max(float(square.sum()), 1e-9)))
+
+
+def landscapes(sight: Sight, config: CalibrationConfig) -> dict[str, Landscape]:
+    """What the methods see in a window, by name: the fused objective, its two witnesses alone (`mi` is the paper's
+    objective, too), and the objective of the configuration if it is another.
+
+    Raises:
+        CalibrationError: the window has no edges or no depth.
+    """
+    kinds = dict.fromkeys(("fused", "mi", config.objective.kind))
+    found: dict[str, Landscape] = {
+        kind: ObjectiveLandscape(ESTIMATORS[kind](sight, config).objective) for kind in kinds
+    }
+    edges = build_edges(sight.window.pairs, sight.points, sight.greys(), sight.window.rig)
+    return {**found, "edges": EdgeLandscape(edges.whole)}
+
+
+def scan(landscape: Landscape, centre: Matrix4, axes: int, span: Span) -> tuple[Scan, ...]:
+    """One scan for each of the first `axes` axes through `centre` (4, 4)."""
+    even = np.linspace(-1.0, 1.0, span.points)
+    steps = np.sign(even) * np.abs(even) ** CROWDING
+    scans = []
+    for axis in range(axes):
+        offsets = steps * (span.rotation_rad if axis < 3 else span.translation_m)
+        poses = [se3.perturb(centre, offset * np.eye(6)[axis]) for offset in offsets]
+        scans.append(Scan(axis, offsets, np.array([landscape.score(pose) for pose in poses])))
+    return tuple(scans)
+
+
+def views(
+    named: Mapping[str, Landscape], centre: Matrix4, axes: int, heard: Callable[[int, str], None]
+) -> dict[str, Views]:
+    """Every landscape from afar and from near; `heard(done, name)` counts the landscapes."""
+    seen = {}
+    for done, (name, landscape) in enumerate(named.items(), start=1):
+        seen[name] = Views(scan(landscape, centre, axes, WIDE), scan(landscape, centre, axes, NARROW))
+        heard(done, name)
+    return seen

@@ -1,0 +1,361 @@
+"""How significantly range edges fall on image edges at very many poses: the workhorse of the global stage.
+
+    z = Σ w·e / √Σ w²
+
+as in `alignment`, but on a chart: the edge map of an image resampled onto the stereographic projection of the
+directions about the optical axis. A direction (x, y, z) lies at (x, y) / (|p| + z) of the chart, for any lens and
+up to any field of view, so a point costs one root and one division instead of a camera model. Strengths and weights are
+whole numbers: their sums come out the same in any order, so that the loops may run in vector registers and a replay is
+still exact to the bit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.geometry.cameras import Camera
+from coec.geometry.compiler import njit, prange
+from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
+from coec.geometry.pixel_lookup import OUTSIDE, exact_pixel
+from coec.geometry.projection import unproject
+
+CELLS_PER_BLUR = 2.5
+"""Cells of a chart per standard deviation of the blur: the nearest cell is then as good as interpolation."""
+
+WEIGHT_STEPS = 64
+"""Whole steps per unit of weight. With 127 steps of strength and a weight of √3, sums of 150,000 points fit 31 bits."""
+
+MAX_CHART_POINTS = 150_000
+"""So many points a chart may hold, for that reason."""
+
+MAX_FIELD_RAD = math.radians(110.0)
+"""Half field of view of a chart at most: beyond no lens sees."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeCharts:
+    """Range edges and charted edge maps of the frames of a window, at one blur.
+
+    Attributes:
+        cells: (1 + F·height·width,) int8, strengths as in `EdgePyramid`; `VOID` where the image shows nothing. Cell 0
+            stands for everything outside of the charts.
+        size: height and width of one frame's chart.
+        cells_per_unit: cells per unit of the stereographic plane.
+        centre: (2,) float32, column and row of the optical axis.
+        xyz_m: (3, E) float32 LiDAR frame, motion-compensated.
+        weight: (E,) int32, in steps.
+        first_cell: (E,) int32, where the chart of the point's frame begins.
+    """
+
+    cells: NDArray[np.int8]
+    size: tuple[int, int]
+    cells_per_unit: float
+    centre: NDArray[np.float32]
+    xyz_m: NDArray[np.float32]
+    weight: NDArray[np.int32]
+    first_cell: NDArray[np.int32]
+
+    @property
+    def frame(self) -> NDArray[np.int64]:
+        """(E,) the frame of each point."""
+        return (self.first_cell.astype(np.int64) - 1) // (self.size[0] * self.size[1])
+
+    def of_points(self, index: NDArray[np.int64]) -> EdgeCharts:
+        """With some of the range edges only."""
+        xyz_m = np.ascontiguousarray(self.xyz_m[:, index])
+        return replace(self, xyz_m=xyz_m, weight=self.weight[index], first_cell=self.first_cell[index])
+
+
+def edge_charts(
+    camera: Camera,
+    maps: NDArray[np.int8],
+    blur_rad: float,
+    xyz_m: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    frame: NDArray[np.int64],
+) -> EdgeCharts:
+    """Charts of the edge maps of a window.
+
+    Args:
+        camera: intrinsics at the resolution of the maps.
+        maps: (F, h, w) int8, as in `EdgePyramid`.
+        blur_rad: standard deviation of the blur of the maps, an angle about the optical axis.
+        xyz_m: (3, E) float32 LiDAR frame; no more than `MAX_CHART_POINTS`.
+        weight: (E,) float32, up to √3.
+        frame: (E,) the frame of each point.
+
+    Raises:
+        ValueError: there are more points, whose sums might not fit.
+    """
+    if xyz_m.shape[1] > MAX_CHART_POINTS:
+        raise ValueError(f"a chart holds up to {MAX_CHART_POINTS} points, got {xyz_m.shape[1]}: thin them")
+    unit = 2.0 * CELLS_PER_BLUR / blur_rad  # near the axis the stereographic plane halves angles
+    low, high = _extent(camera)
+    width, height = (np.ceil((high - low) * unit).astype(np.int64) + 1).tolist()
+    centre = (-low * unit).astype(np.float32)
+    return EdgeCharts(
+        cells=_cells(maps.reshape(len(maps), -1), _pixels(camera, height, width, unit, centre)),
+        size=(height, width),
+        cells_per_unit=unit,
+        centre=centre,
+        xyz_m=np.ascontiguousarray(xyz_m, np.float32),
+        weight=np.rint(weight * WEIGHT_STEPS).astype(np.int32),
+        first_cell=(1 + frame * (height * width)).astype(np.int32),
+    )
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _pixels(camera: Camera, height: int, width: int, unit: float, centre: NDArray[np.float32]) -> NDArray[np.int32]:
+    """(height·width,) the pixel (row · columns + column) at the direction of each cell of a chart, or OUTSIDE."""
+    pixel, here = np.empty(height * width, np.int32), np.eye(4)
+    for row in prange(height):
+        for column in range(width):
+            x, y = (column - centre[0]) / unit, (row - centre[1]) / unit
+            # The inverse of (x, y) / (1 + z) on the unit sphere.
+            square = x * x + y * y
+            pixel[row * width + column] = exact_pixel(camera, here, 2.0 * x, 2.0 * y, 1.0 - square)
+    return pixel
+
+
+@njit(cache=True, parallel=True)
+def _cells(maps: NDArray[np.int8], pixel: NDArray[np.int32]) -> NDArray[np.int8]:
+    """The cells of the charts of all maps (F, h·w), from the pixel of each cell of a chart."""
+    per_chart = pixel.shape[0]
+    cells = np.full(1 + maps.shape[0] * per_chart, VOID)
+    for f in prange(maps.shape[0]):
+        first = 1 + f * per_chart
+        for i in range(per_chart):
+            if pixel[i] != OUTSIDE:
+                cells[first + i] = maps[f, pixel[i]]
+    return cells
+
+
+def _extent(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (2,) of the part of the stereographic plane that the image covers."""
+    columns, rows = np.linspace(0.0, camera.width - 1.0, 65), np.linspace(0.0, camera.height - 1.0, 65)
+    rays, valid = unproject(camera, np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2))
+    rays = rays[valid & (rays[:, 2] > math.cos(MAX_FIELD_RAD))]
+    plane = rays[:, :2] / (1.0 + rays[:, 2:])
+    # A margin of some cells holds what lies between the samples.
+    return plane.min(axis=0) - 0.02, plane.max(axis=0) + 0.02
+
+
+def significances(charts: EdgeCharts, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """z at many poses (K, 4, 4): (K,)."""
+    return _significances(*_arguments(charts), poses)
+
+
+def climb(
+    charts: EdgeCharts,
+    starts: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    halvings: int,
+    centre: NDArray[np.float64],
+    reach: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pattern search from many poses at once (Hooke and Jeeves 1961): the axes in turn, steps halved when none helps.
+
+    Args:
+        charts: edges and charts at one blur.
+        starts: (K, 4, 4) poses.
+        steps: (6,) first steps, radians and metres, about the camera axes; 0 leaves an axis alone.
+        halvings: how often the steps are halved before the search ends.
+        centre: (4, 4) pose about which the search is bounded.
+        reach: (2,) largest rotation, radians, and translation, metres, from the centre; no step leaves it.
+
+    Returns:
+        Poses (K, 4, 4) and their z (K,).
+    """
+    ends, z = _climb(
+        *_arguments(charts), np.ascontiguousarray(starts), steps, halvings, np.ascontiguousarray(centre), reach
+    )
+    return ends, z
+
+
+_Arguments = tuple[
+    NDArray[np.int8], int, int, np.float32, NDArray[np.float32], NDArray[np.float32], NDArray[np.int32],
+    NDArray[np.int32],
+]  # fmt: skip
+
+
+def _arguments(charts: EdgeCharts) -> _Arguments:
+    height, width = charts.size
+    return (
+        charts.cells, height, width, np.float32(charts.cells_per_unit), charts.centre, charts.xyz_m, charts.weight,
+        charts.first_cell,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _significance(
+    cells: NDArray[np.int8],
+    height: int,
+    width: int,
+    unit: np.float32,
+    centre: NDArray[np.float32],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.int32],
+    first_cell: NDArray[np.int32],
+    T: NDArray[np.float32],
+    cell: NDArray[np.int32],
+) -> float:
+    """z at one pose (3, 4); `cell` (E,) is scratch."""
+    r00, r01, r02, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, ty = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, tz = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    # Rounding to the nearest cell is truncation half a cell further on.
+    half = np.float32(0.5)
+    left, top = centre[0] + half, centre[1] + half
+    right, bottom, stride, zero = np.float32(width), np.float32(height), np.int32(width), np.float32(0.0)
+    for i in range(xyz.shape[1]):
+        x, y, z = xyz[0, i], xyz[1, i], xyz[2, i]
+        a = r00 * x + r01 * y + r02 * z + tx
+        b = r10 * x + r11 * y + r12 * z + ty
+        c = r20 * x + r21 * y + r22 * z + tz
+        scale = unit / (np.sqrt(a * a + b * b + c * c) + c)
+        u, v = a * scale + left, b * scale + top
+        # Selections and no branches: the loop runs in vector registers. Infinities and NaN compare false.
+        inside = (u >= zero) & (u < right) & (v >= zero) & (v < bottom)
+        column, row = np.int32(u if inside else zero), np.int32(v if inside else zero)
+        cell[i] = first_cell[i] + row * stride + column if inside else np.int32(0)
+    strength, square = np.int32(0), np.int32(0)
+    for i in range(xyz.shape[1]):
+        e = np.int32(cells[cell[i]])
+        w = weight[i] if e != VOID else np.int32(0)
+        strength += w * e
+        square += w * w
+    # Both in steps: a step of weight cancels, one of strength is left.
+    return strength / (STRENGTH_STEPS * math.sqrt(max(float(square), 1.0)))
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _significances(
+    cells: NDArray[np.int8],
+    height: int,
+    width: int,
+    unit: np.float32,
+    centre: NDArray[np.float32],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.int32],
+    first_cell: NDArray[np.int32],
+    poses: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    z = np.empty(poses.shape[0])
+    for k in prange(poses.shape[0]):
+        narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
+        narrow[:] = poses[k, :3]
+        z[k] = _significance(cells, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
+    return z
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _climb(
+    cells: NDArray[np.int8],
+    height: int,
+    width: int,
+    unit: np.float32,
+    middle: NDArray[np.float32],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.int32],
+    first_cell: NDArray[np.int32],
+    starts: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    halvings: int,
+    centre: NDArray[np.float64],
+    reach: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ends = starts.copy()
+    scores = np.empty(starts.shape[0])
+    for k in prange(starts.shape[0]):
+        pose = starts[k].copy()
+        narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
+        narrow[:] = pose[:3]
+        best = _significance(cells, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
+        step = steps.copy()
+        halved = 0
+        for _ in range(MAX_SWEEPS):
+            improved = False
+            for axis in range(6):
+                if step[axis] == 0.0:
+                    continue
+                for sign in (-1.0, 1.0):
+                    trial = _moved(pose, axis, sign * step[axis])
+                    if not _within(trial, centre, reach):
+                        continue
+                    narrow[:] = trial[:3]
+                    score = _significance(cells, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
+                    if score > best:
+                        best, pose, improved = score, trial, True
+                        break
+            if not improved:
+                halved += 1
+                if halved > halvings:
+                    break
+                step *= 0.5
+        ends[k] = pose
+        scores[k] = best
+    return ends, scores
+
+
+@njit(cache=True)
+def _within(pose: NDArray[np.float64], centre: NDArray[np.float64], reach: NDArray[np.float64]) -> bool:
+    """Whether pose · centre⁻¹ turns and shifts by no more than the reach."""
+    # The trace of R·Cᵀ is the sum of the products of the entries; the shift is t - R·(Cᵀ·c).
+    trace, shift2 = 0.0, 0.0
+    for i in range(3):
+        moved = 0.0
+        for j in range(3):
+            trace += pose[i, j] * centre[i, j]
+            moved += pose[i, j] * (
+                centre[0, j] * centre[0, 3] + centre[1, j] * centre[1, 3] + centre[2, j] * centre[2, 3]
+            )
+        shift2 += (pose[i, 3] - moved) ** 2
+    # A micrometre of grace: with no translation to search, rounding must not stop the rotation.
+    return bool(trace >= 1.0 + 2.0 * math.cos(min(reach[0], math.pi)) and shift2 <= (reach[1] + 1e-6) ** 2)
+
+
+MAX_SWEEPS = 40
+"""Bound on the sweeps over the axes of one climb: a basin is some ten steps wide."""
+
+
+@njit(cache=True)
+def _moved(pose: NDArray[np.float64], axis: int, amount: float) -> NDArray[np.float64]:
+    """The pose perturbed on the left along one axis of [rx ry rz tx ty tz]."""
+    out = pose.copy()
+    if axis >= 3:
+        out[axis - 3, 3] += amount
+        return out
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    c, s = np.cos(amount), np.sin(amount)
+    for j in range(4):
+        out[a, j] = c * pose[a, j] - s * pose[b, j]
+        out[b, j] = s * pose[a, j] + c * pose[b, j]
+    return out
+
+
+@njit(cache=True)
+def keep_apart(poses: NDArray[np.float64], order: NDArray[np.int64], count: int, limit: float) -> NDArray[np.int64]:
+    """The first `count` indices of `order` whose poses (K, 4, 4) lie apart in rotation: the trace of R_a·R_bᵀ, which is
+    the sum of the products of the entries and 1 + 2 cos(angle), is at most `limit` for any two."""
+    kept = np.empty(min(count, order.shape[0]), np.int64)
+    found = 0
+    for index in order:
+        free = True
+        for k in range(found):
+            trace = 0.0
+            for i in range(3):
+                for j in range(3):
+                    trace += poses[index, i, j] * poses[kept[k], i, j]
+            if trace > limit:
+                free = False
+                break
+        if free:
+            kept[found] = index
+            found += 1
+            if found == kept.shape[0]:
+                break
+    return kept[:found]

@@ -1,0 +1,97 @@
+"""The statistics of an evaluation to its wire model: degrees instead of radians, null instead of NaN."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from math import degrees
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.evaluation import statistics
+from coec.evaluation.detection import Tried, table
+from coec.evaluation.split_halves import Halves
+from coec.schemas import evaluation as wire
+from coec.schemas.replies import Maybe6
+
+
+def spread_of(spread: statistics.Spread, scale: float = 1.0) -> wire.Spread:
+    """The spread of a figure, times `scale`."""
+    return wire.Spread(
+        median=number(scale * spread.median), p95=number(scale * spread.p95), max=number(scale * spread.max)
+    )
+
+
+def angle_spread_of(spread_rad: statistics.Spread) -> wire.Spread:
+    """The spread of an angle, radians, in degrees."""
+    return spread_of(spread_rad, degrees(1.0))
+
+
+def verdicts_of(verdicts: statistics.Verdicts) -> wire.VerdictCounts:
+    """The same counts."""
+    return wire.VerdictCounts(**asdict(verdicts))
+
+
+def frames_point_of(point: statistics.FramesPoint) -> wire.FramesPoint:
+    """Errors of windows of one number of frames."""
+    return wire.FramesPoint(
+        frames=point.frames,
+        subsets=point.subsets,
+        hit_rate=point.hit_rate,
+        rotation_deg=angle_spread_of(point.rotation_rad),
+        translation_m=spread_of(point.translation_m),
+        sigma_deg=number(degrees(point.sigma_rad)),
+    )
+
+
+def slice_point_of(point: statistics.SlicePoint) -> wire.SlicePoint:
+    """Errors of windows from slices of one length."""
+    return wire.SlicePoint(
+        length_s=point.length_s,
+        slices=point.slices,
+        pairs=point.frames,
+        solves=point.solves,
+        hit_rate=point.hit_rate,
+        rotation_deg=angle_spread_of(point.rotation_rad),
+        translation_m=spread_of(point.translation_m),
+        sigma_deg=number(degrees(point.sigma_rad)),
+    )
+
+
+def halves_of(halves: Halves) -> wire.HalvesReport:
+    """Differences between halves."""
+    return wire.HalvesReport(
+        splits=halves.splits,
+        pairs=halves.pairs,
+        solved=halves.solved,
+        accepted=halves.accepted,
+        hits=halves.hits,
+        rms=in_degrees(halves.rms),
+        largest=in_degrees(halves.largest),
+        sigma=in_degrees(halves.sigma),
+        claimed=cast("wire.Counts6", tuple(int(count) for count in halves.claimed)),
+        covered=cast("Maybe6", tuple(_numbers(halves.covered))),
+    )
+
+
+def detection_of(tried: Sequence[Tried], splits: int, pairs: int) -> wire.DetectionReport:
+    """The looks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
+    moves = tuple(wire.DetectionRow(**asdict(row)) for row in table(tried))
+    return wire.DetectionReport(splits=splits, pairs=pairs, moves=moves)
+
+
+def in_degrees(rad_m: NDArray[np.float64]) -> Maybe6:
+    """(6,) radians and metres in degrees and metres, null where there is no figure."""
+    return cast("Maybe6", tuple(_numbers(np.concatenate([np.degrees(rad_m[:3]), rad_m[3:]]))))
+
+
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    return [number(float(value)) for value in values]
+
+
+def number(value: float) -> float | None:
+    """Null where there is no figure."""
+    return value if math.isfinite(value) else None

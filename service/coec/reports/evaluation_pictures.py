@@ -1,0 +1,102 @@
+"""The pictures of `coec evaluate --output DIR`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import degrees
+from pathlib import Path
+
+from coec.adapters.files import output
+from coec.calibration.estimators import look
+from coec.calibration.ports import Silence
+from coec.evaluation import profiles, starts, statistics
+from coec.evaluation.experiments import SUBSETS, Bench
+from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
+from coec.reports import curves, pictures, plots
+from coec.reports.evaluation_tables import setting, verdict
+from coec.sources import windows
+
+
+@dataclass(frozen=True, slots=True)
+class Starts:
+    """Radii and number of the starts: degrees, metres."""
+
+    rotation_deg: float
+    translation_m: float
+    directions: int
+
+    def __str__(self) -> str:
+        return setting(self.rotation_deg, self.translation_m)
+
+
+def write(
+    folder: Path,
+    bench: Bench,
+    of_starts: Starts,
+    outcomes: Sequence[Outcome],
+    frames: Sequence[FramesPoint],
+    slices: Sequence[SlicePoint],
+    heard: Callable[[int, str], None],
+) -> None:
+    """Bullseye, landscapes, errors against the amount of data where they were asked for, and the worst start before
+    and after.
+
+    Raises:
+        OutputError: the folder or a file cannot be written.
+    """
+    dof = bench.configuration.search.dof
+    title = (
+        f"{bench.window.window_id}: {bench.configuration.objective.kind}, {dof} degrees of freedom, "
+        f"{len(bench.window.pairs)} frames"
+    )
+    hits = sum(outcome.hit for outcome in outcomes)
+    unit = starts.directions(of_starts.directions)
+    spheres = {"rotation vectors of the starts": unit}
+    if of_starts.translation_m > 0:
+        spheres["translations of the starts"] = unit[starts.partners(of_starts.directions)]
+    rate = f"{hits} of {len(outcomes)} starts hit, from {of_starts}"
+    output.write(folder / "bullseye.png", plots.bullseye(outcomes, spheres, f"{title}\n{rate}"))
+    if frames:
+        about = f"{title} and fewer\n{SUBSETS} subsets of each size, from {of_starts}"
+        output.write(folder / "frames.png", curves.error_against_frames(frames, dof == 6, about))
+    if slices:
+        about = f"{title} in all\n{SUBSETS} solves of each length, from {of_starts}"
+        output.write(folder / "slices.png", curves.error_against_slice(slices, dof == 6, about))
+    write_landscape(folder, bench, title, heard)
+    _write_overlays(folder, bench, outcomes)
+
+
+def write_comparison(
+    folder: Path, window_id: str, of_starts: Starts, outcomes: Mapping[str, Sequence[Outcome]]
+) -> None:
+    """The bullseyes of all methods side by side.
+
+    Raises:
+        OutputError: the folder or the file cannot be written.
+    """
+    title = f"{window_id}: {of_starts.directions} starts, {of_starts}"
+    picture = plots.compared(outcomes, starts.directions(of_starts.directions), title)
+    output.write(folder / "bullseye.png", picture)
+
+
+def write_landscape(folder: Path, bench: Bench, title: str, heard: Callable[[int, str], None]) -> None:
+    """The fused objective and its witnesses about the reference, each by itself."""
+    window = replace(bench.window, T_camera_lidar_start=bench.reference)
+    sight = look(window, bench.depth, bench.images, bench.configuration, Silence())
+    named = profiles.landscapes(sight, bench.configuration)
+    seen = profiles.views(named, bench.reference, bench.configuration.search.dof, heard)
+    output.write(folder / "profiles.png", curves.landscape(seen, f"{title}\nabout the source's calibration"))
+
+
+def _write_overlays(folder: Path, bench: Bench, outcomes: Sequence[Outcome]) -> None:
+    index = statistics.worst(outcomes)
+    outcome = outcomes[index]
+    start_deg = windows.rotation_error_deg(outcome.trial.start, bench.reference)
+    end_deg = degrees(outcome.rotation_rad)
+    where = f"{bench.window.rig.pair}  worst start {index}"
+    poses = {
+        "overlay_before": (outcome.trial.start, f"{where}  {start_deg:.2f} deg off"),
+        "overlay_after": (outcome.T_camera_lidar, f"{where}  {verdict(outcome)}, {end_deg:.2f} deg off"),
+    }
+    pictures.write_overlays(folder, bench.window, poses, bench.configuration.motion_compensation)

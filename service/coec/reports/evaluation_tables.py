@@ -1,0 +1,229 @@
+"""What `coec evaluate` says in tables: for people, and starts.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from math import degrees
+from typing import Any
+
+from coec.calibration.types import Matrix4
+from coec.evaluation import statistics
+from coec.evaluation.statistics import Outcome
+from coec.geometry import se3
+from coec.reports import console
+from coec.reports.evaluation_documents import in_degrees
+from coec.schemas.evaluation import (
+    ComparisonReport,
+    DetectionReport,
+    EvaluationReport,
+    FramesPoint,
+    HalvesReport,
+    SlicePoint,
+    Spread,
+)
+
+CSV_FIGURES = (
+    *("rotation_deg", "translation_m", "hit", "verdict", "reasons", "stop_reason", "solve_s"),
+    *("score_at_start", "score", "mi", "overlap", "evaluations"),
+)
+"""Columns of starts.csv after the two poses."""
+
+
+def setting(rotation_deg: float, translation_m: float) -> str:
+    """How far away the starts are, in words."""
+    return f"{rotation_deg:g} deg" + (f" and {translation_m:g} m away" if translation_m > 0 else " away")
+
+
+def verdict(outcome: Outcome) -> str:
+    """The decision in one word."""
+    return "accepted" if outcome.accepted else "failed"
+
+
+def csv_of(reference: Matrix4, outcomes: Sequence[Outcome]) -> str:
+    """A line per start: where it began and ended from the reference (4, 4), degrees and metres, camera axes."""
+    axes = [f"{axis}_{unit}" for axis, unit in zip(console.AXES, console.UNITS, strict=True)]
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["start", *(f"start_{axis}" for axis in axes), *(f"end_{axis}" for axis in axes), *CSV_FIGURES])
+    for index, outcome in enumerate(outcomes):
+        start = in_degrees(se3.difference(outcome.trial.start, reference))
+        estimate = outcome.trial.estimate
+        found: list[object] = [""] * 5
+        reasons = statistics.NOT_SOLVED
+        if estimate is not None:
+            optimum = estimate.optimum
+            found = [optimum.score_at_start, optimum.score, optimum.mi, optimum.overlap, optimum.evaluations]
+            reasons = " ".join(reason.code for reason in estimate.verdict.reasons)
+        judged = [
+            degrees(outcome.rotation_rad),
+            outcome.translation_m,
+            int(outcome.hit),
+            verdict(outcome),
+            reasons,
+            statistics.stop_reason(outcome),
+        ]
+        table.writerow([index, *start, *in_degrees(outcome.error), *judged, outcome.trial.solve_s, *found])
+    return text.getvalue()
+
+
+def show_comparison(report: ComparisonReport) -> None:
+    """The methods side by side, and why some are missing."""
+    first = next(iter(report.methods.values()))
+    console.show(f"{first.window_id}: {first.pairs} pairs, {first.camera_model} camera, {first.dof} degrees of freedom")
+    console.show(f"{first.starts} starts {setting(first.start_rotation_deg, first.start_translation_m)}")
+    names = list(report.methods)
+    table = console.table("", *names, "unit", right=range(1, 1 + len(names)))
+    for row, unit, values in _comparison(report):
+        table.add_row(row, *values, unit)
+    console.out.print(table)
+    for name, reason in report.not_evaluated.items():
+        console.show(f"{name} was not evaluated: {reason}", "yellow")
+    for name, method in report.methods.items():
+        if method.frames or method.slices or method.halves is not None or method.detection is not None:
+            console.show(name, "bold")
+            _show_experiments(method)
+    console.show(_seconds(report.elapsed_s))
+
+
+def show(report: EvaluationReport) -> None:
+    """The figures of one method."""
+    console.show(
+        f"{report.window_id}: {report.pairs} pairs, {report.camera_model} camera, objective {report.objective}, "
+        f"{report.dof} degrees of freedom"
+    )
+    limits = f"{report.hit_rotation_deg:g} deg"
+    if report.hit_translation_m is not None:
+        limits += f" and {report.hit_translation_m:g} m"
+    box = f"±{report.search_rotation_deg:g} deg"
+    if report.search_translation_m > 0:
+        box += f", ±{report.search_translation_m:g} m"
+    console.show(
+        f"{report.starts} starts {setting(report.start_rotation_deg, report.start_translation_m)}, search {box}"
+    )
+    console.show(f"{report.hits} hits within {limits}: {100 * report.hit_rate:.1f} %", "bold")
+    spreads = console.table("all starts", "median", "p95", "max", "unit", right=(1, 2, 3))
+    _add(spreads, "rotation error", report.rotation_deg, "deg", 3)
+    if report.dof == 6 or report.start_translation_m > 0:
+        _add(spreads, "translation error", report.translation_m, "m", 3)
+    _add(spreads, "one solve", report.solve_s, "s", 2)
+    _add(spreads, "evaluations", report.evaluations, "", 0)
+    console.out.print(spreads)
+    _show_axes(report)
+    verdicts = console.table("verdict", "hits", "misses", right=(1, 2))
+    counts = report.verdicts
+    verdicts.add_row(console.styled("accepted"), str(counts.accepted_hits), str(counts.accepted_misses))
+    verdicts.add_row(console.styled("failed"), str(counts.failed_hits), str(counts.failed_misses))
+    console.out.print(verdicts)
+    ended = ", ".join(f"{count} {reason}" for reason, count in report.stop_reasons.items())
+    console.show(f"classified correctly: {100 * report.classified_correctly:.1f} %; searches ended: {ended}")
+    _show_experiments(report)
+    console.show(_seconds(report.elapsed_s))
+
+
+def _comparison(report: ComparisonReport) -> list[tuple[str, str, list[str]]]:
+    """Rows: name, unit, a figure per method."""
+    methods = list(report.methods.values())
+    dof = methods[0].dof
+
+    def row(name: str, unit: str, values: Sequence[float | None], digits: int = 3, sign: bool = False) -> Any:
+        return name, unit, [console.figure(value, digits, sign) for value in values]
+
+    rows = [row("hits", "%", [100 * method.hit_rate for method in methods], 1)]
+    for name in ("median", "p95", "max"):
+        rows.append(row(f"rotation error, {name}", "deg", [getattr(method.rotation_deg, name) for method in methods]))
+    if dof == 6:
+        for name in ("median", "p95", "max"):
+            values = [getattr(method.translation_m, name) for method in methods]
+            rows.append(row(f"translation error, {name}", "m", values))
+    for axis in range(dof):
+        title, unit = console.AXIS_NAMES[axis], console.UNITS[axis]
+        rows.append(row(f"bias of hits, {title}", unit, [method.bias[axis] for method in methods], sign=True))
+        rows.append(row(f"std of hits, {title}", unit, [method.std[axis] for method in methods]))
+    rows.append(row("accepted misses", "", [method.verdicts.accepted_misses for method in methods], 0))
+    rows.append(row("classified correctly", "%", [100 * method.classified_correctly for method in methods], 1))
+    rows.append(row("one solve, median", "s", [method.solve_s.median for method in methods], 2))
+    return rows
+
+
+def _show_axes(report: EvaluationReport) -> None:
+    columns = ("error", "bias of hits", "std of hits", "rms of hits", "σ claimed", "median of all", "from reference")
+    axes = console.table(*columns, "unit", right=range(1, 7))
+    for axis in range(report.dof):
+        axes.add_row(
+            console.AXIS_NAMES[axis],
+            console.figure(report.bias[axis], sign=True),
+            console.figure(report.std[axis]),
+            console.figure(report.rms[axis]),
+            console.figure(report.sigma[axis]),
+            console.figure(report.median[axis], sign=True),
+            console.figure(report.from_reference[axis], sign=True),
+            console.UNITS[axis],
+        )
+    console.out.print(axes)
+
+
+def _show_experiments(report: EvaluationReport) -> None:
+    if report.frames:
+        frames = console.table("frames", "subsets", "hits", "median", "p95", "max", "σ claimed", "unit", right=range(7))
+        for point in report.frames:
+            frames.add_row(str(point.frames), str(point.subsets), *_errors(point), "deg")
+        console.out.print(frames)
+    if report.slices:
+        columns = ("slice", "slices", "frames", "solves", "hits", "median", "p95", "max", "σ claimed")
+        slices = console.table(*columns, "unit", right=range(9))
+        for of_length in report.slices:
+            counts = (f"{of_length.slices}", f"{of_length.pairs:g}", f"{of_length.solves}")
+            slices.add_row(f"{of_length.length_s:.1f} s", *counts, *_errors(of_length), "deg")
+        console.out.print(slices)
+    if report.halves is not None:
+        _show_halves(report.halves, report.dof)
+    if report.detection is not None:
+        show_detection(report.detection)
+
+
+def show_detection(detection: DetectionReport) -> None:
+    """Looks at moved extrinsics: how many of them each classifier flags."""
+    table = console.table("extrinsic", "looks", "flagged", "by equation (2)", right=(1, 2, 3))
+    for row in detection.moves:
+        table.add_row(row.name, str(row.looks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
+    console.out.print(table)
+    console.show(
+        f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other"
+    )
+
+
+def _show_halves(halves: HalvesReport, dof: int) -> None:
+    console.show(
+        f"{halves.splits} splits into halves of {halves.pairs} frames: {halves.solved} solved, {halves.accepted} "
+        f"accepted on both sides, {halves.hits} hit on both"
+    )
+    table = console.table("difference", "rms", "largest", "σ claimed", "within 3 σ", "unit", right=range(1, 5))
+    for axis in range(dof):
+        covered = halves.covered[axis]
+        table.add_row(
+            console.AXIS_NAMES[axis],
+            console.figure(halves.rms[axis]),
+            console.figure(halves.largest[axis]),
+            console.figure(halves.sigma[axis]),
+            "-" if covered is None else f"{100 * covered:.1f} %",
+            console.UNITS[axis],
+        )
+    console.out.print(table)
+
+
+def _errors(point: FramesPoint | SlicePoint) -> list[str]:
+    """Hits, median, 95th percentile, largest and claimed rotation error."""
+    errors = point.rotation_deg
+    figures = [console.figure(value) for value in (errors.median, errors.p95, errors.max, point.sigma_deg)]
+    return [f"{100 * point.hit_rate:.0f} %", *figures]
+
+
+def _add(table: Any, name: str, spread: Spread, unit: str, digits: int) -> None:
+    figures = [console.figure(value, digits) for value in (spread.median, spread.p95, spread.max)]
+    table.add_row(name, *figures, unit)
+
+
+def _seconds(elapsed_s: dict[str, float]) -> str:
+    return "  ".join(f"{stage} {seconds:.1f} s" for stage, seconds in elapsed_s.items())

@@ -1,0 +1,217 @@
+"""Replies in words and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from typing import Final
+
+from rich.text import Text
+
+from coec.reports import console
+from coec.schemas import replies
+from coec.schemas.base import from_json
+
+NS_PER_S = 1_000_000_000
+
+
+def extrinsic(payload: bytes) -> None:
+    """The current calibration of a pair."""
+    reply = from_json(replies.ExtrinsicReply, payload)
+    console.out.print(
+        f"{reply.vehicle}/{reply.pair}  {reply.camera_frame} from {reply.lidar_frame}: {reply.provenance}, "
+        "latest attempt ",
+        console.styled(reply.status),
+        f", open window {reply.percent_complete:.0f} %",
+        sep="",
+    )
+    _axes(reply.axes)
+    for row in reply.camera_from_lidar.matrix:
+        console.show("  " + "  ".join(f"{value:+.6f}" for value in row))
+    if reply.held:
+        console.show("held by command: nothing is applied", "bold yellow")
+    if reply.pending is not None:
+        waits = f": {reply.pending.waits.text}" if reply.pending.waits else ""
+        console.show(f"a candidate from window {reply.pending.window_id} waits for `command/apply`{waits}", "yellow")
+        if reply.pending.step is not None:
+            console.show(
+                "  step "
+                + "  ".join(f"{name} {v:+.3f}" for name, v in zip(console.AXES, reply.pending.step, strict=True))
+            )
+    if reply.data_stamp_ns is not None:
+        console.show(f"from window {reply.window_id}, data until {_instant(reply.data_stamp_ns)}")
+
+
+def health(payload: bytes) -> None:
+    """The health of a pair."""
+    reply = from_json(replies.HealthReply, payload)
+    age = "" if reply.age_s is None else f", evaluated {_duration(reply.age_s)} ago"
+    console.out.print(
+        f"{reply.vehicle}/{reply.pair}  ",
+        console.styled(reply.state),
+        f" since {_instant(reply.since_ns)}{age}",
+        sep="",
+    )
+    for reason in reply.reasons:
+        console.show(f"  {reason.code}: {reason.text}")
+    for need in reply.needs:
+        console.show(f"  needs: {need}")
+    console.show_metrics(reply.metrics)
+    if reply.drift is not None:
+        drift = "  ".join(
+            f"{name} {console.figure(value, sign=True)}" for name, value in zip(console.AXES, reply.drift, strict=True)
+        )
+        console.show(f"drift from commissioned (deg, m): {drift}")
+    quality = reply.data_quality
+    known = {
+        "pairs per second": quality.pair_rate_hz,
+        "camera after LiDAR, s": quality.sync_error_s,
+        "sharpness": quality.sharpness,
+        "mean level": quality.mean_level,
+        "clipped share": quality.clipped,
+    }
+    figures = "  ".join(f"{name} {console.figure(value)}" for name, value in known.items() if value is not None)
+    if figures:
+        console.show(figures)
+    if quality.frozen_image:
+        console.show("the camera repeats the same picture", "bold red")
+    _losses(quality.drops)
+
+
+def history(payload: bytes) -> None:
+    """Past results of a pair."""
+    reply = from_json(replies.HistoryReply, payload)
+    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.results)} of {reply.total} results")
+    table = console.table("data until", "verdict", "pairs", *console.AXES, "window", right=range(2, 9))
+    for result in reply.results:
+        moved = [console.figure(value, sign=True) for value in result.correction]
+        verdict = console.styled(result.verdict.decision)
+        table.add_row(_instant(result.data_stamp_ns), verdict, str(result.pairs), *moved, result.window_id)
+    console.out.print(table)
+    table = console.table("#", "service time", "what", "outcome", "why", "sender", "sha256", right=(0,))
+    for item in reply.entries:
+        entry = item.entry
+        if entry.kind != "estimate":
+            outcome = console.styled(entry.code)
+            row = (str(entry.sequence), _instant(entry.wall_ns), entry.kind, outcome, entry.text)
+            table.add_row(*row, entry.sender or "", item.sha256[:12])
+    console.out.print(table)
+
+
+def windows(payload: bytes) -> None:
+    """Recorded windows of a pair."""
+    reply = from_json(replies.WindowsReply, payload)
+    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.windows)} windows")
+    table = console.table("window", "pairs", "MB", "verdict", "sha256", right=(1, 2))
+    for window in reply.windows:
+        size = f"{window.size_bytes / 1e6:.1f}"
+        verdict = console.styled(window.decision or "not evaluated")
+        table.add_row(window.window_id, str(window.pairs), size, verdict, window.sha256[:16])
+    console.out.print(table)
+
+
+def evidence(payload: bytes) -> None:
+    """Red events of a pair."""
+    reply = from_json(replies.EvidenceReply, payload)
+    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.events)} red events")
+    table = console.table("event", "began", "why", "window before", "window after", "now")
+    for event in reply.events:
+        why = "; ".join(reason.code for reason in event.reasons)
+        windows_of = (event.window_before or "-", event.window_after or "-")
+        table.add_row(event.event_id, _instant(event.wall_ns), why, *windows_of, event.resolution or "still red")
+    console.out.print(table)
+
+
+def event(payload: bytes) -> None:
+    """One red event."""
+    reply = from_json(replies.EvidenceEvent, payload)
+    console.show(f"{reply.event_id}  began {_instant(reply.wall_ns)}, {reply.resolution or 'still red'}")
+    for reason in reply.reasons:
+        console.show(f"  {reason.code}: {reason.text}")
+    console.show(f"windows: before {reply.window_before or '-'}, after {reply.window_after or '-'}")
+    names = sorted({name for point in reply.metrics for name in point.metrics})
+    table = console.table("look", "state", *names, right=range(2, 2 + len(names)))
+    for point in reply.metrics:
+        figures = [console.figure(point.metrics.get(name)) for name in names]
+        table.add_row(_instant(point.stamp_ns), console.styled(point.state), *figures)
+    console.out.print(table)
+
+
+def status(payload: bytes) -> None:
+    """The daemon."""
+    reply = from_json(replies.StatusReply, payload)
+    worker, storage = reply.worker, reply.storage
+    console.show(
+        f"coec {reply.version} for {reply.vehicle}: {reply.state}, up {_duration(reply.uptime_s)}, "
+        f"configuration {reply.config_hash}"
+    )
+    for reason in reply.reasons:
+        console.show(f"  {reason.code}: {reason.text}", "yellow")
+    console.show(
+        f"worker {worker.state}, process {worker.pid or '-'}, {worker.restarts} restarts, {worker.queued} waiting; "
+        f"windows {storage.bytes_used / 1e6:.0f} MB, free {storage.bytes_free / 1e9:.1f} GB"
+    )
+    table = console.table("pair", "camera", "lidar", "ego", "pairs", "chosen", "windows", "solved", right=range(1, 8))
+    for pair in reply.pairs:
+        streams = [f"{s.accepted}/{s.received}" if s else "-" for s in (pair.camera, pair.lidar, pair.ego)]
+        counts = [str(count) for count in (pair.pairs, pair.selected, pair.windows, pair.solved)]
+        table.add_row(pair.name, *streams, *counts)
+    console.out.print(table)
+    for pair in reply.pairs:
+        streams_of = {
+            "camera": pair.camera.losses,
+            "lidar": pair.lidar.losses,
+            "ego": pair.ego.losses if pair.ego else {},
+        }
+        _losses({**streams_of, "pairs not chosen": pair.rejections, "windows": pair.losses})
+    _losses({"worker": worker.losses, "storage": storage.losses})
+
+
+def command(payload: bytes) -> None:
+    """The answer to a command."""
+    reply = from_json(replies.Acknowledgement, payload)
+    outcome = Text("accepted", "bold green") if reply.accepted else Text("not accepted", "bold yellow")
+    window = f" (window {reply.window_id})" if reply.window_id else ""
+    console.out.print(f"{reply.vehicle}/{reply.pair} {reply.command}: ", outcome, sep="")
+    console.show(f"  {reply.code}: {reply.text}{window}")
+
+
+BY_KIND: Final[Mapping[str, Callable[[bytes], None]]] = {
+    "extrinsic": extrinsic,
+    "health": health,
+    "history": history,
+    "windows": windows,
+    "evidence": evidence,
+    "event": event,
+    "status": status,
+    "command": command,
+}
+"""What shows a reply, by the name of its key. The others are shown as they come."""
+
+
+def _axes(axes: replies.Axes) -> None:
+    table = console.table("axis", "correction", "± σ", "unit", "status", right=(1, 2))
+    for name, title in zip(console.AXES, console.AXIS_NAMES, strict=True):
+        axis: replies.AxisReply = getattr(axes, name)
+        table.add_row(
+            title, console.figure(axis.correction, sign=True), console.figure(axis.sigma), axis.unit, axis.status
+        )
+    console.out.print(table)
+
+
+def _losses(losses: Mapping[str, Mapping[str, int]]) -> None:
+    for place, causes in losses.items():
+        if causes:
+            console.show(
+                f"  lost, {place}: " + ", ".join(f"{count} {cause}" for cause, count in sorted(causes.items()))
+            )
+
+
+def _instant(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC).isoformat(sep=" ").removesuffix("+00:00") + "Z"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

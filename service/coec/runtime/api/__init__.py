@@ -1,0 +1,1 @@
+"""What the service says when it is asked."""

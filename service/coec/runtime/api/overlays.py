@@ -1,0 +1,71 @@
+"""Pictures of a pair on demand: drawn by the worker, the latest ones kept, never made on a thread that others need."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from coec.calibration.types import Matrix4, Reason
+from coec.errors import CoecError
+from coec.runtime.worker.messages import pack_pose
+from coec.runtime.worker.supervisor import Errand, Worker
+
+KEPT = 4
+"""Pictures, some hundred kB each."""
+
+TIMEOUT_S = 8.0
+"""Below the 10 s after which clients give up; the worker may be solving."""
+
+
+class NotDrawnError(CoecError):
+    """The worker could not draw the picture, or not in time."""
+
+    reply_code = "not_drawn"
+
+
+class Overlays:
+    """Draws the windows of one pair."""
+
+    def __init__(self, pair: str, worker: Worker) -> None:
+        self._pair = pair
+        self._worker = worker
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[tuple[str, bytes], bytes] = OrderedDict()
+
+    def jpeg(self, path: Path, T_camera_lidar: Matrix4, title: str) -> bytes:
+        """The points of a window at an extrinsic (4, 4); waits for the worker.
+
+        Raises:
+            NotDrawnError: it did not come.
+        """
+        key = (path.stem, T_camera_lidar.tobytes())
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        drawn: Future[bytes | Reason] = Future()
+        self.request(path, T_camera_lidar, title, drawn.set_result)
+        try:
+            picture = drawn.result(TIMEOUT_S)
+        except TimeoutError as error:
+            raise NotDrawnError("the worker is busy with a window; ask again") from error
+        if isinstance(picture, Reason):
+            raise NotDrawnError(picture.text)
+        with self._lock:
+            self._kept[key] = picture
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+        return picture
+
+    def request(self, path: Path, T_camera_lidar: Matrix4, title: str, done: Callable[[bytes | Reason], None]) -> None:
+        """The same without waiting: `done` is called with the picture, or with why there is none."""
+
+        def answered(answer: dict[str, Any] | Reason) -> None:
+            done(answer if isinstance(answer, Reason) else bytes(answer["jpeg"]))
+
+        body = {"path": str(path), "pose": pack_pose(T_camera_lidar), "title": title}
+        self._worker.run_errand(Errand("overlay", self._pair, body, answered))

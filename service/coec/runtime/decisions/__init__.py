@@ -1,0 +1,1 @@
+"""What answers change, in order, and where it is written down."""

@@ -1,0 +1,349 @@
+"""The books of a pair: its state, its history, its evidence, and when it was last looked at.
+
+Every change of the state passes through `update`, which works out from the state before and after what has to be
+written down: a line of the history for every extrinsic and every state of health, evidence for every red one. Then it
+is all put on the disk. Safe to use from several threads.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from coec.adapters.files.conversions import transform_of
+from coec.adapters.system.logs import LossCounter
+from coec.calibration.lifecycle import HealthState, PairState, Provenance, aged, initial_state
+from coec.calibration.types import Matrix4, Reason, Rig
+from coec.config import StateConfig
+from coec.errors import NotFoundError, StateError
+from coec.runtime.decisions.check_log import LookLog
+from coec.runtime.decisions.history import GENESIS, History, Kept
+from coec.runtime.decisions.incidents import Evidence
+from coec.runtime.decisions.state_store import Clocks, StateStore
+from coec.runtime.recording.window_store import WindowFolder
+from coec.schemas import replies
+from coec.schemas.replies import CalibrationResult, EvidenceEvent, HistoryEntry, LookReply, MetricsPoint
+
+_log = logging.getLogger(__name__)
+
+NS_PER_S = 1_000_000_000
+
+EntryKind = Literal["estimate", "extrinsic", "state", "command", "commissioned", "chain"]
+
+WORDS = {
+    HealthState.HEALTHY: "What is served has been looked at and agrees with the data.",
+    HealthState.UNKNOWN: "What is served has not been looked at.",
+}
+"""Where a state comes without reasons."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Served:
+    """An extrinsic (4, 4) that is or was served; `epoch` counts them."""
+
+    epoch: int
+    T_camera_lidar: Matrix4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Taken:
+    """A step: the states before and after it, and what is served after it."""
+
+    before: PairState
+    after: PairState
+    served: Served
+
+
+class Ledger:
+    """Keeps the books of one pair.
+
+    Attributes:
+        history, evidence: what is kept.
+        damage: why what was found on the disk could not all be used; None when it could.
+        transitions: changes of health, by the state that was entered.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        vehicle: str,
+        config: StateConfig,
+        store: StateStore,
+        folder: WindowFolder,
+        losses: LossCounter,
+    ) -> None:
+        self._rig = rig
+        self._vehicle = vehicle
+        self._store = store
+        self._folder = folder
+        self._losses = losses
+        self._lock = threading.RLock()
+        self._evaluated_s: float | None = None
+        self._evaluated_stamp_ns: int | None = None
+        self._since_ns = time.time_ns()
+        self.damage: Reason | None = None
+        self.transitions: Counter[str] = Counter()
+        self._epoch = 0
+        self._state, head = self._recall()
+        self.history = History(config.directory / f"history-{rig.pair}.jsonl", config.history, head)
+        self.evidence = Evidence(config.directory / "evidence", rig.pair, config.evidence)
+        self._looks = LookLog(config.directory / f"looks-{rig.pair}.jsonl", config.looks)
+        folder.protect(rig.pair, self.evidence.window_ids)
+        if self.history.damage is not None:
+            losses.add("storage", "history_damaged", detail=self.history.damage)
+            text = f"The chain of the history is broken: {self.history.damage}. It is kept aside."
+            self.damage = self.damage or Reason("history_damaged", text)
+            self._write(_entry("chain", "broken", text))
+            self.save()
+
+    @property
+    def state(self) -> PairState:
+        """The state now."""
+        return self._state
+
+    @property
+    def served(self) -> Served:
+        """What is served now."""
+        with self._lock:
+            return Served(self._epoch, self._state.T_camera_lidar)
+
+    @property
+    def since_ns(self) -> int:
+        """Wall clock when the state of health began."""
+        return self._since_ns
+
+    @property
+    def evaluated_stamp_ns(self) -> int | None:
+        """Sensor time of the last pair that was looked at, in a window or by the monitor."""
+        return self._evaluated_stamp_ns
+
+    @property
+    def age_s(self) -> float | None:
+        """Since the last look; None before the first."""
+        return None if self._evaluated_s is None else time.monotonic() - self._evaluated_s
+
+    def update(
+        self,
+        step: Callable[[PairState], PairState],
+        stamp_ns: int | None,
+        *,
+        looked: bool,
+        epoch: int | None = None,
+    ) -> Taken | None:
+        """Take a step. None when the extrinsic has changed since `epoch`.
+
+        Args:
+            stamp_ns: sensor time of the data behind it.
+            looked: whether data were judged, so that the age begins anew.
+
+        Raises:
+            CommandRefusedError: as `step` does; nothing has changed then.
+        """
+        with self._lock:
+            if epoch is not None and epoch != self._epoch:
+                return None
+            before = self._state
+            after = self._state = step(before)
+            if looked:
+                self._evaluated_s, self._evaluated_stamp_ns = time.monotonic(), stamp_ns
+                self.damage = None if self.history.damage is None else self.damage
+            self._note(before, after, stamp_ns)
+            self.save()
+            return Taken(before, after, self.served)
+
+    def age(self, stale_after_s: float) -> None:
+        """Time has passed."""
+        with self._lock:
+            if aged(self._state, self.age_s, stale_after_s) is not self._state:
+                self.update(lambda state: aged(state, self.age_s, stale_after_s), None, looked=False)
+
+    def note_result(self, result: CalibrationResult) -> None:
+        """A window was solved."""
+        reasons = "; ".join(reason.text for reason in result.verdict.reasons)
+        text = reasons or f"A window of {result.pairs} pairs was accepted."
+        entry = _entry("estimate", result.verdict.decision, text, result.data_stamp_ns)
+        self._write(entry.model_copy(update={"window_id": result.window_id}), result)
+
+    def note_look(self, look: LookReply) -> None:
+        """The monitor had a look."""
+        values = {name: metric.value for name, metric in look.metrics.items()}
+        self.evidence.note(MetricsPoint(stamp_ns=look.stamp_ns, state=look.state, metrics=values))
+        try:
+            self._looks.append(look)
+        except StateError as error:
+            self._losses.add("storage", "look_not_saved", detail=str(error))
+
+    def looks(self) -> tuple[LookReply, ...]:
+        """The looks of the monitor that are kept, oldest first."""
+        return self._looks.looks()
+
+    def note_command(self, name: str, code: str, text: str, sender: str, *, accepted: bool) -> None:
+        """A command was carried out or refused. Of equal refusals in a row only the first is written down: whoever
+        floods the service with them must not push the calibrations out of the history."""
+        with self._lock:
+            last = next(reversed(self.history.entries()), None)
+            told = f"{name}: {text}"
+            if (
+                not accepted
+                and last is not None
+                and (last.entry.kind, last.entry.code, last.entry.text)
+                == (
+                    "command",
+                    code,
+                    told,
+                )
+            ):
+                return
+            self._write(_entry("command", code, told).model_copy(update={"sender": sender}))
+
+    def note_commissioned(self, text: str) -> None:
+        """The rig has a baseline."""
+        self._write(_entry("commissioned", "commissioned", text))
+
+    def accepted_calibration(self, name: str | None) -> tuple[Kept, CalibrationResult]:
+        """An accepted calibration of the history by its sha256 (or its beginning), or its window; without a name the
+        one before what is served. With the result that it rests on.
+
+        Raises:
+            NotFoundError: there is none of this name, or the name is ambiguous.
+        """
+        entries = self.history.entries()
+        results = {kept.result.window_id: kept.result for kept in entries if kept.result and _is_accepted(kept.result)}
+        served = transform_of(self._state.T_camera_lidar).matrix
+        found = []
+        for kept in entries:
+            pose = kept.entry.camera_from_lidar or (kept.result.camera_from_lidar if kept.result else None)
+            if pose is None or kept.entry.window_id not in results:
+                continue
+            if kept.result is not None and not _is_accepted(kept.result):
+                continue
+            if name is None:
+                wanted = kept.entry.kind == "extrinsic" and pose.matrix != served
+            else:
+                wanted = name == kept.entry.window_id or (len(name) >= 8 and kept.sha256.startswith(name))
+            if wanted:
+                found.append(kept)
+        if not found:
+            raise NotFoundError("no such accepted calibration in `history`; `reset` returns to nominal")
+        if name is not None and len({kept.entry.window_id for kept in found}) > 1:
+            raise NotFoundError("the beginning of the hash is ambiguous: give more of it")
+        return found[-1], results[str(found[-1].entry.window_id)]
+
+    def save(self) -> None:
+        """Put the state on the disk; a failure is counted."""
+        with self._lock:
+            age_s = self.age_s
+            evaluated_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
+            clocks = Clocks(evaluated_ns, self._evaluated_stamp_ns, self._since_ns)
+            try:
+                self._store.remember(self._rig, self._state, clocks, self.history.head)
+            except StateError as error:
+                self._losses.add("storage", "state_not_saved", detail=str(error))
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    def _recall(self) -> tuple[PairState, str | None]:
+        damage = self._store.damage
+        try:
+            remembered = self._store.recall(self._rig)
+        except StateError as error:
+            damage, remembered = (*damage, str(error)), None
+        if damage:
+            source = "the previous copy" if remembered else "the nominal calibration"
+            self.damage = Reason("state_damaged", f"The state on the disk was damaged; {source} is served.")
+            self._losses.add("storage", "state_damaged", len(damage), detail="; ".join(damage))
+        if remembered is None:
+            return initial_state(self._rig), None
+        clocks = remembered.clocks
+        if clocks.evaluated_wall_ns is not None:
+            self._evaluated_s = time.monotonic() - max(time.time_ns() - clocks.evaluated_wall_ns, 0) / NS_PER_S
+            self._evaluated_stamp_ns = clocks.evaluated_stamp_ns
+        if clocks.since_wall_ns is not None:
+            self._since_ns = clocks.since_wall_ns
+        return remembered.state, remembered.history_head
+
+    def _note(self, before: PairState, after: PairState, stamp_ns: int | None) -> None:
+        window_id = after.accepted.window_id if after.accepted else None
+        moved = not np.array_equal(before.T_camera_lidar, after.T_camera_lidar)
+        if moved or before.provenance is not after.provenance:
+            self._epoch += moved
+            entry = _entry("extrinsic", after.provenance.value, _ORIGIN[after.provenance], stamp_ns)
+            served = {"camera_from_lidar": transform_of(after.T_camera_lidar), "window_id": window_id}
+            self._write(entry.model_copy(update=served))
+        if before.health is after.health:
+            return
+        self._since_ns = time.time_ns()
+        self.transitions[after.health.value] += 1
+        text = "; ".join(reason.text for reason in after.reasons) or WORDS.get(after.health, "")
+        self._write(_entry("state", after.health.value, text, stamp_ns))
+        fields = {"pair": self._rig.pair, "from": before.health.value, "to": after.health.value, "why": text}
+        _log.info("the health of a pair changed", extra={"fields": fields})
+        if after.health is HealthState.MISCALIBRATED:
+            self._begin_evidence(after, stamp_ns)
+        elif before.health is HealthState.MISCALIBRATED:
+            self.evidence.resolve(stamp_ns, f"{after.health.value}: {text}")
+
+    def _begin_evidence(self, state: PairState, stamp_ns: int | None) -> None:
+        at_ns = stamp_ns if stamp_ns is not None else time.time_ns()
+        since_ns = state.flagged_since_ns if state.flagged_since_ns is not None else at_ns
+        by_window = state.pending is not None and state.latest is state.pending.estimate
+        # What contradicts is not what came before.
+        deciding = state.latest.window_id if by_window and state.latest else None
+        earlier = [
+            result.window_id
+            for result in self.history.results()
+            if result.window_id != deciding
+            and result.data_stamp_ns < since_ns
+            and self._folder.path(result.window_id).exists()
+        ]
+        self.evidence.begin(
+            EvidenceEvent(
+                event_id=f"{self._rig.pair}-{at_ns}",
+                vehicle=self._vehicle,
+                pair=self._rig.pair,
+                stamp_ns=at_ns,
+                wall_ns=time.time_ns(),
+                reasons=tuple(replies.Reason(code=reason.code, text=reason.text) for reason in state.reasons),
+                camera_from_lidar=transform_of(state.T_camera_lidar),
+                window_before=earlier[-1] if earlier else None,
+                window_after=deciding,
+                metrics=(),
+            )
+        )
+        self.protect()
+
+    def protect(self) -> None:
+        """Tell the window folder what is evidence."""
+        self._folder.protect(self._rig.pair, self.evidence.window_ids)
+
+    def _write(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> None:
+        try:
+            self.history.append(entry, result)
+        except StateError as error:
+            self._losses.add("storage", "history_not_saved", detail=str(error))
+
+
+_ORIGIN = {
+    Provenance.NOMINAL: "The workshop calibration is served.",
+    Provenance.COMMISSIONED: "The commissioned calibration is served.",
+    Provenance.ESTIMATED: "An accepted estimate is served.",
+    Provenance.RESTORED: "An earlier calibration is served again.",
+}
+
+
+def _entry(kind: EntryKind, code: str, text: str, stamp_ns: int | None = None) -> HistoryEntry:
+    """An entry dated now; its place in the chain is filled in when it is appended."""
+    return HistoryEntry(
+        sequence=0, previous_sha256=GENESIS, kind=kind, code=code, text=text, wall_ns=time.time_ns(), stamp_ns=stamp_ns
+    )
+
+
+def _is_accepted(result: CalibrationResult) -> bool:
+    return result.status == "accepted"

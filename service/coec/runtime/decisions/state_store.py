@@ -1,0 +1,225 @@
+"""The state of every pair in the one state file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import threading
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import ValidationError
+
+from coec.adapters.files.conversions import estimate_of, result_of
+from coec.adapters.files.rig import rig_to_json
+from coec.adapters.files.state_file import StateFile
+from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState, Provenance, Status, restored
+from coec.calibration.monitor.change_detector import MonitorState, Outcome
+from coec.calibration.tracker import track_from_dict, track_to_dict
+from coec.calibration.types import Reason, Rig
+from coec.errors import CoecError, StateError
+from coec.schemas import replies
+from coec.schemas.base import Part
+from coec.schemas.replies import CalibrationResult
+
+_log = logging.getLogger(__name__)
+
+
+Rows = tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]
+
+
+class StoredCandidate(Part):
+    """`Candidate` on the disk."""
+
+    T_camera_lidar: Rows
+    result: CalibrationResult
+    waits: replies.Reason
+    contradicts: bool
+
+
+class StoredChange(Part):
+    """`Change` on the disk."""
+
+    stamp_ns: int
+    step: tuple[float, ...]
+
+
+class StoredPair(Part):
+    """`PairState` on the disk; when (wall clock) it was looked at and since when it is in its state of health; and the
+    last hash of its history. What is not in a file of an earlier version is as at the first start."""
+
+    rig_sha256: str
+    T_camera_lidar: Rows
+    provenance: Literal["nominal", "commissioned", "estimated", "restored"]
+    status: Literal["not_accepted", "accepted", "failed"]
+    valid_from_ns: int
+    latest: CalibrationResult | None
+    accepted: CalibrationResult | None
+    failures: tuple[replies.Reason, ...]
+    evaluated_wall_ns: int | None
+    health: replies.HealthState = "unknown"
+    reasons: tuple[replies.Reason, ...] = ()
+    pending: StoredCandidate | None = None
+    frozen: bool = False
+    proven: bool = False
+    track: dict[str, Any] | None = None
+    monitor: dict[str, Any] | None = None
+    flagged_since_ns: int | None = None
+    changes: tuple[StoredChange, ...] = ()
+    since_wall_ns: int | None = None
+    evaluated_stamp_ns: int | None = None
+    history_head: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """When the pair was last looked at (wall clock and sensor time), and since when (wall clock) it is in its state."""
+
+    evaluated_wall_ns: int | None
+    evaluated_stamp_ns: int | None
+    since_wall_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Remembered:
+    """A pair's state as it was before the restart."""
+
+    state: PairState
+    clocks: Clocks
+    history_head: str | None
+
+
+class StateStore:
+    """Keeps the state file; safe to use from several threads.
+
+    Attributes:
+        damage: what was wrong with the copies found at the start, one sentence each.
+    """
+
+    def __init__(self, folder: Path, vehicle: str) -> None:
+        self._file = StateFile(folder / "state.json")
+        self._vehicle = vehicle
+        self._lock = threading.Lock()
+        loaded = self._file.load()
+        self.damage = loaded.damage
+        pairs = loaded.body.get("pairs") if loaded.body else None
+        self._pairs: dict[str, Any] = pairs if isinstance(pairs, dict) else {}
+
+    def recall(self, rig: Rig) -> Remembered | None:
+        """What is known of the pair; None when nothing is, or when it belongs to another rig (then said in the log).
+
+        Raises:
+            StateError: the file is intact, but not what this version can read.
+        """
+        document = self._pairs.get(rig.pair)
+        if document is None:
+            return None
+        try:
+            stored = StoredPair.model_validate(document)
+            if stored.rig_sha256 != _rig_sha256(rig):
+                _log.warning(
+                    "the state on the disk belongs to another rig: starting from nominal",
+                    extra={"fields": {"pair": rig.pair}},
+                )
+                return None
+            clocks = Clocks(stored.evaluated_wall_ns, stored.evaluated_stamp_ns, stored.since_wall_ns)
+            return Remembered(restored(_state_of(stored)), clocks, stored.history_head)
+        except (ValidationError, CoecError, ValueError, TypeError) as error:
+            raise StateError(f"the state of pair {rig.pair} cannot be used: it has another form") from error
+
+    def remember(self, rig: Rig, state: PairState, clocks: Clocks, history_head: str | None = None) -> None:
+        """Put the pair's state on the disk.
+
+        Raises:
+            StateError: it could not be written; it is tried again with the next change.
+        """
+        stored = StoredPair(
+            rig_sha256=_rig_sha256(rig),
+            T_camera_lidar=_rows(state.T_camera_lidar.tolist()),
+            provenance=state.provenance.value,
+            status=state.status.value,
+            valid_from_ns=state.valid_from_ns,
+            latest=result_of(state.latest, rig, self._vehicle) if state.latest else None,
+            accepted=result_of(state.accepted, rig, self._vehicle) if state.accepted else None,
+            failures=_told(state.failures),
+            evaluated_wall_ns=clocks.evaluated_wall_ns,
+            health=state.health.value,
+            reasons=_told(state.reasons),
+            pending=self._candidate(state.pending, rig) if state.pending else None,
+            frozen=state.frozen,
+            proven=state.proven,
+            track=track_to_dict(state.track) if state.track else None,
+            monitor=asdict(state.monitor),
+            flagged_since_ns=state.flagged_since_ns,
+            changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
+            since_wall_ns=clocks.since_wall_ns,
+            evaluated_stamp_ns=clocks.evaluated_stamp_ns,
+            history_head=history_head,
+        )
+        with self._lock:
+            self._pairs[rig.pair] = stored.model_dump(mode="json")
+            self._file.save({"pairs": self._pairs})
+
+    def _candidate(self, pending: Candidate, rig: Rig) -> StoredCandidate:
+        return StoredCandidate(
+            T_camera_lidar=_rows(pending.T_camera_lidar.tolist()),
+            result=result_of(pending.estimate, rig, self._vehicle),
+            waits=replies.Reason(code=pending.waits.code, text=pending.waits.text),
+            contradicts=pending.contradicts,
+        )
+
+
+def _rig_sha256(rig: Rig) -> str:
+    return hashlib.sha256(json.dumps(rig_to_json(rig), sort_keys=True).encode()).hexdigest()
+
+
+def _rows(rows: list[list[float]]) -> Rows:
+    a, b, c, d = ((row[0], row[1], row[2], row[3]) for row in rows)
+    return a, b, c, d
+
+
+def _told(reasons: tuple[Reason, ...]) -> tuple[replies.Reason, ...]:
+    return tuple(replies.Reason(code=reason.code, text=reason.text) for reason in reasons)
+
+
+def _reasons(stored: tuple[replies.Reason, ...]) -> tuple[Reason, ...]:
+    return tuple(Reason(reason.code, reason.text) for reason in stored)
+
+
+def _state_of(stored: StoredPair) -> PairState:
+    pending = stored.pending
+    return PairState(
+        T_camera_lidar=np.array(stored.T_camera_lidar, dtype=np.float64),
+        provenance=Provenance(stored.provenance),
+        status=Status(stored.status),
+        valid_from_ns=stored.valid_from_ns,
+        latest=estimate_of(stored.latest) if stored.latest else None,
+        accepted=estimate_of(stored.accepted) if stored.accepted else None,
+        failures=_reasons(stored.failures),
+        health=HealthState(stored.health),
+        reasons=_reasons(stored.reasons),
+        pending=None
+        if pending is None
+        else Candidate(
+            np.array(pending.T_camera_lidar, dtype=np.float64),
+            estimate_of(pending.result),
+            Reason(pending.waits.code, pending.waits.text),
+            pending.contradicts,
+        ),
+        frozen=stored.frozen,
+        proven=stored.proven,
+        track=track_from_dict(stored.track) if stored.track else None,
+        monitor=_monitor_of(stored.monitor) if stored.monitor else MonitorState(),
+        flagged_since_ns=stored.flagged_since_ns,
+        changes=tuple(Change(change.stamp_ns, change.step) for change in stored.changes),
+    )
+
+
+def _monitor_of(document: dict[str, Any]) -> MonitorState:
+    """JSON knows lists only, the state is made of tuples."""
+    values: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in document.items()}
+    values["outcome"] = Outcome(values["outcome"])
+    return MonitorState(**values)

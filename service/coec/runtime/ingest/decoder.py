@@ -1,0 +1,117 @@
+"""From a sample to a frame: which decoder, whose frame, what size, which number; everything refused is counted."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from dataclasses import dataclass
+
+from coec.adapters.frames import msgpack_frames
+from coec.adapters.ros import cdr
+from coec.adapters.system.logs import LossCounter
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.config import LimitsConfig, PairConfig
+from coec.errors import DecodeError
+from coec.runtime.ingest.inbox import Parcel
+
+_log = logging.getLogger(__name__)
+
+CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+
+MAX_SEQUENCE_GAP = 100_000
+"""A larger step is a sender that started to count anew: at 100 Hz this would be a quarter of an hour of loss."""
+
+Frame = CameraFrame | LidarFrame | EgoMotion
+
+
+@dataclass(frozen=True, slots=True)
+class StreamCounts:
+    """Samples that came, and frames that were made of them."""
+
+    received: int
+    accepted: int
+
+
+class Intake:
+    """Decodes and checks the samples of one pair's streams."""
+
+    def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:
+        self._pair = pair
+        self._limits = limits
+        self._losses = losses
+        self._sequence: dict[str, int] = {}
+        self._received: Counter[str] = Counter()
+        self._accepted: Counter[str] = Counter()
+
+    def counts(self, stream: str) -> StreamCounts:
+        """Counters of a stream since the start."""
+        return StreamCounts(self._received[stream], self._accepted[stream])
+
+    def frame(self, parcel: Parcel) -> Frame | None:
+        """The frame in a sample, or None when it was refused (and counted). Never raises for what a sender sent."""
+        stream = parcel.stream
+        self._received[stream] += 1
+        try:
+            if len(parcel.payload) > self._limits.max_message_bytes:
+                raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
+            frame = self._decode(parcel)
+            self._check(stream, frame)
+        except DecodeError as error:
+            self._losses.add(stream, error.reason)
+            return None
+        except Exception:
+            # A fault of a decoder must cost the message, not the service.
+            _log.exception("a decoder failed", extra={"fields": {"pair": self._pair.name, "stream": stream}})
+            self._losses.add(stream, "decoder_fault")
+            return None
+        self._count_gap(stream, frame.sequence)
+        self._accepted[stream] += 1
+        return frame
+
+    def _decode(self, parcel: Parcel) -> Frame:
+        encoding, _, schema = parcel.encoding.partition(";")
+        if encoding not in ("application/msgpack", "application/cdr"):
+            encoding = f"application/{self._configured_encoding(parcel.stream)}"
+        if encoding == "application/cdr":
+            return cdr.decode(schema or self._configured_type(parcel.stream), parcel.payload, self._limits)
+        if parcel.stream == CAMERA:
+            return msgpack_frames.decode_camera(parcel.payload, self._limits)
+        if parcel.stream == LIDAR:
+            return msgpack_frames.decode_lidar(parcel.payload, self._limits)
+        return msgpack_frames.decode_ego(parcel.payload, self._limits)
+
+    def _configured_encoding(self, stream: str) -> str:
+        configured = {CAMERA: self._pair.camera, LIDAR: self._pair.lidar, EGO: self._pair.ego}[stream]
+        return configured.encoding if configured else "msgpack"
+
+    def _configured_type(self, stream: str) -> str:
+        if stream == CAMERA:
+            return self._pair.camera.type
+        if stream == LIDAR or self._pair.ego is None:
+            return POINT_CLOUD
+        return self._pair.ego.type
+
+    def _check(self, stream: str, frame: Frame) -> None:
+        expected = {CAMERA: CameraFrame, LIDAR: LidarFrame, EGO: EgoMotion}[stream]
+        if not isinstance(frame, expected):
+            raise DecodeError("wrong_type", f"a {type(frame).__name__} on the {stream} stream")
+        if isinstance(frame, CameraFrame):
+            self._check_camera(frame)
+        elif isinstance(frame, LidarFrame) and frame.frame_id != self._pair.lidar.frame_id:
+            raise DecodeError("frame_id", "not the frame id of the configuration")
+
+    def _check_camera(self, frame: CameraFrame) -> None:
+        camera = self._pair.camera
+        if frame.frame_id != camera.frame_id:
+            raise DecodeError("frame_id", "not the frame id of the configuration")
+        if (frame.image.width, frame.image.height) != (camera.intrinsics.width, camera.intrinsics.height):
+            raise DecodeError("image_size", "not the size of the intrinsics")
+
+    def _count_gap(self, stream: str, sequence: int | None) -> None:
+        if sequence is None:
+            return
+        previous = self._sequence.get(stream)
+        self._sequence[stream] = sequence
+        if previous is not None and 1 < sequence - previous <= MAX_SEQUENCE_GAP:
+            self._losses.add(stream, "sequence_gap", sequence - previous - 1)

@@ -1,0 +1,244 @@
+"""The thread that writes windows: what fails here costs a window, never the service."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from coec.adapters.mcap.windows import RecordedWindow, WindowWriter, read_result, salvage
+from coec.adapters.system.logs import LossCounter
+from coec.adapters.system.threads import ServiceThread
+from coec.calibration.frames.window import SliceEnded
+from coec.calibration.types import FramePair, Matrix4, Reason, Rig
+from coec.config import CalibrationConfig
+from coec.errors import CoecError, RecordingError
+from coec.runtime.recording.window_store import WindowFolder
+
+_log = logging.getLogger(__name__)
+
+PAIRS_WAITING = 8
+"""Pairs that may wait for the disk, some MB each."""
+
+UNSOLVED_RESUMED = 4
+"""Windows of earlier runs that are still solved after a start, newest first."""
+
+POLL_S = 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Add:
+    window_id: str
+    pair: FramePair
+    T_camera_lidar: Matrix4
+
+
+@dataclass(slots=True)
+class _Open:
+    """The window being written."""
+
+    window_id: str
+    writer: WindowWriter
+    pairs: int
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingPlan:
+    """What every window of a pair has in common."""
+
+    rig: Rig
+    configuration: CalibrationConfig
+    min_pairs: int
+    metadata: dict[str, str]
+
+
+class Recorder:
+    """Writes the windows of one pair on a thread of its own, and looks after what earlier runs left."""
+
+    def __init__(
+        self,
+        plan: RecordingPlan,
+        folder: WindowFolder,
+        losses: LossCounter,
+        on_recorded: Callable[[str, Path, bool], None],
+        on_lost: Callable[[str], None],
+    ) -> None:
+        """`on_recorded(window_id, path, live)` is called on the recorder's thread for each finished window, and with
+        `live` False for unsolved ones of earlier runs; `on_lost(window_id)` for each that ended and came to nothing."""
+        self._plan = plan
+        self._configuration = plan.configuration
+        self._folder = folder
+        self._losses = losses
+        self._on_recorded = on_recorded
+        self._on_lost = on_lost
+        self._condition = threading.Condition()
+        self._queue: deque[_Add | SliceEnded] = deque()
+        self._adds = 0
+        self._open: _Open | None = None
+        self._lost: str | None = None
+        self._latest: Path | None = None
+        self.recorded = 0
+        self.trouble: Reason | None = None
+        self.thread = ServiceThread(f"recorder-{plan.rig.pair}", self._run)
+
+    @property
+    def latest(self) -> Path | None:
+        """The latest finished window; None when there is none on the disk."""
+        return self._latest
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a chosen pair would be taken now."""
+        return self._adds < PAIRS_WAITING
+
+    def use(self, configuration: CalibrationConfig) -> None:
+        """The next window is to be calibrated with this: the limits of the rig were learned anew."""
+        self._configuration = configuration
+
+    def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
+        """Queue a chosen pair; never waits for the disk. `T_camera_lidar` (4, 4) is where a search will start if this
+        is the first pair of its window."""
+        with self._condition:
+            if self._adds >= PAIRS_WAITING:
+                overrun = True
+            else:
+                overrun = False
+                self._adds += 1
+                self._queue.append(_Add(window_id, pair, T_camera_lidar))
+                self._condition.notify()
+        if overrun:
+            self._losses.add("window", "recorder_overrun")
+
+    def end(self, ended: SliceEnded) -> None:
+        """Queue the end of a window; it is finished when it holds enough pairs, else abandoned."""
+        with self._condition:
+            self._queue.append(ended)
+            self._condition.notify()
+
+    def request_stop(self) -> None:
+        """Write what waits, finish or abandon the open window, and end the thread."""
+        self.thread.request_stop()
+        with self._condition:
+            self._condition.notify()
+
+    # --- on the recorder's thread -----------------------------------------------------------------------------------
+
+    def _run(self, thread: ServiceThread) -> None:
+        self._resume()
+        while True:
+            thread.beat()
+            with self._condition:
+                if not self._queue and not thread.stopping:
+                    self._condition.wait(POLL_S)
+                item = self._queue.popleft() if self._queue else None
+                self._adds -= isinstance(item, _Add)
+            if isinstance(item, _Add):
+                self._write(item)
+            elif isinstance(item, SliceEnded):
+                self._end(item.window_id)
+            elif thread.stopping:
+                break
+        if self._open is not None:
+            self._end(self._open.window_id)
+
+    def _resume(self) -> None:
+        pair = self._plan.rig.pair
+        for part in self._folder.leftovers(pair):
+            self._salvage(part)
+        windows = self._folder.windows(pair)
+        self._latest = windows[-1] if windows else None
+        unsolved: list[Path] = []
+        for path in reversed(windows):
+            if len(unsolved) == UNSOLVED_RESUMED:
+                break
+            with contextlib.suppress(CoecError, OSError):
+                if read_result(path) is None:
+                    unsolved.append(path)
+        for path in unsolved:
+            self._on_recorded(path.stem, path, False)
+
+    def _salvage(self, part: Path) -> None:
+        try:
+            window = salvage(part)
+        except (CoecError, OSError) as error:
+            self._losses.add("window", "salvage_failed", detail=str(error))
+            return
+        if window is None or window.pairs < self._plan.min_pairs:
+            if window is not None:
+                window.path.unlink(missing_ok=True)
+            self._losses.add("window", "too_few_pairs_salvaged")
+            return
+        self._folder.note(window.window_id, window.pairs)
+        _log.info("a window was salvaged", extra={"fields": {"window": window.window_id, "pairs": window.pairs}})
+
+    def _write(self, item: _Add) -> None:
+        if item.window_id == self._lost:
+            return
+        try:
+            if self._open is None or self._open.window_id != item.window_id:
+                self._close_stray()
+                self._open = self._start(item)
+            self._open.writer.add(item.pair)
+            self._open.pairs += 1
+        except (RecordingError, OSError) as error:
+            self._lose(item.window_id, error)
+
+    def _start(self, item: _Add) -> _Open:
+        self._folder.make_room()
+        writer = WindowWriter(
+            self._folder.path(item.window_id),
+            self._plan.rig,
+            item.T_camera_lidar,
+            item.window_id,
+            self._configuration,
+            self._plan.metadata,
+        )
+        return _Open(item.window_id, writer, 0)
+
+    def _end(self, window_id: str) -> None:
+        if self._open is None or self._open.window_id != window_id:
+            self._on_lost(window_id)
+            return
+        opened = self._open
+        if opened.pairs < self._plan.min_pairs:
+            self._close_stray()
+            self._on_lost(window_id)
+            return
+        try:
+            recorded = opened.writer.finish()
+        except (RecordingError, OSError) as error:
+            self._lose(window_id, error)
+            self._on_lost(window_id)
+            return
+        self._open = None
+        self._finished(recorded)
+
+    def _finished(self, recorded: RecordedWindow) -> None:
+        self.recorded += 1
+        self.trouble = None
+        self._latest = recorded.path
+        self._folder.note(recorded.window_id, recorded.pairs)
+        fields = {"window": recorded.window_id, "pairs": recorded.pairs, "bytes": recorded.bytes}
+        _log.info("a window was recorded", extra={"fields": fields})
+        self._on_recorded(recorded.window_id, recorded.path, True)
+
+    def _close_stray(self) -> None:
+        """Abandon the open window: it ended with too few pairs."""
+        if self._open is not None:
+            self._open.writer.abandon()
+            self._open = None
+            self._losses.add("window", "too_few_pairs")
+
+    def _lose(self, window_id: str, error: Exception) -> None:
+        """Give the window up; the next one tries again."""
+        self._lost = window_id
+        self.trouble = Reason("recording_failed", f"The last window could not be recorded: {error}")
+        self._losses.add("window", "recording_failed", detail=str(error))
+        if self._open is not None:
+            with contextlib.suppress(RecordingError, OSError):
+                self._open.writer.abandon()
+            self._open = None

@@ -1,0 +1,1 @@
+"""The process that infers and solves, and whoever looks after it."""

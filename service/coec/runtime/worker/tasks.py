@@ -1,0 +1,249 @@
+"""The work of the worker: depth of an image, calibration of a window file. No process, no socket."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from coec.adapters.depth.maps import CachedDepth, DepthAhead, open_depth
+from coec.adapters.files.baseline_file import BASELINES, load_baseline, save_baseline
+from coec.adapters.files.rig import rig_of
+from coec.adapters.frames.msgpack_frames import decode_camera
+from coec.adapters.images.codec import CachedGreys, GreyImages, decode_bgr, encode_jpeg
+from coec.calibration.calibrator import calibrate
+from coec.calibration.commissioning.baseline import Baseline, learned_hash, mismatch
+from coec.calibration.commissioning.learning import commission
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.monitor.check_verdict import MIN_PAIRS, observe
+from coec.calibration.ports import Silence
+from coec.calibration.types import (
+    CameraFrame,
+    DepthMap,
+    EgoMotion,
+    EncodedImage,
+    FramePair,
+    ImageFormat,
+    LidarFrame,
+    Reason,
+    Rig,
+    Window,
+)
+from coec.config import Config, DepthConfig
+from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
+from coec.geometry.cameras import scaled
+from coec.reports.overlay import draw
+from coec.runtime.worker.messages import pack_observation, unpack_pairs
+
+if TYPE_CHECKING:
+    from coec.schemas.replies import CalibrationResult
+
+_log = logging.getLogger(__name__)
+
+WARM_UP_POINTS = 4000
+WARM_UP_DEPTH_PX = (48, 64)
+
+WARM_UP_CAMERA_PX = 128
+"""Longer side of the images of the warm-up: kernels are compiled for types, not for sizes, and a few milliseconds of
+work on an image of this size would be more than a second on the camera's own."""
+
+WARM_UP_EVALUATIONS = 4
+"""Of the searches of the warm-up."""
+
+OVERLAY_JPEG_QUALITY = 88
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The result of a window; `note` says why the window file does not hold it, if it does not."""
+
+    result: CalibrationResult
+    note: Reason | None
+
+
+class Solver:
+    """Opens the networks of the configuration once and keeps the depth of recent images.
+
+    What belongs to window files and results is imported by what reads and writes them: the types of ROS messages and
+    the schemas take 0.15 s, and a look, which comes first, needs none.
+    """
+
+    def __init__(self, config: Config, depth_maps_kept: int) -> None:
+        """Open every depth model that a pair of `config` names.
+
+        Raises:
+            ModelError: a network is missing, corrupt or does not match its card.
+            ConfigError: a rig cannot be built.
+        """
+        self._config = config
+        self._depth_maps_kept = depth_maps_kept
+        self._images = GreyImages(config.limits)
+        self._networks: dict[DepthConfig, CachedDepth] = {}
+        self._pairs = {pair.name: pair for pair in config.pairs}
+        self._rigs = {pair.name: rig_of(pair) for pair in config.pairs}
+        for pair in config.pairs:
+            self._network(pair.calibration.depth)
+
+    def warm_up(self) -> None:
+        """Run every kernel once on a few invented points, so that no window waits for a compiler."""
+        for pair in self._config.pairs:
+            search = pair.calibration.search.model_copy(update={"max_evaluations": WARM_UP_EVALUATIONS})
+            configuration = pair.calibration.model_copy(update={"search": search})
+            rig = _small(self._rigs[pair.name])
+            # A look runs every kernel that a calibration runs. An invented one need not lead anywhere.
+            with contextlib.suppress(CalibrationError, DecodeError):
+                observe(_invented_window(rig), _Ramp(), self._images, configuration, None)
+
+    def prefetch(self, pair: str, frame: bytes) -> None:
+        """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
+
+        Raises:
+            DecodeError: the frame cannot be decoded.
+        """
+        self._network(self._pairs[pair].calibration.depth).infer(decode_camera(frame, self._config.limits))
+
+    def solve(self, path: Path) -> Solution:
+        """Calibrate a finished window by the configuration it carries, and write the result into its file.
+
+        Raises:
+            WindowError, CalibrationError, DecodeError, ModelError: there is no result.
+        """
+        from coec.adapters.files.conversions import result_of
+        from coec.adapters.mcap.windows import read_window, write_result
+
+        window, configuration = read_window(path)
+        estimate = calibrate(window, self._network(configuration.depth), self._images, configuration, Silence())
+        result = result_of(estimate, window.rig, self._config.vehicle)
+        try:
+            write_result(path, result)
+        except (RecordingError, WindowError, OSError) as error:
+            _log.warning("the result could not be written into its window", extra={"fields": {"window": path.stem}})
+            code = error.reply_code if isinstance(error, CoecError) else "recording_failed"
+            return Solution(result, Reason(code, f"The window file does not hold the result: {error}"))
+        return Solution(result, None)
+
+    def observe(
+        self, pair: str, pose: Sequence[Sequence[float]], frames: Sequence[Sequence[bytes | None]]
+    ) -> dict[str, Any]:
+        """A look of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs
+        them; and why the baseline of the rig was not used, if there is one.
+
+        Raises:
+            CalibrationError, DecodeError, ModelError: there is no answer.
+        """
+        configuration = self._pairs[pair].calibration
+        window = Window(
+            f"{pair}-look",
+            self._rigs[pair],
+            np.array(pose, dtype=np.float64),
+            unpack_pairs(frames, self._config.limits),
+        )
+        network = self._network(configuration.depth)
+        baseline, not_used = self._baseline(pair, network.identity)
+        images = CachedGreys(self._images, len(window.pairs))
+        with DepthAhead(network, (each.camera for each in window.pairs)) as depth:
+            observation = observe(window, depth, images, configuration, baseline)
+        return {**pack_observation(observation), "baseline_not_used": not_used}
+
+    def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> bytes:
+        """JPEG of the points of a window's last pair on its image, at an extrinsic (rows of the (4, 4) matrix).
+
+        Raises:
+            WindowError, DecodeError: the window or its image cannot be read.
+        """
+        from coec.adapters.mcap.windows import read_window
+
+        window, configuration = read_window(path)
+        pair, rig = window.pairs[-1], window.rig
+        xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
+        image = decode_bgr(pair.camera.image, self._config.limits)
+        T_camera_lidar = np.array(pose, dtype=np.float64)
+        return encode_jpeg(draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title), OVERLAY_JPEG_QUALITY)
+
+    def commission(self, pair: str, pose: Sequence[Sequence[float]], paths: Sequence[Path]) -> dict[str, Any]:
+        """Learn the baseline of a rig at an extrinsic (rows of the (4, 4) matrix) from recorded windows; write it.
+
+        Raises:
+            WindowError, CalibrationError, DecodeError, ModelError, StateError: there is no baseline.
+        """
+        from coec.adapters.mcap.windows import read_window
+
+        configuration = self._pairs[pair].calibration
+        start = np.array(pose, dtype=np.float64)
+        windows = [replace(read_window(path)[0], T_camera_lidar_start=start) for path in paths]
+        baseline = commission(
+            windows,
+            self._network(configuration.depth),
+            self._images,
+            configuration,
+            sensors={},
+            reference=start,
+        )
+        saved = save_baseline(self._config.state.directory / BASELINES, baseline)
+        told = {"windows": baseline.windows, "pairs": baseline.pairs, "hash": saved}
+        return {**told, "pose": baseline.T_camera_lidar.tolist()}
+
+    def _baseline(self, pair: str, depth_identity: str) -> tuple[Baseline | None, str | None]:
+        """What was learned of the rig, if it holds for this configuration and network; else why it does not."""
+        try:
+            learned = load_baseline(self._config.state.directory / BASELINES, pair)
+        except StateError as error:
+            return None, str(error)
+        if learned is None:
+            return None, None
+        configured = learned_hash(self._pairs[pair].calibration)
+        against = mismatch(learned, self._rigs[pair], depth_identity, configured)
+        return (learned, None) if against is None else (None, against)
+
+    def _network(self, config: DepthConfig) -> CachedDepth:
+        if config not in self._networks:
+            self._networks[config] = CachedDepth(open_depth(config, self._config.limits), self._depth_maps_kept)
+        return self._networks[config]
+
+
+class _Ramp:
+    """Depth that grows from left to right, of any image: for the warm-up."""
+
+    @property
+    def identity(self) -> str:
+        return "warm-up"
+
+    def infer(self, frame: CameraFrame) -> DepthMap:
+        del frame
+        height, width = WARM_UP_DEPTH_PX
+        return DepthMap(np.tile(np.linspace(1.0, 2.0, width, dtype=np.float32), (height, 1)))
+
+
+def _small(rig: Rig) -> Rig:
+    """The rig with a camera of fewer pixels, and of as large a field of view."""
+    scale = min(1.0, WARM_UP_CAMERA_PX / max(rig.camera.width, rig.camera.height))
+    camera = scaled(rig.camera, scale, scale)
+    mask = None if rig.mask is None else np.ones((camera.height, camera.width), np.bool_)
+    return replace(rig, camera=camera, mask=mask)
+
+
+def _invented_window(rig: Rig) -> Window:
+    """Pairs with points all around the LiDAR, seeded; as a window from the disk holds them, so that the kernels are
+    compiled for the same arrays: sweeps that may not be written to, images from a decoder, motion to compensate."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(WARM_UP_POINTS, 3))
+    range_m = rng.uniform(5.0, 30.0, size=(WARM_UP_POINTS, 1))
+    xyz_m = (range_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    xyz_m.setflags(write=False)
+    width, height = rig.camera.width, rig.camera.height
+    jpeg = encode_jpeg(rng.integers(0, 256, (height, width), np.uint8))
+    image = EncodedImage(ImageFormat.JPEG, width, height, jpeg)
+    pairs = tuple(
+        FramePair(
+            CameraFrame(stamp, rig.camera_frame, image),
+            LidarFrame(stamp, rig.lidar_frame, xyz_m),
+            EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
+        )
+        for stamp in range(0, MIN_PAIRS * 100_000_000, 100_000_000)
+    )
+    return Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)

@@ -1,0 +1,144 @@
+"""From a SOURCE to a window, the way the daemon would have cut it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.adapters.mcap.windows import is_window, read_result, read_window
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.types import FramePair, Matrix4, Window
+from coec.config import CalibrationConfig, Config, PairingConfig
+from coec.errors import SourceError, UsageError
+from coec.geometry import se3
+from coec.sources import open_source
+from coec.sources.spec import parse_spec
+
+WHOLE = (0.0, math.inf)
+"""Seconds after the first camera frame that hold all of a recording."""
+
+RECORDED_GAP_S = 1e9
+"""Frames that were chosen from a recording may be any time apart; its order is already certain."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loaded:
+    """A window and what came with it.
+
+    Attributes:
+        configuration: that of a recorded window, else None.
+        vehicle: that of a recorded window that holds its result, else the default name.
+        unpaired: frames that found no partner, by cause.
+    """
+
+    window: Window
+    configuration: CalibrationConfig | None
+    vehicle: str
+    unpaired: dict[str, int]
+
+
+def load(
+    source: str,
+    frames: int | None,
+    default_frames: int,
+    heard: Callable[[int, int], None],
+    between_s: tuple[float, float] = WHOLE,
+) -> Loaded:
+    """The window of a recorded window's file as it is, of any other recording by choosing `frames` (at most
+    `default_frames` if None) camera frames evenly and pairing them. `heard(done, total)` counts camera frames. Only
+    camera frames that were taken `between_s` seconds after the first one are looked at.
+
+    Raises:
+        UsageError, SourceError, WindowError: see `open_source`; no camera frame found a sweep.
+    """
+    spec = parse_spec(source)
+    if (
+        spec.layout is None
+        and not spec.query
+        and spec.path.suffix == ".mcap"
+        and spec.path.is_file()
+        and is_window(spec.path)
+    ):
+        return _recorded(spec.path, frames, between_s)
+    recording = open_source(source)
+    within = _within(recording.camera_stamps_ns, between_s)
+    chosen = [within[index] for index in evenly(len(within), frames or default_frames)]
+    pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
+    pairs: list[FramePair] = []
+    for message in recording.messages(chosen):
+        pairs += pairer.push(message)
+        heard(len(pairs), len(chosen))
+    pairs += pairer.flush()
+    heard(len(pairs), len(chosen))
+    if not pairs:
+        raise SourceError(
+            f"{recording.name}: none of {len(chosen)} camera frames has a sweep within "
+            f"{PairingConfig().tolerance_s} s: check the stamps of both"
+        )
+    window = Window(
+        f"{recording.rig.pair}-{pairs[0].stamp_ns}", recording.rig, recording.T_camera_lidar_start, tuple(pairs)
+    )
+    losses = {cause: count for cause, count in pairer.losses.items() if count}
+    return Loaded(window, recording.configuration, _default_vehicle(), losses)
+
+
+def evenly(count: int, wanted: int) -> list[int]:
+    """At most `wanted` of `count` indices, evenly spread, the first and the last among them (the first if one)."""
+    if wanted >= count:
+        return list(range(count))
+    return sorted({round(index) for index in np.linspace(0, count - 1, wanted)})
+
+
+def perturbation_of(text: str) -> NDArray[np.float64]:
+    """ξ (6,) in radians and metres from `rx,ry,rz[,tx,ty,tz]` in degrees and metres.
+
+    Raises:
+        UsageError: it is not three or six finite numbers.
+    """
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError as error:
+        raise UsageError(f"--perturb {text}: {error}") from error
+    if len(values) not in (3, 6) or not np.isfinite(values).all():
+        raise UsageError(f"--perturb {text}: give three numbers (degrees), or six (degrees, then metres)")
+    xi = np.zeros(6)
+    xi[: len(values)] = values
+    xi[:3] = np.radians(xi[:3])
+    return xi
+
+
+def started_at(window: Window, xi: NDArray[np.float64]) -> Window:
+    """The window with its start moved by ξ (6,), on the left."""
+    return replace(window, T_camera_lidar_start=se3.perturb(window.T_camera_lidar_start, xi))
+
+
+def rotation_error_deg(T_a: Matrix4, T_b: Matrix4) -> float:
+    """Geodesic angle between the rotations of two transforms (4, 4)."""
+    return float(np.degrees(se3.rotation_angle_rad(T_a @ se3.inverse(T_b))))
+
+
+def _within(stamps_ns: Sequence[int], between_s: tuple[float, float]) -> list[int]:
+    """Indices of the stamps, ascending nanoseconds, so many seconds after the first of them."""
+    first_s, last_s = between_s
+    return [index for index, stamp in enumerate(stamps_ns) if first_s <= (stamp - stamps_ns[0]) * 1e-9 <= last_s]
+
+
+def _recorded(path: Path, frames: int | None, between_s: tuple[float, float]) -> Loaded:
+    window, configuration = read_window(path)
+    within = _within([pair.stamp_ns for pair in window.pairs], between_s)
+    if not within:
+        raise SourceError(f"{path}: no pair was recorded {between_s[0]:g} to {between_s[1]:g} s after the first")
+    window = replace(window, pairs=tuple(window.pairs[index] for index in within))
+    if frames is not None:
+        window = replace(window, pairs=tuple(window.pairs[index] for index in evenly(len(window.pairs), frames)))
+    result = read_result(path)
+    return Loaded(window, configuration, result.vehicle if result else _default_vehicle(), {})
+
+
+def _default_vehicle() -> str:
+    return str(Config.model_fields["vehicle"].default)

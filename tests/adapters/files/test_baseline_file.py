@@ -1,0 +1,83 @@
+"""`rig.json`: what is written reads back to the same bits, and nothing damaged is read."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from baselines import a_baseline
+from coec.adapters.files.baseline_file import (
+    baseline_from_json,
+    baseline_hash,
+    baseline_to_json,
+    load_baseline,
+    save_baseline,
+)
+from coec.errors import StateError
+
+
+def assert_same(a: object, b: object) -> None:
+    """Equal to the bit, NaN included."""
+    if is_dataclass(a):
+        for field in fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, np.ndarray):
+        assert isinstance(b, np.ndarray)
+        np.testing.assert_array_equal(a, b)
+    else:
+        assert a == b
+
+
+def test_reads_back_to_the_same_bits(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "rig.json"
+    written = save_baseline(path, a_baseline())
+    read = load_baseline(path, "front")
+    assert read is not None
+    assert_same(read, a_baseline())
+    assert baseline_hash(read) == written
+
+
+def test_holds_a_baseline_for_every_pair(tmp_path: Path) -> None:
+    path = tmp_path / "rig.json"
+    save_baseline(path, a_baseline())
+    save_baseline(path, replace(a_baseline(), pair="rear", pairs=7))
+    save_baseline(path, replace(a_baseline(), pairs=99))
+    front, rear = load_baseline(path, "front"), load_baseline(path, "rear")
+    assert front is not None
+    assert rear is not None
+    assert (front.pairs, rear.pairs) == (99, 7)
+
+
+def test_absent(tmp_path: Path) -> None:
+    assert load_baseline(tmp_path / "rig.json", "front") is None
+    save_baseline(tmp_path / "rig.json", a_baseline())
+    assert load_baseline(tmp_path / "rig.json", "left") is None
+
+
+def test_a_flipped_digit_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rig.json"
+    save_baseline(path, a_baseline())
+    path.write_bytes(path.read_bytes().replace(b"1234.5", b"1235.5", 1))
+    with pytest.raises(StateError, match="does not match its checksum; commission again"):
+        load_baseline(path, "front")
+
+
+def test_another_content_has_another_hash() -> None:
+    assert baseline_hash(a_baseline()) != baseline_hash(replace(a_baseline(), pairs=41))
+
+
+def test_an_incomplete_document_is_refused() -> None:
+    document = baseline_to_json(a_baseline())
+    del document["monitor"]
+    with pytest.raises(StateError, match="monitor"):
+        baseline_from_json(document)
+
+
+def test_a_matrix_that_is_not_rigid_is_refused() -> None:
+    document = baseline_to_json(a_baseline())
+    document["T_camera_lidar"][0][0] = 3.0
+    with pytest.raises(StateError, match="not a rigid transform"):
+        baseline_from_json(document)

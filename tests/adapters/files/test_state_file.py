@@ -1,0 +1,104 @@
+"""The state file: round trip, every flipped bit, cuts, the previous copy, a folder that refuses."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from coec.adapters.files.state_file import StateFile
+from coec.errors import StateError
+
+FIRST: dict[str, object] = {"pairs": {"front": {"matrix": [[1.0, 0.1], [1e-17, -0.0]], "name": "Ä"}}}
+SECOND: dict[str, object] = {"pairs": {"front": {"matrix": [[2.0, 0.30000000000000004], [3, None]]}}}
+
+
+def saved(folder: Path, *bodies: dict[str, object]) -> Path:
+    path = folder / "state.json"
+    file = StateFile(path)
+    for body in bodies:
+        file.save(body)
+    return path
+
+
+def test_nothing_there_is_no_damage(tmp_path: Path) -> None:
+    loaded = StateFile(tmp_path / "state.json").load()
+    assert loaded.body is None
+    assert loaded.damage == ()
+
+
+def test_what_was_saved_last_is_loaded(tmp_path: Path) -> None:
+    path = saved(tmp_path, FIRST, SECOND)
+    loaded = StateFile(path).load()
+    assert loaded.body == SECOND
+    assert loaded.damage == ()
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["state.json", "state.json.previous"]
+
+
+def test_any_flipped_bit_is_found_and_the_previous_copy_served(tmp_path: Path) -> None:
+    path = saved(tmp_path, FIRST, SECOND)
+    good = path.read_bytes()
+    for index in range(len(good)):
+        for bit in range(8):
+            bad = bytearray(good)
+            bad[index] ^= 1 << bit
+            path.write_bytes(bad)
+            loaded = StateFile(path).load()
+            assert loaded.body == FIRST, f"byte {index}, bit {bit}"
+            assert len(loaded.damage) == 1
+
+
+def test_any_cut_is_found_and_nothing_is_served_without_a_good_copy(tmp_path: Path) -> None:
+    path = saved(tmp_path, FIRST)
+    good = path.read_bytes()
+    for length in range(len(good)):
+        path.write_bytes(good[:length])
+        loaded = StateFile(path).load()
+        assert loaded.body is None
+        assert len(loaded.damage) == 1
+
+
+def test_a_damaged_copy_never_replaces_the_good_previous_one(tmp_path: Path) -> None:
+    path = saved(tmp_path, FIRST, SECOND)
+    path.write_bytes(b"{")
+    file = StateFile(path)
+    assert file.load().body == FIRST
+    file.save(SECOND)
+    path.write_bytes(b"{")
+    assert StateFile(path).load().body == FIRST
+
+
+def test_another_schema_version_is_named(tmp_path: Path) -> None:
+    path = saved(tmp_path, FIRST)
+    path.write_bytes(path.read_bytes().replace(b'"schema_version":1', b'"schema_version":2'))
+    loaded = StateFile(path).load()
+    assert loaded.body is None
+    assert "schema version" in loaded.damage[0]
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"null", b"[]", b'{"body":3}', b"[" * 100_000, b'{"body":{"a":NaN},"schema_version":1}']
+)
+def test_foreign_files_are_damage_not_exceptions(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "state.json"
+    path.write_bytes(text)
+    loaded = StateFile(path).load()
+    assert loaded.body is None
+    assert loaded.damage
+
+
+def test_a_failed_write_is_an_error_and_keeps_the_old_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path, FIRST)
+    file = StateFile(path)
+    file.load()
+
+    def full(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StateError, match="No space left"):
+        file.save(SECOND)
+    monkeypatch.undo()
+    assert StateFile(path).load().body == FIRST
+    assert [entry.name for entry in tmp_path.iterdir()] == ["state.json"]

@@ -1,0 +1,635 @@
+"""Windows on disk: exact round trip, readable by others, and nothing half-written under any kind of failure."""
+
+import hashlib
+import json
+import struct
+import subprocess
+import sys
+import textwrap
+import tracemalloc
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+from coec.adapters.mcap.files import McapDamaged, read_records
+from coec.adapters.mcap.windows import (
+    PART_SUFFIX,
+    RecordedWindow,
+    WindowWriter,
+    is_window,
+    read_result,
+    read_window,
+    salvage,
+    write_result,
+)
+from coec.calibration.types import (
+    CameraFrame,
+    EgoMotion,
+    EncodedImage,
+    FramePair,
+    ImageFormat,
+    LidarFrame,
+    Rig,
+    SweepTiming,
+)
+from coec.config import CalibrationConfig, SearchConfig
+from coec.errors import RecordingError, WindowError
+from coec.geometry import cameras, se3
+from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Transform, Verdict
+
+WIDTH, HEIGHT = 64, 48
+START_NS = 1_600_000_000_123_456_789
+CONFIGURATION = CalibrationConfig(search=SearchConfig(dof=6, rotation_deg=7.3))
+
+
+def a_rig(*, mask: bool = True) -> Rig:
+    rng = np.random.default_rng(3)
+    return Rig(
+        pair="front",
+        camera=cameras.build(
+            "double_sphere", width=WIDTH, height=HEIGHT, fx=21.1, fy=0.1 + 0.2, cx=31.5, cy=23.7, xi=-0.2, alpha=0.59
+        ),
+        camera_frame="camera",
+        lidar_frame="lidar",
+        T_camera_lidar_nominal=se3.exp(rng.normal(size=6)),
+        T_lidar_ego=se3.exp(rng.normal(size=6)),
+        mask=rng.random((HEIGHT, WIDTH)) > 0.2 if mask else None,
+        sweep=SweepTiming(0.104493824, -1, 1 / 3),
+    )
+
+
+def a_pair(index: int, *, raw: bool = False, motion: bool = True, points: int = 300) -> FramePair:
+    rng = np.random.default_rng(100 + index)
+    pixels = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()
+    depth = cv2.imencode(".png", rng.integers(0, 65535, (12, 16), dtype=np.uint16))[1].tobytes()
+    stamp_ns = START_NS + index * 7_000_000_001
+    image = (
+        EncodedImage(ImageFormat.BGR8, WIDTH, HEIGHT, pixels.tobytes())
+        if raw
+        else EncodedImage(ImageFormat.JPEG, WIDTH, HEIGHT, jpeg)
+    )
+    return FramePair(
+        CameraFrame(stamp_ns, "camera", image, depth=EncodedImage(ImageFormat.PNG, 16, 12, depth)),
+        LidarFrame(
+            stamp_ns - 3_000_000,
+            "lidar",
+            rng.normal(size=(points, 3)).astype(np.float32) * 20,
+            intensity=rng.random(points).astype(np.float32),
+            ring=rng.integers(0, 64, points, dtype=np.uint16),
+            time_offset_s=(rng.random(points) * 0.1 - 0.05).astype(np.float32),
+        ),
+        EgoMotion(stamp_ns, "base", (0.1 + 0.2, -1e-17, 8.0), (1 / 3, -2 / 3, 1e-300)) if motion else None,
+    )
+
+
+def a_window(path: Path, pairs: list[FramePair] | None = None, rig: Rig | None = None) -> RecordedWindow:
+    rig = rig or a_rig()
+    writer = WindowWriter(path, rig, rig.T_camera_lidar_nominal, path.stem, CONFIGURATION, {"vehicle": "car"})
+    for pair in pairs if pairs is not None else [a_pair(i) for i in range(3)]:
+        writer.add(pair)
+    return writer.finish()
+
+
+def a_result(window_id: str = "front-1", reasons: tuple[Reason, ...] = ()) -> CalibrationResult:
+    six = (0.1, 0.2, 0.3, 0.0, 0.0, 0.0)
+    return CalibrationResult(
+        vehicle="car",
+        pair="front",
+        camera_frame="camera",
+        lidar_frame="lidar",
+        window_id=window_id,
+        data_stamp_ns=START_NS,
+        pairs=3,
+        camera_from_lidar=Transform(
+            matrix=((1, 0, 0, 0.1 + 0.2), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+            translation_m=(0.3, 0, 0),
+            quaternion_xyzw=(0, 0, 0, 1),
+        ),
+        correction=six,
+        sigma=(*six[:3], None, None, None),
+        correction_rad_m=six,
+        sigma_rad_m=(*six[:3], None, None, None),
+        solved=(True, True, True, False, False, False),
+        unobservable=(False, False, False, False, False, False),
+        status="failed" if reasons else "accepted",
+        verdict=Verdict(decision="failed" if reasons else "accepted", reasons=reasons),
+        metrics={"overlap": MetricReply(value=0.97, limit=0.5, at_least=True, passed=True)},
+        score=0.5,
+        score_at_start=0.4,
+        mi=0.5,
+        overlap=0.97,
+        points_in_view=900,
+        evaluations=40,
+        stop_reason="tolerance_reached",
+        first_derivative=(*six[:3], None, None, None),
+        second_derivative=(*six[:3], None, None, None),
+        compensation={"done": 3},
+        depth_identity="precomputed",
+        config_hash="0123456789abcdef",
+    )
+
+
+def assert_same_pair(got: FramePair, expected: FramePair) -> None:
+    assert got.camera == expected.camera
+    assert got.motion == expected.motion
+    assert (got.lidar.stamp_ns, got.lidar.frame_id) == (expected.lidar.stamp_ns, expected.lidar.frame_id)
+    for column in ("xyz_m", "intensity", "ring", "time_offset_s"):
+        a, b = getattr(got.lidar, column), getattr(expected.lidar, column)
+        assert (a is None) == (b is None)
+        if a is not None:
+            assert a.dtype == b.dtype
+            assert a.tobytes() == b.tobytes()
+
+
+def assert_same_rig(got: Rig, expected: Rig) -> None:
+    assert got.camera == expected.camera
+    assert (got.pair, got.camera_frame, got.lidar_frame, got.sweep) == (
+        expected.pair,
+        expected.camera_frame,
+        expected.lidar_frame,
+        expected.sweep,
+    )
+    assert got.T_camera_lidar_nominal.tobytes() == expected.T_camera_lidar_nominal.tobytes()
+    assert got.T_lidar_ego.tobytes() == expected.T_lidar_ego.tobytes()
+    assert (got.mask is None) == (expected.mask is None)
+    if got.mask is not None and expected.mask is not None:
+        assert np.array_equal(got.mask, expected.mask)
+
+
+# --- round trip -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mask", [True, False])
+@pytest.mark.parametrize("raw", [True, False])
+def test_reads_back_to_the_same_bits(tmp_path: Path, mask: bool, raw: bool) -> None:
+    rig = a_rig(mask=mask)
+    pairs = [a_pair(i, raw=raw, motion=i != 1) for i in range(4)]
+    start = se3.perturb(rig.T_camera_lidar_nominal, np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]))
+    writer = WindowWriter(tmp_path / "w.mcap", rig, start, "w", CONFIGURATION, {})
+    for pair in pairs:
+        writer.add(pair)
+    recorded = writer.finish()
+
+    window, configuration = read_window(tmp_path / "w.mcap")
+
+    assert configuration == CONFIGURATION
+    assert window.window_id == recorded.window_id == "w"
+    assert window.T_camera_lidar_start.tobytes() == start.tobytes()
+    assert_same_rig(window.rig, rig)
+    assert len(window.pairs) == recorded.pairs == 4
+    for got, expected in zip(window.pairs, pairs, strict=True):
+        assert_same_pair(got, expected)
+
+
+def test_a_sweep_without_optional_columns_comes_back_without_them(tmp_path: Path) -> None:
+    pair = a_pair(0)
+    bare = replace(pair, lidar=LidarFrame(pair.lidar.stamp_ns, "lidar", pair.lidar.xyz_m))
+    a_window(tmp_path / "w.mcap", [bare])
+    assert_same_pair(read_window(tmp_path / "w.mcap")[0].pairs[0], bare)
+
+
+def test_senders_sequence_numbers_are_not_kept(tmp_path: Path) -> None:
+    pair = a_pair(0)
+    numbered = replace(pair, camera=replace(pair.camera, sequence=77))
+    a_window(tmp_path / "w.mcap", [numbered])
+    assert_same_pair(read_window(tmp_path / "w.mcap")[0].pairs[0], pair)
+
+
+def test_equal_pairs_give_equal_bytes(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    a, b = a_window(tmp_path / "a" / "w.mcap"), a_window(tmp_path / "b" / "w.mcap")
+    assert a.sha256 == b.sha256
+    assert a.path.read_bytes() == b.path.read_bytes()
+    assert write_result(a.path, a_result()).sha256 == write_result(b.path, a_result()).sha256
+
+
+def test_the_record_describes_the_file(tmp_path: Path) -> None:
+    recorded = a_window(tmp_path / "w.mcap")
+    data = recorded.path.read_bytes()
+    assert (recorded.bytes, recorded.sha256) == (len(data), hashlib.sha256(data).hexdigest())
+    assert [p.name for p in tmp_path.iterdir()] == ["w.mcap"]
+
+
+def test_while_it_is_recorded_the_final_name_does_not_exist(tmp_path: Path) -> None:
+    rig = a_rig()
+    writer = WindowWriter(tmp_path / "w.mcap", rig, rig.T_camera_lidar_nominal, "w", CONFIGURATION, {})
+    writer.add(a_pair(0))
+    assert [p.name for p in tmp_path.iterdir()] == ["w.mcap" + PART_SUFFIX]
+    writer.abandon()
+    writer.abandon()
+    assert not list(tmp_path.iterdir())
+
+
+# --- the result -----------------------------------------------------------------------------------------------
+
+
+def test_the_result_is_written_into_the_window_and_replaced_by_a_later_one(tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    a_window(path)
+    before, _ = read_window(path)
+    assert read_result(path) is None
+
+    first = write_result(path, a_result(reasons=(Reason(code="mi_low", text="too little information"),)))
+    second = write_result(path, a_result())
+
+    assert read_result(path) == a_result()
+    assert first.pairs == second.pairs == 3
+    assert second.window_id == "w"
+    after, configuration = read_window(path)
+    assert configuration == CONFIGURATION
+    for got, expected in zip(after.pairs, before.pairs, strict=True):
+        assert_same_pair(got, expected)
+    assert topics(path).count("/coec/front/result") == topics(path).count("/diagnostics") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["w.mcap"]
+
+
+def topics(path: Path) -> list[str]:
+    with path.open("rb") as stream:
+        return [channel.topic for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages()]
+
+
+def test_a_result_for_a_damaged_window_leaves_it_alone(tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    a_window(path)
+    data = path.read_bytes()[:-100]
+    path.write_bytes(data)
+    with pytest.raises(WindowError, match="cut off"):
+        write_result(path, a_result())
+    assert path.read_bytes() == data
+    assert [p.name for p in tmp_path.iterdir()] == ["w.mcap"]
+
+
+# --- other readers --------------------------------------------------------------------------------------------
+
+EXPECTED_TYPES = {
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/coec/front/lidar/points": "sensor_msgs/msg/PointCloud2",
+    "/coec/front/odometry": "nav_msgs/msg/Odometry",
+    "/coec/front/camera/depth/compressed": "sensor_msgs/msg/CompressedImage",
+    "/coec/front/camera/camera_info": "sensor_msgs/msg/CameraInfo",
+    "/coec/front/camera/image/compressed": "sensor_msgs/msg/CompressedImage",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+
+
+def test_rosbags_reads_a_window_with_its_result(tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    a_window(path)
+    write_result(path, a_result())
+    pair = a_pair(0)
+
+    with Reader(path) as bag:
+        assert {c.topic: c.msgtype for c in bag.connections if c.topic != "/coec/front/result"} == EXPECTED_TYPES
+        assert bag.start_time == pair.lidar.stamp_ns
+    with AnyReader([path]) as reader:
+        seen: dict[str, tuple[int, Any]] = {}
+        for connection, stamp_ns, data in reader.messages([c for c in reader.connections if c.topic in EXPECTED_TYPES]):
+            seen.setdefault(connection.topic, (stamp_ns, reader.deserialize(data, connection.msgtype)))
+    stamp_ns, cloud = seen["/coec/front/lidar/points"]
+    assert stamp_ns == pair.lidar.stamp_ns
+    assert cloud.width * cloud.height == 300
+    assert seen["/coec/front/camera/image/compressed"][1].data.tobytes() == pair.camera.image.data
+    assert seen["/coec/front/odometry"][1].child_frame_id == "base"
+    assert seen["/tf_static"][1].transforms[0].child_frame_id == "lidar"
+    assert seen["/diagnostics"][1].status[0].hardware_id == "car"
+
+
+def test_mcap_ros2_decodes_every_message_and_the_json(tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    a_window(path)
+    write_result(path, a_result())
+    decoders = DecoderFactory()
+    seen = set()
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        assert reader.get_header().library.startswith("coec")
+        assert [a.name for a in reader.iter_attachments()] == [
+            "rig.json",
+            "configuration.json",
+            "mask.png",
+            "result.json",
+        ]
+        for schema, channel, message in reader.iter_messages():
+            seen.add(channel.topic)
+            decoder = decoders.decoder_for(channel.message_encoding, schema)
+            if channel.topic == "/coec/front/result":
+                assert (channel.message_encoding, schema, decoder) == ("json", None, None)
+                assert json.loads(message.data)["window_id"] == "front-1"
+            else:
+                assert decoder is not None
+                assert "offered_qos_profiles" not in channel.metadata
+                decoder(message.data)
+    assert seen == {*EXPECTED_TYPES, "/coec/front/result"}
+
+
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.ZSTD, CompressionType.NONE])
+def test_a_window_that_another_tool_recompressed_and_sorted_is_still_the_window(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    path = tmp_path / "w.mcap"
+    a_window(path)
+    original, _ = read_window(path)
+    with path.open("rb") as source, (tmp_path / "z.mcap").open("wb") as sink:
+        reader, writer = make_reader(source), Writer(sink, compression=compression, chunk_size=10_000)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in sorted(reader.iter_messages(), key=lambda item: -item[2].log_time):
+            if channel.id not in channels:
+                assert schema is not None
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", schema_id)
+            writer.add_message(channels[channel.id], message.log_time, message.data, 0, message.sequence)
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
+        writer.finish()  # type: ignore[no-untyped-call]
+    window, _ = read_window(tmp_path / "z.mcap")
+    for got, expected in zip(window.pairs, original.pairs, strict=True):
+        assert_same_pair(got, expected)
+
+
+# --- damage ---------------------------------------------------------------------------------------------------
+
+
+def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    a_window(path, [a_pair(0, points=5)])
+    write_result(path, a_result())
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for at in sorted({*range(60), *range(len(whole) - 400, len(whole)), *rng.integers(0, len(whole), 400).tolist()}):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        with pytest.raises(WindowError):
+            read_window(path)
+
+
+def test_every_cut_is_noticed_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    a_window(path, [a_pair(0, points=5)])
+    whole = path.read_bytes()
+    rng = np.random.default_rng(1)
+    for size in sorted({0, 1, 7, 8, 20, len(whole) - 1, *rng.integers(0, len(whole), 60).tolist()}):
+        path.write_bytes(whole[:size])
+        with pytest.raises(WindowError, match=r"cut off|not an MCAP"):
+            read_window(path)
+        with pytest.raises(WindowError):
+            read_result(path)
+
+
+def test_bytes_behind_the_end_are_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    a_window(path)
+    path.write_bytes(path.read_bytes() + b"more")
+    with pytest.raises(WindowError):
+        read_window(path)
+
+
+def chunk_record(compression: str, promised: int, packed: bytes, crc: int = 0) -> bytes:
+    """A chunk, packed by hand (MCAP specification, "Chunk (op=0x06)")."""
+    name = compression.encode()
+    body = struct.pack("<QQQI", 0, 0, promised, crc) + struct.pack("<I", len(name)) + name
+    body += struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 0x06, len(body)) + body
+
+
+def mcap_of(*records: bytes) -> bytes:
+    """Magic, header, records, data end, footer without summary, magic."""
+    magic = b"\x89MCAP0\r\n"
+    header = struct.pack("<BQII", 0x01, 8, 0, 0)
+    data_end = struct.pack("<BQI", 0x0F, 4, 0)
+    footer = struct.pack("<BQQQI", 0x02, 20, 0, 0, 0)
+    return magic + header + b"".join(records) + data_end + footer + magic
+
+
+def one_record(size: int) -> Iterator[bytes]:
+    """A record of an opcode that is left to applications, `size` bytes in all, zero behind its length; in pieces."""
+    yield struct.pack("<BQ", 0x80, size - 9)
+    for at in range(9, size, 1_000_000):
+        yield bytes(min(1_000_000, size - at))
+
+
+def lz4_bomb(size: int) -> bytes:
+    compressor = lz4.frame.LZ4FrameCompressor()
+    packed = compressor.begin() + b"".join(compressor.compress(piece) for piece in one_record(size))
+    return bytes(packed + compressor.flush())
+
+
+def zstd_bomb(size: int) -> bytes:
+    """Its frame states its size, which `zstandard.decompress` would trust."""
+    compressor = zstandard.ZstdCompressor().compressobj(size=size)
+    return b"".join(compressor.compress(piece) for piece in one_record(size)) + compressor.flush()
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+@pytest.mark.parametrize("honest", [True, False])
+def test_a_chunk_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, compression: str, honest: bool) -> None:
+    size = 300_000_000
+    packed = {"lz4": lz4_bomb, "zstd": zstd_bomb}[compression](size)
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(mcap_of(chunk_record(compression, size if honest else 1000, packed)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(WindowError, match="would unpack" if honest else "size or CRC"):
+            read_window(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 20_000_000
+
+
+def test_many_chunks_that_are_small_by_themselves_are_refused_together(tmp_path: Path) -> None:
+    packed = lz4_bomb(20_000_000)
+    path = tmp_path / "bombs.mcap"
+    path.write_bytes(mcap_of(*[chunk_record("lz4", 20_000_000, packed)] * 50))
+    with pytest.raises(WindowError, match="unpacks to more than"):
+        read_window(path)
+
+
+@pytest.mark.parametrize(
+    ("record", "complaint"),
+    [
+        (struct.pack("<BQ", 0x06, 2**62), "cut off"),
+        (chunk_record("lz4", 100, b"not lz4"), "cannot be unpacked"),
+        (chunk_record("zstd", 100, b"not zstd"), "cannot be unpacked"),
+        (chunk_record("rar", 100, b""), "compression"),
+        (chunk_record("", 4, b"abcd", crc=zlib.crc32(b"abce")), "CRC"),
+        (chunk_record("", 9, struct.pack("<BQ", 0x05, 1000)), "cut"),
+        (struct.pack("<BQHI", 0x04, 6, 1, 2**31), "passes its end"),
+        (struct.pack("<BQI", 0x09, 4, 0), "passes its end"),
+    ],
+)
+def test_lengths_that_lie_are_refused(tmp_path: Path, record: bytes, complaint: str) -> None:
+    path = tmp_path / "lie.mcap"
+    path.write_bytes(mcap_of(record))
+    with path.open("rb") as stream, pytest.raises(McapDamaged, match=complaint):
+        list(read_records(stream))
+
+
+def test_an_mcap_that_is_no_window_is_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    path.write_bytes(mcap_of())
+    assert not is_window(path)
+    with pytest.raises(WindowError, match=r"no attachment rig\.json"):
+        read_window(path)
+    with pytest.raises(WindowError, match="cannot read"):
+        read_window(tmp_path / "absent.mcap")
+
+
+def test_a_window_without_a_pair_is_refused(tmp_path: Path) -> None:
+    a_window(tmp_path / "w.mcap", [])
+    with pytest.raises(WindowError, match="no camera-LiDAR pair"):
+        read_window(tmp_path / "w.mcap")
+
+
+# --- salvage --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def part_file(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[int]]:
+    """A `.part` file as a killed recorder leaves it, and its size after each pair."""
+    path = tmp_path_factory.mktemp("part") / "w.mcap"
+    rig = a_rig()
+    writer = WindowWriter(path, rig, rig.T_camera_lidar_nominal, "w", CONFIGURATION, {"vehicle": "car"})
+    part = path.with_name(path.name + PART_SUFFIX)
+    sizes = [part.stat().st_size]
+    for index in range(4):
+        writer.add(a_pair(index, points=5000))
+        sizes.append(part.stat().st_size)
+    data = part.read_bytes()
+    writer.abandon()
+    return data, sizes
+
+
+def test_salvage_saves_every_whole_pair_of_a_part_cut_anywhere(
+    tmp_path: Path, part_file: tuple[bytes, list[int]]
+) -> None:
+    data, sizes = part_file
+    part = tmp_path / ("w.mcap" + PART_SUFFIX)
+    saved_at: list[tuple[int, int]] = []
+    rng = np.random.default_rng(2)
+    for size in sorted({0, 5, *sizes, len(data), *rng.integers(0, len(data), 60).tolist()}):
+        part.write_bytes(data[:size])
+        recorded = salvage(part)
+        assert not part.exists()
+        saved_at.append((size, 0 if recorded is None else recorded.pairs))
+        if recorded is None:
+            assert not list(tmp_path.iterdir())
+            continue
+        window, configuration = read_window(recorded.path)
+        assert (window.window_id, configuration) == ("w", CONFIGURATION)
+        assert_same_rig(window.rig, a_rig())
+        for index, got in enumerate(window.pairs):
+            assert_same_pair(got, a_pair(index, points=5000))
+        recorded.path.unlink()
+    counts = [pairs for _, pairs in saved_at]
+    assert counts == sorted(counts)
+    # The last pair may still lie in an open chunk (CHUNK_BYTES); all before it are on the disk.
+    for written, size in enumerate(sizes[1:], start=1):
+        assert dict(saved_at)[size] >= written - 1
+
+
+def test_salvaging_a_whole_part_gives_the_bytes_that_finish_would_have(tmp_path: Path) -> None:
+    recorded = a_window(tmp_path / "w.mcap")
+    whole = recorded.path.read_bytes()
+    part = tmp_path / ("w.mcap" + PART_SUFFIX)
+    recorded.path.rename(part)
+    salvaged = salvage(part)
+    assert salvaged == recorded
+    assert recorded.path.read_bytes() == whole
+
+
+def test_salvage_stops_at_a_flipped_bit(tmp_path: Path, part_file: tuple[bytes, list[int]]) -> None:
+    data, sizes = part_file
+    damaged = bytearray(data)
+    damaged[sizes[2] + 30_000] ^= 4
+    part = tmp_path / ("w.mcap" + PART_SUFFIX)
+    part.write_bytes(damaged)
+    recorded = salvage(part)
+    assert recorded is not None
+    assert 1 <= recorded.pairs <= 2
+
+
+def test_salvage_leaves_a_finished_window_alone(tmp_path: Path) -> None:
+    recorded = a_window(tmp_path / "w.mcap")
+    whole = recorded.path.read_bytes()
+    part = tmp_path / ("w.mcap" + PART_SUFFIX)
+    part.write_bytes(whole[:2000])
+    assert salvage(part) is None
+    assert not part.exists()
+    assert recorded.path.read_bytes() == whole
+
+
+# --- a disk that is full --------------------------------------------------------------------------------------
+
+FULL_DISK = """
+import resource, signal, sys
+sys.path[:0] = {paths!r}
+from pathlib import Path
+from test_windows import CONFIGURATION, a_pair, a_result, a_rig, a_window
+from coec.adapters.mcap.windows import WindowWriter, write_result
+from coec.errors import RecordingError
+folder, limit = Path(sys.argv[1]), int(sys.argv[2])
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # the write then fails with EFBIG, as with ENOSPC on a full disk
+kept = a_window(folder / "kept.mcap")
+pairs = [a_pair(index) for index in range(5)]
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+outcomes = []
+try:
+    rig = a_rig()
+    writer = WindowWriter(folder / "w.mcap", rig, rig.T_camera_lidar_nominal, "w", CONFIGURATION, {{}})
+    for pair in pairs:
+        writer.add(pair)
+    writer.finish()
+except RecordingError as error:
+    outcomes.append("refused" if "w.mcap" in str(error) else str(error))
+try:
+    write_result(kept.path, a_result())
+except RecordingError:
+    outcomes.append("refused")
+print(*outcomes, *sorted(path.name for path in folder.iterdir()))
+"""
+
+
+@pytest.mark.parametrize("limit", [100, 3_000, 20_000])
+def test_a_full_disk_is_a_recording_error_and_leaves_nothing_behind(tmp_path: Path, limit: int) -> None:
+    here = Path(__file__).resolve()
+    program = textwrap.dedent(FULL_DISK).format(paths=[str(here.parent), str(here.parents[3] / "service")])
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program, str(tmp_path), str(limit)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout.split(), done.returncode, done.stderr) == (["refused", "refused", "kept.mcap"], 0, "")
+    assert read_window(tmp_path / "kept.mcap")[0].pairs
+
+
+def test_a_folder_that_is_not_there_is_a_recording_error(tmp_path: Path) -> None:
+    rig = a_rig()
+    with pytest.raises(RecordingError, match="cannot write"):
+        WindowWriter(tmp_path / "no" / "w.mcap", rig, rig.T_camera_lidar_nominal, "w", CONFIGURATION, {})
+
+
+@pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9])
+def test_a_stamp_that_ros_cannot_hold_is_a_recording_error(tmp_path: Path, stamp_ns: int) -> None:
+    pair = a_pair(0)
+    with pytest.raises(RecordingError, match="stamp"):
+        a_window(tmp_path / "w.mcap", [replace(pair, camera=replace(pair.camera, stamp_ns=stamp_ns))])
+    assert not list(tmp_path.iterdir())

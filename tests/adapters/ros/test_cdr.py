@@ -1,0 +1,542 @@
+"""ROS 2 messages: packed by hand with struct, hostile, and what the recorder writes."""
+
+import math
+import struct
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap_ros2.decoder import DecoderFactory
+
+from coec.adapters.frames.incoming import Refusal
+from coec.adapters.images.codec import encode_depth_png, encode_jpeg, probe
+from coec.adapters.ros import cdr
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
+from coec.config import LimitsConfig
+from coec.errors import DecodeError
+from coec.geometry.cameras import Camera, build
+
+LIMITS = LimitsConfig()
+SEC, NSEC = 1_700_000_000, 123_456_789
+STAMP = SEC * 10**9 + NSEC
+JPEG = encode_jpeg(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8))
+NAN = math.nan
+
+CODES = {"i1": 1, "u1": 2, "<i2": 3, "<u2": 4, "<i4": 5, "<u4": 6, "<f4": 7, "<f8": 8}
+
+
+class Packer:
+    """CDR, little-endian, packed by hand: alignment counts from behind the 4 bytes of encapsulation."""
+
+    def __init__(self) -> None:
+        self.body = bytearray()
+
+    def put(self, form: str, *values: float) -> "Packer":
+        for value in values:
+            self.body += bytes(-len(self.body) % struct.calcsize("<" + form))
+            self.body += struct.pack("<" + form, value)
+        return self
+
+    def text(self, text: str) -> "Packer":
+        self.put("I", len(text.encode()) + 1)
+        self.body += text.encode() + b"\0"
+        return self
+
+    def octets(self, data: bytes, claimed: int | None = None) -> "Packer":
+        self.put("I", len(data) if claimed is None else claimed)
+        self.body += data
+        return self
+
+    def header(self, frame_id: str, sec: int = SEC, nsec: int = NSEC) -> "Packer":
+        return self.put("i", sec).put("I", nsec).text(frame_id)
+
+    def done(self) -> bytes:
+        return b"\x00\x01\x00\x00" + bytes(self.body)
+
+
+def compressed(data: bytes = JPEG, form: str = "jpeg", **header: Any) -> bytes:
+    return Packer().header(**({"frame_id": "camera"} | header)).text(form).octets(data).done()
+
+
+def image(encoding: str, width: int, height: int, step: int, data: bytes) -> bytes:
+    packer = Packer().header("camera").put("I", height, width).text(encoding)
+    return packer.put("B", 0).put("I", step).octets(data).done()
+
+
+def cloud(
+    fields: list[tuple[str, int, int]],
+    data: bytes,
+    width: int,
+    point_step: int,
+    *,
+    height: int = 1,
+    row_step: int | None = None,
+    big: bool = False,
+    claimed: int | None = None,
+    claimed_fields: int | None = None,
+) -> bytes:
+    packer = Packer().header("lidar").put("I", height, width)
+    packer.put("I", len(fields) if claimed_fields is None else claimed_fields)
+    for name, offset, datatype in fields:
+        packer.text(name).put("I", offset).put("B", datatype).put("I", 1)
+    packer.put("?", big).put("I", point_step, width * point_step if row_step is None else row_step)
+    return packer.octets(data, claimed).put("?", False).done()
+
+
+def packed(columns: list[tuple[str, str, list[float]]], **options: Any) -> bytes:
+    """A cloud of one row, without padding, its columns in the order given."""
+    fields, formats, offset = [], [], 0
+    for name, form, _ in columns:
+        fields.append((name, offset, CODES[form]))
+        formats.append((name, form))
+        offset += np.dtype(form).itemsize
+    rows = np.zeros(len(columns[0][2]), formats)
+    for name, _, values in columns:
+        rows[name] = values
+    return cloud(fields, rows.tobytes(), len(rows), offset, **options)
+
+
+def twist(linear: tuple[float, ...] = (1.5, 0.0, -0.25), angular: tuple[float, ...] = (0.0, 0.5, 0.125)) -> bytes:
+    return Packer().header("base_link").put("d", *linear, *angular).done()
+
+
+def odometry(child: str = "base_link") -> bytes:
+    packer = Packer().header("odom").text(child).put("d", *range(7), *[0.0] * 36)
+    return packer.put("d", 1.5, 0.0, -0.25, 0.0, 0.5, 0.125, *[0.0] * 36).done()
+
+
+XYZ: list[tuple[str, str, list[float]]] = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
+REASONS_OR_NONE = {None, *Refusal}
+MESSAGES = [
+    (cdr.COMPRESSED_IMAGE, compressed()),
+    (cdr.IMAGE, image("rgb8", 2, 2, 8, bytes(16))),
+    (cdr.POINT_CLOUD, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 9])])),
+    (cdr.ODOMETRY, odometry()),
+    (cdr.TWIST, twist()),
+]
+
+
+def sweep(payload: bytes) -> LidarFrame:
+    frame = cdr.decode(cdr.POINT_CLOUD, payload, LIMITS)
+    assert isinstance(frame, LidarFrame)
+    return frame
+
+
+def reason_of(type_name: str, payload: bytes, limits: LimitsConfig = LIMITS) -> str:
+    with pytest.raises(DecodeError) as refused:
+        cdr.decode(type_name, payload, limits)
+    assert refused.value.reason in set(Refusal)
+    return refused.value.reason
+
+
+def refusal_or_none(type_name: str, payload: bytes) -> str | None:
+    """The reason, or None for what was read; any other exception fails the test."""
+    try:
+        cdr.decode(type_name, payload, LIMITS)
+    except DecodeError as error:
+        return error.reason
+    return None
+
+
+# --- images -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["jpeg", "", "bgr8; jpeg compressed bgr8", "rgb8; png compressed "])
+def test_a_compressed_image_is_known_by_its_bytes(form: str) -> None:
+    frame = cdr.decode(cdr.COMPRESSED_IMAGE, compressed(form=form), LIMITS)
+
+    assert frame == CameraFrame(STAMP, "camera", EncodedImage(ImageFormat.JPEG, 64, 48, JPEG))
+
+
+def test_the_padding_of_rows_is_removed() -> None:
+    data = bytes(range(6)) + b"\xaa\xaa" + bytes(range(6, 12)) + b"\xaa\xaa"
+    for sent in (data, data[:-2]):  # some drivers leave out the padding of the last row
+        frame = cdr.decode(cdr.IMAGE, image("bgr8", 2, 2, 8, sent), LIMITS)
+
+        assert isinstance(frame, CameraFrame)
+        assert frame.image == EncodedImage(ImageFormat.BGR8, 2, 2, bytes(range(12)))
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (image("bayer_rggb8", 2, 2, 2, bytes(4)), "image_unknown_format"),
+        (image("jpeg", 2, 2, 2, bytes(4)), "image_unknown_format"),
+        (image("mono8", 4, 2, 3, bytes(8)), "image_size_mismatch"),
+        (image("mono8", 4, 2, 4, bytes(7)), "image_size_mismatch"),
+        (image("mono8", 2**32 - 1, 2**32 - 1, 2**32 - 1, bytes(8)), "image_size_mismatch"),
+        (image("mono8", 0, 2, 0, b""), "image_corrupt"),
+        (image("mono8", 4, 0, 4, b""), "image_corrupt"),
+    ],
+)
+def test_a_wrong_raw_image_is_refused_by_reason(payload: bytes, reason: str) -> None:
+    assert reason_of(cdr.IMAGE, payload) == reason
+
+
+def test_a_truncated_jpeg_is_refused() -> None:
+    assert reason_of(cdr.COMPRESSED_IMAGE, compressed(JPEG[:-9])) == "image_truncated"
+
+
+# --- clouds -------------------------------------------------------------------------------------------------
+
+
+def test_fields_in_any_order_with_padding_between_and_rows_apart() -> None:
+    # Points of 24 bytes, 2 rows of 2, 56 bytes apart: z f64 at 0, x f32 at 12, ring u8 at 17, y f32 at 20.
+    data = bytearray(2 * 56)
+    for i in range(4):
+        at = (i // 2) * 56 + (i % 2) * 24
+        struct.pack_into("<d", data, at, 10.5 + i)
+        struct.pack_into("<f", data, at + 12, 1 + i)
+        data[at + 17] = i
+        struct.pack_into("<f", data, at + 20, -1 - i)
+    fields = [("z", 0, 8), ("x", 12, 7), ("ring", 17, 2), ("y", 20, 7), ("rgb", 4, 7)]
+
+    frame = sweep(cloud(fields, bytes(data), 2, 24, height=2, row_step=56))
+
+    assert (frame.stamp_ns, frame.frame_id) == (STAMP, "lidar")
+    assert frame.xyz_m.tolist() == [[1 + i, -1 - i, 10.5 + i] for i in range(4)]
+    assert frame.ring is not None
+    assert frame.ring.tolist() == [0, 1, 2, 3]
+    assert frame.intensity is None
+    assert frame.time_offset_s is None
+
+
+@pytest.mark.parametrize("form", ["<f4", "<f8", "u1", "<u2"])
+def test_intensity_of_any_type(form: str) -> None:
+    frame = sweep(packed([*XYZ, ("intensity", form, [7, 200])]))
+
+    assert frame.intensity is not None
+    assert frame.intensity.dtype == np.float32
+    assert frame.intensity.tolist() == [7, 200]
+
+
+@pytest.mark.parametrize(("name", "form"), [("ring", "u1"), ("ring", "<u2"), ("ring", "<u4"), ("channel", "<u2")])
+def test_ring_of_any_unsigned_type(name: str, form: str) -> None:
+    frame = sweep(packed([*XYZ, (name, form, [7, 63])]))
+
+    assert frame.ring is not None
+    assert frame.ring.dtype == np.uint16
+    assert frame.ring.tolist() == [7, 63]
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "values"),
+    [
+        ("t", "<u4", [0, 99_000_000]),  # Ouster
+        ("offset_time", "<u4", [0, 99_000_000]),
+        ("time", "<f4", [0.0, 0.099]),  # Velodyne
+        ("time_offset", "<f8", [0.0, 0.099]),
+        ("timestamp", "<f8", [SEC + NSEC * 1e-9, SEC + NSEC * 1e-9 + 0.099]),  # Hesai
+        ("timestamp", "<f8", [float(STAMP), float(STAMP + 99_000_000)]),  # Livox
+    ],
+)
+def test_time_of_every_known_driver(name: str, form: str, values: list[float]) -> None:
+    frame = sweep(packed([*XYZ, (name, form, values)]))
+
+    assert frame.time_offset_s is not None
+    assert frame.time_offset_s.dtype == np.float32
+    assert frame.time_offset_s.tolist() == pytest.approx([0.0, 0.099], abs=1e-6)
+
+
+def test_a_time_before_the_stamp() -> None:
+    frame = sweep(packed([*XYZ, ("timestamp", "<f8", [SEC + NSEC * 1e-9 - 0.05, SEC + NSEC * 1e-9 + 0.05])]))
+
+    assert frame.time_offset_s is not None
+    assert frame.time_offset_s.tolist() == pytest.approx([-0.05, 0.05], abs=1e-6)
+
+
+def test_a_time_of_another_clock_is_refused() -> None:
+    payload = packed([*XYZ, ("timestamp", "<f8", [SEC - 3600.0, SEC - 3599.9])])
+
+    assert reason_of(cdr.POINT_CLOUD, payload) == "cloud_time"
+
+
+def test_points_that_are_none_go_with_their_row_whatever_their_other_columns_hold() -> None:
+    payload = packed(
+        [
+            ("x", "<f8", [NAN, 1, 1e300, 4]),
+            ("y", "<f4", [0, 2, 0, 5]),
+            ("z", "<f4", [0, 3, 0, 6]),
+            ("ring", "<u2", [0, 1, 2, 3]),
+            ("timestamp", "<f8", [0.0, SEC + NSEC * 1e-9, NAN, SEC + NSEC * 1e-9 + 0.1]),
+        ]
+    )
+
+    frame = sweep(payload)
+
+    assert frame.xyz_m.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert frame.ring is not None
+    assert frame.ring.tolist() == [1, 3]
+    assert frame.time_offset_s is not None
+    assert frame.time_offset_s.tolist() == pytest.approx([0.0, 0.1], abs=1e-6)
+
+
+SHORT = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
+MAX = 2**32 - 1
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (packed(XYZ, big=True), "cloud_big_endian"),
+        (packed([("x", "<f4", [NAN]), ("y", "<f4", [0]), ("z", "<f4", [0])]), "cloud_empty"),
+        (cloud(SHORT, b"", 0, 12), "cloud_empty"),
+        (cloud(SHORT, b"", 5, 12, height=0), "cloud_empty"),
+        (packed(XYZ[:2]), "cloud_fields"),
+        (packed([("x", "<i4", [1]), ("y", "<f4", [1]), ("z", "<f4", [1])]), "cloud_fields"),
+        (packed([*XYZ, ("ring", "<u4", [1, 70_000])]), "cloud_fields"),
+        (cloud([*SHORT, ("q", 0, 99)], bytes(12), 1, 12), ""),
+        (cloud([("x", 9, 7), *SHORT[1:]], bytes(12), 1, 12), "cloud_shape"),
+        (cloud([("x", MAX, 7), *SHORT[1:]], bytes(12), 1, 12), "cloud_shape"),
+        (cloud(SHORT, bytes(24), 2, 0), "cloud_shape"),
+        (cloud(SHORT, bytes(24), 3, 12), "cloud_shape"),
+        (cloud(SHORT, bytes(24), 2, 12, row_step=12), "cloud_shape"),
+        (cloud(SHORT, bytes(24), 1, 12, height=2, row_step=MAX), "cloud_shape"),
+        (cloud(SHORT, bytes(24), 2, MAX, row_step=MAX), "cloud_shape"),
+        (cloud(SHORT, bytes(24), MAX, MAX, height=MAX, row_step=MAX), "cloud_too_large"),
+        (cloud(SHORT, bytes(24), 2**16, 12, height=2**16, row_step=0), "cloud_too_large"),  # 0 in 32 bits
+        (cloud(SHORT, bytes(24), 2, 12, claimed=MAX), "message_malformed"),
+        (cloud(SHORT, bytes(24), 2, 12, claimed=25 + 4000), "message_malformed"),
+        (cloud(SHORT, bytes(24), 2, 12, claimed_fields=MAX), "cloud_fields"),
+        (cloud(SHORT * 30, bytes(24), 2, 12), "cloud_fields"),
+    ],
+)
+def test_a_wrong_cloud_is_refused_by_reason(payload: bytes, reason: str) -> None:
+    if reason:
+        assert reason_of(cdr.POINT_CLOUD, payload) == reason
+    else:  # a field of an unknown type that nobody asked for
+        assert len(sweep(payload).xyz_m) == 1
+
+
+# --- ego-motion ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("type_name", "payload", "frame_id"),
+    [
+        (cdr.ODOMETRY, odometry(), "base_link"),  # the twist is expressed in the child frame
+        (cdr.ODOMETRY, odometry(""), "odom"),
+        (cdr.TWIST, twist(), "base_link"),
+    ],
+)
+def test_ego_motion(type_name: str, payload: bytes, frame_id: str) -> None:
+    motion = EgoMotion(STAMP, frame_id, (1.5, 0.0, -0.25), (0.0, 0.5, 0.125))
+
+    assert cdr.decode(type_name, payload, LIMITS) == motion
+
+
+@pytest.mark.parametrize("value", [NAN, math.inf, -1e30])
+def test_a_velocity_that_is_none_is_refused(value: float) -> None:
+    assert reason_of(cdr.TWIST, twist(angular=(0.0, value, 0.0))) == "motion_invalid"
+
+
+# --- headers and hostility ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "reason"),
+    [
+        ({"sec": -1}, "stamp_invalid"),
+        ({"nsec": 10**9}, "stamp_invalid"),
+        ({"frame_id": "x" * 129}, "frame_id_invalid"),
+    ],
+)
+def test_a_wrong_header_is_refused_by_reason(header: dict[str, Any], reason: str) -> None:
+    assert reason_of(cdr.COMPRESSED_IMAGE, compressed(**header)) == reason
+
+
+def test_a_type_that_is_not_read_is_refused() -> None:
+    assert reason_of("std_msgs/msg/String", b"\0\1\0\0") == "message_type"
+
+
+def test_a_message_beyond_the_limit_is_not_even_looked_at() -> None:
+    limits = LimitsConfig(max_message_bytes=2**16)
+
+    assert reason_of(cdr.POINT_CLOUD, bytes(2**16 + 1), limits) == "message_too_large"
+
+
+@pytest.mark.parametrize(("type_name", "payload"), MESSAGES)
+def test_a_message_cut_at_any_byte_is_refused(type_name: str, payload: bytes) -> None:
+    cdr.decode(type_name, payload, LIMITS)
+    for size in range(0, len(payload) - 1, max(1, len(payload) // 400)):
+        assert reason_of(type_name, payload[:size])
+
+
+@pytest.mark.parametrize(("type_name", "payload"), MESSAGES)
+def test_a_huge_length_anywhere_allocates_nothing(type_name: str, payload: bytes) -> None:
+    cdr.decode(type_name, payload, LIMITS)  # builds the decoder, which is not the sender's memory
+    tracemalloc.start()
+    try:
+        for at in range(4, min(len(payload) - 4, 300)):
+            for value in (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x01"):
+                hostile = payload[:at] + value + payload[at + 4 :]
+                assert refusal_or_none(type_name, hostile) in REASONS_OR_NONE
+        assert tracemalloc.get_traced_memory()[1] < 4 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@given(st.sampled_from(MESSAGES), st.binary(max_size=300))
+def test_no_bytes_raise_anything_else(message: tuple[str, bytes], payload: bytes) -> None:
+    for head in (b"", b"\0\1\0\0", b"\0\0\0\0"):
+        assert refusal_or_none(message[0], head + payload) in REASONS_OR_NONE
+
+
+@given(st.data())
+def test_flipped_bits_raise_nothing_else(data: st.DataObject) -> None:
+    type_name, payload = data.draw(st.sampled_from(MESSAGES))
+    flipped = bytearray(payload)
+    # Mostly in the first bytes, where the lengths are.
+    places = st.integers(0, 8 * min(len(flipped), 160) - 1) | st.integers(0, 8 * len(flipped) - 1)
+    for at in data.draw(st.lists(places, min_size=1, max_size=4)):
+        flipped[at // 8] ^= 1 << at % 8
+    assert refusal_or_none(type_name, bytes(flipped)) in REASONS_OR_NONE
+
+
+# --- what the recorder writes -------------------------------------------------------------------------------
+
+T_CAMERA_LIDAR = np.array([[0, -1, 0, 0.1], [0, 0, -1, 0.2], [1, 0, 0, 0.3], [0, 0, 0, 1]], dtype=np.float64)
+CAMERAS: dict[str, tuple[Camera, str, list[float]]] = {
+    "pinhole": (
+        build("pinhole", width=640, height=480, fx=500.0, fy=501.0, cx=319.5, cy=239.5),
+        "plumb_bob",
+        [0.0] * 5,
+    ),
+    "radtan": (
+        build(
+            "radtan", width=640, height=480, fx=500.0, fy=501.0, cx=319.5, cy=239.5,
+            k1=-0.1, k2=0.02, p1=1e-3, p2=2e-3, k3=3e-3,
+        ),
+        "plumb_bob",
+        [-0.1, 0.02, 1e-3, 2e-3, 3e-3],
+    ),
+    "kannala_brandt": (
+        build(
+            "kannala_brandt", width=640, height=480, fx=300.0, fy=301.0, cx=319.5, cy=239.5,
+            k1=0.1, k2=-0.01, k3=1e-3, k4=2e-4,
+        ),
+        "equidistant",
+        [0.1, -0.01, 1e-3, 2e-4],
+    ),
+    "double_sphere": (
+        build(
+            "double_sphere", width=640, height=480, fx=300.0, fy=301.0, cx=319.5, cy=239.5, xi=-0.2, alpha=0.6
+        ),
+        "double_sphere",
+        [-0.2, 0.6],
+    ),
+}  # fmt: skip
+
+
+def rig(camera: Camera) -> Rig:
+    return Rig("front", camera, "camera", "lidar", T_CAMERA_LIDAR, np.eye(4))
+
+
+def read_by_others(type_name: str, payload: bytes) -> Any:
+    """Decoded by mcap_ros2, which shares nothing with our decoder but the definition."""
+    from mcap.records import Schema
+
+    schema = Schema(id=1, name=type_name, encoding="ros2msg", data=cdr.definition(type_name).encode())
+    decode = DecoderFactory().decoder_for("cdr", schema)
+    assert decode is not None
+    return decode(payload)
+
+
+@pytest.mark.parametrize(
+    "encoded",
+    [
+        EncodedImage(ImageFormat.JPEG, 64, 48, JPEG),
+        EncodedImage(ImageFormat.RGB8, 2, 3, bytes(range(18))),
+        EncodedImage(ImageFormat.MONO8, 2, 3, bytes(range(6))),
+    ],
+)
+def test_an_image_there_and_back(encoded: EncodedImage) -> None:
+    frame = CameraFrame(STAMP, "camera", encoded)
+
+    type_name, payload = cdr.encode_image(frame)
+
+    assert cdr.decode(type_name, payload, LIMITS) == frame
+    assert bytes(read_by_others(type_name, payload).data) == encoded.data
+
+
+def test_a_depth_map_there_and_back() -> None:
+    depth = probe(encode_depth_png(np.full((12, 16), 7, np.uint16)), LIMITS)
+
+    payload = cdr.encode_depth(STAMP, "camera", depth)
+
+    frame = cdr.decode(cdr.COMPRESSED_IMAGE, payload, LIMITS)
+    assert isinstance(frame, CameraFrame)
+    assert frame.image == depth
+    assert read_by_others(cdr.COMPRESSED_IMAGE, payload).format == "16UC1; png"
+
+
+@pytest.mark.parametrize("names", [(), ("time_offset_s",), ("intensity", "ring", "time_offset_s")])
+def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(1)
+    columns: dict[str, Any] = {
+        "intensity": rng.random(500, np.float32),
+        "ring": rng.integers(0, 128, 500).astype(np.uint16),
+        "time_offset_s": rng.uniform(-5, 5, 500).astype(np.float32),
+    }
+    xyz_m = rng.normal(size=(500, 3)).astype(np.float32)
+    frame = LidarFrame(STAMP, "lidar", xyz_m, **{name: columns[name] for name in names})
+
+    back = sweep(cdr.encode_cloud(frame))
+
+    assert (back.stamp_ns, back.frame_id) == (STAMP, "lidar")
+    assert back.xyz_m.tobytes() == xyz_m.tobytes()
+    for name, values in columns.items():
+        column = getattr(back, name)
+        assert (column is None) if name not in names else (column.tobytes() == values.tobytes())
+
+
+def test_an_odometry_there_and_back() -> None:
+    motion = EgoMotion(STAMP, "base_link", (1 / 3, 0.0, -2.0), (1e-9, 0.5, 3.0))
+
+    payload = cdr.encode_odometry(motion, "base_link")
+
+    assert cdr.decode(cdr.ODOMETRY, payload, LIMITS) == motion
+    assert read_by_others(cdr.ODOMETRY, payload).child_frame_id == "base_link"
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_camera_info(model: str) -> None:
+    camera, distortion_model, d = CAMERAS[model]
+
+    message = read_by_others(cdr.CAMERA_INFO, cdr.encode_camera_info(rig(camera), STAMP))
+
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (SEC, NSEC)
+    assert (message.width, message.height, message.header.frame_id) == (640, 480, "camera")
+    assert message.distortion_model == distortion_model
+    assert list(message.d) == d
+    assert list(message.k) == [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
+
+
+def test_every_camera_model_has_a_distortion_model() -> None:
+    from coec.geometry.cameras import MODELS
+
+    assert set(cdr.DISTORTION) == set(MODELS)
+    for name, (_, parameters) in cdr.DISTORTION.items():
+        assert set(parameters) == set(MODELS[name].parameters) - {"width", "height", "fx", "fy", "cx", "cy"}
+
+
+def test_tf_maps_the_child_to_the_parent() -> None:
+    payload = cdr.encode_tf_static(rig(CAMERAS["pinhole"][0]), T_CAMERA_LIDAR, STAMP)
+
+    (transform,) = read_by_others(cdr.TF, payload).transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("camera", "lidar")
+    moved, turned = transform.transform.translation, transform.transform.rotation
+    assert (moved.x, moved.y, moved.z) == (0.1, 0.2, 0.3)
+    assert (turned.x, turned.y, turned.z, turned.w) == pytest.approx((0.5, -0.5, 0.5, 0.5))
+
+
+def test_diagnostics() -> None:
+    payload = cdr.encode_diagnostics(STAMP, "coec/front", 3, "not looked yet", {"mi": "0.5"}, "truck-7")
+
+    (status,) = read_by_others(cdr.DIAGNOSTICS, payload).status
+    assert (status.name, status.message, status.hardware_id) == ("coec/front", "not looked yet", "truck-7")
+    assert ord(status.level) if isinstance(status.level, bytes) else status.level == 3
+    assert [(item.key, item.value) for item in status.values] == [("mi", "0.5")]

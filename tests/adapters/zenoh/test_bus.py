@@ -1,0 +1,222 @@
+"""The bus against an embedded router on a free loopback port, with a client session of its own."""
+
+from __future__ import annotations
+
+import json
+import queue
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgpack
+import pytest
+import zenoh
+
+from coec.adapters.zenoh.bus import JSON, MSGPACK, SLOW_QUERIES_WAITING, Answer, Bus, Request, Route, open_session
+from coec.config import LimitsConfig, ZenohConfig
+from coec.errors import ConfigError, NotFoundError
+from fakes import wait_until
+
+DEADLINE_S = 20.0
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def bus(endpoint: str) -> Iterator[Bus]:
+    session = open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
+    bus = Bus(session)
+    answering = (bus.thread, bus.drawing_thread)
+    for thread in answering:
+        thread.start()
+    yield bus
+    bus.undeclare_inputs()
+    for thread in answering:
+        thread.request_stop()
+    assert all(thread.join(DEADLINE_S) for thread in answering)
+    bus.undeclare_queryables()
+    assert bus.close(DEADLINE_S)
+
+
+@pytest.fixture
+def client(endpoint: str, bus: Bus) -> Iterator[zenoh.Session]:
+    del bus  # the router has to be there first
+    with open_session(ZenohConfig(connect=(endpoint,)), LimitsConfig()) as session:
+        yield session
+
+
+def ask(client: zenoh.Session, selector: str, payload: bytes | None = None) -> list[zenoh.Reply]:
+    return list(client.get(selector, payload=payload, timeout=DEADLINE_S))
+
+
+def ask_ok(client: zenoh.Session, selector: str) -> zenoh.Sample:
+    """The one good reply; asks again until the queryable is known to the client."""
+    for _ in range(1000):
+        replies = ask(client, selector)
+        if replies:
+            break
+    (reply,) = replies
+    assert reply.ok is not None
+    return reply.ok
+
+
+def ask_error(client: zenoh.Session, selector: str, payload: bytes | None = None) -> zenoh.ReplyError:
+    (reply,) = ask(client, selector, payload)
+    assert reply.err is not None
+    return reply.err
+
+
+def serve_value(bus: Bus, key: str, value: bytes) -> None:
+    route = Route(key, lambda _: Answer(value, MSGPACK), quick=True)
+    bus.serve(key, lambda _: [route])
+
+
+def test_a_query_is_answered_with_encoding_and_timestamp(bus: Bus, client: zenoh.Session) -> None:
+    serve_value(bus, "test/value", b"\x01")
+    sample = ask_ok(client, "test/value")
+    assert sample.payload.to_bytes() == b"\x01"
+    assert str(sample.encoding) == MSGPACK
+    assert sample.timestamp is not None
+
+
+def test_errors_are_replies_in_the_format_asked_for(bus: Bus, client: zenoh.Session) -> None:
+    def find(key: str) -> Sequence[Route]:
+        if key.endswith("good"):
+            return [Route(key, lambda _: Answer(b"", MSGPACK), quick=True)]
+        if key.endswith("fault"):
+            return [Route(key, fail, quick=True)]
+        raise NotFoundError("no such thing")
+
+    def fail(_: Request) -> Answer:
+        raise ZeroDivisionError("secret")
+
+    bus.serve("test/**", find)
+    ask_ok(client, "test/good")
+    plain = ask_error(client, "test/none")
+    assert str(plain.encoding) == MSGPACK
+    assert msgpack.unpackb(plain.payload.to_bytes())["code"] == "not_found"
+    as_json = ask_error(client, "test/none?format=json")
+    assert str(as_json.encoding) == JSON
+    assert json.loads(as_json.payload.to_bytes())["message"] == "no such thing"
+    fault = ask_error(client, "test/fault?format=json").payload.to_bytes()
+    assert json.loads(fault)["code"] == "internal"
+    assert b"secret" not in fault
+    too_long = ask_error(client, "test/good", bytes(100_000)).payload.to_bytes()
+    assert msgpack.unpackb(too_long)["code"] == "bad_request"
+
+
+def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: Bus, client: zenoh.Session) -> None:
+    entered, release = threading.Event(), threading.Event()
+
+    def slow(request: Request) -> Answer:
+        entered.set()
+        assert release.wait(DEADLINE_S)
+        return Answer(request.parameters.encode(), MSGPACK)
+
+    serve_value(bus, "test/quick", b"q")
+    bus.serve("test/slow", lambda key: [Route(key, slow, quick=False)])
+    ask_ok(client, "test/quick")
+    replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
+    client.get("test/slow?n=0", replies.put, timeout=DEADLINE_S)
+    assert entered.wait(DEADLINE_S)
+    for number in range(1, SLOW_QUERIES_WAITING + 2):
+        client.get(f"test/slow?n={number}", replies.put, timeout=DEADLINE_S)
+    refused = replies.get(timeout=DEADLINE_S)
+    assert refused.err is not None
+    assert msgpack.unpackb(refused.err.payload.to_bytes())["code"] == "busy"
+    assert ask_ok(client, "test/quick").payload.to_bytes() == b"q"
+    release.set()
+    for _ in range(SLOW_QUERIES_WAITING + 1):
+        assert replies.get(timeout=DEADLINE_S).ok is not None
+
+
+def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Session) -> None:
+    bus.thread.request_stop()
+    assert bus.thread.join(DEADLINE_S)
+    serve_value(bus, "test/quick", b"q")
+    bus.serve("test/slow", lambda key: [Route(key, lambda _: Answer(b"", MSGPACK), quick=False)])
+    ask_ok(client, "test/quick")
+    replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
+    client.get("test/slow", replies.put, timeout=DEADLINE_S)
+    ask_ok(client, "test/quick")  # one link, one order: the slow query has arrived
+    bus.undeclare_queryables()
+    error = replies.get(timeout=DEADLINE_S).err
+    assert error is not None
+    assert msgpack.unpackb(error.payload.to_bytes())["code"] == "stopping"
+
+
+def test_samples_arrive_with_their_encoding_and_a_failing_reader_does_no_harm(bus: Bus, client: zenoh.Session) -> None:
+    got: queue.SimpleQueue[tuple[bytes, str]] = queue.SimpleQueue()
+
+    def receive(payload: bytes, encoding: str) -> None:
+        if payload == b"bad":
+            raise ValueError
+        got.put((payload, encoding))
+
+    bus.subscribe("test/in", receive)
+    publisher: Any = client.declare_publisher("test/in")
+    wait_until(lambda: publisher.matching_status.matching, "the subscription is known to the publisher")
+    publisher.put(b"bad")
+    publisher.put(b"one", encoding="application/cdr;sensor_msgs/msg/Image")
+    publisher.delete()
+    publisher.put(b"two")
+    assert got.get(timeout=DEADLINE_S) == (b"one", "application/cdr;sensor_msgs/msg/Image")
+    assert got.get(timeout=DEADLINE_S) == (b"two", "zenoh/bytes")
+
+
+def test_a_published_value_and_the_liveliness_token_are_seen(bus: Bus, client: zenoh.Session) -> None:
+    alive: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+    watcher = client.liveliness().declare_subscriber("test/alive", alive.put, history=True)
+    bus.declare_alive("test/alive")
+    assert alive.get(timeout=DEADLINE_S).kind == zenoh.SampleKind.PUT
+    bus.undeclare_inputs()
+    assert alive.get(timeout=DEADLINE_S).kind == zenoh.SampleKind.DELETE
+    watcher.undeclare()
+
+
+def test_a_port_in_use_is_a_clear_error(bus: Bus, endpoint: str) -> None:
+    del bus
+    with pytest.raises(ConfigError, match="cannot open the Zenoh session"):
+        open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
+
+
+def test_no_router_is_no_error(endpoint: str) -> None:
+    open_session(ZenohConfig(connect=(endpoint,)), LimitsConfig()).close()
+
+
+def test_the_attachment_of_a_query_is_handed_on(bus: Bus, client: zenoh.Session) -> None:
+    seen: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+
+    def answer(request: Request) -> Answer:
+        seen.put(request.attachment)
+        return Answer(b"", MSGPACK)
+
+    bus.serve("test/who", lambda _: [Route("test/who", answer, quick=False)])
+    ask_ok(client, "test/who")
+    assert seen.get(timeout=DEADLINE_S) is None
+    list(client.get("test/who", attachment=b"me", timeout=DEADLINE_S))
+    assert seen.get(timeout=DEADLINE_S) == b"me"
+
+
+def test_a_picture_that_takes_long_keeps_no_other_query_waiting(bus: Bus, client: zenoh.Session) -> None:
+    drawn = threading.Event()
+
+    def draw(_: Request) -> Answer:
+        drawn.wait(DEADLINE_S)
+        return Answer(b"jpeg", "image/jpeg")
+
+    bus.serve("test/overlay", lambda _: [Route("test/overlay", draw, quick=False, draws=True)])
+    bus.serve("test/list", lambda _: [Route("test/list", lambda _: Answer(b"list", MSGPACK), quick=False)])
+    assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
+    waiting = client.get("test/overlay", timeout=DEADLINE_S)
+    assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
+    drawn.set()
+    (reply,) = waiting
+    assert reply.ok is not None
+    assert reply.ok.payload.to_bytes() == b"jpeg"

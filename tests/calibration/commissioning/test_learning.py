@@ -1,0 +1,175 @@
+"""From windows to a baseline, on a synthetic street whose truth is known, and from its limits to detection."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.adapters.files.baseline_file import baseline_hash
+from coec.adapters.images.codec import CachedGreys, GreyImages
+from coec.calibration.commissioning import learning, verdict_limits
+from coec.calibration.commissioning.baseline import PRIOR_SPREAD_POSE, Baseline, learned_hash
+from coec.calibration.commissioning.learning import commission, learn_accuracy
+from coec.calibration.commissioning.verdict_limits import learned
+from coec.calibration.estimators import look
+from coec.calibration.monitor.check import Evidence, gather
+from coec.calibration.monitor.check_verdict import observe
+from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.types import Decision, Estimate, Metric, Rig, Verdict, Window
+from coec.config import CalibrationConfig, LimitsConfig, SearchConfig
+from coec.errors import CalibrationError
+from coec.evaluation.detection import MIN_RECORDED, table, try_detection
+from coec.geometry import se3
+from estimates import estimate
+
+CONFIG = CalibrationConfig(search=SearchConfig(reach_deg=8.0))
+"""The starts are 5 degrees away: looking no further keeps the solves short."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_looks() -> Iterator[None]:
+    """What is learned from few looks is less precise, and learned in the same way."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learning, "LOOKS", 5)
+        patch.setattr(learning, "FAR_LOOKS", 3)
+        patch.setattr(verdict_limits, "SOLVES", 2)
+        yield
+
+
+@pytest.fixture(scope="module")
+def images() -> ImageReader:
+    return CachedGreys(GreyImages(LimitsConfig()), 16)
+
+
+@pytest.fixture(scope="module")
+def baseline(sharp_street: Window, stereo: DepthModel, images: ImageReader) -> Baseline:
+    return commission([sharp_street], stereo, images, CONFIG, sensors={"camera_serial": "C1"})
+
+
+class TestCommission:
+    def test_learns_that_the_estimator_is_right_on_this_rig(self, baseline: Baseline, sharp_street: Window) -> None:
+        np.testing.assert_array_equal(baseline.T_camera_lidar, sharp_street.rig.T_camera_lidar_nominal)
+        assert np.degrees(np.abs(baseline.bias[:3])).max() < 0.3
+        assert baseline.pairs == len(sharp_street.pairs)
+        assert baseline.sensors["camera_serial"] == "C1"
+        assert baseline.config_hash == learned_hash(CONFIG)
+
+    def test_its_limits_see_what_they_have_to(self, baseline: Baseline) -> None:
+        assert baseline.detected["1 deg"] == 1.0
+        assert baseline.detected["3 deg"] == 1.0
+
+    def test_a_look_at_the_commissioned_pose_is_clear_and_at_a_moved_one_is_not(
+        self, baseline: Baseline, sharp_street: Window, stereo: DepthModel, images: ImageReader
+    ) -> None:
+        right = observe(sharp_street, stereo, images, CONFIG, baseline)
+        assert not right.flagged
+        assert right.flagged_by_paper is not None
+        moved = se3.perturb(sharp_street.T_camera_lidar_start, np.radians([0.6, -0.6, 0.5, 0, 0, 0]))
+        wrong = observe(replace(sharp_street, T_camera_lidar_start=moved), stereo, images, CONFIG, baseline)
+        assert wrong.flagged
+
+    def test_refuses_a_reference_that_the_windows_do_not_show(
+        self, sharp_street: Window, stereo: DepthModel, images: ImageReader
+    ) -> None:
+        wrong = se3.perturb(sharp_street.rig.T_camera_lidar_nominal, np.radians([0, 2.0, 0, 0, 0, 0]))
+        with pytest.raises(CalibrationError, match="away from the reference: calibrate first"):
+            commission([sharp_street], stereo, images, CONFIG, sensors={}, reference=wrong)
+
+    def test_refuses_too_few_pairs(self, sharp_street: Window, stereo: DepthModel, images: ImageReader) -> None:
+        few = replace(sharp_street, pairs=sharp_street.pairs[:4])
+        with pytest.raises(CalibrationError, match="more than 4 pairs"):
+            commission([few], stereo, images, CONFIG, sensors={})
+
+    def test_refuses_windows_of_several_rigs(
+        self, sharp_street: Window, stereo: DepthModel, images: ImageReader
+    ) -> None:
+        other = replace(sharp_street, rig=replace(sharp_street.rig, pair="other"))
+        with pytest.raises(CalibrationError, match="several camera-LiDAR pairs"):
+            commission([sharp_street, other], stereo, images, CONFIG, sensors={})
+
+    @pytest.mark.slow
+    def test_same_windows_same_baseline(
+        self, baseline: Baseline, sharp_street: Window, stereo: DepthModel, images: ImageReader
+    ) -> None:
+        again = commission([sharp_street], stereo, images, CONFIG, sensors={"camera_serial": "C1"})
+        assert baseline_hash(again) == baseline_hash(baseline)
+
+
+class _Scripted:
+    """Pairs whose looks put the optimum at the mean of what each pair says (n, 6)."""
+
+    def __init__(self, says: NDArray[np.float64], rig: Rig) -> None:
+        self.says, self.rig, self.pairs = says, rig, range(len(says))
+
+    def of(self, indices: Sequence[int]) -> _Scripted:
+        return _Scripted(self.says[list(indices)], self.rig)
+
+
+def test_spread_of_a_pair_is_found_from_looks_at_halves(sharp_street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without bias: on the average of drives the variance is the true one and that of the prior, by their weights."""
+    true = np.array([np.radians(0.3)] * 3 + [0.1] * 3)
+
+    def look_of(evidence: _Scripted, *_: object) -> SimpleNamespace:
+        mean = evidence.says.mean(axis=0)
+        return SimpleNamespace(offset_rotation=np.where(np.arange(6) < 3, mean, 0.0), offset_pose=mean)
+
+    monkeypatch.setattr(learning, "look_at", look_of)
+    drives = true * np.random.default_rng(1).normal(size=(100, 48, 6))
+    learned_from = [
+        learn_accuracy(cast("Evidence", _Scripted(says, sharp_street.rig)), np.eye(4), CONFIG) for says in drives
+    ]
+    variance = np.mean([pose.spread**2 for _, pose in learned_from], axis=0)
+    free = learning.BLOCKS - 1
+    expected = learning.PRIOR_BLOCKS * PRIOR_SPREAD_POSE**2 + free * true**2
+    np.testing.assert_allclose(variance * (learning.PRIOR_BLOCKS + free), expected, rtol=0.15)
+    for says, (rotation, pose) in zip(drives, learned_from, strict=True):
+        np.testing.assert_allclose(pose.bias, says.mean(axis=0))
+        assert np.isfinite(rotation.spread[:3]).all()
+        assert np.isnan(rotation.bias[3:]).all()
+
+
+def test_detection_learns_on_some_pairs_and_tries_others(
+    sharp_street: Window, stereo: DepthModel, images: ImageReader
+) -> None:
+    evidence = gather(look(sharp_street, stereo, images, CONFIG, Silence()))
+    heard: list[tuple[int, int]] = []
+    tried = try_detection(evidence, sharp_street.T_camera_lidar_start, CONFIG, 1, 3, lambda *step: heard.append(step))
+    rows = {row.name: row for row in table(tried)}
+    assert heard == [(1, 1)]
+    assert {"right", "0.5 deg", "1 deg", "3 deg"} <= set(rows)
+    assert rows["3 deg"].flagged == 1.0
+    assert all(row.looks == 3 for row in rows.values())
+
+
+def test_detection_refuses_looks_that_the_monitor_would_not_take(
+    sharp_street: Window, stereo: DepthModel, images: ImageReader
+) -> None:
+    few = replace(sharp_street, pairs=sharp_street.pairs[: MIN_RECORDED - 1])
+    evidence = gather(look(few, stereo, images, CONFIG, Silence()))
+    with pytest.raises(CalibrationError, match=f"needs {MIN_RECORDED} pairs, there are {MIN_RECORDED - 1}"):
+        try_detection(evidence, few.T_camera_lidar_start, CONFIG, 1, 3, lambda *_: None)
+
+
+def with_metrics(contrast: float, runner_up: float, sigma_deg: float) -> Estimate:
+    metrics = (
+        Metric("edge_contrast", contrast, 4.0, at_least=True),
+        Metric("runner_up", runner_up, 0.9, at_least=False),
+        Metric("sigma_deg", sigma_deg, 0.25, at_least=False),
+    )
+    return replace(estimate(0), verdict=Verdict(Decision.ACCEPTED, metrics, ()))
+
+
+class TestVerdictLimits:
+    def test_lie_half_way_between_right_and_wrong(self) -> None:
+        limits = learned([with_metrics(16.0, 0.4, 0.1)], [with_metrics(4.0, 0.9, 0.2)])
+        assert limits == {"min_edge_contrast": pytest.approx(8.0), "max_runner_up": pytest.approx(0.6)}
+
+    def test_a_figure_that_does_not_tell_them_apart_has_none(self) -> None:
+        near = [with_metrics(16.0, 0.4, 0.1), with_metrics(3.0, 0.5, 0.1)]
+        assert set(learned(near, [with_metrics(4.0, 0.9, 0.2)])) == {"max_runner_up"}

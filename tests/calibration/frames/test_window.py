@@ -1,0 +1,161 @@
+"""A window's pairs: one per bin, each good enough, cut by sensor time."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from coec.calibration.frames.window import PairSelected, SliceEnded, WindowCutter
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, ImageQuality, Window
+from coec.config import WindowConfig
+from coec.errors import DecodeError
+
+S = 1_000_000_000
+SHARP = ImageQuality(sharpness=0.3, mean_level=110.0, clipped=0.01, digest=1)
+CONFIG = WindowConfig(pairs=5, min_pairs=3, slice_s=50.0)
+
+
+class Inspector:
+    """Sees what the test wants it to see, and counts its looks. A digest of 0 stands for the stamp's own."""
+
+    def __init__(self, see: Callable[[int], ImageQuality] = lambda _: replace(SHARP, digest=0)) -> None:
+        self._see = see
+        self.looks = 0
+
+    def inspect(self, frame: CameraFrame) -> ImageQuality:
+        self.looks += 1
+        quality = self._see(frame.stamp_ns)
+        return quality if quality.digest else replace(quality, digest=frame.stamp_ns)
+
+
+def at(street: Window, seconds: float, speed: float | None = 5.0) -> FramePair:
+    stamp = 1_000 * S + round(seconds * S)
+    pair = street.pairs[0]
+    motion = None if speed is None else EgoMotion(stamp, "ego", (speed, 0.0, 0.0), (0.0, 0.0, 0.0))
+    return FramePair(replace(pair.camera, stamp_ns=stamp), replace(pair.lidar, stamp_ns=stamp), motion)
+
+
+def drive(
+    cutter: WindowCutter, street: Window, seconds: list[float], speed: float | None = 5.0
+) -> list[PairSelected | SliceEnded]:
+    start = street.T_camera_lidar_start
+    return [event for s in seconds for event in cutter.offer(at(street, s, speed), start)]
+
+
+def selected_s(events: list[PairSelected | SliceEnded]) -> list[float]:
+    return [(e.pair.stamp_ns - 1_000 * S) / S for e in events if isinstance(e, PairSelected)]
+
+
+def test_one_pair_of_each_bin_and_the_rest_is_not_looked_at(street: Window) -> None:
+    inspector = Inspector()
+    events = drive(WindowCutter(CONFIG, street.rig, inspector), street, [i * 0.5 for i in range(100)])
+    assert selected_s(events) == [0.0, 10.0, 20.0, 30.0, 40.0]
+    assert inspector.looks == 5
+
+
+def test_the_slice_ends_by_sensor_time_and_the_next_begins(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector())
+    events = drive(cutter, street, [float(i) for i in range(0, 60, 2)])
+    ends = [e for e in events if isinstance(e, SliceEnded)]
+    assert ends == [SliceEnded("street-1000000000000" if street.rig.pair == "street" else ends[0].window_id, 5, True)]
+    firsts = [e for e in events if isinstance(e, PairSelected) and e.first]
+    assert [e.pair.stamp_ns // S for e in firsts] == [1000, 1050]
+    assert firsts[0].window_id == f"{street.rig.pair}-{1000 * S}"
+
+
+def test_a_slice_with_too_few_pairs_is_no_window(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector())
+    drive(cutter, street, [0.0, 20.0])
+    assert [(e.pairs, e.complete) for e in cutter.finish()] == [(2, False)]
+
+
+def test_a_short_slice_with_enough_pairs_is_one(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector())
+    drive(cutter, street, [0.0, 12.0, 24.0])
+    assert [(e.pairs, e.complete) for e in cutter.finish()] == [(3, True)]
+
+
+def test_silence_ends_a_slice_when_its_time_has_passed(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector())
+    drive(cutter, street, [0.0, 12.0, 24.0])
+    assert cutter.advance(1_049 * S) == []
+    assert [e.complete for e in cutter.advance(1_050 * S)] == [True]
+    assert cutter.advance(2_000 * S) == []
+
+
+def test_nothing_selected_is_nothing_ended(street: Window) -> None:
+    assert WindowCutter(CONFIG, street.rig, Inspector()).finish() == []
+
+
+def test_a_bin_without_a_good_pair_stays_empty_and_the_next_good_one_counts(street: Window) -> None:
+    blurred_until_4 = Inspector(lambda stamp: replace(SHARP, digest=0, sharpness=0.0 if stamp < 1004 * S else 0.3))
+    cutter = WindowCutter(CONFIG, street.rig, blurred_until_4)
+    assert selected_s(drive(cutter, street, [0.0, 1.0, 2.0, 5.0, 12.0])) == [5.0, 12.0]
+    assert cutter.rejections == {"blurred": 3}
+
+
+def test_pairs_of_neighbouring_bins_keep_their_distance(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector())
+    drive(cutter, street, [0.0])
+    assert selected_s(drive(cutter, street, [3.0, 10.0, 19.5, 20.5, 26.0])) == [10.0, 20.5]
+    late = WindowCutter(
+        CONFIG, street.rig, Inspector(lambda stamp: replace(SHARP, digest=0, sharpness=0.3 * (stamp >= 1008 * S)))
+    )
+    assert selected_s(drive(late, street, [0.0, 9.0, 10.5, 14.5])) == [9.0, 14.5]
+
+
+@pytest.mark.parametrize(
+    ("quality", "reason"),
+    [
+        (replace(SHARP, sharpness=0.001), "blurred"),
+        (replace(SHARP, mean_level=2.0), "too_dark"),
+        (replace(SHARP, clipped=0.9), "clipped"),
+    ],
+)
+def test_bad_exposures_are_refused_by_reason(street: Window, quality: ImageQuality, reason: str) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector(lambda _: quality))
+    drive(cutter, street, [0.0])
+    assert cutter.rejections == {reason: 1}
+
+
+def test_a_standing_vehicle_gives_no_pairs_unless_configured_otherwise(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector())
+    assert drive(cutter, street, [0.0, 10.0], speed=0.1) == []
+    assert cutter.rejections == {"standing": 2}
+    tolerant = WindowCutter(CONFIG.model_copy(update={"require_motion": False}), street.rig, Inspector())
+    assert selected_s(drive(tolerant, street, [0.0, 10.0], speed=0.1)) == [0.0, 10.0]
+
+
+def test_unknown_motion_is_not_standing(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector())
+    assert selected_s(drive(cutter, street, [0.0], speed=None)) == [0.0]
+
+
+def test_a_frozen_image_of_a_moving_vehicle_is_refused(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector(lambda _: SHARP))
+    assert selected_s(drive(cutter, street, [0.0, 10.0, 20.0])) == [0.0]
+    assert cutter.rejections == {"frozen": 2}
+
+
+def test_a_pair_out_of_view_is_refused_before_its_image_is_decoded(street: Window) -> None:
+    inspector = Inspector()
+    cutter = WindowCutter(CONFIG.model_copy(update={"min_points_in_view": 10**6}), street.rig, inspector)
+    drive(cutter, street, [0.0])
+    assert cutter.rejections == {"out_of_view": 1}
+    assert inspector.looks == 0
+
+
+def test_an_image_that_cannot_be_decoded_is_counted_by_its_reason(street: Window) -> None:
+    def broken(_: int) -> ImageQuality:
+        raise DecodeError("image_truncated", "ends early")
+
+    cutter = WindowCutter(CONFIG, street.rig, Inspector(broken))
+    drive(cutter, street, [0.0, 1.0])
+    assert cutter.rejections == {"image_truncated": 2}
+
+
+def test_sensor_time_that_steps_back_ends_the_slice(street: Window) -> None:
+    cutter = WindowCutter(CONFIG, street.rig, Inspector())
+    events = drive(cutter, street, [0.0, 12.0, 24.0, -500.0])
+    assert [(e.pairs, e.complete) for e in events if isinstance(e, SliceEnded)] == [(3, True)]
+    assert selected_s(events)[-1] == -500.0

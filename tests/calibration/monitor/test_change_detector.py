@@ -1,0 +1,178 @@
+"""The sequential decision: what looks add up to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.monitor.change_detector import MonitorState, Observation, Outcome, after_observation, diagnose
+from coec.calibration.monitor.check_verdict import MIN_PAIRS, observe
+from coec.calibration.monitor.sensor_faults import BENT_MOUNT, DARK, LENS_DIRTY, TIME_OFFSET, Cause
+from coec.calibration.ports import DepthModel
+from coec.calibration.types import Window
+from coec.config import CalibrationConfig, LimitsConfig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+
+OFFSET = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def seen(
+    stamps: Sequence[int], flagged: bool = True, weak: bool = False, causes: tuple[Cause, ...] = ()
+) -> Observation:
+    return Observation(
+        stamp_ns=stamps[-1],
+        pair_stamps_ns=tuple(stamps),
+        metrics=(),
+        offset=OFFSET,
+        sigma=np.full(6, 0.001),
+        distance2=9.0 if flagged else 0.1,
+        flagged=flagged,
+        weak=weak,
+        flagged_by_paper=None,
+        causes=causes,
+    )
+
+
+def after(*observations: Observation) -> MonitorState:
+    state = MonitorState()
+    for observation in observations:
+        state = after_observation(state, observation)
+    return state
+
+
+def fresh(number: int, **how: object) -> Observation:
+    """A look whose pairs no other look holds."""
+    return seen(range(10 * number, 10 * number + 5), **how)  # type: ignore[arg-type]
+
+
+class TestEvidence:
+    def test_nothing_seen_is_unknown(self) -> None:
+        assert MonitorState().outcome is Outcome.UNKNOWN
+        assert diagnose(MonitorState()) is None
+
+    def test_one_look_decides_nothing(self) -> None:
+        state = after(fresh(0))
+        assert state.outcome is Outcome.CLEAR
+        assert diagnose(state) is None
+
+    def test_two_looks_are_a_suspicion_and_three_a_certainty(self) -> None:
+        assert after(fresh(0), fresh(1)).outcome is Outcome.SUSPECT
+        state = after(fresh(0), fresh(1), fresh(2))
+        assert state.outcome is Outcome.CONFIRMED
+        assert diagnose(state) == BENT_MOUNT
+        assert state.offset == pytest.approx(tuple(OFFSET))
+
+    def test_looks_at_the_same_pairs_are_one_look(self) -> None:
+        assert after(*[seen([1, 2, 3, 4])] * 10).outcome is Outcome.CLEAR
+
+    def test_one_bad_pair_in_overlapping_looks_decides_nothing(self) -> None:
+        # Six pairs to a look, three of them new; the bad pair is in two looks.
+        looks = [seen(range(3 * k, 3 * k + 6), flagged=k in (4, 5)) for k in range(10)]
+        states = [after(*looks[: k + 1]) for k in range(len(looks))]
+        assert {state.outcome for state in states} == {Outcome.CLEAR}
+
+    def test_clears_with_hysteresis(self) -> None:
+        confirmed = [fresh(k) for k in range(3)]
+        right = [fresh(10 + k, flagged=False) for k in range(3)]
+        assert after(*confirmed, right[0]).outcome is Outcome.CONFIRMED
+        assert after(*confirmed, *right[:2]).outcome is Outcome.CONFIRMED
+        assert after(*confirmed, *right).outcome is Outcome.CLEAR
+
+    def test_faint_edges_suspect_and_never_confirm(self) -> None:
+        state = after(*[fresh(k, weak=True) for k in range(40)])
+        assert state.outcome is Outcome.SUSPECT
+
+    def test_a_faint_look_at_a_right_pose_is_no_evidence_for_it(self) -> None:
+        suspect = after(fresh(0), fresh(1))
+        assert after_observation(suspect, fresh(2, flagged=False, weak=True)).evidence == suspect.evidence
+
+    def test_goes_through_json(self) -> None:
+        state = after(fresh(0), fresh(1), fresh(2, causes=(DARK,)))
+        read = json.loads(json.dumps(asdict(state)))
+        again = MonitorState(
+            evidence=read["evidence"],
+            outcome=Outcome(read["outcome"]),
+            blind=read["blind"],
+            dirt=read["dirt"],
+            offset=tuple(read["offset"]),
+            last_stamps_ns=tuple(read["last_stamps_ns"]),
+        )
+        assert again == state
+
+
+class TestCauses:
+    def test_bad_data_are_no_evidence_of_a_bent_mount(self) -> None:
+        state = after(*[fresh(k, causes=(LENS_DIRTY,)) for k in range(10)])
+        assert state.evidence == 0.0
+        assert diagnose(state) == LENS_DIRTY
+
+    def test_one_look_with_a_cause_is_not_believed(self) -> None:
+        assert diagnose(after(fresh(0, flagged=False), fresh(1, causes=(DARK,)))) is None
+
+    def test_what_hides_others_comes_first(self) -> None:
+        both = [fresh(k, causes=(TIME_OFFSET, DARK)) for k in range(3)]
+        assert diagnose(after(*both)) == DARK
+
+    def test_a_cause_that_went_away_is_forgotten(self) -> None:
+        dark = [fresh(k, causes=(DARK,)) for k in range(3)]
+        light = [fresh(10 + k, flagged=False) for k in range(3)]
+        assert diagnose(after(*dark, *light)) is None
+
+
+class TestDirt:
+    SPOT = tuple(range(40, 52))
+
+    def looks(self, *dirty: tuple[int, ...], textured: int = 400) -> MonitorState:
+        return after(*[replace(fresh(k, flagged=False), dirty=seen, textured=textured) for k, seen in enumerate(dirty)])
+
+    def test_is_what_stays_where_it_is(self) -> None:
+        assert diagnose(self.looks(*[self.SPOT] * 4)) is None
+        assert diagnose(self.looks(*[self.SPOT] * 5)) == LENS_DIRTY
+
+    def test_a_sky_that_changes_is_none(self) -> None:
+        assert diagnose(self.looks(*[tuple(range(20 * k, 20 * k + 30)) for k in range(12)])) is None
+
+    def test_one_exposure_with_contrast_clears_a_block(self) -> None:
+        assert diagnose(self.looks(*[self.SPOT] * 3, (), *[self.SPOT] * 4)) is None
+
+    def test_a_few_blocks_are_no_dirty_lens(self) -> None:
+        assert diagnose(self.looks(*[self.SPOT[:4]] * 10)) is None
+
+    def test_goes_away_when_it_was_cleaned(self) -> None:
+        assert diagnose(self.looks(*[self.SPOT] * 8, *[()] * 3)) is None
+
+    def test_a_night_is_no_cleaning(self) -> None:
+        day = [replace(fresh(k, flagged=False), dirty=self.SPOT, textured=400) for k in range(5)]
+        night = [fresh(10 + k, causes=(DARK,)) for k in range(3)]
+        assert after(*day, *night).dirt.keys() == {str(block) for block in self.SPOT}
+
+
+class TestLook:
+    def test_needs_some_pairs(self, street: Window, stereo: DepthModel) -> None:
+        short = replace(street, pairs=street.pairs[: MIN_PAIRS - 1])
+        with pytest.raises(CalibrationError, match="a look needs 4 pairs, there are 3"):
+            observe(short, stereo, GreyImages(LimitsConfig()), CalibrationConfig(), None)
+
+    def test_flags_a_turn_of_two_degrees_and_not_the_truth(self, sharp_street: Window, stereo: DepthModel) -> None:
+        images, config = GreyImages(LimitsConfig()), CalibrationConfig()
+        right = observe(sharp_street, stereo, images, config, None)
+        assert not right.flagged
+        assert right.causes == ()
+        moved = se3.perturb(sharp_street.T_camera_lidar_start, np.radians([1.2, -1.2, 1.0, 0, 0, 0]))
+        wrong = observe(replace(sharp_street, T_camera_lidar_start=moved), stereo, images, config, None)
+        assert wrong.flagged
+        assert not wrong.weak
+        # The offset leads back to the truth: minus the turn, within the tolerance of an uncommissioned rig.
+        np.testing.assert_allclose(np.degrees(wrong.offset[:3]), [-1.2, 1.2, -1.0], atol=0.35)
+
+    def test_same_pairs_same_look(self, street: Window, stereo: DepthModel) -> None:
+        images, config = GreyImages(LimitsConfig()), CalibrationConfig()
+        a, b = (observe(street, stereo, images, config, None) for _ in range(2))
+        assert a.metrics == b.metrics
+        assert a.offset.tobytes() == b.offset.tobytes()

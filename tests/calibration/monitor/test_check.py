@@ -1,0 +1,103 @@
+"""The figures of a look: the paper's derivatives on every axis, and the edges that a pose keeps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
+from coec.calibration.estimators import look
+from coec.calibration.monitor.check import Evidence, Look, gather, look_at
+from coec.calibration.monitor.check_verdict import over_limits
+from coec.calibration.objective.curvature import axis_derivatives, measure_curvature
+from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.types import Matrix4, Window
+from coec.config import CalibrationConfig, LimitsConfig
+from coec.geometry import se3
+
+CONFIG = CalibrationConfig()
+
+CENTRE = np.array([0.01, -0.02, 0.005, 0.02, 0.01, -0.03])
+PEAKEDNESS = np.array([3.0, 2.0, 1.0, 0.5, 0.4, 0.3])
+
+
+class Hill:
+    """-½ Σ p (ξ - c)² in two frames."""
+
+    step_rad = 1e-3
+
+    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
+        off = se3.difference(T_camera_lidar, np.eye(4)) - CENTRE
+        score = float(-0.5 * (PEAKEDNESS * off**2).sum())
+        frames = np.array([score - 1.0, score + 1.0])
+        return Evaluation(score, frames, mi=score, overlap=1.0, points_in_view=1)
+
+
+def test_are_those_of_the_hill() -> None:
+    first, second = axis_derivatives(Hill(), np.eye(4))
+    np.testing.assert_allclose(first, PEAKEDNESS * CENTRE, rtol=1e-6)
+    np.testing.assert_allclose(second, PEAKEDNESS, rtol=1e-6)
+
+
+def test_are_those_of_the_curvature() -> None:
+    first, second = axis_derivatives(Hill(), np.eye(4))
+    curvature = measure_curvature(Hill(), np.eye(4), 6)
+    np.testing.assert_array_equal(first, curvature.first_derivative)
+    np.testing.assert_array_equal(second, curvature.second_derivative)
+
+
+@pytest.fixture(scope="module")
+def evidence(sharp_street: Window, stereo: DepthModel) -> Evidence:
+    return gather(look(sharp_street, stereo, GreyImages(LimitsConfig()), CONFIG, Silence()))
+
+
+class TestEdgesKept:
+    def test_are_kept_at_the_right_pose_and_lost_to_its_left(self, evidence: Evidence, sharp_street: Window) -> None:
+        right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
+        kept = look_at(evidence, right, CONFIG).edges_kept
+        beside = look_at(evidence, se3.perturb(right, xi), CONFIG).edges_kept
+        assert kept > 0.9
+        assert beside < 0.7 * kept
+
+    def test_are_looked_for_where_the_bias_puts_them(self, evidence: Evidence, sharp_street: Window) -> None:
+        right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
+        assert look_at(evidence, se3.perturb(right, xi), CONFIG, -xi).edges_kept > 0.9
+
+
+A_LOOK = Look(
+    pairs=1,
+    T_rotation=np.eye(4),
+    T_pose=np.eye(4),
+    offset_rotation=np.zeros(6),
+    offset_pose=np.zeros(6),
+    mi=1.0,
+    first_derivative=np.zeros(6),
+    second_derivative=np.ones(6),
+    edges=10.0,
+    edges_at_best=10.0,
+    edges_kept=1.0,
+    contrast=10.0,
+    agreement_rad=0.0,
+    overlap=1.0,
+    deficit=0.0,
+)
+
+
+class TestOverLimits:
+    LIMITS = MonitorLimits(12.0, 12.0, 4.0, min_edges_kept=0.8)
+    ACCURACY = Accuracy(np.zeros(6), np.full(6, 0.001), np.zeros(6))
+
+    @pytest.mark.parametrize(("kept", "flagged"), [(0.9, False), (0.7, True)])
+    def test_a_quarter_of_the_distance_is_too_far_where_the_edges_are_lost(self, kept: float, flagged: bool) -> None:
+        seen = replace(A_LOOK, offset_rotation=np.array([0.002, 0, 0, 0, 0, 0]), edges_kept=kept)
+        of_rotation, of_pose = over_limits(seen, self.ACCURACY, self.ACCURACY, self.LIMITS)
+        assert (of_rotation > 1.0) is flagged
+        assert of_pose == 0.0
+
+    def test_lost_edges_alone_flag_nothing(self) -> None:
+        of_rotation, _ = over_limits(replace(A_LOOK, edges_kept=0.1), self.ACCURACY, self.ACCURACY, self.LIMITS)
+        assert of_rotation == 0.0

@@ -1,0 +1,219 @@
+"""Causes told apart: a recorded drive with one thing changed at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import scenarios
+from coec.adapters.depth.maps import CachedDepth, open_depth
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.commissioning.baseline import Baseline
+from coec.calibration.commissioning.learning import learn_accuracy
+from coec.calibration.estimators import look
+from coec.calibration.monitor.change_detector import MonitorState, Outcome, after_observation, diagnose
+from coec.calibration.monitor.check import gather
+from coec.calibration.monitor.check_verdict import UNCOMMISSIONED, observe
+from coec.calibration.monitor.sensor_faults import (
+    BANDS,
+    BLOCK_COLUMNS,
+    BLOCK_ROWS,
+    CAUSES,
+    SECTORS,
+    SceneBaseline,
+    SceneFacts,
+    data_causes,
+    dirty_blocks,
+    scene_baseline,
+)
+from coec.calibration.ports import DepthModel, Silence
+from coec.calibration.types import LidarFrame, Window
+from coec.config import CalibrationConfig, DepthConfig, LimitsConfig
+from coec.geometry import se3
+from coec.sources import windows
+
+Change = Callable[[Window, np.random.Generator], Window]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Five pairs of a drive, and a baseline from five others."""
+
+    window: Window
+    depth: DepthModel
+    baseline: Baseline
+
+
+@pytest.fixture(scope="module")
+def drive(sample_data: Path) -> Drive:
+    whole = windows.load(f"kitti360:{sample_data / 'kitti360'}?camera=image_00", None, 25, lambda *_: None).window
+    depth = CachedDepth(open_depth(DepthConfig(model="stereo"), LimitsConfig()), 10)
+    learned = replace(whole, pairs=whole.pairs[::2])
+    evidence = gather(look(learned, depth, GreyImages(LimitsConfig()), CalibrationConfig(), Silence()))
+    right = whole.rig.T_camera_lidar_nominal
+    rotation, pose = learn_accuracy(evidence, right, CalibrationConfig())
+    baseline = Baseline(
+        pair=whole.rig.pair, T_camera_lidar=right, rotation=rotation, pose=pose, dof=3, limits={},
+        monitor=replace(UNCOMMISSIONED, min_edges_per_pair=10.0), scene=scene_baseline(evidence.scenes),
+        false_alarm_rate=0.01, windows=1, pairs=5, detected={}, sensors={}, depth_identity="", config_hash="",
+    )  # fmt: skip
+    return Drive(replace(whole, pairs=whole.pairs[1::2]), depth, baseline)
+
+
+def turned(degrees: tuple[float, float, float]) -> Change:
+    def change(window: Window, rng: np.random.Generator) -> Window:
+        del rng
+        xi = np.array([*(radians(angle) for angle in degrees), 0.0, 0.0, 0.0])
+        return replace(window, T_camera_lidar_start=se3.perturb(window.T_camera_lidar_start, xi))
+
+    return change
+
+
+def late_camera_by_a_period(window: Window, rng: np.random.Generator) -> Window:
+    return scenarios.late_camera(window, rng, 100_000_000)
+
+
+def ground_alone(window: Window, rng: np.random.Generator) -> Window:
+    """Nothing stands on the plain; the sensor is 1.7 m above it."""
+    del rng
+
+    def chosen(sweep: LidarFrame, index: int) -> NDArray[np.intp]:
+        del index
+        return np.flatnonzero(sweep.xyz_m[:, 2] < -1.4)
+
+    return scenarios.with_points(window, chosen)
+
+
+def unchanged(window: Window, rng: np.random.Generator) -> Window:
+    del rng
+    return window
+
+
+def states(drive: Drive, change: Change, looks: int = 6) -> list[MonitorState]:
+    """What looks at the changed drive add up to, each at pairs that were not seen before."""
+    changed = change(drive.window, np.random.default_rng(1))
+    seen = observe(changed, drive.depth, GreyImages(LimitsConfig()), CalibrationConfig(), drive.baseline)
+    state, after = MonitorState(), []
+    for number in range(looks):
+        fresh = tuple(stamp + number * 10**12 for stamp in seen.pair_stamps_ns)
+        state = after_observation(state, replace(seen, pair_stamps_ns=fresh))
+        after.append(state)
+    return after
+
+
+class TestScenarios:
+    @pytest.mark.parametrize(
+        ("change", "code"),
+        [
+            (turned((0.7, -0.5, 0.5)), "bent_mount"),
+            (turned((0.0, 0.6, 0.0)), "bent_mount"),
+            (scenarios.dirt, "lens_dirty"),
+            (scenarios.covered_lens, "lens_covered"),
+            (scenarios.frozen_camera, "camera_frozen"),
+            (scenarios.sixteen_beams, "lidar_beams_lost"),
+            (scenarios.half_the_azimuths, "lidar_beams_lost"),
+            (scenarios.wrong_ego_motion, "ego_motion_wrong"),
+            (scenarios.fast_ego_motion, "ego_motion_wrong"),
+            (scenarios.late_camera, "time_offset"),
+            (late_camera_by_a_period, "time_offset"),
+            (scenarios.night, "dark"),
+            (ground_alone, "open_field"),
+        ],
+    )
+    def test_has_its_own_reason(self, drive: Drive, change: Change, code: str) -> None:
+        cause = diagnose(states(drive, change)[-1])
+        assert cause is not None
+        assert cause.code == code
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            unchanged,
+            scenarios.rain_drops,
+            scenarios.blown_out_sky,
+            scenarios.boxes_in_the_image,
+            scenarios.unorganised,
+            scenarios.clusters_moved_in_the_cloud,
+        ],
+    )
+    def test_what_happens_on_every_drive_is_no_cause(self, drive: Drive, change: Change) -> None:
+        state = states(drive, change)[-1]
+        assert diagnose(state) is None
+        assert state.outcome is Outcome.CLEAR
+
+    @pytest.mark.parametrize("change", [turned((5.0, -5.0, 3.0)), scenarios.images_of_other_frames])
+    def test_what_no_look_can_explain_is_suspect_and_never_certain(self, drive: Drive, change: Change) -> None:
+        after = states(drive, change, looks=8)
+        assert after[-1].outcome is Outcome.SUSPECT
+        assert diagnose(after[-1]) is None
+
+
+def facts(stamp_ns: int = 0, **other: object) -> SceneFacts:
+    """A sharp, bright picture of a full scene."""
+    plain = SceneFacts(
+        stamp_ns=stamp_ns,
+        gradient=np.full((BLOCK_ROWS, BLOCK_COLUMNS), 10.0),
+        bright=180.0,
+        thumbnail=np.random.default_rng(stamp_ns).normal(100, 40, (6, 8)).astype(np.float32),
+        digest=stamp_ns,
+        bands=np.full(BANDS, 400, np.int64),
+        sectors=np.full(SECTORS, 400, np.int64),
+        range_edges=1000,
+        speed_mps=8.0,
+    )
+    return replace(plain, **other)  # type: ignore[arg-type]
+
+
+def drive_of(**other: object) -> list[SceneFacts]:
+    return [facts(second * 1_000_000_000, **other) for second in range(5)]
+
+
+def usual() -> SceneBaseline:
+    return scene_baseline(drive_of())
+
+
+class TestFacts:
+    def test_nothing_wrong(self) -> None:
+        assert data_causes(drive_of(), usual()) == ()
+        assert data_causes(drive_of(), None) == ()
+
+    def test_equal_pictures_of_a_standing_vehicle_are_no_fault(self) -> None:
+        assert data_causes(drive_of(digest=7, speed_mps=0.0), None) == ()
+        assert [cause.code for cause in data_causes(drive_of(digest=7), None)] == ["camera_frozen"]
+
+    def test_equal_pictures_without_ego_motion_are_a_fault(self) -> None:
+        assert [cause.code for cause in data_causes(drive_of(digest=7, speed_mps=None), None)] == ["camera_frozen"]
+
+    def test_one_blurred_picture_is_no_dirt(self) -> None:
+        spot = np.full((BLOCK_ROWS, BLOCK_COLUMNS), 10.0)
+        spot[:3] = 1.0
+        scenes = drive_of()
+        blocks = BLOCK_ROWS * BLOCK_COLUMNS
+        assert dirty_blocks([replace(scenes[0], gradient=spot), *scenes[1:]], usual()) == ((), blocks)
+        dirty = dirty_blocks([replace(scene, gradient=spot) for scene in scenes], usual())
+        assert dirty == (tuple(range(3 * BLOCK_COLUMNS)), blocks)
+
+    def test_what_never_had_contrast_cannot_lose_it(self) -> None:
+        sky = np.full((BLOCK_ROWS, BLOCK_COLUMNS), 10.0)
+        sky[:3] = 1.0
+        assert dirty_blocks(drive_of(gradient=sky / 5.0), scene_baseline(drive_of(gradient=sky)))[1] == (
+            (BLOCK_ROWS - 3) * BLOCK_COLUMNS
+        )
+
+    def test_a_beam_that_is_missing_once_is_not_lost(self) -> None:
+        holes = np.full(BANDS, 400, np.int64)
+        holes[:6] = 0
+        scenes = drive_of()
+        assert data_causes([replace(scenes[0], bands=holes), *scenes[1:]], usual()) == ()
+        lost = data_causes([replace(scene, bands=holes) for scene in scenes], usual())
+        assert [cause.code for cause in lost] == ["lidar_beams_lost"]
+
+    def test_every_cause_is_listed_under_its_code(self) -> None:
+        assert all(code == cause.code == cause.as_reason().code for code, cause in CAUSES.items())
+        assert len(CAUSES) == 9

@@ -1,0 +1,151 @@
+"""The edge witness of a window: its levels, whatever the camera, and its points."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.objective.edges import (
+    BANDS,
+    COARSEST_BLUR_RAD,
+    MAX_PIXELS,
+    RANKED_POINTS,
+    THINNED_POINTS,
+    EdgeWitness,
+    build_edges,
+)
+from coec.calibration.types import Rig, Window
+from coec.config import LimitsConfig
+from coec.errors import CalibrationError
+from coec.geometry.cameras import Camera, build
+from coec.geometry.edges.charts import CELLS_PER_BLUR, MAX_CHART_POINTS
+from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, VOID, EdgeScales
+from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.projection import project, unproject
+
+GREY = GreyImages(LimitsConfig())
+
+
+def with_camera(window: Window, camera: Camera) -> EdgeWitness:
+    """The edges of one pair, seen through another lens in an image of noise."""
+    pair, rig = window.pairs[0], replace(window.rig, camera=camera, mask=None)
+    grey = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width)).astype(np.uint8)
+    return build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [grey], rig)
+
+
+def pinhole(width: int, height: int, focal_px: float) -> Camera:
+    return build(
+        "pinhole", width=width, height=height, fx=focal_px, fy=focal_px, cx=(width - 1) / 2, cy=(height - 1) / 2
+    )
+
+
+CAMERAS = {
+    "common": pinhole(1280, 480, 700.0),
+    "odd": pinhole(701, 333, 400.0),
+    "narrow": pinhole(1024, 512, 3000.0),
+    "coarse": pinhole(160, 120, 100.0),
+    "huge": pinhole(3200, 2400, 1800.0),
+    "fisheye": build(
+        "kannala_brandt", width=700, height=700, fx=220.0, fy=220.0, cx=350.0, cy=350.0, k1=0.0, k2=0.0, k3=0.0, k4=0.0
+    ),
+}
+
+
+def seen_blur_rad(camera: Camera) -> float:
+    """The angle of the blur's pixels next to the optical axis."""
+    (axis,), _ = project(camera, np.array([[0.0, 0.0, 1.0]]))
+    rays, _ = unproject(camera, np.stack([axis, axis + np.array([BLUR_SIGMA_PX, 0.0])]))
+    return float(np.linalg.norm(np.cross(rays[0], rays[1])))
+
+
+@pytest.mark.parametrize("lens", CAMERAS)
+def test_levels_double_and_end_at_the_same_angle_for_any_lens(street: Window, lens: str) -> None:
+    camera = CAMERAS[lens]
+    edges = with_camera(street, camera)
+    assert len(edges.bands) == len(edges.band_blur_rad) == BANDS
+    assert edges.band_blur_rad == pytest.approx([edges.band_blur_rad[0] * 2**k for k in range(BANDS)])
+    for frames, blur_rad in zip(edges.bands, edges.band_blur_rad, strict=True):
+        assert frames.maps.shape == (1, frames.camera.height, frames.camera.width)
+        assert blur_rad == pytest.approx(seen_blur_rad(frames.camera), rel=0.01)
+    assert edges.blur_rad == pytest.approx(seen_blur_rad(edges.sharp.camera), rel=0.01)
+    assert edges.blur_rad <= edges.band_blur_rad[0]
+    assert edges.whole.maps.shape[1:] == tuple(side // 2 for side in edges.sharp.maps.shape[1:])
+    assert edges.sharp.maps.size <= MAX_PIXELS
+    # Unless the image is too coarse for it.
+    if seen_blur_rad(camera) * 2 ** (BANDS - 1) < COARSEST_BLUR_RAD:
+        assert COARSEST_BLUR_RAD <= edges.band_blur_rad[-1] < 2.0 * COARSEST_BLUR_RAD
+
+
+def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    rig = sharp_street.rig
+    lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
+    scales = EdgeScales(lit, 0, BANDS - 1)
+    for f in (0, len(sharp_street.pairs) - 1):
+        pyramid = scales.pyramid(GREY.grey(sharp_street.pairs[f].camera))
+        np.testing.assert_array_equal(sharp_edges.sharp.maps[f], pyramid.sharp)
+        np.testing.assert_array_equal(sharp_edges.whole.maps[f], pyramid.whole)
+        for frames, band in zip(sharp_edges.bands, pyramid.bands, strict=True):
+            np.testing.assert_array_equal(frames.maps[f], band)
+
+
+def test_points_are_the_range_edges_where_they_were_at_the_exposure(
+    sharp_street: Window, sharp_edges: EdgeWitness
+) -> None:
+    first = sharp_edges.sharp.first_point
+    for f, pair in enumerate(sharp_street.pairs):
+        found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
+        cloud = compensate(pair, sharp_street.rig, enabled=True)
+        np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, cloud[found.index])
+        np.testing.assert_array_equal(sharp_edges.sharp.weight[first[f] : first[f + 1]], found.weight)
+
+
+def test_charts_are_of_the_coarse_bands_with_all_of_their_points_or_some(sharp_edges: EdgeWitness) -> None:
+    for charts, band, blur_rad in zip(
+        sharp_edges.charts, sharp_edges.bands[:0:-1], sharp_edges.band_blur_rad[:0:-1], strict=True
+    ):
+        assert charts.cells_per_unit == pytest.approx(2.0 * CELLS_PER_BLUR / blur_rad)
+        np.testing.assert_array_equal(charts.xyz_m, band.xyz_m)
+        np.testing.assert_array_equal(np.bincount(charts.frame), np.diff(band.first_point))
+    for thinned, charts in zip(sharp_edges.thinned, sharp_edges.charts, strict=True):
+        assert thinned.xyz_m.shape[1] == THINNED_POINTS < charts.xyz_m.shape[1]
+        assert thinned.cells is charts.cells
+        # Evenly chosen: every frame keeps its share.
+        share = np.bincount(thinned.frame) / np.bincount(charts.frame)
+        assert share == pytest.approx(THINNED_POINTS / charts.xyz_m.shape[1], rel=0.02)
+
+
+def test_basins_are_ranked_with_some_of_the_points_where_there_are_very_many(
+    street: Window, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert RANKED_POINTS <= MAX_CHART_POINTS
+    monkeypatch.setattr("coec.calibration.objective.edges.RANKED_POINTS", 200)
+    edges = with_camera(street, CAMERAS["coarse"])
+    assert [charts.xyz_m.shape[1] for charts in (*edges.charts, *edges.thinned)] == [200] * 4
+    assert [band.xyz_m.shape[1] for band in edges.bands] == [200] * BANDS
+    assert edges.sharp.xyz_m.shape[1] > 200
+    # The ones that are kept are the same everywhere, with their weights.
+    every = {tuple(column) for column in np.vstack([edges.sharp.xyz_m, edges.sharp.weight]).T}
+    assert all(tuple(column) in every for column in np.vstack([edges.bands[0].xyz_m, edges.bands[0].weight]).T)
+
+
+@pytest.mark.parametrize("grown", [(1, 0), (0, 1), (-1, 0), (0, -1)])
+def test_an_image_of_another_size_is_refused(street: Window, grown: tuple[int, int]) -> None:
+    pair, camera = street.pairs[0], street.rig.camera
+    grey = np.zeros((camera.height + grown[0], camera.width + grown[1]), np.uint8)
+    with pytest.raises(CalibrationError, match="px, the camera model"):
+        build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [grey], street.rig)
+
+
+def test_a_mask_hides_pixels_on_every_level(street: Window) -> None:
+    camera = street.rig.camera
+    mask = np.ones((camera.height, camera.width), np.bool_)
+    mask[camera.height // 2 :] = False
+    rig: Rig = replace(street.rig, mask=mask)
+    pair = street.pairs[0]
+    edges = build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [GREY.grey(pair.camera)], rig)
+    for frames in (edges.sharp, edges.whole, *edges.bands):
+        height = frames.maps.shape[1]
+        assert (frames.maps[0, -(height // 2) :] == VOID).all()
+        assert (frames.maps[0, : height // 2] != VOID).all()

@@ -1,0 +1,149 @@
+"""The global stage: an even cover of the reach, and the true basin from far away."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibration.conftest import pairs_of
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.objective.edges import EdgeWitness, build_edges
+from coec.calibration.objective.mutual_information import SearchBox
+from coec.calibration.search.global_search import AT_RIM, FINE, ROUNDS, at_rim, find_basins, sample_reach
+from coec.calibration.types import Matrix4, Window
+from coec.config import LimitsConfig
+from coec.geometry import se3
+from coec.geometry.edges.charts import significances
+
+START = se3.perturbation(np.array([0.4, -0.3, 1.2, 0.5, -1.0, 2.0]))
+TURN = SearchBox(np.radians(28.0), 0.0)
+BOTH = SearchBox(np.radians(28.0), 0.55)
+
+
+def moves(poses: NDArray[np.float64], start: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation vectors and shifts (K, 3) that lead from the start to the poses."""
+    steps = [se3.perturbation_log(pose @ se3.inverse(start)) for pose in poses]
+    shifts = [pose[:3, 3] - pose[:3, :3] @ start[:3, :3].T @ start[:3, 3] for pose in poses]
+    return np.array(steps)[:, :3], np.array(shifts)
+
+
+def angle_deg(a: Matrix4, b: Matrix4) -> float:
+    return float(np.degrees(se3.rotation_angle_rad(a @ se3.inverse(b))))
+
+
+def away_from(truth: Matrix4, angle_deg: float, seed: int) -> Matrix4:
+    axis = np.random.default_rng(seed).normal(size=3)
+    axis *= np.radians(angle_deg) / np.linalg.norm(axis)
+    return se3.perturb(truth, np.array([*axis, 0.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize("reach", [TURN, BOTH], ids=["turn", "both"])
+def test_the_cover_stays_within_the_reach(reach: SearchBox) -> None:
+    poses = sample_reach(START, reach, 3000)
+    assert poses.shape == (3000, 4, 4)
+    assert all(se3.is_rigid(pose) for pose in poses)
+    turns, shifts = moves(poses, START)
+    assert np.linalg.norm(turns, axis=1).max() <= reach.rotation_rad + 1e-9
+    assert np.linalg.norm(shifts, axis=1).max() <= reach.translation_m + 1e-9
+
+
+def test_the_cover_is_deterministic() -> None:
+    assert sample_reach(START, BOTH, 500).tobytes() == sample_reach(START, BOTH, 500).tobytes()
+
+
+def test_the_cover_is_even() -> None:
+    turns, shifts = moves(sample_reach(START, BOTH, 4000), START)
+    for vectors, radius in ((turns / BOTH.rotation_rad, 1.0), (shifts / BOTH.translation_m, 1.0)):
+        # As many points in each octant, and an eighth of them within half the radius.
+        octants = np.bincount((vectors > 0.0) @ [1, 2, 4], minlength=8)
+        assert np.abs(octants / 4000 - 1 / 8).max() < 0.01
+        assert np.mean(np.linalg.norm(vectors, axis=1) < radius / 2) == pytest.approx(1 / 8, abs=0.01)
+    # Where the LiDAR turns tells nothing about where it shifts.
+    correlation = np.corrcoef(turns.T, shifts.T)[:3, 3:]
+    assert np.abs(correlation).max() < 0.05
+
+
+def test_no_pose_of_the_reach_is_far_from_the_cover() -> None:
+    turns, _ = moves(sample_reach(START, TURN, 4000), START)
+    rng = np.random.default_rng(0)
+    anywhere = rng.normal(size=(300, 3))
+    anywhere *= TURN.rotation_rad * rng.random((300, 1)) ** (1 / 3) / np.linalg.norm(anywhere, axis=1, keepdims=True)
+    gaps = np.linalg.norm(anywhere[:, None] - turns[None], axis=2).min(axis=1)
+    # Side of the cube that each of 4000 poses has to itself.
+    side = TURN.rotation_rad * (4.0 / 3.0 * np.pi / 4000) ** (1 / 3)
+    assert gaps.max() < 1.5 * side
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_true_basin_is_found_from_twenty_degrees_away(
+    sharp_street: Window, sharp_edges: EdgeWitness, seed: int
+) -> None:
+    truth = sharp_street.rig.T_camera_lidar_nominal
+    basins = find_basins(sharp_edges, away_from(truth, 20.0, seed), TURN)
+    # On the hill of the fine chart, from where a basin is polished.
+    nearest_deg = min(angle_deg(basin.T_camera_lidar, truth) for basin in basins)
+    assert nearest_deg < 1.5 * np.degrees(sharp_edges.band_blur_rad[1])
+
+
+def test_the_true_translation_is_found_from_half_a_metre_away(sample_data: Path) -> None:
+    """On real streets: the synthetic one hardly tells height."""
+    _, window = pairs_of(f"kitti360:{sample_data}/kitti360?camera=image_00")
+    images = GreyImages(LimitsConfig())
+    edges = build_edges(
+        window.pairs,
+        lambda frame, chosen: compensate(window.pairs[frame], window.rig, enabled=True, chosen=chosen),
+        [images.grey(pair.camera) for pair in window.pairs],
+        window.rig,
+    )
+    truth = window.T_camera_lidar_start
+    for shift in 0.5 * np.concatenate([np.eye(3), -np.eye(3)]):
+        start = se3.perturb(truth, np.concatenate([np.radians(shift), shift]))
+        best = find_basins(edges, start, SearchBox(np.radians(3.5), 0.65))[0].T_camera_lidar
+        assert angle_deg(best, truth) < 0.6
+        assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.2
+
+
+def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    basins = find_basins(sharp_edges, away_from(sharp_street.rig.T_camera_lidar_nominal, 10.0, 4), TURN)
+    assert 1 <= len(basins) <= ROUNDS[-1].poses
+    z = [basin.significance for basin in basins]
+    assert z == sorted(z, reverse=True)
+    poses = np.stack([basin.T_camera_lidar for basin in basins])
+    assert z == significances(sharp_edges.charts[FINE], poses).tolist()
+    for index, a in enumerate(basins):
+        for b in basins[:index]:
+            assert angle_deg(a.T_camera_lidar, b.T_camera_lidar) >= np.degrees(ROUNDS[-1].apart_rad) - 1e-6
+
+
+def test_rotation_only_leaves_the_lidar_where_the_start_has_it(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    start = away_from(sharp_street.rig.T_camera_lidar_nominal, 8.0, 6)
+    poses = np.stack([basin.T_camera_lidar for basin in find_basins(sharp_edges, start, TURN)])
+    _, shifts = moves(poses, start)
+    assert np.abs(shifts).max() < 1e-9
+
+
+def test_basins_lie_within_the_reach(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    start = away_from(sharp_street.rig.T_camera_lidar_nominal, 15.0, 0)
+    turns, shifts = moves(np.stack([b.T_camera_lidar for b in find_basins(sharp_edges, start, BOTH)]), start)
+    assert np.linalg.norm(turns, axis=1).max() <= BOTH.rotation_rad + 1e-6
+    assert np.linalg.norm(shifts, axis=1).max() <= BOTH.translation_m + 2e-6
+
+
+@pytest.mark.parametrize("share", [0.5, AT_RIM - 0.01, AT_RIM + 0.01, 1.5])
+@pytest.mark.parametrize("axis", [1, 4])
+def test_a_pose_near_the_bound_of_either_reach_lies_on_the_rim(axis: int, share: float) -> None:
+    bound = BOTH.rotation_rad if axis < 3 else BOTH.translation_m
+    assert at_rim(se3.perturb(START, share * bound * np.eye(6)[axis]), START, BOTH) == (share > AT_RIM)
+
+
+def test_rotation_only_has_no_rim_of_translation() -> None:
+    assert not at_rim(se3.perturb(START, np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])), START, TURN)
+
+
+def test_same_input_same_basins_to_the_bit(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    start = away_from(sharp_street.rig.T_camera_lidar_nominal, 12.0, 3)
+    first, second = (find_basins(sharp_edges, start, BOTH) for _ in range(2))
+    assert [b.T_camera_lidar.tobytes() for b in first] == [b.T_camera_lidar.tobytes() for b in second]
+    assert [b.significance for b in first] == [b.significance for b in second]

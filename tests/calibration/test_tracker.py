@@ -1,0 +1,281 @@
+"""Windows combined into one extrinsic: noise is averaged away, a step is noticed at once and taken at the second."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import permutations
+from math import degrees, radians, sqrt
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.calibration.tracker import (
+    NS_PER_H,
+    Measurement,
+    StepState,
+    Track,
+    absorb,
+    chi_square_tail,
+    prior_sigma,
+    track_from_dict,
+    track_to_dict,
+)
+from coec.config import FusionConfig
+from coec.geometry import se3
+
+Array = NDArray[np.float64]
+
+STILL = FusionConfig(drift_deg_per_sqrt_h=0.0, drift_m_per_sqrt_h=0.0)
+"""A mount that does not creep: the order of windows does not matter."""
+
+SIGMA = np.array([radians(0.05), radians(0.04), radians(0.1), 0.03, 0.02, 0.05])
+ROTATION_ONLY = np.where(np.arange(6) < 3, SIGMA, np.nan)
+TRUTH = se3.perturb(
+    np.array([[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.3], [1.0, 0.0, 0.0, -0.4], [0.0, 0.0, 0.0, 1.0]]),
+    np.array([0.02, -0.03, 0.01, 0.0, 0.0, 0.0]),
+)
+PERIOD_NS = NS_PER_H // 20
+"""A window every three minutes."""
+
+
+def track_at(T_camera_lidar: Array) -> Track:
+    return Track.initial(T_camera_lidar, prior_sigma(STILL))
+
+
+def about(T_camera_lidar: Array, xi: Array, sigma: Array = SIGMA, stamp_ns: int = 0) -> Measurement:
+    return Measurement.independent(se3.perturb(T_camera_lidar, xi), sigma, stamp_ns)
+
+
+def yaw(angle_deg: float) -> Array:
+    return np.array([0.0, radians(angle_deg), 0.0, 0.0, 0.0, 0.0])
+
+
+def drawn(rng: np.random.Generator, count: int, sigma: Array = SIGMA) -> list[Measurement]:
+    return [about(TRUTH, rng.normal(0.0, SIGMA), sigma, k * PERIOD_NS) for k in range(count)]
+
+
+def after(track: Track, measurements: list[Measurement], config: FusionConfig = STILL) -> Track:
+    for measurement in measurements:
+        track = absorb(track, measurement, config)
+    return track
+
+
+def error(track: Track) -> Array:
+    return se3.difference(track.T_camera_lidar, TRUTH)
+
+
+# -------------------------------------------------------------------------------------------------- the slow track
+@pytest.mark.parametrize("count", [1, 4, 25])
+def test_variance_falls_with_the_number_of_windows(count: int, rng: np.random.Generator) -> None:
+    track = after(track_at(TRUTH), drawn(rng, count))
+    information = count / SIGMA**2 + 1.0 / prior_sigma(STILL) ** 2
+    np.testing.assert_allclose(np.sqrt(track.covariance.diagonal()), 1.0 / np.sqrt(information), rtol=1e-3)
+    assert track.windows == count
+
+
+def test_the_mean_is_weighted_by_information() -> None:
+    sharp, vague = about(TRUTH, yaw(0.1), 0.5 * SIGMA), about(TRUTH, yaw(-0.1), SIGMA)
+    assert degrees(error(after(track_at(TRUTH), [sharp, vague]))[1]) == pytest.approx((4 * 0.1 - 0.1) / 5, abs=1e-4)
+
+
+def test_a_window_that_counts_double_is_two_windows(rng: np.random.Generator) -> None:
+    once = about(TRUTH, rng.normal(0.0, SIGMA))
+    double = Measurement(once.T_camera_lidar, 0.5 * once.covariance, 0)
+    twice, at_once = after(track_at(TRUTH), [once, once]), after(track_at(TRUTH), [double])
+    np.testing.assert_allclose(twice.T_camera_lidar, at_once.T_camera_lidar, atol=1e-9)
+    np.testing.assert_allclose(twice.covariance, at_once.covariance, rtol=1e-7, atol=1e-15)
+
+
+def test_without_creep_the_order_does_not_matter(rng: np.random.Generator) -> None:
+    windows = drawn(rng, 4)
+    tracks = [after(track_at(TRUTH), list(order)) for order in permutations(windows)]
+    for track in tracks[1:]:
+        assert np.abs(se3.difference(track.T_camera_lidar, tracks[0].T_camera_lidar)).max() < 0.01 * SIGMA.min()
+        np.testing.assert_allclose(track.covariance, tracks[0].covariance, rtol=1e-9, atol=1e-18)
+
+
+def test_moving_the_lidar_frame_moves_the_track_with_it(rng: np.random.Generator) -> None:
+    """The perturbation is about the camera: another LiDAR frame on the right changes nothing else."""
+    T_lidar_other = se3.exp(rng.normal(size=6))
+    windows = drawn(rng, 5)
+    moved = [replace(w, T_camera_lidar=w.T_camera_lidar @ T_lidar_other) for w in windows]
+    here, there = after(track_at(TRUTH), windows), after(track_at(TRUTH @ T_lidar_other), moved)
+    np.testing.assert_allclose(here.T_camera_lidar @ T_lidar_other, there.T_camera_lidar, atol=1e-9)
+    np.testing.assert_allclose(here.covariance, there.covariance, rtol=1e-9, atol=1e-18)
+
+
+def test_axes_that_no_window_tells_keep_their_prior(rng: np.random.Generator) -> None:
+    start = se3.perturb(TRUTH, np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    windows = [about(TRUTH, np.where(np.arange(6) < 3, rng.normal(0.0, SIGMA), 9.0), ROTATION_ONLY) for _ in range(6)]
+    track = after(track_at(start), windows)
+    moved = se3.difference(track.T_camera_lidar, start)
+    np.testing.assert_allclose(moved[3:], 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(track.covariance.diagonal())[3:], prior_sigma(STILL)[3:])
+    assert track.observed.tolist() == [True] * 3 + [False] * 3
+    assert np.abs(error(track)[:3]).max() < 3 * SIGMA.max()
+
+
+def test_correlated_axes_inform_each_other() -> None:
+    """Pitch and height move together: a window that tells the height alone tells the pitch, too."""
+    covariance = np.diag(SIGMA**2)
+    covariance[0, 4] = covariance[4, 0] = 0.9 * SIGMA[0] * SIGMA[4]
+    track = after(track_at(TRUTH), [Measurement(TRUTH, covariance, 0)])
+    height_only = np.where(np.arange(6) == 4, 1e-4, np.nan)
+    told = after(track, [about(TRUTH, np.array([0.0, 0.0, 0.0, 0.0, 0.01, 0.0]), height_only)])
+    assert error(told)[0] == pytest.approx(0.9 * SIGMA[0] / SIGMA[4] * 0.01, rel=0.05)
+    assert sqrt(told.covariance[0, 0]) == pytest.approx(sqrt(1.0 - 0.81) * SIGMA[0], rel=0.05)
+
+
+def test_a_window_that_tells_nothing_changes_nothing() -> None:
+    track = track_at(TRUTH)
+    assert absorb(track, about(TRUTH, yaw(1.0), np.full(6, np.nan)), STILL) is track
+
+
+def test_a_mount_that_creeps_is_followed(rng: np.random.Generator) -> None:
+    """A fifth of a degree in twenty hours, a window every three minutes."""
+    config = FusionConfig()
+    track = Track.initial(TRUTH, prior_sigma(config))
+    hours = 20
+    for k in range(hours * 20):
+        crept = yaw(0.2 * k / (hours * 20))
+        track = absorb(track, about(TRUTH, crept + rng.normal(0.0, SIGMA), SIGMA, k * PERIOD_NS), config)
+        assert track.step is StepState.NONE
+    assert degrees(error(track)[1]) == pytest.approx(0.2, abs=0.03)
+
+
+def test_reported_sigma_never_falls_below_what_averaging_cannot_remove(rng: np.random.Generator) -> None:
+    track = after(track_at(TRUTH), drawn(rng, 200))
+    sigma = track.sigma(STILL)
+    assert (sigma[:3] >= radians(STILL.floor_deg)).all()
+    assert (sigma[3:] >= STILL.floor_m).all()
+    assert np.sqrt(track.covariance.diagonal())[1] < 0.1 * SIGMA[1]
+
+
+def test_three_sigma_covers() -> None:
+    """Honest windows: the track's own three sigma, without any floor, hold in at least 99 of 100 runs per axis."""
+    config = FusionConfig(floor_deg=0.0, floor_m=0.0, drift_deg_per_sqrt_h=0.0, drift_m_per_sqrt_h=0.0)
+    rng = np.random.default_rng(11)
+    covered = np.zeros(6)
+    for _ in range(300):
+        track = after(track_at(TRUTH), drawn(rng, 8), config)
+        covered += np.abs(error(track)) <= 3.0 * track.sigma(config)
+    assert (covered >= 0.99 * 300).all()
+
+
+# -------------------------------------------------------------------------------------------------- the fast track
+def test_a_step_is_noticed_by_the_first_window_and_taken_at_the_second(rng: np.random.Generator) -> None:
+    track = after(track_at(TRUTH), drawn(rng, 20))
+    before = track.T_camera_lidar
+    first, second = (about(TRUTH, yaw(1.0) + rng.normal(0.0, SIGMA)) for _ in range(2))
+    track = absorb(track, first, STILL)
+    assert track.step is StepState.SUSPECTED
+    assert track.candidate is not None
+    assert track.chance < STILL.step_false_alarm
+    np.testing.assert_array_equal(track.T_camera_lidar, before)
+    track = absorb(track, second, STILL)
+    assert track.step is StepState.CONFIRMED
+    assert track.candidate is None
+    assert track.windows == 2
+    assert degrees(error(track)[1]) == pytest.approx(1.0, abs=3 * 0.04 / sqrt(2))
+    assert absorb(track, second, STILL).step is StepState.NONE
+
+
+def test_one_outlier_does_not_move_the_track(rng: np.random.Generator) -> None:
+    windows = drawn(rng, 12)
+    outlier = about(TRUTH, np.array([0.3, -0.2, 0.1, 0.4, 0.0, 0.0]), SIGMA, 5 * PERIOD_NS)
+    clean, hit = after(track_at(TRUTH), windows), after(track_at(TRUTH), [*windows[:6], outlier, *windows[6:]])
+    np.testing.assert_array_equal(hit.T_camera_lidar, clean.T_camera_lidar)
+    assert hit.step is StepState.NONE
+    assert hit.candidate is None
+
+
+def test_two_outliers_that_disagree_confirm_nothing(rng: np.random.Generator) -> None:
+    track = after(track_at(TRUTH), drawn(rng, 6))
+    wrong = after(track, [about(TRUTH, yaw(2.0)), about(TRUTH, yaw(-2.0))])
+    assert wrong.step is StepState.SUSPECTED
+    np.testing.assert_array_equal(wrong.T_camera_lidar, track.T_camera_lidar)
+
+
+def test_what_lies_within_the_floor_is_no_step(rng: np.random.Generator) -> None:
+    """Another scene, another tenth of a degree: that is not a bent mount."""
+    track = after(track_at(TRUTH), drawn(rng, 200))
+    assert absorb(track, about(TRUTH, yaw(2.0 * STILL.floor_deg)), STILL).step is StepState.NONE
+
+
+def test_after_a_step_of_the_rotation_the_translation_is_as_uncertain_as_at_first(rng: np.random.Generator) -> None:
+    track = after(track_at(TRUTH), drawn(rng, 10))
+    bent = after(track, [about(TRUTH, yaw(3.0), ROTATION_ONLY)] * 2)
+    assert bent.step is StepState.CONFIRMED
+    np.testing.assert_allclose(np.sqrt(bent.covariance.diagonal())[3:], prior_sigma(STILL)[3:])
+    assert bent.observed.tolist() == [True] * 3 + [False] * 3
+
+
+def test_an_overwhelming_window_is_taken_alone_only_where_that_is_allowed(rng: np.random.Generator) -> None:
+    bold = STILL.model_copy(update={"overwhelming_false_alarm": 1e-30})
+    track = after(track_at(TRUTH), drawn(rng, 10))
+    window = about(TRUTH, yaw(5.0))
+    assert absorb(track, window, STILL).step is StepState.SUSPECTED
+    taken = absorb(track, window, bold)
+    assert taken.step is StepState.CONFIRMED
+    np.testing.assert_allclose(taken.T_camera_lidar, window.T_camera_lidar, atol=1e-12)
+
+
+def test_false_alarms_are_as_rare_as_asked_for() -> None:
+    """Without a floor the distance is chi-square distributed: at a limit of a hundredth, a hundredth."""
+    config = STILL.model_copy(update={"step_false_alarm": 0.01, "floor_deg": 0.0, "floor_m": 0.0})
+    rng = np.random.default_rng(5)
+    track = after(track_at(TRUTH), drawn(rng, 20), config)
+    alarms = sum(absorb(track, w, config).step is StepState.SUSPECTED for w in drawn(rng, 3000))
+    assert alarms == pytest.approx(30, abs=4 * sqrt(30))
+
+
+# -------------------------------------------------------------------------------------------------------- the rest
+@pytest.mark.parametrize("degrees_of_freedom", range(1, 7))
+def test_chi_square_tail_is_the_integral_of_its_density(degrees_of_freedom: int) -> None:
+    # In s = √x the density s^(k-1)·exp(-s²/2) has no pole at zero.
+    s = np.linspace(0.0, 12.0, 240_001)
+    density = s ** (degrees_of_freedom - 1) * np.exp(-(s**2) / 2.0)
+    steps = 0.5 * (density[1:] + density[:-1])
+    for at in (0.5, 1.0, 2.5, 4.0):
+        expected = steps[s[:-1] >= at - 1e-9].sum() / steps.sum()
+        assert chi_square_tail(at**2, degrees_of_freedom) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(("x", "k"), [(3.841459, 1), (7.814728, 3), (12.591587, 6)])
+def test_chi_square_tail_at_five_percent(x: float, k: int) -> None:
+    assert chi_square_tail(x, k) == pytest.approx(0.05, rel=1e-5)
+    assert chi_square_tail(0.0, k) == 1.0
+    assert chi_square_tail(1e6, k) == 0.0
+
+
+def test_a_restart_gives_the_same_bytes(rng: np.random.Generator) -> None:
+    windows = [*drawn(rng, 5), about(TRUTH, yaw(1.0)), about(TRUTH, yaw(1.01)), *drawn(rng, 2)]
+    config = FusionConfig()
+    through = track_at(TRUTH)
+    restarted = through
+    for window in windows:
+        through = absorb(through, window, config)
+        restarted = absorb(track_from_dict(json.loads(json.dumps(track_to_dict(restarted)))), window, config)
+    assert json.dumps(track_to_dict(through)) == json.dumps(track_to_dict(restarted))
+    assert through.T_camera_lidar.tobytes() == restarted.T_camera_lidar.tobytes()
+
+
+@pytest.mark.parametrize("broken", ["slow", "stamp_ns", "step", "prior_sigma"])
+def test_a_broken_document_is_refused(broken: str) -> None:
+    document = track_to_dict(track_at(TRUTH))
+    for value in (None, "x", [[1.0]]):
+        with pytest.raises(ValueError):  # noqa: PT011
+            track_from_dict({**document, broken: value})
+    del document[broken]
+    with pytest.raises(ValueError, match="not a track"):
+        track_from_dict(document)
+
+
+@pytest.mark.parametrize(
+    ("pose", "sigma"), [(2.0 * TRUTH, SIGMA), (TRUTH, np.zeros(6)), (TRUTH, ROTATION_ONLY), (TRUTH, SIGMA[:3])]
+)
+def test_a_track_starts_at_a_rigid_pose_with_a_spread(pose: Array, sigma: Array) -> None:
+    with pytest.raises(ValueError, match="of a track must be"):
+        Track.initial(pose, sigma)

@@ -1,0 +1,72 @@
+"""Scans along the axes, on hills whose summit is known."""
+
+from __future__ import annotations
+
+from math import radians
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.calibration.types import Matrix4
+from coec.evaluation.profiles import NARROW, WIDE, EdgeLandscape, Span, scan, views
+from coec.geometry import se3
+from coec.geometry.cameras import build
+from coec.geometry.edges.alignment import EdgeFrames, significances
+
+REFERENCE = se3.exp(np.array([1.2, -1.2, 1.2, 0.1, -0.3, 0.8]))
+
+
+class _Hill:
+    """Highest where the perturbation from the reference is `summit`."""
+
+    def __init__(self, summit: NDArray[np.float64]) -> None:
+        self._summit = summit
+
+    def score(self, T_camera_lidar: Matrix4) -> float:
+        return -float(np.sum((se3.difference(T_camera_lidar, REFERENCE) - self._summit) ** 2))
+
+
+SUMMIT = np.array([radians(1.0), radians(-1.0), radians(0.4), 0.05, -0.08, 0.02])
+
+
+@pytest.mark.parametrize("span", [WIDE, NARROW])
+@pytest.mark.parametrize("axes", [3, 6])
+def test_scan_finds_the_summit_on_every_axis(span: Span, axes: int) -> None:
+    scans = scan(_Hill(SUMMIT), REFERENCE, axes, span)
+    assert [one.axis for one in scans] == list(range(axes))
+    for one in scans:
+        reach = span.rotation_rad if one.axis < 3 else span.translation_m
+        assert one.offsets[[0, -1]] == pytest.approx([-reach, reach])
+        assert 0.0 in one.offsets
+        assert len(one.offsets) == len(one.scores) == span.points
+        nearest = np.abs(one.offsets - SUMMIT[one.axis]).min()
+        assert abs(one.best_offset - SUMMIT[one.axis]) == pytest.approx(nearest)
+
+
+def test_points_crowd_about_the_pose() -> None:
+    steps = np.diff(scan(_Hill(SUMMIT), REFERENCE, 1, WIDE)[0].offsets)
+    assert steps[len(steps) // 2] < radians(0.1)
+    assert steps[0] > radians(0.5)
+
+
+def test_views_are_those_of_every_landscape() -> None:
+    heard: list[tuple[int, str]] = []
+    named = {"one": _Hill(SUMMIT), "other": _Hill(-SUMMIT)}
+    seen = views(named, REFERENCE, 3, lambda done, name: heard.append((done, name)))
+    assert list(seen) == ["one", "other"]
+    assert heard == [(1, "one"), (2, "other")]
+    assert seen["one"].narrow[0].best_offset > 0 > seen["other"].narrow[0].best_offset
+
+
+def test_edge_landscape_is_the_significance() -> None:
+    camera = build("pinhole", width=40, height=30, fx=30.0, fy=30.0, cx=19.5, cy=14.5)
+    rng = np.random.default_rng(7)
+    # Pixels at integers, where both ways to look up a pixel agree.
+    u, v = rng.integers(2, 37, 50), rng.integers(2, 27, 50)
+    xyz = np.stack([(u - 19.5) / 30.0, (v - 14.5) / 30.0, np.ones(50)]).astype(np.float32)
+    maps = np.repeat(rng.integers(-40, 40, (1, 30, 1)), 40, axis=2).astype(np.int8)
+    frames = EdgeFrames(camera, xyz, np.ones(50, np.float32), np.array([0, 50]), maps)
+    expected = float(significances(frames, np.eye(4)[None])[0])
+    assert EdgeLandscape(frames).score(np.eye(4)) == pytest.approx(expected, abs=1e-3)
+    assert EdgeLandscape(frames).score(se3.exp(np.array([0, 3.0, 0, 0, 0, 0]))) == 0.0

@@ -1,0 +1,89 @@
+"""The significance of range edges on edge maps against its plain form."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.geometry import se3
+from coec.geometry.cameras import Camera, build
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
+from coec.geometry.projection import project
+from oracles import alignment_sums
+
+WIDTH, HEIGHT = 96, 64
+SENSOR = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 61.0, "cx": 47.2, "cy": 30.9}
+CAMERAS = {
+    "pinhole": build("pinhole", **SENSOR),
+    "kannala_brandt": build("kannala_brandt", **(SENSOR | {"fx": 30.0, "fy": 31.0}), k1=-0.02, k2=0.01, k3=0.0, k4=0.0),
+    "double_sphere": build("double_sphere", **(SENSOR | {"fx": 30.0, "fy": 31.0}), xi=-0.2, alpha=0.6),
+}
+POSE = se3.perturbation(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
+
+
+def frames_of(camera: Camera, counts: tuple[int, ...], seed: int = 0, blank: float = 0.1) -> EdgeFrames:
+    """Points all around, a part of them behind the camera, on maps of noise; `blank` is the share of masked pixels."""
+    rng = np.random.default_rng(seed)
+    maps = np.rint(STRENGTH_STEPS * rng.normal(size=(len(counts), HEIGHT, WIDTH))).astype(np.int8)
+    maps[rng.random(maps.shape) < blank] = VOID
+    return EdgeFrames(
+        camera=camera,
+        xyz_m=rng.normal(scale=10.0, size=(3, sum(counts))).astype(np.float32),
+        weight=rng.uniform(0.5, 1.8, sum(counts)).astype(np.float32),
+        first_point=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        maps=maps,
+    )
+
+
+def by_oracle(frames: EdgeFrames, pose: NDArray[np.float64], between_pixels: bool) -> NDArray[np.float64]:
+    """(F, 2): Σ w·e and Σ w² of every frame."""
+    strengths = np.where(frames.maps == VOID, np.nan, frames.maps / STRENGTH_STEPS)
+    uv_px, valid = project(frames.camera, frames.xyz_m.T.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
+    return np.array(
+        [
+            alignment_sums(uv_px[a:b], valid[a:b], frames.weight[a:b], strengths[f], between_pixels)
+            for f, (a, b) in enumerate(zip(frames.first_point[:-1], frames.first_point[1:], strict=True))
+        ]
+    )
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_every_camera_model_agrees_with_the_plain_form_between_pixels(model: str) -> None:
+    frames = frames_of(CAMERAS[model], (2000, 0, 1, 1501))
+    expected = by_oracle(frames, POSE, between_pixels=True)
+    assert expected[0, 1] > 50.0
+    strength, square = frame_alignment(frames, POSE)
+    np.testing.assert_allclose(strength, expected[:, 0], atol=1e-3)
+    np.testing.assert_allclose(square, expected[:, 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", CAMERAS)
+def test_every_camera_model_agrees_with_the_plain_form_at_the_nearest_pixel(model: str) -> None:
+    frames = frames_of(CAMERAS[model], (2000, 0, 1, 1501))
+    poses = np.stack([POSE, np.eye(4), se3.inverse(POSE)])
+    sums = [by_oracle(frames, pose, between_pixels=False).sum(axis=0) for pose in poses]
+    expected = [strength / np.sqrt(square) for strength, square in sums]
+    np.testing.assert_allclose(significances(frames, poses), expected, atol=1e-4)
+
+
+def test_points_behind_the_camera_and_masked_pixels_count_for_nothing() -> None:
+    frames = frames_of(CAMERAS["pinhole"], (500,))
+    behind = EdgeFrames(
+        frames.camera, -np.abs(frames.xyz_m), frames.weight, frames.first_point, np.ones_like(frames.maps)
+    )
+    assert [float(s[0]) for s in frame_alignment(behind, np.eye(4))] == [0.0, 0.0]
+    assert significances(behind, np.eye(4)[None]).tolist() == [0.0]
+    masked = EdgeFrames(frames.camera, frames.xyz_m, frames.weight, frames.first_point, np.full_like(frames.maps, VOID))
+    assert [float(s[0]) for s in frame_alignment(masked, np.eye(4))] == [0.0, 0.0]
+    assert significances(masked, np.eye(4)[None]).tolist() == [0.0]
+
+
+def test_edges_laid_at_random_have_a_significance_of_about_one_however_many_are_in_view() -> None:
+    for count in (300, 30_000):
+        z = [
+            significances(frames_of(CAMERAS["double_sphere"], (count,), seed, blank=0.0), POSE[None])[0]
+            for seed in range(60)
+        ]
+        assert np.mean(z) == pytest.approx(0.0, abs=4.0 / np.sqrt(60))
+        # Points share pixels when there are more of them than pixels: the deviation of many is above one.
+        assert 0.7 < np.std(z) < 2.5

@@ -1,0 +1,116 @@
+"""Range edges on scenes whose edges are known: a pole before a wall, seen by sensors of different make."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.geometry.edges.range_edges import MAX_WEIGHT_M, range_edges
+
+POLE_M, POLE_RADIUS_M, WALL_M = 6.0, 0.25, 15.0
+
+Cloud = tuple[NDArray[np.float32], NDArray[np.uint16]]
+
+
+def rays(beams: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint16]]:
+    """Azimuth, elevation and ring of an organised sweep over a quarter of a turn, 0.2° apart."""
+    # Off the round numbers, so that no beam lies on the border of a band of elevation.
+    elevation = np.radians(np.linspace(-15.03, 15.11, beams))
+    azimuth = np.radians(np.arange(-45.0, 45.0, 0.2) + 0.03)
+    ring = np.repeat(np.arange(beams, dtype=np.uint16), len(azimuth))
+    return np.tile(azimuth, beams), np.repeat(elevation, len(azimuth)), ring
+
+
+def placed(
+    azimuth: NDArray[np.float64], elevation: NDArray[np.float64], horizontal_m: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Points of the rays at these horizontal distances."""
+    xyz_m = [horizontal_m * np.cos(azimuth), horizontal_m * np.sin(azimuth), horizontal_m * np.tan(elevation)]
+    return np.column_stack(xyz_m).astype(np.float32)
+
+
+def pole_before_wall(beams: int, pole_m: float = POLE_M, wall_m: float = WALL_M) -> Cloud:
+    azimuth, elevation, ring = rays(beams)
+    on_pole = np.abs(pole_m * np.sin(azimuth)) < POLE_RADIUS_M
+    return placed(azimuth, elevation, np.where(on_pole, pole_m, wall_m / np.cos(azimuth))), ring
+
+
+def horizontal_m(xyz_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(np.hypot(xyz_m[:, 0], xyz_m[:, 1]))
+
+
+@pytest.mark.parametrize("beams", [16, 32, 64, 128])
+@pytest.mark.parametrize("with_ring", [True, False])
+def test_a_pole_before_a_wall_has_two_edges_per_beam_and_the_wall_none(beams: int, with_ring: bool) -> None:
+    xyz_m, ring = pole_before_wall(beams)
+    edges = range_edges(xyz_m, ring if with_ring else None)
+    assert np.bincount(ring[edges.index], minlength=beams).tolist() == [2] * beams
+    found = xyz_m[edges.index]
+    assert horizontal_m(found) == pytest.approx(POLE_M, abs=1e-3)
+    # The outermost columns on the pole, left and right of it.
+    assert np.abs(found[:, 1]).min() > POLE_RADIUS_M - POLE_M * np.radians(0.2)
+    assert np.count_nonzero(found[:, 1] > 0) == beams
+
+
+@pytest.mark.parametrize("beams", [16, 64, 128])
+def test_a_cloud_with_and_without_ring_agree(beams: int) -> None:
+    xyz_m, ring = pole_before_wall(beams)
+    known, unknown = range_edges(xyz_m, ring), range_edges(xyz_m, None)
+    assert sorted(known.index) == sorted(unknown.index)
+
+
+@pytest.mark.parametrize("with_ring", [True, False])
+def test_the_order_of_the_points_does_not_matter(with_ring: bool) -> None:
+    xyz_m, ring = pole_before_wall(64)
+    shuffle = np.random.default_rng(1).permutation(len(xyz_m))
+    plain = range_edges(xyz_m, ring if with_ring else None)
+    shuffled = range_edges(xyz_m[shuffle], ring[shuffle] if with_ring else None)
+    assert dict(zip(plain.index, plain.weight, strict=True)) == dict(
+        zip(shuffle[shuffled.index], shuffled.weight, strict=True)
+    )
+
+
+def test_the_weight_is_the_root_of_the_jump_up_to_a_cap() -> None:
+    xyz_m, ring = pole_before_wall(1, pole_m=10.0, wall_m=11.5)
+    edges = range_edges(xyz_m, ring)
+    range_m = np.linalg.norm(xyz_m, axis=1)
+    jumps_m = [max(range_m[i - 1], range_m[i + 1]) - range_m[i] for i in edges.index]
+    assert edges.weight == pytest.approx(np.sqrt(jumps_m), rel=1e-5)
+    far = range_edges(*pole_before_wall(1))
+    assert far.weight == pytest.approx(np.sqrt(MAX_WEIGHT_M))
+
+
+@pytest.mark.parametrize(("pole_m", "wall_m"), [(14.6, 15.0), (37.0, 38.5)])
+def test_a_step_below_half_a_metre_or_a_twentieth_of_the_range_is_no_edge(pole_m: float, wall_m: float) -> None:
+    xyz_m, ring = pole_before_wall(16, pole_m, wall_m)
+    ahead = np.abs(np.arctan2(xyz_m[:, 1], xyz_m[:, 0])) < np.radians(3.0)
+    assert len(range_edges(xyz_m[ahead], ring[ahead]).index) == 0
+
+
+def test_a_level_ground_has_no_edges() -> None:
+    """Rings lie far apart on the ground: their distance is no jump, whether the rings are known or not."""
+    azimuth, elevation, ring = rays(64)
+    down = elevation < np.radians(-2.0)
+    ground = placed(azimuth[down], elevation[down], -1.8 / np.tan(elevation[down]))
+    assert len(range_edges(ground, ring[down]).index) == 0
+    assert len(range_edges(ground, None).index) == 0
+
+
+def test_beyond_a_hole_is_no_neighbour() -> None:
+    """Glass or sky around a pole gives no returns: there is no telling what lies behind."""
+    xyz_m, ring = pole_before_wall(16)
+    half_width_rad = POLE_RADIUS_M / POLE_M
+    azimuth = np.abs(np.arctan2(xyz_m[:, 1], xyz_m[:, 0]))
+    kept = (azimuth < half_width_rad) | (azimuth > half_width_rad + np.radians(1.5))
+    assert len(range_edges(xyz_m[kept], ring[kept]).index) == 0
+
+
+def test_the_vehicle_itself_has_no_edges() -> None:
+    xyz_m, ring = pole_before_wall(16, pole_m=1.5)
+    assert len(range_edges(xyz_m, ring).index) == 0
+
+
+@pytest.mark.parametrize("ring", [None, np.zeros(0, np.uint16)])
+def test_an_empty_cloud_has_no_edges(ring: NDArray[np.uint16] | None) -> None:
+    edges = range_edges(np.zeros((0, 3), np.float32), ring)
+    assert edges.index.shape == (0,)
+    assert edges.weight.shape == (0,)

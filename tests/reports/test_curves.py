@@ -1,0 +1,55 @@
+"""Curves: that they are drawn whatever the figures are."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from coec.evaluation.profiles import Scan, Views
+from coec.evaluation.statistics import FramesPoint, SlicePoint, Spread
+from coec.reports import curves
+
+FLAT = Spread(0.01, 0.02, 0.03)
+EXACT = Spread(0.0, 0.0, 0.0)
+
+
+def _size(png: bytes) -> tuple[int, int]:
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    assert picture.std() > 5
+    return picture.shape[1], picture.shape[0]
+
+
+def _views(axes: int) -> Views:
+    offsets = np.linspace(-0.1, 0.1, 11)
+    scans = tuple(Scan(axis, offsets, np.exp(-(offsets**2))) for axis in range(axes))
+    return Views(scans, scans)
+
+
+def test_landscape_has_a_second_pair_of_rows_for_translations() -> None:
+    turned = curves.landscape(dict.fromkeys(("fused", "mi", "edges"), _views(3)), "title")
+    moved = curves.landscape(dict.fromkeys(("fused", "mi", "edges"), _views(6)), "title")
+    assert _size(moved)[1] > 1.8 * _size(turned)[1]
+
+
+def test_flat_landscape() -> None:
+    flat = tuple(Scan(axis, np.linspace(-1.0, 1.0, 5), np.zeros(5)) for axis in range(3))
+    _size(curves.landscape({"mi": Views(flat, flat)}, "title"))
+
+
+@pytest.mark.parametrize("with_translation", [False, True])
+@pytest.mark.parametrize("errors", [FLAT, EXACT])
+def test_error_against_frames(with_translation: bool, errors: Spread) -> None:
+    points = [FramesPoint(frames, 5, 0.8, errors, errors, np.nan) for frames in (1, 2, 5)]
+    _size(curves.error_against_frames(points, with_translation, "title"))
+
+
+def test_error_against_one_number_of_frames() -> None:
+    _size(curves.error_against_frames([FramesPoint(1, 1, 1.0, FLAT, FLAT, 0.01)], False, "title"))
+
+
+@pytest.mark.parametrize("with_translation", [False, True])
+def test_error_against_slice(with_translation: bool) -> None:
+    points = [SlicePoint(length, 5, 2.0, 20, 0.8, FLAT, FLAT, 0.02) for length in (7.5, 15.0, 120.0)]
+    _size(curves.error_against_slice(points, with_translation, "title"))

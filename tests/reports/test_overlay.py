@@ -1,0 +1,65 @@
+"""Points on images: where they land, which colour wins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coec.geometry.cameras import build
+from coec.reports.overlay import draw
+
+WIDTH, HEIGHT = 960, 540
+CAMERA = build("pinhole", width=WIDTH, height=HEIGHT, fx=400.0, fy=400.0, cx=480.0, cy=270.0)
+T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+TITLE_ROWS = round(WIDTH / 34)
+
+
+def _drawn(*points: tuple[float, float, float], mask: np.ndarray | None = None) -> np.ndarray:
+    """The picture without title and bar, on black."""
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    picture = draw(image, CAMERA, T_CAMERA_LIDAR, np.array(points, np.float32), mask, "title")
+    assert not image.any()
+    return picture[TITLE_ROWS : TITLE_ROWS + HEIGHT]
+
+
+def test_a_point_lands_where_the_camera_sees_it() -> None:
+    # 10 m ahead, 1 m to the left, 0.5 m up: u = 480 - 40, v = 270 - 20.
+    rows, columns = np.nonzero(_drawn((10.0, 1.0, 0.5)).any(axis=2))
+    assert rows.mean() == pytest.approx(250.0)
+    assert columns.mean() == pytest.approx(440.0)
+    assert len(rows) < 12
+
+
+def test_the_nearer_of_two_points_is_on_top_whatever_their_order() -> None:
+    near, far = (5.0, 0.0, 0.0), (50.0, 0.0, 0.0)
+    np.testing.assert_array_equal(_drawn(near, far), _drawn(far, near))
+    np.testing.assert_array_equal(_drawn(near, far), _drawn(near))
+    assert (_drawn(near)[270, 480] != _drawn(far)[270, 480]).any()
+
+
+def test_near_is_red_and_far_is_blue() -> None:
+    near, far = _drawn((2.5, 0, 0))[270, 480].astype(int), _drawn((79.0, 0, 0))[270, 480].astype(int)
+    assert near[2] > near[0]
+    assert far[0] > far[2]
+
+
+def test_points_behind_outside_and_masked_are_left_out() -> None:
+    assert not _drawn((-10.0, 0, 0)).any()
+    assert not _drawn((1.9, 0, 0)).any()
+    assert not _drawn((10.0, 50.0, 0)).any()
+    mask = np.ones((HEIGHT, WIDTH), np.bool_)
+    mask[:, 470:490] = False
+    assert not _drawn((10.0, 0, 0), mask=mask).any()
+    assert _drawn((10.0, 1, 0), mask=mask).any()
+
+
+def test_a_point_on_the_edge_is_cut_off() -> None:
+    # u = 480 - 400 · 12 / 10 = 0.
+    assert _drawn((10.0, 12.0, 0))[270, 0].any()
+
+
+def test_small_images_are_enlarged() -> None:
+    small = build("pinhole", width=200, height=100, fx=100.0, fy=100.0, cx=99.5, cy=49.5)
+    picture = draw(np.zeros((100, 200, 3), np.uint8), small, T_CAMERA_LIDAR, np.zeros((0, 3)), None, "")
+    assert picture.shape[1] == 1000
+    assert picture.shape[0] > 500

@@ -1,0 +1,62 @@
+"""What a command may say, and what is written down of who said it."""
+
+import msgpack
+import pytest
+
+from coec.errors import UsageError
+from coec.runtime.api.commands import MAX_SENDER, NAMES, parse, sender_of
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("payload", [b"", b"{}", b"\x80"])
+def test_every_command_can_come_without_arguments(name: str, payload: bytes) -> None:
+    assert parse(name, payload) == {}
+
+
+@pytest.mark.parametrize("pack", [lambda d: msgpack.packb(d), lambda d: str(d).replace("'", '"').encode()])
+def test_arguments_in_either_encoding(pack: object) -> None:
+    assert callable(pack)
+    assert parse("rollback", pack({"to": "0123abcd"})) == {"to": "0123abcd"}
+    assert parse("hold", msgpack.packb({"release": True})) == {"release": True}
+
+
+@pytest.mark.parametrize(
+    ("name", "payload"),
+    [
+        ("dance", b""),
+        ("calibrate", b"x"),
+        ("apply", b'{"force":true}'),
+        ("hold", b'{"release":1}'),
+        ("rollback", b'{"to":["a"]}'),
+        ("rollback", b"[]"),
+        ("reset", b"\xc1"),
+        ("reset", b"\x81\x01\x02"),
+        ("reset", b"{" * 100_000),
+        ("hold", msgpack.packb({str(i): i for i in range(1000)})),
+    ],
+)
+def test_what_is_no_command_is_refused_without_echo(name: str, payload: bytes) -> None:
+    with pytest.raises(UsageError) as refused:
+        parse(name, payload)
+    assert "force" not in str(refused.value)
+    assert "dance" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("attachment", "told"),
+    [
+        (None, "anonymous"),
+        (b"", "anonymous"),
+        (b"fleet@example.org/operator=7", "fleet@example.org/operator=7"),
+        (b'eve\n{"level": "error"}\x1b[31m', "eve___level_: _error___[31m".replace("[", "_")),
+    ],
+)
+def test_senders_are_one_harmless_line(attachment: bytes | None, told: str) -> None:
+    assert sender_of(attachment) == told
+
+
+def test_long_and_binary_senders_are_bounded() -> None:
+    assert sender_of(b"a" * 100_000) == "a" * MAX_SENDER
+    binary = sender_of(bytes(range(128, 256)) * 1000)
+    assert binary.startswith("128000 bytes, sha256 ")
+    assert len(binary) < MAX_SENDER

@@ -1,0 +1,90 @@
+"""Red events: kept over a restart, bounded, with what is needed to judge them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coec.adapters.files.conversions import transform_of
+from coec.errors import NotFoundError
+from coec.runtime.decisions.incidents import POINTS_AFTER, POINTS_KEPT, Evidence
+from coec.schemas.replies import EvidenceEvent, MetricsPoint, Reason
+
+
+def event(stamp: int, before: str | None = "front-1") -> EvidenceEvent:
+    return EvidenceEvent(
+        event_id=f"front-{stamp}",
+        vehicle="test",
+        pair="front",
+        stamp_ns=stamp,
+        wall_ns=7,
+        reasons=(Reason(code="bent_mount", text="It moved."),),
+        camera_from_lidar=transform_of(np.eye(4)),
+        window_before=before,
+        metrics=(),
+    )
+
+
+def point(stamp: int) -> MetricsPoint:
+    return MetricsPoint(stamp_ns=stamp, state="healthy", metrics={"mi": 0.5, "f1": None})
+
+
+def test_an_event_holds_the_figures_before_and_after_it(tmp_path: Path) -> None:
+    evidence = Evidence(tmp_path, "front", 3)
+    for stamp in range(POINTS_KEPT + 10):
+        evidence.note(point(stamp))
+    evidence.begin(event(1000))
+    for stamp in range(1001, 1001 + POINTS_AFTER + 20):
+        evidence.note(point(stamp))
+    stamps = [p.stamp_ns for p in evidence.event("front-1000").metrics]
+    assert stamps == [*range(10, POINTS_KEPT + 10), *range(1001, 1001 + POINTS_AFTER)]
+    assert evidence.listing("test").events[0].metrics == ()
+
+
+def test_windows_pictures_and_the_end_are_added_and_survive_a_restart(tmp_path: Path) -> None:
+    evidence = Evidence(tmp_path, "front", 3)
+    evidence.begin(event(1000))
+    assert evidence.awaiting is not None
+    evidence.add_window_after("front-2")
+    assert evidence.awaiting is None
+    assert evidence.add_window_after("front-3") is None
+    evidence.add_overlay("front-1000", "after", b"jpeg")
+    evidence.resolve(2000, "healthy: corrected")
+    evidence.resolve(3000, "again")
+    again = Evidence(tmp_path, "front", 3)
+    kept = again.event("front-1000")
+    assert (kept.window_before, kept.window_after, kept.overlays) == ("front-1", "front-2", ("after",))
+    assert (kept.resolved_stamp_ns, kept.resolution) == (2000, "healthy: corrected")
+    assert again.overlay("front-1000", "after") == b"jpeg"
+    assert again.window_ids == {"front-1", "front-2"}
+    with pytest.raises(NotFoundError, match="no picture"):
+        again.overlay("front-1000", "before")
+    with pytest.raises(NotFoundError, match="no such event"):
+        again.event("../../etc")
+
+
+def test_the_oldest_goes_when_there_are_too_many(tmp_path: Path) -> None:
+    evidence = Evidence(tmp_path, "front", 2)
+    for stamp in (1000, 900, 30_000):
+        evidence.begin(event(stamp, f"front-{stamp - 1}"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["front-30000", "front-900"]
+    assert evidence.window_ids == {"front-899", "front-29999"}
+    assert [e.event_id for e in Evidence(tmp_path, "front", 2).listing("test").events] == ["front-900", "front-30000"]
+
+
+def test_damaged_and_foreign_folders_are_passed_over(tmp_path: Path) -> None:
+    Evidence(tmp_path, "front", 2).begin(event(1000))
+    (tmp_path / "front-2000").mkdir()
+    (tmp_path / "front-2000" / "event.json").write_text("{")
+    (tmp_path / "front-1000").rename(tmp_path / "front-3000")
+    assert Evidence(tmp_path, "front", 2).listing("test").events == ()
+
+
+def test_a_disk_that_cannot_be_written_costs_evidence_only(tmp_path: Path) -> None:
+    (tmp_path / "evidence").write_text("a file")
+    evidence = Evidence(tmp_path / "evidence", "front", 2)
+    evidence.begin(event(1000))
+    assert evidence.lost == 1
+    assert evidence.event("front-1000").window_before == "front-1"

@@ -1,0 +1,98 @@
+"""What is remembered over a restart: states bit for bit, of the same rig only; results line by line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coec.adapters.files.conversions import result_of
+from coec.calibration.lifecycle import (
+    Change,
+    HealthState,
+    PairState,
+    Provenance,
+    Rules,
+    Status,
+    after_estimate,
+    after_failure,
+    held,
+    initial_state,
+)
+from coec.calibration.monitor.change_detector import MonitorState, Outcome
+from coec.calibration.types import Decision, Reason, Rig
+from coec.config import FusionConfig, PolicyConfig
+from coec.errors import StateError
+from coec.runtime.decisions.state_store import Clocks, StateStore
+from estimates import RIG, estimate
+
+RULES = Rules(PolicyConfig(apply="always"), FusionConfig())
+NEVER = Rules(PolicyConfig(apply="never"), FusionConfig())
+CLOCKS = Clocks(77, 88, 99)
+
+
+def restarted(folder: Path, rig: Rig = RIG) -> PairState | None:
+    remembered = StateStore(folder, "test").recall(rig)
+    return remembered.state if remembered else None
+
+
+def test_a_state_comes_back_bit_for_bit_and_says_that_it_was_restored(tmp_path: Path) -> None:
+    state = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
+    state = after_estimate(state, estimate(2, Decision.FAILED), 0, RULES)
+    StateStore(tmp_path, "test").remember(RIG, after_failure(state, Reason("worker_failed", "crash")), CLOCKS, "head")
+    remembered = StateStore(tmp_path, "test").recall(RIG)
+    assert remembered is not None
+    assert (remembered.clocks, remembered.history_head) == (CLOCKS, "head")
+    back = remembered.state
+    assert np.array_equal(back.T_camera_lidar, estimate(1).optimum.T_camera_lidar)
+    assert (back.provenance, back.status, back.valid_from_ns) == (Provenance.RESTORED, Status.FAILED, 1)
+    assert back.failures == (Reason("worker_failed", "crash"),)
+    assert back.latest is not None
+    assert back.accepted is not None
+    for kept, made in ((back.latest, estimate(2, Decision.FAILED)), (back.accepted, estimate(1))):
+        assert result_of(kept, RIG, "test") == result_of(made, RIG, "test")
+        assert np.array_equal(kept.correction, made.correction)
+    assert (back.health, back.reasons, back.proven) == (HealthState.DEGRADED, back.failures, True)
+
+
+def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> None:
+    state = held(after_estimate(initial_state(RIG), estimate(1), 0, NEVER))
+    monitor = MonitorState(1 / 3, Outcome.SUSPECT, {"dark": 0.1}, {"40": 2.5}, (0.1, 0.2), (5, 6))
+    state = replace(state, monitor=monitor, flagged_since_ns=4, changes=(Change(3, (0.1,) * 6),))
+    StateStore(tmp_path, "test").remember(RIG, state, CLOCKS)
+    first = (tmp_path / "state.json").read_bytes()
+    back = restarted(tmp_path)
+    assert back is not None
+    assert (back.frozen, back.monitor, back.flagged_since_ns, back.changes) == (True, monitor, 4, state.changes)
+    assert back.pending is not None
+    assert back.pending.contradicts
+    assert np.array_equal(back.pending.T_camera_lidar, estimate(1).optimum.T_camera_lidar)
+    StateStore(tmp_path, "test").remember(RIG, back, CLOCKS)
+    assert (tmp_path / "state.json").read_bytes() == first
+
+
+def test_pairs_do_not_touch_each_other(tmp_path: Path) -> None:
+    rear = replace(RIG, pair="rear")
+    store = StateStore(tmp_path, "test")
+    store.remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS)
+    store.remember(rear, initial_state(rear), CLOCKS)
+    front, back = restarted(tmp_path), restarted(tmp_path, rear)
+    assert front is not None
+    assert front.status is Status.ACCEPTED
+    assert back is not None
+    assert back.status is Status.NOT_ACCEPTED
+
+
+def test_the_state_of_another_rig_is_not_used(tmp_path: Path) -> None:
+    StateStore(tmp_path, "test").remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS)
+    assert restarted(tmp_path, replace(RIG, T_camera_lidar_nominal=np.eye(4))) is None
+    assert restarted(tmp_path, replace(RIG, pair="other")) is None
+
+
+def test_an_intact_file_of_another_form_is_an_error(tmp_path: Path) -> None:
+    store = StateStore(tmp_path, "test")
+    store._file.save({"pairs": {"front": {"matrix": 1}}})
+    with pytest.raises(StateError, match="another form"):
+        StateStore(tmp_path, "test").recall(RIG)

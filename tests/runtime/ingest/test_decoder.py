@@ -1,0 +1,148 @@
+"""From samples to frames: the encoding chooses the decoder, what does not fit is counted, nothing is raised."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+
+import numpy as np
+import pytest
+
+from coec.adapters.frames import msgpack_frames
+from coec.adapters.ros import cdr
+from coec.adapters.system.logs import LossCounter
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
+from coec.config import IDENTITY, CameraConfig, CameraIntrinsics, EgoConfig, LidarConfig, LimitsConfig, PairConfig
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Intake
+from coec.runtime.ingest.inbox import Call, Inbox, Parcel
+
+MSGPACK, CDR = "application/msgpack", "application/cdr"
+PAIR = PairConfig(
+    name="front",
+    camera=CameraConfig(
+        key="c",
+        type="sensor_msgs/msg/Image",
+        intrinsics=CameraIntrinsics(model="pinhole", width=4, height=3, fx=1, fy=1, cx=1, cy=1),
+    ),
+    lidar=LidarConfig(key="l", encoding="cdr"),
+    ego=EgoConfig(key="e"),
+    T_camera_lidar=IDENTITY,
+)
+CLOUD = LidarFrame(5, "lidar", np.ones((2, 3), np.float32))
+MOTION = EgoMotion(5, "base", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def camera(sequence: int | None = None, frame_id: str = "camera", width: int = 4, height: int = 3) -> CameraFrame:
+    image = EncodedImage(ImageFormat.MONO8, width, height, bytes(width * height))
+    return CameraFrame(5, frame_id, image, sequence)
+
+
+class Desk:
+    """An intake and what it lost."""
+
+    def __init__(self) -> None:
+        self.losses = LossCounter(logging.getLogger("test"), "front")
+        self.intake = Intake(PAIR, LimitsConfig(), self.losses)
+        self._order = itertools.count()
+
+    def take(self, stream: str, payload: bytes, encoding: str = "zenoh/bytes") -> object:
+        return self.intake.frame(Parcel(next(self._order), stream, payload, encoding))
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+def test_the_samples_encoding_is_believed(desk: Desk) -> None:
+    type_name, image = cdr.encode_image(camera())
+    assert desk.take(CAMERA, msgpack_frames.encode_camera(camera()), MSGPACK) == camera()
+    assert desk.take(CAMERA, image, f"{CDR};{type_name}") == camera()
+    assert desk.take(CAMERA, image, CDR) == camera(), "the type of the configuration"
+    assert isinstance(desk.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK), LidarFrame)
+    assert isinstance(desk.take(EGO, cdr.encode_odometry(MOTION, "base"), CDR), EgoMotion)
+    assert not desk.losses.snapshot()
+
+
+def test_else_the_configurations(desk: Desk) -> None:
+    assert desk.take(CAMERA, msgpack_frames.encode_camera(camera())) == camera()
+    assert isinstance(desk.take(LIDAR, cdr.encode_cloud(CLOUD)), LidarFrame)
+    assert desk.take(EGO, msgpack_frames.encode_ego(MOTION), "text/plain") == MOTION
+    assert desk.intake.counts(EGO).accepted == 1
+
+
+@pytest.mark.parametrize(
+    ("stream", "payload", "encoding", "reason"),
+    [
+        (CAMERA, msgpack_frames.encode_camera(camera(frame_id="other")), MSGPACK, "frame_id"),
+        (CAMERA, msgpack_frames.encode_camera(camera(width=5)), MSGPACK, "image_size"),
+        (CAMERA, cdr.encode_cloud(CLOUD), f"{CDR};sensor_msgs/msg/PointCloud2", "wrong_type"),
+        (LIDAR, bytes(33 * 2**20), CDR, "message_too_large"),
+    ],
+)
+def test_what_does_not_fit_is_counted_by_reason(
+    desk: Desk, stream: str, payload: bytes, encoding: str, reason: str
+) -> None:
+    assert desk.take(stream, payload, encoding) is None
+    assert desk.losses.snapshot() == {(stream, reason): 1}
+    assert (desk.intake.counts(stream).received, desk.intake.counts(stream).accepted) == (1, 0)
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80", b"\xdd\xff\xff\xff\xff", b"\x00\x01\x00\x00"])
+@pytest.mark.parametrize("encoding", [MSGPACK, CDR, f"{CDR};no_such/msg/Type", "", ";;;"])
+@pytest.mark.parametrize("stream", [CAMERA, LIDAR, EGO])
+def test_rubbish_is_counted_once(desk: Desk, stream: str, payload: bytes, encoding: str) -> None:
+    assert desk.take(stream, payload, encoding) is None
+    ((place, reason),) = desk.losses.snapshot()
+    assert place == stream
+    assert reason != "decoder_fault"
+
+
+def test_a_fault_of_a_decoder_costs_the_message_only(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(msgpack_frames, "decode_ego", lambda *_: 1 // 0)
+    assert desk.take(EGO, b"", MSGPACK) is None
+    assert desk.losses.snapshot() == {(EGO, "decoder_fault"): 1}
+
+
+def test_gaps_in_the_numbers_are_loss_but_a_new_count_is_not(desk: Desk) -> None:
+    for sequence in (7, 8, 11, 11, 0, 1, 2_000_000):
+        assert desk.take(CAMERA, msgpack_frames.encode_camera(camera(sequence)), MSGPACK) is not None
+    assert desk.losses.snapshot() == {(CAMERA, "sequence_gap"): 2}
+
+
+def test_losses_are_logged_first_and_then_ever_more_rarely(caplog: pytest.LogCaptureFixture) -> None:
+    losses = LossCounter(logging.getLogger("test"), "front")
+    for _ in range(1000):
+        losses.add(CAMERA, "frame_id")
+    assert len(caplog.records) == 10  # 1, 2, 4, ... 512
+    assert losses.snapshot() == {(CAMERA, "frame_id"): 1000}
+
+
+# --- the inbox ---------------------------------------------------------------------------------------------------
+
+
+def test_samples_are_taken_in_the_order_of_arrival_and_the_oldest_go_first() -> None:
+    overruns: list[str] = []
+    inbox = Inbox({CAMERA: 2, EGO: 8}, overruns.append)
+    for number, stream in enumerate([CAMERA, EGO, CAMERA, EGO, CAMERA]):
+        inbox.put(stream, bytes([number]), "")
+    taken = [inbox.take(0.0) for _ in range(5)]
+    assert [item.payload[0] for item in taken if isinstance(item, Parcel)] == [1, 2, 3, 4]
+    assert taken[-1] is None
+    assert overruns == [CAMERA]
+
+
+def test_a_call_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
+    inbox = Inbox({CAMERA: 2}, lambda _: None)
+    inbox.put(CAMERA, b"", "")
+    inbox.call(lambda: None)
+    assert isinstance(inbox.take(0.0), Call)
+    assert isinstance(inbox.take(0.0), Parcel)
+    got: list[object] = []
+    reader = threading.Thread(target=lambda: got.append(inbox.take(60.0)))
+    reader.start()
+    inbox.put(CAMERA, b"x", "")
+    reader.join(20.0)
+    assert len(got) == 1
+    assert isinstance(got[0], Parcel)

@@ -1,0 +1,34 @@
+"""Pairs that wait are bounded in bytes and in time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame
+from coec.runtime.ingest.pair_buffer import HeldPairs, bytes_of
+
+IMAGE = EncodedImage(ImageFormat.MONO8, 4, 2, bytes(8))
+
+
+def pair(stamp_ns: int) -> FramePair:
+    cloud = LidarFrame(stamp_ns, "lidar", np.zeros((10, 3), np.float32), ring=np.zeros(10, np.uint16))
+    return FramePair(CameraFrame(stamp_ns, "camera", IMAGE, depth=IMAGE), cloud)
+
+
+def test_bytes_are_those_of_images_and_points() -> None:
+    assert bytes_of(pair(0)) == 8 + 8 + 120 + 20
+
+
+def test_the_oldest_goes_first_and_waits_for_so_many_seconds_and_bytes() -> None:
+    held = HeldPairs(max_bytes=3 * bytes_of(pair(0)), max_wait_s=10.0)
+    for stamp_ns in (1, 2, 3):
+        held.add(pair(stamp_ns))
+    assert not held.has_waited(100.0)
+    assert not held.has_waited(110.0)
+    assert held.has_waited(110.5)
+    held.may_go()
+    assert not held.has_waited(111.0)
+    held.add(pair(4))
+    assert held.has_waited(111.0)
+    assert (held.next_ns, held.take().stamp_ns, len(held)) == (1, 1, 3)
+    assert not held.has_waited(111.0)

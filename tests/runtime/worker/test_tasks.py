@@ -1,0 +1,48 @@
+"""What a worker that says it is ready has behind it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+SCRIPT = """
+import gc
+from numba.core.dispatcher import Dispatcher
+from coec.runtime.worker.tasks import Solver
+from coec.calibration.calibrator import calibrate
+from coec.calibration.ports import Silence
+from coec.sources import windows
+from coec.cli.convert import configuration_for
+from coec.config import CalibrationConfig, Config, DepthConfig, ObjectiveConfig, SearchConfig
+from coec.sources import open_source
+
+source = "synthetic:?frames=6&width=160&period_s=2"
+window = windows.load(source, None, 25, lambda *_: None).window
+pair = configuration_for(open_source(source), window.T_camera_lidar_start, None)
+settings = dict(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=4.0))
+configuration = CalibrationConfig(**settings)
+config = Config(pairs=(pair.model_copy(update={"calibration": configuration}),))
+
+
+def kernels():
+    compiled = [kernel for kernel in gc.get_objects() if isinstance(kernel, Dispatcher)]
+    return {(kernel.py_func.__qualname__, str(types)) for kernel in compiled for types in kernel.overloads}
+
+
+solver = Solver(config, 8)
+solver.warm_up()
+warm = kernels()
+for kind in ("fused", "mi"):
+    solved = CalibrationConfig(**settings, objective=ObjectiveConfig(kind=kind))
+    calibrate(window, solver._network(solved.depth), solver._images, solved, Silence())
+print(len(warm), sorted(kernels() - warm))
+"""
+
+
+def test_no_calibration_waits_for_a_kernel_after_the_warm_up() -> None:
+    """In a process of its own: in this one, other tests have run them all."""
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    warm, left = done.stdout.split(maxsplit=1)
+    assert int(warm) > 15
+    assert left.strip() == "[]"
