@@ -256,7 +256,7 @@ class CalibrationConfig(Stage):
     motion_compensation: bool = True
 
 
-class FusionConfig(Stage):
+class TrackerConfig(Stage):
     """How accepted windows combine into the extrinsic that is served. Rotations per axis in degrees, translations in
     metres."""
 
@@ -284,9 +284,9 @@ class FusionConfig(Stage):
 class MonitorConfig(Stage):
     """When the latest pairs are judged at the current extrinsic, between two windows."""
 
-    period_s: float = Field(default=5.0, gt=0, le=86_400, description="one look per so much sensor time, s")
-    pairs: int = Field(default=6, ge=4, le=10, description="pairs of one look, evenly over the period")
-    min_pairs: int = Field(default=4, ge=4, le=10, description="with fewer the look waits for the next period")
+    period_s: float = Field(default=5.0, gt=0, le=86_400, description="one check per so much sensor time, s")
+    pairs: int = Field(default=6, ge=4, le=10, description="pairs of one check, evenly over the period")
+    min_pairs: int = Field(default=4, ge=4, le=10, description="with fewer the check waits for the next period")
     urgent_slice_s: float = Field(
         default=30.0, gt=0, le=3600, description="slice of the window that is taken as soon as the monitor suspects, s"
     )
@@ -329,7 +329,7 @@ class PairConfig(Stage):
     calibration: CalibrationConfig = CalibrationConfig()
     monitor: MonitorConfig = MonitorConfig()
     policy: PolicyConfig = PolicyConfig()
-    fusion: FusionConfig = FusionConfig()
+    tracker: TrackerConfig = TrackerConfig()
 
 
 class LimitsConfig(Stage):
@@ -355,7 +355,7 @@ class StateConfig(Stage):
         default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
     )
     history: int = Field(default=500, ge=1, le=10_000, description="entries kept per pair")
-    looks: int = Field(default=2000, ge=1, le=100_000, description="looks of the monitor kept per pair, 2 kB each")
+    checks: int = Field(default=2000, ge=1, le=100_000, description="checks of the monitor kept per pair, 2 kB each")
     evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
 
 

@@ -100,7 +100,7 @@ class Daemon:
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: PairService(pair, config, outside) for pair in config.pairs}
         self._bus = Bus(open_session(config.zenoh, config.limits))
-        self._status_reply = self._look()
+        self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
 
     def serve(self, signals: Signals, reread: Callable[[], Config] | None) -> int:
@@ -247,10 +247,10 @@ class Daemon:
     def _renew(self) -> None:
         for pair in self._pairs.values():
             pair.refresh()
-        self._status_reply = self._look()
+        self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
 
-    def _look(self) -> replies.StatusReply:
+    def _status_now(self) -> replies.StatusReply:
         usage = self._folder.usage()
         return replies.StatusReply(
             version=__version__,

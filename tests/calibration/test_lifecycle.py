@@ -28,10 +28,10 @@ from coec.calibration.lifecycle import (
     restored,
     rolled_back,
 )
-from coec.calibration.monitor.change_detector import Observation, Outcome
+from coec.calibration.monitor.change_detector import Finding, Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import Decision, Estimate, Optimum, Reason, Rig, StopReason, Verdict
-from coec.config import FusionConfig, PolicyConfig
+from coec.config import PolicyConfig, TrackerConfig
 from coec.geometry import se3
 from coec.geometry.cameras import build
 
@@ -41,8 +41,8 @@ LATE_NS = 10_000 * S
 CRASH = Reason("worker_failed", "The worker crashed twice.")
 OVERLAP = Reason("overlap", "too little")
 
-RULES = Rules(PolicyConfig(), FusionConfig())
-NEVER = Rules(PolicyConfig(apply="never"), FusionConfig())
+RULES = Rules(PolicyConfig(), TrackerConfig())
+NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig())
 
 RIG = Rig(
     "front",
@@ -89,7 +89,7 @@ def solved(state: PairState, value: Estimate, rules: Rules = RULES) -> PairState
     return after_estimate(state, value, value.data_stamp_ns - 50 * S, rules)
 
 
-def look(stamp_s: int, flagged: bool = False, cause: str | None = None) -> Observation:
+def check(stamp_s: int, flagged: bool = False, cause: str | None = None) -> Observation:
     return Observation(
         stamp_ns=stamp_s * S,
         pair_stamps_ns=tuple((stamp_s - i) * S for i in range(4, -1, -1)),
@@ -104,16 +104,16 @@ def look(stamp_s: int, flagged: bool = False, cause: str | None = None) -> Obser
     )
 
 
-def watched(state: PairState, *looks: Observation) -> PairState:
-    return reduce(after_observation, looks, state)
+def watched(state: PairState, *checks: Observation) -> PairState:
+    return reduce(after_observation, checks, state)
 
 
 def flagged_from(stamp_s: int, count: int) -> list[Observation]:
-    return [look(stamp_s + 5 * i, flagged=True) for i in range(count)]
+    return [check(stamp_s + 5 * i, flagged=True) for i in range(count)]
 
 
 def clear_from(stamp_s: int, count: int) -> list[Observation]:
-    return [look(stamp_s + 5 * i) for i in range(count)]
+    return [check(stamp_s + 5 * i) for i in range(count)]
 
 
 HEALTHY = solved(initial_state(RIG), estimate(0.5))
@@ -179,7 +179,7 @@ def test_a_single_window_that_differs_moves_nothing_and_a_second_one_decides() -
     assert one.health is HealthState.SUSPECT
     assert [reason.code for reason in one.reasons] == ["step_suspected"]
     assert one.pending is not None
-    assert watched(one, *clear_from(310, 3)).health is HealthState.SUSPECT, "against a window a look does not count"
+    assert watched(one, *clear_from(310, 3)).health is HealthState.SUSPECT, "against a window a check does not count"
     back = solved(one, estimate(0.5, 500))
     assert back.health is HealthState.HEALTHY
     assert back.pending is None
@@ -191,8 +191,8 @@ def test_a_single_window_that_differs_moves_nothing_and_a_second_one_decides() -
 # --- the monitor ------------------------------------------------------------------------------------------------
 
 
-def test_one_bad_look_decides_nothing() -> None:
-    state = watched(HEALTHY, *clear_from(110, 3), look(125, flagged=True), *clear_from(130, 2))
+def test_one_bad_check_decides_nothing() -> None:
+    state = watched(HEALTHY, *clear_from(110, 3), check(125, flagged=True), *clear_from(130, 2))
     assert state.health is HealthState.HEALTHY
     assert state.flagged_since_ns is None
 
@@ -213,7 +213,7 @@ def test_a_moved_mount_becomes_suspect_then_red_and_the_next_window_corrects_it(
     fresh = after_estimate(mixed, estimate(1.5, 260), 220 * S, RULES)
     assert fresh.health is HealthState.HEALTHY
     np.testing.assert_array_equal(fresh.T_camera_lidar, pose_of(estimate(1.5)))
-    assert fresh.monitor.outcome is Outcome.UNKNOWN
+    assert fresh.monitor.outcome is Finding.UNKNOWN
     assert fresh.flagged_since_ns is None
 
 
@@ -233,7 +233,7 @@ def test_a_window_elsewhere_and_a_monitor_that_suspects_are_two_witnesses() -> N
     assert before_estimate(HEALTHY, moved, begin_ns, RULES) is HEALTHY, "one witness"
 
 
-def test_where_no_look_was_ever_clear_the_first_window_counts_in_full() -> None:
+def test_where_no_check_was_ever_clear_the_first_window_counts_in_full() -> None:
     red = watched(initial_state(RIG), *flagged_from(200, 3))
     assert red.flagged_since_ns == 0
     assert after_estimate(red, estimate(1.5, 260), 150 * S, RULES).health is HealthState.HEALTHY
@@ -271,7 +271,7 @@ def test_red_fades_by_staying_clear_through_yellow_only() -> None:
 
 @pytest.mark.parametrize("code", sorted(set(CAUSES) - {"bent_mount"}))
 def test_a_cause_in_the_data_degrades_with_its_own_reason_and_passes(code: str) -> None:
-    state = watched(HEALTHY, *[look(200 + 5 * i, flagged=True, cause=code) for i in range(4)])
+    state = watched(HEALTHY, *[check(200 + 5 * i, flagged=True, cause=code) for i in range(4)])
     assert state.health is HealthState.DEGRADED
     assert [reason.code for reason in state.reasons] == [code]
     assert watched(state, *clear_from(300, 6)).health is HealthState.HEALTHY
@@ -279,7 +279,7 @@ def test_a_cause_in_the_data_degrades_with_its_own_reason_and_passes(code: str) 
 
 def test_bad_data_do_not_hide_a_red_state() -> None:
     red = watched(HEALTHY, *flagged_from(200, 3))
-    dirty = watched(red, *[look(300 + 5 * i, cause="lens_dirty") for i in range(4)])
+    dirty = watched(red, *[check(300 + 5 * i, cause="lens_dirty") for i in range(4)])
     assert dirty.health is HealthState.MISCALIBRATED
     assert [reason.code for reason in dirty.reasons] == ["bent_mount", "lens_dirty"]
 
@@ -305,7 +305,7 @@ def test_a_step_beyond_the_limits_waits_for_a_person() -> None:
 
 
 def test_the_steps_of_a_day_add_up() -> None:
-    rules = Rules(PolicyConfig(max_step_deg=2.0, max_per_day_deg=3.0), FusionConfig())
+    rules = Rules(PolicyConfig(max_step_deg=2.0, max_per_day_deg=3.0), TrackerConfig())
     state = solved(initial_state(RIG), estimate(1.9, 100), rules)
     state = reduce(lambda s, e: solved(s, e, rules), [estimate(0.2, 300), estimate(0.2, 500)], state)
     assert [reason.code for reason in state.reasons] == ["candidate_waits", "day_exhausted"]

@@ -22,12 +22,12 @@ from coec.calibration.tracker import (
     track_from_dict,
     track_to_dict,
 )
-from coec.config import FusionConfig
+from coec.config import TrackerConfig
 from coec.geometry import se3
 
 Array = NDArray[np.float64]
 
-STILL = FusionConfig(drift_deg_per_sqrt_h=0.0, drift_m_per_sqrt_h=0.0)
+STILL = TrackerConfig(drift_deg_per_sqrt_h=0.0, drift_m_per_sqrt_h=0.0)
 """A mount that does not creep: the order of windows does not matter."""
 
 SIGMA = np.array([radians(0.05), radians(0.04), radians(0.1), 0.03, 0.02, 0.05])
@@ -56,7 +56,7 @@ def drawn(rng: np.random.Generator, count: int, sigma: Array = SIGMA) -> list[Me
     return [about(TRUTH, rng.normal(0.0, SIGMA), sigma, k * PERIOD_NS) for k in range(count)]
 
 
-def after(track: Track, measurements: list[Measurement], config: FusionConfig = STILL) -> Track:
+def after(track: Track, measurements: list[Measurement], config: TrackerConfig = STILL) -> Track:
     for measurement in measurements:
         track = absorb(track, measurement, config)
     return track
@@ -135,7 +135,7 @@ def test_a_window_that_tells_nothing_changes_nothing() -> None:
 
 def test_a_mount_that_creeps_is_followed(rng: np.random.Generator) -> None:
     """A fifth of a degree in twenty hours, a window every three minutes."""
-    config = FusionConfig()
+    config = TrackerConfig()
     track = Track.initial(TRUTH, prior_sigma(config))
     hours = 20
     for k in range(hours * 20):
@@ -155,7 +155,7 @@ def test_reported_sigma_never_falls_below_what_averaging_cannot_remove(rng: np.r
 
 def test_three_sigma_covers() -> None:
     """Honest windows: the track's own three sigma, without any floor, hold in at least 99 of 100 runs per axis."""
-    config = FusionConfig(floor_deg=0.0, floor_m=0.0, drift_deg_per_sqrt_h=0.0, drift_m_per_sqrt_h=0.0)
+    config = TrackerConfig(floor_deg=0.0, floor_m=0.0, drift_deg_per_sqrt_h=0.0, drift_m_per_sqrt_h=0.0)
     rng = np.random.default_rng(11)
     covered = np.zeros(6)
     for _ in range(300):
@@ -252,7 +252,7 @@ def test_chi_square_tail_at_five_percent(x: float, k: int) -> None:
 
 def test_a_restart_gives_the_same_bytes(rng: np.random.Generator) -> None:
     windows = [*drawn(rng, 5), about(TRUTH, yaw(1.0)), about(TRUTH, yaw(1.01)), *drawn(rng, 2)]
-    config = FusionConfig()
+    config = TrackerConfig()
     through = track_at(TRUTH)
     restarted = through
     for window in windows:

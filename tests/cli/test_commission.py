@@ -10,10 +10,10 @@ from typing import Any
 Coec = Callable[..., Any]
 
 RIG = "synthetic:?frames=8&width=320&period_s=2"
-"""A street that is cast in a second and has edges enough for a look."""
+"""A street that is cast in a second and has edges enough for a check."""
 
 
-def test_one_look_at_a_right_and_at_a_wrong_extrinsic(coec: Coec) -> None:
+def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec) -> None:
     right = coec("diagnose", RIG, "--depth", "stereo", "--json")
     assert right.status == 0
     assert right.document["causes"] == []

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from coec.calibration.types import EgoMotion
 from coec.cli.demo import report, story
-from coec.cli.demo.outcome import Outcome, outcome_of
+from coec.cli.demo.outcome import Ending, outcome_of
 from coec.cli.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
 from coec.cli.demo.screen import BARS, curve
 from coec.cli.demo.vehicle import NS_PER_S, paced
@@ -38,7 +38,7 @@ ALARM = replace(KNOCKED, drive_s=51.0, health="miscalibrated")
 REPAIRED = replace(HEALTHY, drive_s=61.0, window_id="w-2", error_deg=0.06)
 
 
-def outcome(*moments: Moment) -> Outcome:
+def outcome(*moments: Moment) -> Ending:
     return outcome_of(moments, KNOCK_S, MAX_ERROR_DEG)
 
 
@@ -180,7 +180,7 @@ def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
     (pair,) = config.pairs
     assert pair.calibration.objective.kind == "fused"
     assert pair.calibration == type(pair.calibration)(), "with the network that comes with it"
-    assert (pair.policy, pair.fusion) == (type(pair.policy)(), type(pair.fusion)())
+    assert (pair.policy, pair.tracker) == (type(pair.policy)(), type(pair.tracker)())
     left, top, width, height = story.CLOSE_UP_PX
     assert left + width <= drive.rig.camera.width
     assert top + height <= drive.rig.camera.height

@@ -214,16 +214,16 @@ def test_starts_too_far_for_any_box_are_a_usage_error() -> None:
 
 
 def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("LOOKS", "FAR_LOOKS", "HALVES"):
+    for name in ("CHECKS", "FAR_CHECKS", "HALVES"):
         monkeypatch.setattr(learning, name, 3)
-    monkeypatch.setattr(experiments, "LOOKS", 2)
+    monkeypatch.setattr(experiments, "CHECKS", 2)
     arguments = (SMALL.replace("frames=6", "frames=9"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
     diagnosed = coec("diagnose", *arguments, "--looks", "2", "--json").document
     detection = report.document["detection"]
     assert detection == {key: diagnosed[key] for key in ("splits", "pairs", "moves")}
     assert [row["name"] for row in detection["moves"]][:4] == ["right", "0.5 deg", "1 deg", "3 deg"]
-    assert all(row["looks"] == 2 for row in detection["moves"])
+    assert all(row["checks"] == 2 for row in detection["moves"])
 
 
 def test_a_recording_too_short_for_detection_is_refused_before_the_work(coec: Coec) -> None:

@@ -36,7 +36,7 @@ STEP = f"&faults=step:{STEP_S}:ry=1"
 SPEED = 8.0
 """Seconds of the drive per second."""
 
-LOOK_S = 5.0
+CHECK_S = 5.0
 PATIENCE_S = 180.0
 POLL_S = 0.05
 AT_REST = 4
@@ -66,7 +66,7 @@ def configured(folder: Path, calibration: CalibrationConfig, policy: PolicyConfi
     pair = config.pairs[0].model_copy(
         update={
             "window": WindowConfig(pairs=16, min_pairs=8, slice_s=32.0),
-            "monitor": MonitorConfig(period_s=LOOK_S, pairs=5, min_pairs=4, urgent_slice_s=16.0),
+            "monitor": MonitorConfig(period_s=CHECK_S, pairs=5, min_pairs=4, urgent_slice_s=16.0),
             "policy": policy or PolicyConfig(),
         }
     )

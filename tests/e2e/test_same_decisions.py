@@ -40,7 +40,7 @@ def decisions(ride: Ride) -> dict[str, Any]:
         "results": ride.ask(ride.keys.history(ride.pair))["results"],
         "windows": [(window["window_id"], window["pairs"], window["decision"]) for window in windows],
         "extrinsic": ride.extrinsic()["camera_from_lidar"],
-        "looks": ride.ask(ride.keys.history(ride.pair))["looks"],
+        "checks": ride.ask(ride.keys.history(ride.pair))["checks"],
         "losses": ride.status()["losses"],
     }
 

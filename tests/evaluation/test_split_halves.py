@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coec.evaluation.split_halves import compare, split
-from coec.evaluation.statistics import Outcome, Trial, judge
+from coec.evaluation.statistics import Outcome, Trial, score
 from evaluation.test_statistics import FAR, REFERENCE, _estimate, _xi
 
 
@@ -35,7 +35,7 @@ def test_one_frame_has_no_halves() -> None:
 
 def _ended(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> Outcome:
     estimate = _estimate(_xi(*deg), accepted, radians(sigma_deg))
-    return judge(Trial(FAR, estimate, 1.0), REFERENCE, 3)
+    return score(Trial(FAR, estimate, 1.0), REFERENCE, 3)
 
 
 def test_differences_and_their_cover_are_per_axis() -> None:

@@ -14,7 +14,7 @@ from coec.evaluation.statistics import (
     Outcome,
     Trial,
     frames_point,
-    judge,
+    score,
     slice_point,
     spread,
     summarise,
@@ -65,7 +65,7 @@ def _estimate(error: NDArray[np.float64], accepted: bool, sigma: float = np.nan)
 
 
 def _outcome(*deg_m: float, accepted: bool = True, dof: int = 3, solve_s: float = 1.0, sigma: float = 0.1) -> Outcome:
-    return judge(Trial(FAR, _estimate(_xi(*deg_m), accepted, sigma), solve_s), REFERENCE, dof)
+    return score(Trial(FAR, _estimate(_xi(*deg_m), accepted, sigma), solve_s), REFERENCE, dof)
 
 
 def test_errors_are_counted_from_the_reference_about_the_camera_axes() -> None:
@@ -91,7 +91,7 @@ def test_a_hit_is_near_in_what_was_searched(deg_m: tuple[float, ...], dof: int, 
 
 
 def test_without_an_estimate_it_ends_where_it_started() -> None:
-    outcome = judge(Trial(FAR, None, 0.1), REFERENCE, 3)
+    outcome = score(Trial(FAR, None, 0.1), REFERENCE, 3)
     assert outcome.rotation_rad == pytest.approx(radians(10.0))
     assert not outcome.hit
     assert not outcome.accepted

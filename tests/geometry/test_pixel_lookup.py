@@ -36,7 +36,7 @@ def single_precision(camera: Camera, pose: NDArray[np.float64], xyz: NDArray[np.
 
 
 def double_precision(camera: Camera, pose: NDArray[np.float64], xyz: NDArray[np.float32]) -> NDArray[np.int64]:
-    """By the projection of arrays, not by the look-up's own exact form."""
+    """By the projection of arrays, not by the check-up's own exact form."""
     with np.errstate(invalid="ignore"):
         p_camera = xyz.T.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     uv_px, valid = project(camera, p_camera)

@@ -113,7 +113,7 @@ class KnowingWorker:
     fault: Reason | None = None
     estimates: dict[str, Estimate] = field(default_factory=dict)
 
-    def look(self, errand: Errand) -> None:
+    def check(self, errand: Errand) -> None:
         if self.fault is not None:
             errand.done(self.fault)
             return
@@ -150,8 +150,8 @@ class SlowWorker(KnowingWorker):
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     waiting: list[Callable[[], None]] = field(default_factory=list)
 
-    def look(self, errand: Errand) -> None:
-        self.waiting.append(partial(super().look, errand))
+    def check(self, errand: Errand) -> None:
+        self.waiting.append(partial(super().check, errand))
 
     def solve(self, job: SolveJob) -> None:
         self.waiting.append(partial(super().solve, job))
@@ -426,26 +426,26 @@ def test_a_red_event_leaves_evidence(bench: Bench) -> None:
     assert bench.service.ledger.evidence.event(event.event_id) == whole
 
 
-def test_every_look_can_be_read_afterwards(bench: Bench) -> None:
+def test_every_check_can_be_read_afterwards(bench: Bench) -> None:
     bench.drive(BEGIN_S, END_S)
     history = bench.service.history(0, 2**63 - 1, 1000)
-    assert len(history.looks) == bench.service.status().looks > 20
-    states = [look.state for look in history.looks]
+    assert len(history.checks) == bench.service.status().checks > 20
+    states = [check.state for check in history.checks]
     assert [state for state, before in zip(states, [None, *states], strict=False) if state != before] == [
         "unknown",
         "healthy",
         "suspect",
         "healthy",
     ], "red is the word of a window here"
-    suspect = next(look for look in history.looks if look.state == "suspect")
+    suspect = next(check for check in history.checks if check.state == "suspect")
     assert (suspect.outcome, suspect.flagged) == ("suspect", True)
     assert suspect.evidence >= 1.5
-    told = bench.service.history(STEP_S * S, 2**63 - 1, 3).looks
-    assert told == history.looks[-3:]
+    told = bench.service.history(STEP_S * S, 2**63 - 1, 3).checks
+    assert told == history.checks[-3:]
     health = bench.service.health_reply
-    assert health.look == history.looks[-1]
+    assert health.check == history.checks[-1]
     bench.restart()
-    assert bench.service.history(0, 2**63 - 1, 1000).looks == history.looks
+    assert bench.service.history(0, 2**63 - 1, 1000).checks == history.checks
 
 
 def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: Bench) -> None:
@@ -458,7 +458,7 @@ def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: Bench) -> 
     (reason,) = told.reasons
     assert reason.code == "monitor_blind"
     assert "ZeroDivisionError" in reason.text
-    assert bench.service.status().losses["look_internal_error"] >= 3
+    assert bench.service.status().losses["check_internal_error"] >= 3
     assert bench.health == "healthy", "the decisions are not touched"
     bench.worker.fault = None
     bench.drive(BEGIN_S + 90, STEP_S)
@@ -488,7 +488,7 @@ def test_a_baseline_of_something_else_is_refused_aloud(bench: Bench, spoilt: dic
     assert bench.service.health_reply.drift is None
 
 
-def test_a_baseline_of_another_network_is_refused_at_the_first_look(bench: Bench) -> None:
+def test_a_baseline_of_another_network_is_refused_at_the_first_check(bench: Bench) -> None:
     learned = learned_hash(bench.config.pairs[0].calibration)
     save_baseline(bench.folder / "rig.json", replace(a_baseline(), config_hash=learned))
     bench.restart()

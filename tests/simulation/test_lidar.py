@@ -54,7 +54,7 @@ def test_points_lie_on_the_walls() -> None:
     np.testing.assert_allclose(elevation, np.asarray(EXACT.elevations_rad)[found.ring], atol=1e-5)
 
 
-def test_it_turns_clockwise_from_the_rear_and_is_stamped_as_it_looks_forward() -> None:
+def test_it_turns_clockwise_from_the_rear_and_is_stamped_as_it_checks_forward() -> None:
     found = sweep(a_scene(a_room()), EXACT, moving(0.0), 5.0, np.random.default_rng(0))
     azimuth = np.arctan2(found.xyz_m[:, 1], found.xyz_m[:, 0])
     np.testing.assert_allclose(found.time_offset_s, -azimuth / (2 * np.pi) * EXACT.period_s, atol=1e-6)

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 
-from coec.calibration.estimators import ESTIMATORS, look
+from coec.calibration.estimators import ESTIMATORS, sight_of
 from coec.calibration.frames.motion_compensation import compensation
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
@@ -33,7 +33,7 @@ def calibrate(
     dof = config.search.dof
 
     # P_i and D_i, the objective and its maximum.
-    sight = look(window, depth, images, config, progress)
+    sight = sight_of(window, depth, images, config, progress)
     found = ESTIMATORS[config.objective.kind](sight, config)
     search, curvature = found.search, measure_curvature(found.objective, found.search.T_camera_lidar, dof)
     blind = unobservable(curvature, dof, config.verdict)

@@ -83,17 +83,17 @@ class Sight:
         """
         return self._each("images", lambda index: self.images.grey(self.window.pairs[index].camera))
 
-    def _each(self, stage: str, look: Callable[[int], Seen]) -> Iterator[Seen]:
+    def _each(self, stage: str, sight_of: Callable[[int], Seen]) -> Iterator[Seen]:
         for index, pair in enumerate(self.window.pairs):
             try:
-                seen = look(index)
+                seen = sight_of(index)
             except DecodeError as error:
                 raise CalibrationError(f"no {stage} for the camera frame at {pair.stamp_ns} ns: {error}") from error
             self.progress.step(stage, index + 1, len(self.window.pairs))
             yield seen
 
 
-def look(
+def sight_of(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, progress: Progress
 ) -> Sight:
     """The window as `config` wants it seen; without a mask of the rig's, with the one its frames tell."""

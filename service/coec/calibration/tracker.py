@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.types import Estimate, Matrix4
-from coec.config import FusionConfig
+from coec.config import TrackerConfig
 from coec.geometry import se3
 from coec.geometry.linear import congruent, solved
 
@@ -141,19 +141,19 @@ class Track:
         """Windows in the slow track since it started or started again."""
         return self.slow.windows
 
-    def sigma(self, config: FusionConfig) -> NDArray[np.float64]:
+    def sigma(self, config: TrackerConfig) -> NDArray[np.float64]:
         """(6,) standard deviations to report, radians and metres: noise, and the error that averaging cannot remove."""
         return np.array(
             [sqrt(v + f * f) for v, f in zip(self.covariance.diagonal().tolist(), _floor(config), strict=True)]
         )
 
 
-def prior_sigma(config: FusionConfig) -> NDArray[np.float64]:
+def prior_sigma(config: TrackerConfig) -> NDArray[np.float64]:
     """(6,) how far the nominal calibration may be off, radians and metres."""
     return np.array([radians(config.prior_deg)] * 3 + [config.prior_m] * 3)
 
 
-def absorb(track: Track, measurement: Measurement, config: FusionConfig) -> Track:
+def absorb(track: Track, measurement: Measurement, config: TrackerConfig) -> Track:
     """The track after another accepted window; a window that tells no axis leaves it as it is."""
     axes = measurement.told_axes()
     if not axes:
@@ -187,14 +187,14 @@ def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belie
     return Belief(pose, covariance, told, 1)
 
 
-def _drifted(belief: Belief, elapsed_h: float, config: FusionConfig) -> Belief:
+def _drifted(belief: Belief, elapsed_h: float, config: TrackerConfig) -> Belief:
     """A mount creeps: a random walk on every axis."""
     walk = [radians(config.drift_deg_per_sqrt_h) ** 2] * 3 + [config.drift_m_per_sqrt_h**2] * 3
     return replace(belief, covariance=belief.covariance + np.diag([elapsed_h * q for q in walk]))
 
 
 def _disagreement(
-    belief: Belief, measurement: Measurement, axes: list[int], config: FusionConfig
+    belief: Belief, measurement: Measurement, axes: list[int], config: TrackerConfig
 ) -> tuple[float, float]:
     """Squared Mahalanobis distance on the axes told, and its probability. Windows of different scenes differ by what
     windows of one scene have in common, so the floor counts as noise here."""
@@ -227,7 +227,7 @@ def _updated(belief: Belief, measurement: Measurement, axes: list[int]) -> Belie
     )
 
 
-def _floor(config: FusionConfig) -> list[float]:
+def _floor(config: TrackerConfig) -> list[float]:
     return [radians(config.floor_deg)] * 3 + [config.floor_m] * 3
 
 

@@ -60,7 +60,7 @@ class CameraFrame:
 
 @dataclass(frozen=True, slots=True)
 class ImageQuality:
-    """What one look at an exposure tells, at half its size.
+    """What one check at an exposure tells, at half its size.
 
     Attributes:
         sharpness: mean squared gradient over twice the grey-value variance: 0 to about 1, falls with blur.

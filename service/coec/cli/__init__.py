@@ -213,7 +213,7 @@ def _commission(
     dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None,
     frames: Frames = None,
     false_alarm_rate: Annotated[
-        float, typer.Option(help="Share of looks at a right extrinsic that may be flagged.", min=1e-4, max=0.2)
+        float, typer.Option(help="Share of checks at a right extrinsic that may be flagged.", min=1e-4, max=0.2)
     ] = 0.01,
     sensor: Annotated[
         list[str] | None,
@@ -255,11 +255,11 @@ def _diagnose(
             help="Instead, print how well moved extrinsics are seen, over N splits of the pairs.", metavar="N", min=0
         ),
     ] = 0,
-    looks: Annotated[int, typer.Option(help="Looks per split and move, with --detection.", min=1)] = 10,
+    checks: Annotated[int, typer.Option(help="Checks per split and move, with --detection.", min=1)] = 10,
     frames: Frames = None,
     as_json: Json = False,
 ) -> None:
-    """Take one look at the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong."""
+    """Take one check of the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong."""
     from coec.cli import diagnose as command
 
     options = command.Options(
@@ -268,7 +268,7 @@ def _diagnose(
         rig=rig,
         perturb=perturb,
         detection=detection,
-        looks=looks,
+        checks=checks,
         frames=frames,
         as_json=as_json,
     )

@@ -13,7 +13,7 @@ import numpy as np
 from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
 from coec.adapters.files import output
 from coec.adapters.images.codec import GreyImages, decode_bgr
-from coec.calibration.estimators import Sight, look
+from coec.calibration.estimators import Sight, sight_of
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.types import Window
 from coec.cli import calibrate as calibrate_command
@@ -61,7 +61,7 @@ def run(options: Options) -> int:
         configuration = calibrate_command.configuration_of(asked, loaded.configuration)
         depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
         took_ms = _infer(window, depth, stages)
-        sight = look(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
+        sight = sight_of(window, depth, GreyImages(LimitsConfig()), configuration, Silence())
         quality = depth_quality.assess(sight, configuration, stages.begin("compare", STAGES))
         if options.output is not None:
             draw = stages.begin("draw", None)

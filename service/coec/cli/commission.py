@@ -130,19 +130,19 @@ def show(baseline: Baseline) -> None:
         f"{baseline.pair}: commissioned from {baseline.pairs} pairs of {baseline.windows} "
         f"window{'s' if baseline.windows > 1 else ''}, hash {baseline_hash(baseline)}"
     )
-    table = console.table("axis", "bias", "± σ", "σ of a look at 6 pairs", "unit", right=(1, 2, 3))
+    table = console.table("axis", "bias", "± σ", "σ of a check at 6 pairs", "unit", right=(1, 2, 3))
     bias, known = _in_degrees(baseline.pose.bias), _in_degrees(baseline.pose.bias_sigma)
-    of_look = _in_degrees(baseline.pose.sigma(6))
+    of_check = _in_degrees(baseline.pose.sigma(6))
     for axis, name in enumerate(console.AXIS_NAMES):
         table.add_row(
             name,
             console.figure(bias[axis], sign=True),
             console.figure(known[axis]),
-            console.figure(of_look[axis]),
+            console.figure(of_check[axis]),
             console.UNITS[axis],
         )
     console.out.print(table)
-    limits = console.table("limit of a look", "value", right=(1,))
+    limits = console.table("limit of a check", "value", right=(1,))
     monitor = baseline.monitor
     for name, value in (
         ("mi, nats, at least", monitor.min_mi),

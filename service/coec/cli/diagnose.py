@@ -11,7 +11,7 @@ import numpy as np
 from coec.adapters.files.baseline_file import load_baseline
 from coec.adapters.files.conversions import metric_of
 from coec.calibration.commissioning.baseline import learned_hash, mismatch
-from coec.calibration.estimators import look
+from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import gather
 from coec.calibration.monitor.check_verdict import observe
 from coec.cli import calibrate as calibrate_command
@@ -33,13 +33,13 @@ class Options:
     rig: Path | None = None
     perturb: str | None = None
     detection: int = 0
-    looks: int = 10
+    checks: int = 10
     frames: int | None = None
     as_json: bool = False
 
 
 def run(options: Options) -> int:
-    """One look at the recording's extrinsic, 1 if it is flagged; with `detection`, the table instead.
+    """One check at the recording's extrinsic, 1 if it is flagged; with `detection`, the table instead.
 
     Raises:
         CoecError: nothing can be seen.
@@ -52,18 +52,18 @@ def run(options: Options) -> int:
         rigged = commission.load((options.source,), of_source, times)
         if options.detection > 0:
             return _tabulate(rigged, options, times)
-        return _look(rigged, options)
+        return _check(rigged, options)
 
 
 def _tabulate(rigged: commission.Rigged, options: Options, times: calibrate_command.StageTimes) -> int:
     window = rigged.windows[0]
-    evidence = gather(look(window, rigged.depth, rigged.images, rigged.configuration, times))
+    evidence = gather(sight_of(window, rigged.depth, rigged.images, rigged.configuration, times))
     tried = try_detection(
         evidence,
         window.T_camera_lidar_start,
         rigged.configuration,
         options.detection,
-        options.looks,
+        options.checks,
         lambda done, total: times.step("splits", done, total),
     )
     report = detection_of(tried, options.detection, len(evidence.pairs))
@@ -74,7 +74,7 @@ def _tabulate(rigged: commission.Rigged, options: Options, times: calibrate_comm
     return 0
 
 
-def _look(rigged: commission.Rigged, options: Options) -> int:
+def _check(rigged: commission.Rigged, options: Options) -> int:
     window = rigged.windows[0]
     if options.perturb is not None:
         moved = se3.perturb(window.T_camera_lidar_start, windows.perturbation_of(options.perturb))

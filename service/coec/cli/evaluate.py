@@ -251,7 +251,7 @@ def _experiments(options: Options, subject: _Subject, bench: Bench, stages: Stag
         halves = experiments.in_halves(bench, options.halves, *radii, stages)
     detection = None
     if options.detection:
-        tried = experiments.detected(bench, options.detection, experiments.LOOKS, stages)
+        tried = experiments.detected(bench, options.detection, experiments.CHECKS, stages)
         detection = detection_of(tried, options.detection, len(bench.window.pairs))
     return _Experiments(from_reference, outcomes, frames, slices, halves, detection)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
-from coec.calibration.estimators import depth_features, look
+from coec.calibration.estimators import depth_features, sight_of
 from coec.calibration.ports import Silence
 from coec.cli import calibrate as calibrate_command
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
@@ -91,7 +91,7 @@ def run(options: Options) -> int:
 
 def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
     """Limits learned on every second pair, tried on the others."""
-    sight = look(bench.window, bench.depth, bench.images, bench.configuration, Silence())
+    sight = sight_of(bench.window, bench.depth, bench.images, bench.configuration, Silence())
     frames = depth_features(sight, bench.reference)
     heard = stages.begin("metrics", 2 * options.samples)
     rig, right = bench.window.rig, bench.reference
@@ -106,7 +106,7 @@ def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> dict[str
     rows = [
         {
             "moved_deg": moved,
-            "looks": options.samples,
+            "checks": options.samples,
             "flagged": float(np.mean([limits.flags(f) for f in tried if f.moved_deg == moved])),
         }
         for moved in paper.MOVES_DEG
@@ -232,11 +232,11 @@ def _figures(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def _show(document: dict[str, Any]) -> None:
-    moves = console.table("extrinsic off by", "looks", "flagged by equation (2)", "published", right=(1, 2, 3))
+    moves = console.table("extrinsic off by", "checks", "flagged by equation (2)", "published", right=(1, 2, 3))
     for row in document["failure_metrics"]["moves"]:
         published = paper_published.FLAGGED.get(row["moved_deg"])
         theirs = "" if published is None else f"{100 * published:.1f} %"
-        moves.add_row(f"{row['moved_deg']:g}°", str(row["looks"]), f"{100 * row['flagged']:.1f} %", theirs)
+        moves.add_row(f"{row['moved_deg']:g}°", str(row["checks"]), f"{100 * row['flagged']:.1f} %", theirs)
     console.out.print(moves)
     solves = console.table("solves", "runs", "hits", "classified", "pitch", "yaw", "roll", right=(1, 2, 3, 4, 5, 6))
     for name, row in [("all pairs", document["bullseye"]), *(("windows", row) for row in document["drive"])]:

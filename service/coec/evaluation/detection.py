@@ -1,6 +1,6 @@
 """How well a wrong extrinsic is seen: limits learned on some pairs of a recording, tried on the others.
 
-Both classifiers are tried on the same looks: the paper's, equation (2), and the distance of the local optimum.
+Both classifiers are tried on the same checks: the paper's, equation (2), and the distance of the local optimum.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.learning import is_flagged, learn_accuracy, learn_limits
-from coec.calibration.monitor.check import Evidence, Look, look_at
+from coec.calibration.monitor.check import Check, CheckInput, check_at
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, by_equation_2
 from coec.calibration.types import Matrix4
 from coec.config import CalibrationConfig
@@ -30,33 +30,33 @@ MOVES = (
 """By name: rotation about a random axis (rad), translation along a camera axis (m)."""
 
 OBSERVABLE_M = 0.02
-"""An axis of translation is observable where a look knows it to this: 10 cm are five of them."""
+"""An axis of translation is observable where a check knows it to this: 10 cm are five of them."""
 
 MIN_RECORDED = 2 * MIN_PAIRS + 1
-"""Pairs of a recording that can be split: a look needs `MIN_PAIRS`, commissioning one more."""
+"""Pairs of a recording that can be split: a check needs `MIN_PAIRS`, commissioning one more."""
 
 SEED = 20_230_617
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """Looks at one kind of move: how many, and the share that each classifier flagged. Of the right pose these are the
-    false alarms."""
+    """Checks after one kind of move: how many, and the share that each classifier flagged. Of the right pose these are
+    the false alarms."""
 
     name: str
-    looks: int
+    checks: int
     flagged: float
     flagged_by_paper: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tried:
-    """One look: the move it was after, and what both classifiers said."""
+    """One check: the move it was after, and what both classifiers said."""
 
     name: str
     flagged: bool
     flagged_by_paper: bool
-    look: Look
+    check: Check
 
 
 def require_enough(pairs: int) -> None:
@@ -73,15 +73,15 @@ def require_enough(pairs: int) -> None:
 
 
 def try_detection(
-    evidence: Evidence,
+    evidence: CheckInput,
     right: Matrix4,
     config: CalibrationConfig,
     splits: int,
-    looks: int,
+    checks: int,
     heard: Callable[[int, int], None],
 ) -> list[Tried]:
-    """Splits the pairs in two `splits` times (seeded), learns on one half, and tries `looks` looks after every move on
-    the other; `heard(done, total)` counts the splits.
+    """Splits the pairs in two `splits` times (seeded), learns on one half, and tries `checks` checks after every move
+    on the other; `heard(done, total)` counts the splits.
 
     Raises:
         CalibrationError: fewer than `MIN_RECORDED` pairs.
@@ -100,11 +100,11 @@ def try_detection(
         for name, turn_rad, shift_m in MOVES:
             if shift_m > 0.0 and not known:
                 continue
-            for _ in range(looks):
+            for _ in range(checks):
                 size = int(rng.integers(MIN_PAIRS, len(kept) + 1))
                 indices = sorted(rng.permutation(kept)[:size].tolist())
                 xi = _move(rng, turn_rad, shift_m, known)
-                seen = look_at(evidence.of(indices), se3.perturb(right, xi), config, accuracies[0].expected)
+                seen = check_at(evidence.of(indices), se3.perturb(right, xi), config, accuracies[0].expected)
                 tried.append(Tried(name, is_flagged(seen, *accuracies, limits), by_equation_2(seen, limits), seen))
         heard(split + 1, splits)
     return tried

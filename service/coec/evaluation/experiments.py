@@ -12,7 +12,7 @@ from rich.progress import Progress
 from coec.adapters.depth.maps import CachedDepth
 from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.calibrator import calibrate
-from coec.calibration.estimators import look
+from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import gather
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Matrix4, Window
@@ -32,8 +32,8 @@ SLICE_SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 SLICES = 5
 """Places in a recording from which slices of one length are taken, at most; they do not overlap."""
 
-LOOKS = 10
-"""Looks per split and move at which detection is tried, unless told otherwise."""
+CHECKS = 10
+"""Checks per split and move at which detection is tried, unless told otherwise."""
 
 
 class Stages:
@@ -87,7 +87,7 @@ class Bench:
         except CalibrationError:
             estimate = None
         trial = Trial(start, estimate, time.perf_counter() - began_s)
-        return statistics.judge(trial, self.reference, self.configuration.search.dof)
+        return statistics.score(trial, self.reference, self.configuration.search.dof)
 
 
 def inferred(window: Window, model: DepthModel, heard: Callable[[int, str], None]) -> DepthModel:
@@ -214,14 +214,16 @@ def in_halves(bench: Bench, splits: int, rotation_rad: float, translation_m: flo
     return split_halves.compare(outcomes, available // 2, bench.configuration.search.dof)
 
 
-def detected(bench: Bench, splits: int, looks: int, stages: Stages) -> list[Tried]:
-    """How well the monitor sees a wrong extrinsic: limits learned on some pairs, `looks` looks per split and move at
+def detected(bench: Bench, splits: int, checks: int, stages: Stages) -> list[Tried]:
+    """How well the monitor sees a wrong extrinsic: limits learned on some pairs, `checks` checks per split and move at
     the others."""
-    decode, heard = stages.begin("looks", None), stages.begin("detection", splits)
+    decode, heard = stages.begin("checks", None), stages.begin("detection", splits)
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
-    evidence = gather(look(window, bench.depth, bench.images, bench.configuration, Silence()))
+    evidence = gather(sight_of(window, bench.depth, bench.images, bench.configuration, Silence()))
     decode(1, "")
-    return try_detection(evidence, bench.reference, bench.configuration, splits, looks, lambda done, _: heard(done, ""))
+    return try_detection(
+        evidence, bench.reference, bench.configuration, splits, checks, lambda done, _: heard(done, "")
+    )
 
 
 def poses_of(bench: Bench, directions: int, rotation_deg: float, translation_m: float) -> list[Matrix4]:

@@ -10,7 +10,7 @@ from math import radians
 import numpy as np
 
 from coec.adapters.depth.maps import open_depth
-from coec.calibration.estimators import depth_features, look
+from coec.calibration.estimators import depth_features, sight_of
 from coec.calibration.objective.mutual_information import build_mutual_information
 from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import box_of
@@ -57,7 +57,7 @@ def run_times(source: str, configuration: CalibrationConfig, stages: Stages) -> 
 
 def _run_time(bench: Bench, chosen: list[int]) -> RunTime:
     window = replace(bench.window, pairs=tuple(bench.window.pairs[index] for index in chosen))
-    sight = look(window, bench.depth, bench.images, bench.configuration, Silence())
+    sight = sight_of(window, bench.depth, bench.images, bench.configuration, Silence())
     features = depth_features(sight, bench.reference)
     box = box_of(bench.configuration.search)
     mutual = build_mutual_information(features, window.rig, bench.reference, box, bench.configuration.objective)

@@ -154,7 +154,7 @@ class SlicePoint:
     sigma_rad: float
 
 
-def judge(trial: Trial, reference: Matrix4, dof: int) -> Outcome:
+def score(trial: Trial, reference: Matrix4, dof: int) -> Outcome:
     """The trial against the reference (4, 4); with 6 degrees of freedom a hit needs the translation too."""
     estimate = trial.estimate
     ended = trial.start if estimate is None else estimate.optimum.T_camera_lidar

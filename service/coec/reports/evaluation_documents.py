@@ -78,7 +78,7 @@ def halves_of(halves: Halves) -> wire.HalvesReport:
 
 
 def detection_of(tried: Sequence[Tried], splits: int, pairs: int) -> wire.DetectionReport:
-    """The looks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
+    """The checks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
     moves = tuple(wire.DetectionRow(**asdict(row)) for row in table(tried))
     return wire.DetectionReport(splits=splits, pairs=pairs, moves=moves)
 

@@ -8,7 +8,7 @@ from math import degrees
 from pathlib import Path
 
 from coec.adapters.files import output
-from coec.calibration.estimators import look
+from coec.calibration.estimators import sight_of
 from coec.calibration.ports import Silence
 from coec.evaluation import profiles, starts, statistics
 from coec.evaluation.experiments import SUBSETS, Bench
@@ -83,7 +83,7 @@ def write_comparison(
 def write_landscape(folder: Path, bench: Bench, title: str, heard: Callable[[int, str], None]) -> None:
     """The fused objective and its witnesses about the reference, each by itself."""
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
-    sight = look(window, bench.depth, bench.images, bench.configuration, Silence())
+    sight = sight_of(window, bench.depth, bench.images, bench.configuration, Silence())
     named = profiles.landscapes(sight, bench.configuration)
     seen = profiles.views(named, bench.reference, bench.configuration.search.dof, heard)
     output.write(folder / "profiles.png", curves.landscape(seen, f"{title}\nabout the source's calibration"))

@@ -184,10 +184,10 @@ def _show_experiments(report: EvaluationReport) -> None:
 
 
 def show_detection(detection: DetectionReport) -> None:
-    """Looks at moved extrinsics: how many of them each classifier flags."""
-    table = console.table("extrinsic", "looks", "flagged", "by equation (2)", right=(1, 2, 3))
+    """Checks of moved extrinsics: how many of them each classifier flags."""
+    table = console.table("extrinsic", "checks", "flagged", "by equation (2)", right=(1, 2, 3))
     for row in detection.moves:
-        table.add_row(row.name, str(row.looks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
+        table.add_row(row.name, str(row.checks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
     console.out.print(table)
     console.show(
         f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other"

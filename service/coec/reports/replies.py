@@ -130,7 +130,7 @@ def event(payload: bytes) -> None:
         console.show(f"  {reason.code}: {reason.text}")
     console.show(f"windows: before {reply.window_before or '-'}, after {reply.window_after or '-'}")
     names = sorted({name for point in reply.metrics for name in point.metrics})
-    table = console.table("look", "state", *names, right=range(2, 2 + len(names)))
+    table = console.table("check", "state", *names, right=range(2, 2 + len(names)))
     for point in reply.metrics:
         figures = [console.figure(point.metrics.get(name)) for name in names]
         table.add_row(_instant(point.stamp_ns), console.styled(point.state), *figures)

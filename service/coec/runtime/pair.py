@@ -1,6 +1,6 @@
-"""The flow of one camera-LiDAR pair: samples to windows and looks, both to the worker, results to what is served.
+"""The flow of one camera-LiDAR pair: samples to windows and checks, both to the worker, results to what is served.
 
-Three threads meet here, and each owns its part: the ingest thread the streams (pairing, window, looks), the recorder
+Three threads meet here, and each owns its part: the ingest thread the streams (pairing, window, checks), the recorder
 thread the files, the worker's supervisor the results. What they share is the ledger, which has a lock of its own.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from coec.adapters.depth.maps import STEREO
 from coec.adapters.files.baseline_file import BASELINES, load_baseline
-from coec.adapters.files.conversions import degrees_or_null, estimate_of, look_of, result_of
+from coec.adapters.files.conversions import check_of, degrees_or_null, estimate_of, result_of
 from coec.adapters.files.rig import rig_of
 from coec.adapters.frames.msgpack_frames import encode_camera
 from coec.adapters.images.codec import Inspector
@@ -30,10 +30,10 @@ from coec.adapters.zenoh.bus import Answer
 from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Baseline, drift, learned_hash, mismatch
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.frames.sampling import LookSampler
+from coec.calibration.frames.sampling import CheckSampler
 from coec.calibration.frames.window import PairSelected, SliceEnded, WindowCutter
 from coec.calibration.lifecycle import Health, HealthState, PairState, Rules
-from coec.calibration.monitor.change_detector import Observation, Outcome
+from coec.calibration.monitor.change_detector import Finding, Observation
 from coec.calibration.monitor.urgency import Urgency
 from coec.calibration.types import Estimate, FramePair, Matrix4, Reason
 from coec.config import CalibrationConfig, Config, PairConfig, config_hash
@@ -44,7 +44,7 @@ from coec.runtime.api.overlays import Overlays
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.decisions.incidents import Side
 from coec.runtime.decisions.pair_store import Ledger, Served, Taken
-from coec.runtime.decisions.queue import Effect, Judgements, Question
+from coec.runtime.decisions.queue import DecisionQueue, Effect, Question
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Intake, StreamCounts
 from coec.runtime.ingest.inbox import Call, Inbox
@@ -73,13 +73,13 @@ GRACE_NS = NS_PER_S
 
 WINDOW_PERIODS = 2
 """Periods of the monitor after the end of a window from which on its result counts in the choice of further pairs: at
-10 s more than a solve takes, so that a live stream does not wait. The result of a look counts after one period."""
+10 s more than a solve takes, so that a live stream does not wait. The result of a check counts after one period."""
 
 IDLE_S = 0.25
 COMMAND_TIMEOUT_S = 10.0
 
-LOOKS_IN_VAIN = 3
-"""Looks in a row that came to nothing, from which on health says so."""
+CHECKS_IN_VAIN = 3
+"""Checks in a row that came to nothing, from which on health says so."""
 
 COMMISSIONING_WINDOWS = 8
 """Windows that a rig is commissioned from, the newest: 200 pairs."""
@@ -115,7 +115,7 @@ class PairService:
         self._config = config
         self._outside = outside
         self._rig = rig_of(pair)
-        self._rules = Rules(pair.policy, pair.fusion)
+        self._rules = Rules(pair.policy, pair.tracker)
         self.losses = LossCounter(_log, pair.name)
         depths = {CAMERA: FRAMES_WAITING, LIDAR: FRAMES_WAITING, EGO: MOTIONS_WAITING}
         self.inbox = Inbox(depths, lambda stream: self.losses.add(stream, "overrun"))
@@ -130,7 +130,7 @@ class PairService:
         self._intake = Intake(pair, config.limits, self.losses)
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._cutter = WindowCutter(pair.window, self._rig, Inspector(config.limits))
-        self._sampler = LookSampler(pair.monitor, pair.window)
+        self._sampler = CheckSampler(pair.monitor, pair.window)
         self._urgency = Urgency(pair.monitor, pair.window)
         self._clock, self._pace = SensorClock(), SensorClock()
         self._held = HeldPairs(config.limits.max_held_bytes, config.worker.timeout_s)
@@ -144,13 +144,13 @@ class PairService:
         # Shared.
         self.ledger = Ledger(self._rig, config.vehicle, config.state, outside.store, outside.folder, self.losses)
         self._view = self.ledger.served
-        self._judgements = Judgements()
+        self._decisions = DecisionQueue()
         self._asked: dict[str, Question] = {}
         self._overlays = Overlays(pair.name, outside.worker)
         self._lock = threading.RLock()
-        self._latest_look: replies.LookReply | None = None
-        self._looks = 0
-        self._looks_in_vain = 0
+        self._latest_check: replies.CheckReply | None = None
+        self._checks = 0
+        self._checks_in_vain = 0
         self._monitor_trouble: Reason | None = None
         self._solved = 0
         self._health: replies.HealthReply
@@ -193,7 +193,7 @@ class PairService:
             total=len(results),
             results=tuple(result for result in results if since_ns <= result.data_stamp_ns <= until_ns)[-limit:],
             entries=tuple(kept.chained for kept in entries if inside(kept.entry))[-limit:],
-            looks=tuple(look for look in self.ledger.looks() if since_ns <= look.stamp_ns <= until_ns)[-limit:],
+            checks=tuple(check for check in self.ledger.checks() if since_ns <= check.stamp_ns <= until_ns)[-limit:],
         )
 
     def windows(self) -> replies.WindowsReply:
@@ -250,7 +250,7 @@ class PairService:
             losses={**drops.get("window", {}), **drops.get("storage", {}), **drops.get("monitor", {})},
             windows=self.recorder.recorded,
             solved=self._solved,
-            looks=self._looks,
+            checks=self._checks,
             transitions=dict(self.ledger.transitions),
             commands=dict(self._commands),
         )
@@ -274,7 +274,7 @@ class PairService:
                 accepted,
                 self.percent_complete,
                 config_hash(self._pair.calibration),
-                self._pair.fusion,
+                self._pair.tracker,
             )
             health = self._health = self._health_of(state, latest)
             self._served = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
@@ -350,7 +350,7 @@ class PairService:
         return self._acknowledge("hold", "held", "The extrinsic stays as it is until it is released.")
 
     def _replaced(self, name: str, code: str, text: str, window_id: str | None = None) -> replies.Acknowledgement:
-        self._latest_look = None
+        self._latest_check = None
         self.inbox.call(self._start_over)
         return self._acknowledge(name, code, text, window_id=window_id)
 
@@ -431,7 +431,7 @@ class PairService:
         too long, or with too many."""
         if not self._held:
             return False
-        if self.recorder.has_room and not self._judgements.waits(self._held.next_ns):
+        if self.recorder.has_room and not self._decisions.waits(self._held.next_ns):
             self._held.may_go()
             return True
         return self._held.has_waited(time.monotonic())
@@ -444,9 +444,9 @@ class PairService:
     def _choose_from_next(self) -> None:
         """Look at the next pair: is it one for the window, one for the monitor?"""
         pair = self._held.take()
-        if self._judgements.waits(pair.stamp_ns):
+        if self._decisions.waits(pair.stamp_ns):
             self.losses.add("monitor", "not_awaited")
-        self._judgements.settle(pair.stamp_ns)
+        self._decisions.settle(pair.stamp_ns)
         self._last_ns = pair.stamp_ns
         self._pace.observe(pair.stamp_ns, time.monotonic())
         T_camera_lidar = self._view.T_camera_lidar
@@ -461,11 +461,11 @@ class PairService:
                 self._end(event, pair.stamp_ns)
                 self._urgency.ended(event, self._cutter, self._pace.rate_hz)
         self._frozen |= self._cutter.rejections["frozen"] > frozen_before
-        look = self._sampler.offer(pair)
-        if look is not None:
-            self._unasked.append(look)
+        check = self._sampler.offer(pair)
+        if check is not None:
+            self._unasked.append(check)
         if pair.stamp_ns >= self._window_due_ns:
-            self._look(pair.stamp_ns)
+            self._check(pair.stamp_ns)
 
     def _select(self, event: PairSelected, T_camera_lidar: Matrix4) -> None:
         self.recorder.add(event.window_id, event.pair, T_camera_lidar)
@@ -475,20 +475,20 @@ class PairService:
     def _end(self, event: SliceEnded, stamp_ns: int) -> None:
         """A slice ended, at this sensor time: what it holds goes to the disk, and from there to the worker."""
         if event.complete:
-            question = self._judgements.ask(stamp_ns + WINDOW_PERIODS * self._period_ns)
+            question = self._decisions.ask(stamp_ns + WINDOW_PERIODS * self._period_ns)
             self._asked[event.window_id], self._window_due_ns = question, question.due_ns
         fields = {"window": event.window_id, "pairs": event.pairs, "complete": event.complete}
         _log.info("a slice ended", extra={"fields": fields})
         self.recorder.end(event)
 
-    def _look(self, stamp_ns: int) -> None:
+    def _check(self, stamp_ns: int) -> None:
         """Have the worker judge the latest pairs at what is served. While a window is about to change that, they wait:
         they would be judged at what is no longer served."""
         for pairs in self._unasked:
-            question = self._judgements.ask(stamp_ns + self._period_ns)
+            question = self._decisions.ask(stamp_ns + self._period_ns)
             body = {"pose": pack_pose(self._view.T_camera_lidar), "frames": pack_pairs(pairs)}
             done = partial(self._on_observed, question, self._view.epoch)
-            self._outside.worker.look(Errand("observe", self.name, body, done))
+            self._outside.worker.check(Errand("check", self.name, body, done))
         self._unasked.clear()
 
     def _end_in_silence(self) -> None:
@@ -586,13 +586,13 @@ class PairService:
         self._answer(self._asked.pop(job.window_id, None), take)
 
     def _on_observed(self, question: Question, epoch: int, answer: dict[str, Any] | Reason) -> None:
-        self._answer(question, partial(self._take_look, epoch, answer))
+        self._answer(question, partial(self._take_check, epoch, answer))
 
-    def _take_look(self, epoch: int, answer: dict[str, Any] | Reason) -> Effect | None:
+    def _take_check(self, epoch: int, answer: dict[str, Any] | Reason) -> Effect | None:
         if isinstance(answer, Reason):
-            self._note_look_in_vain(answer)
+            self._note_check_in_vain(answer)
             return None
-        self._looks_in_vain, self._monitor_trouble = 0, None
+        self._checks_in_vain, self._monitor_trouble = 0, None
         if (why_not := answer["baseline_not_used"]) is not None:
             self._refuse_baseline(why_not)
         observation = unpack_observation(answer)
@@ -600,27 +600,27 @@ class PairService:
             lambda state: lifecycle.after_observation(state, observation), observation.stamp_ns, observation, epoch
         )
         if effect is None:
-            self.losses.add("monitor", "look_overtaken")
+            self.losses.add("monitor", "check_overtaken")
             return None
-        self._looks += 1
-        self._latest_look = look_of(observation, self.ledger.state)
-        self.ledger.note_look(self._latest_look)
+        self._checks += 1
+        self._latest_check = check_of(observation, self.ledger.state)
+        self.ledger.note_check(self._latest_check)
         return effect
 
-    def _note_look_in_vain(self, reason: Reason) -> None:
+    def _note_check_in_vain(self, reason: Reason) -> None:
         """Whoever cannot look must not go on saying that all is well."""
-        self.losses.add("monitor", f"look_{reason.code}", detail=reason.text)
+        self.losses.add("monitor", f"check_{reason.code}", detail=reason.text)
         if reason is SUPERSEDED:
             return
-        self._looks_in_vain += 1
-        if self._looks_in_vain >= LOOKS_IN_VAIN:
-            text = f"The last {self._looks_in_vain} looks came to nothing. {reason.text}"
+        self._checks_in_vain += 1
+        if self._checks_in_vain >= CHECKS_IN_VAIN:
+            text = f"The last {self._checks_in_vain} checks came to nothing. {reason.text}"
             self._monitor_trouble = Reason("monitor_blind", text)
 
     def _answer(self, question: Question | None, take: Callable[[], Effect | None]) -> None:
         """An answer came; one to a question that the stream did not ask takes effect at once."""
         if question is not None:
-            self._judgements.answer(question, take)
+            self._decisions.answer(question, take)
             self.inbox.wake()
         elif (effect := take()) is not None:
             self.inbox.call(effect)
@@ -640,7 +640,7 @@ class PairService:
             return None
         before, after = taken.before, taken.after
         if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
-            self._latest_look = None
+            self._latest_check = None
         red = HealthState.MISCALIBRATED
         if after.health is red and before.health is not red:
             self._draw_new_event()
@@ -648,16 +648,16 @@ class PairService:
 
     # --- on the ingest thread again ---------------------------------------------------------------------------------
 
-    def _go_on_with(self, taken: Taken, by_look: bool) -> None:
+    def _go_on_with(self, taken: Taken, by_check: bool) -> None:
         """What a step changes for the pairs to come: the extrinsic at which they are looked at, and how soon a window
         is wanted: soon when the monitor's word has become worse, or a window did not settle it."""
         self._adopt(taken.served)
         before, after = taken.before, taken.after
-        if after.monitor.outcome not in (Outcome.SUSPECT, Outcome.CONFIRMED) or after.flagged_since_ns is None:
+        if after.monitor.outcome not in (Finding.SUSPECT, Finding.CONFIRMED) or after.flagged_since_ns is None:
             self._urgency.calm()
             return
         waiting = after.pending is not None and after.pending.contradicts
-        if not waiting and not (by_look and before.monitor.outcome is after.monitor.outcome):
+        if not waiting and not (by_check and before.monitor.outcome is after.monitor.outcome):
             self._urgency.alarm(after.flagged_since_ns)
 
     def _start_over(self) -> None:
@@ -773,13 +773,13 @@ class PairService:
             state=health.state.value,
             level=replies.ROS_LEVELS[health.state.value],
             reasons=snapshots.reasons_of(health.reasons),
-            metrics={**metrics, **(self._latest_look.metrics if self._latest_look else {})},
+            metrics={**metrics, **(self._latest_check.metrics if self._latest_check else {})},
             axes=snapshots.axes_of(latest, state.status),
             drift=value,
             drift_sigma=sigma,
             result_drift=result_value,
             result_drift_sigma=result_sigma,
-            look=self._latest_look,
+            check=self._latest_check,
             needs=self._report.needs(self._pair, state.latest),
             data_quality=self._report.data_quality(self.losses.snapshot()),
             since_ns=self.ledger.since_ns,

@@ -74,11 +74,11 @@ class HalvesReport(Part):
 
 
 class DetectionRow(Part):
-    """Looks at one kind of move of the extrinsic, and the share that each classifier flagged; of the right extrinsic
-    these are the false alarms."""
+    """Checks after one kind of move of the extrinsic, and the share that each classifier flagged; of the right
+    extrinsic these are the false alarms."""
 
     name: str = Field(description="`right`, or how far the extrinsic was moved")
-    looks: Count
+    checks: Count
     flagged: float = Field(ge=0, le=1, description="by the distance of the local optimum")
     flagged_by_paper: float = Field(ge=0, le=1, description="by equation (2) with learned limits")
 

@@ -186,15 +186,15 @@ class DataQuality(Part):
     frozen_image: bool = Field(default=False, description="the camera repeats the same picture")
 
 
-class LookReply(Part):
-    """One look of the monitor at the extrinsic that was served, and what the looks so far add up to."""
+class CheckReply(Part):
+    """One check of the monitor at the extrinsic that was served, and what the checks so far add up to."""
 
     stamp_ns: int = Field(description="of the last pair, ns")
     pair_stamps_ns: tuple[int, ...] = Field(description="of all of them, ns, ascending")
     flagged: bool = Field(description="the pose is wrong, or the data are")
-    weak: bool = Field(description="the edges are fainter than they should be: the look counts less")
+    weak: bool = Field(description="the edges are fainter than they should be: the check counts less")
     flagged_by_paper: bool | None = Field(description="equation (2); null until the rig is commissioned")
-    causes: tuple[Reason, ...] = Field(description="what is wrong with the data; such a look says nothing of the pose")
+    causes: tuple[Reason, ...] = Field(description="what is wrong with the data; such a check says nothing of the pose")
     metrics: dict[str, MetricReply] = Field(description="by name")
     first_derivative: Maybe6 = Field(description="f' at the pose: dMI, nats per rad or m")
     second_derivative: Maybe6 = Field(description="f'' at the pose: -d²MI, nats per rad² or m²")
@@ -204,9 +204,9 @@ class LookReply(Part):
         description="of the local optimum from commissioned (deg, m); null before commissioning"
     )
     drift_sigma: Maybe6 | None = Field(description="standard deviations of `drift` (deg, m)")
-    outcome: Literal["unknown", "clear", "suspect", "confirmed"] = Field(description="of all looks so far")
-    evidence: float = Field(description="for a moved mount, in independent looks")
-    state: HealthState = Field(description="of the pair after the look")
+    outcome: Literal["unknown", "clear", "suspect", "confirmed"] = Field(description="of all checks so far")
+    evidence: float = Field(description="for a moved mount, in independent checks")
+    state: HealthState = Field(description="of the pair after the check")
 
 
 class HealthReply(Message):
@@ -217,7 +217,7 @@ class HealthReply(Message):
     state: HealthState
     level: Literal[0, 1, 2, 3] = Field(description="ROS: 0 OK, 1 WARN, 2 ERROR, 3 STALE")
     reasons: tuple[Reason, ...]
-    metrics: dict[str, MetricReply] = Field(description="of the latest result and of the latest look, by name")
+    metrics: dict[str, MetricReply] = Field(description="of the latest result and of the latest check, by name")
     axes: Axes
     drift: Maybe6 | None = Field(
         default=None, description="of what is served from commissioned (deg, m); null before commissioning"
@@ -227,8 +227,8 @@ class HealthReply(Message):
         default=None, description="of the latest result, accepted or not, from commissioned (deg, m)"
     )
     result_drift_sigma: Maybe6 | None = Field(default=None, description="standard deviations of `result_drift`")
-    look: LookReply | None = Field(
-        default=None, description="the latest look; null when none was taken at what is served"
+    check: CheckReply | None = Field(
+        default=None, description="the latest check; null when none was taken at what is served"
     )
     needs: tuple[str, ...] = Field(description="what is still missing, one sentence each")
     data_quality: DataQuality
@@ -269,11 +269,11 @@ class HistoryReply(Message):
     total: Count = Field(description="results kept, before the selector")
     results: tuple[CalibrationResult, ...]
     entries: tuple[ChainedEntry, ...] = Field(default=(), description="of the hash chain, results without their bodies")
-    looks: tuple[LookReply, ...] = Field(default=(), description="of the monitor, as far as they are kept")
+    checks: tuple[CheckReply, ...] = Field(default=(), description="of the monitor, as far as they are kept")
 
 
 class MetricsPoint(Part):
-    """The figures of the monitor at one look."""
+    """The figures of the monitor at one check."""
 
     stamp_ns: int
     state: HealthState
@@ -346,7 +346,7 @@ class PairStatus(Part):
     losses: Counts = Field(default_factory=dict, description="frames that found no partner, and windows lost, by cause")
     windows: Count = Field(default=0, description="windows recorded")
     solved: Count = Field(default=0, description="windows evaluated")
-    looks: Count = Field(default=0, description="looks of the monitor at the served extrinsic")
+    checks: Count = Field(default=0, description="checks of the monitor at the served extrinsic")
     transitions: Counts = Field(default_factory=dict, description="changes of health, by the state that was entered")
     commands: Counts = Field(default_factory=dict, description="commands, by name and outcome")
 

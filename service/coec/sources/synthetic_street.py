@@ -14,7 +14,7 @@ Floats = NDArray[np.float32]
 
 GROUND, SKY = -1, -2  # instead of the index of a box
 HAZE_M = 120.0
-"""Range at which 60 % of a surface's colour is lost to haze: what a camera takes for far looks far."""
+"""Range at which 60 % of a surface's colour is lost to haze: what a camera takes for far checks far."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

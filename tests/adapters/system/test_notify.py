@@ -14,9 +14,9 @@ from coec.runtime.api import metrics
 from coec.schemas.replies import (
     Axes,
     AxisReply,
+    CheckReply,
     DataQuality,
     HealthReply,
-    LookReply,
     MetricReply,
     PairStatus,
     StatusReply,
@@ -63,7 +63,7 @@ def a_health() -> HealthReply:
         "mi": MetricReply(value=0.5, limit=0.25, at_least=True, passed=True),
         "overlap": MetricReply(value=None, limit=0.5, at_least=True, passed=False),
     }
-    look = LookReply(
+    check = CheckReply(
         stamp_ns=1,
         pair_stamps_ns=(1,),
         flagged=False,
@@ -90,7 +90,7 @@ def a_health() -> HealthReply:
         metrics=figures,
         axes=Axes(rx=axis, ry=axis, rz=axis, tx=axis, ty=axis, tz=axis),
         drift=(0.0, 0.0, None, 0.125, None, None),
-        look=look,
+        check=check,
         needs=(),
         data_quality=DataQuality(),
         since_ns=0,
@@ -121,13 +121,13 @@ def test_metrics_are_open_metrics_text() -> None:
         'coec_windows_recorded_total{pair="front"} 4',
         "coec_worker_restarts_total 1",
         "coec_uptime_seconds 1.5",
-        'coec_look_age_seconds{pair="front"} 2.5',
+        'coec_check_age_seconds{pair="front"} 2.5',
         'coec_diagnosis{pair="front",metric="mi"} 0.5',
         'coec_diagnosis_limit{pair="front",metric="mi"} 0.25',
         'coec_mi_first_derivative{pair="front",axis="ry"} -2',
         'coec_mi_second_derivative{pair="front",axis="rx"} 9',
         'coec_drift{pair="front",axis="tx",unit="m"} 0.125',
-        'coec_look_drift{pair="front",axis="rx",unit="deg"} 0.5',
+        'coec_check_drift{pair="front",axis="rx",unit="deg"} 0.5',
     ):
         assert line in text.splitlines(), line
     assert 'coec_diagnosis{pair="front",metric="overlap"}' not in text, "it could not be computed"

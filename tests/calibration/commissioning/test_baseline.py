@@ -96,7 +96,7 @@ class TestUncommissioned:
     def camera(focal_px: float) -> Camera:
         return build("pinhole", width=640, height=480, fx=focal_px, fy=focal_px, cx=320.0, cy=240.0)
 
-    def test_no_look_claims_much_less_than_a_pixel(self) -> None:
+    def test_no_check_claims_much_less_than_a_pixel(self) -> None:
         coarse, fine = (uncommissioned(self.camera(focal_px)) for focal_px in (80.0, 700.0))
         for accuracy in coarse:
             assert accuracy.sigma(1000)[:3].min() > PIXEL_SHARE / 80.0

@@ -17,8 +17,8 @@ from coec.calibration.commissioning import learning, verdict_limits
 from coec.calibration.commissioning.baseline import PRIOR_SPREAD_POSE, Baseline, learned_hash
 from coec.calibration.commissioning.learning import commission, learn_accuracy
 from coec.calibration.commissioning.verdict_limits import learned
-from coec.calibration.estimators import look
-from coec.calibration.monitor.check import Evidence, gather
+from coec.calibration.estimators import sight_of
+from coec.calibration.monitor.check import CheckInput, gather
 from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Decision, Estimate, Metric, Rig, Verdict, Window
@@ -33,11 +33,11 @@ CONFIG = CalibrationConfig(search=SearchConfig(reach_deg=8.0))
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_looks() -> Iterator[None]:
-    """What is learned from few looks is less precise, and learned in the same way."""
+def few_checks() -> Iterator[None]:
+    """What is learned from few checks is less precise, and learned in the same way."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning, "LOOKS", 5)
-        patch.setattr(learning, "FAR_LOOKS", 3)
+        patch.setattr(learning, "CHECKS", 5)
+        patch.setattr(learning, "FAR_CHECKS", 3)
         patch.setattr(verdict_limits, "SOLVES", 2)
         yield
 
@@ -64,7 +64,7 @@ class TestCommission:
         assert baseline.detected["1 deg"] == 1.0
         assert baseline.detected["3 deg"] == 1.0
 
-    def test_a_look_at_the_commissioned_pose_is_clear_and_at_a_moved_one_is_not(
+    def test_a_check_at_the_commissioned_pose_is_clear_and_at_a_moved_one_is_not(
         self, baseline: Baseline, sharp_street: Window, stereo: DepthModel, images: ImageReader
     ) -> None:
         right = observe(sharp_street, stereo, images, CONFIG, baseline)
@@ -111,18 +111,18 @@ class _Scripted:
         return _Scripted(self.says[list(indices)], self.rig)
 
 
-def test_spread_of_a_pair_is_found_from_looks_at_halves(sharp_street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_spread_of_a_pair_is_found_from_checks_at_halves(sharp_street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without bias: on the average of drives the variance is the true one and that of the prior, by their weights."""
     true = np.array([np.radians(0.3)] * 3 + [0.1] * 3)
 
-    def look_of(evidence: _Scripted, *_: object) -> SimpleNamespace:
+    def check_of(evidence: _Scripted, *_: object) -> SimpleNamespace:
         mean = evidence.says.mean(axis=0)
         return SimpleNamespace(offset_rotation=np.where(np.arange(6) < 3, mean, 0.0), offset_pose=mean)
 
-    monkeypatch.setattr(learning, "look_at", look_of)
+    monkeypatch.setattr(learning, "check_at", check_of)
     drives = true * np.random.default_rng(1).normal(size=(100, 48, 6))
     learned_from = [
-        learn_accuracy(cast("Evidence", _Scripted(says, sharp_street.rig)), np.eye(4), CONFIG) for says in drives
+        learn_accuracy(cast(CheckInput, _Scripted(says, sharp_street.rig)), np.eye(4), CONFIG) for says in drives
     ]
     variance = np.mean([pose.spread**2 for _, pose in learned_from], axis=0)
     free = learning.BLOCKS - 1
@@ -137,21 +137,21 @@ def test_spread_of_a_pair_is_found_from_looks_at_halves(sharp_street: Window, mo
 def test_detection_learns_on_some_pairs_and_tries_others(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
-    evidence = gather(look(sharp_street, stereo, images, CONFIG, Silence()))
+    evidence = gather(sight_of(sharp_street, stereo, images, CONFIG, Silence()))
     heard: list[tuple[int, int]] = []
     tried = try_detection(evidence, sharp_street.T_camera_lidar_start, CONFIG, 1, 3, lambda *step: heard.append(step))
     rows = {row.name: row for row in table(tried)}
     assert heard == [(1, 1)]
     assert {"right", "0.5 deg", "1 deg", "3 deg"} <= set(rows)
     assert rows["3 deg"].flagged == 1.0
-    assert all(row.looks == 3 for row in rows.values())
+    assert all(row.checks == 3 for row in rows.values())
 
 
-def test_detection_refuses_looks_that_the_monitor_would_not_take(
+def test_detection_refuses_checks_that_the_monitor_would_not_take(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
     few = replace(sharp_street, pairs=sharp_street.pairs[: MIN_RECORDED - 1])
-    evidence = gather(look(few, stereo, images, CONFIG, Silence()))
+    evidence = gather(sight_of(few, stereo, images, CONFIG, Silence()))
     with pytest.raises(CalibrationError, match=f"needs {MIN_RECORDED} pairs, there are {MIN_RECORDED - 1}"):
         try_detection(evidence, few.T_camera_lidar_start, CONFIG, 1, 3, lambda *_: None)
 

@@ -1,8 +1,8 @@
-"""Looks of the monitor: evenly over periods of sensor time, the same ones wherever the stream begins."""
+"""Checks of the monitor: evenly over periods of sensor time, the same ones wherever the stream begins."""
 
 from dataclasses import replace
 
-from coec.calibration.frames.sampling import LookSampler
+from coec.calibration.frames.sampling import CheckSampler
 from coec.calibration.types import EgoMotion, FramePair, Window
 from coec.config import MonitorConfig, WindowConfig
 
@@ -16,24 +16,24 @@ def at(street: Window, stamp_ns: int, speed_mps: float | None = 5.0) -> FramePai
     return FramePair(replace(pair.camera, stamp_ns=stamp_ns), replace(pair.lidar, stamp_ns=stamp_ns), motion)
 
 
-def looks(street: Window, stamps_s: list[float], speed_mps: float | None = 5.0) -> list[list[float]]:
-    sampler = LookSampler(CONFIG, WindowConfig())
+def checks(street: Window, stamps_s: list[float], speed_mps: float | None = 5.0) -> list[list[float]]:
+    sampler = CheckSampler(CONFIG, WindowConfig())
     offered = (sampler.offer(at(street, round(stamp * S), speed_mps)) for stamp in stamps_s)
-    return [[pair.stamp_ns / S for pair in look] for look in offered if look is not None]
+    return [[pair.stamp_ns / S for pair in check] for check in offered if check is not None]
 
 
-def test_ten_hertz_are_thinned_to_the_pairs_of_a_look_per_period(street: Window) -> None:
-    made = looks(street, [100.0 + 0.1 * i for i in range(160)])
+def test_ten_hertz_are_thinned_to_the_pairs_of_a_check_per_period(street: Window) -> None:
+    made = checks(street, [100.0 + 0.1 * i for i in range(160)])
     assert made == [[100.0 + 5 * k + i for i in range(5)] for k in range(3)]
 
 
-def test_a_stream_that_begins_in_the_middle_makes_the_same_looks_from_then_on(street: Window) -> None:
+def test_a_stream_that_begins_in_the_middle_makes_the_same_checks_from_then_on(street: Window) -> None:
     stamps = [100.0 + 0.1 * i for i in range(210)]
-    assert looks(street, stamps[73:])[-2:] == looks(street, stamps)[-2:]
+    assert checks(street, stamps[73:])[-2:] == checks(street, stamps)[-2:]
 
 
 def test_a_slow_stream_collects_until_there_is_enough(street: Window) -> None:
-    assert looks(street, [100.0 + 3 * i for i in range(10)]) == [
+    assert checks(street, [100.0 + 3 * i for i in range(10)]) == [
         [100.0, 103.0, 106.0, 109.0],
         [112.0, 115.0, 118.0, 121.0, 124.0],
     ]
@@ -41,10 +41,10 @@ def test_a_slow_stream_collects_until_there_is_enough(street: Window) -> None:
 
 def test_nothing_new_is_seen_while_standing(street: Window) -> None:
     stamps = [100.0 + 0.5 * i for i in range(60)]
-    assert looks(street, stamps, speed_mps=0.0) == []
-    assert len(looks(street, stamps, speed_mps=None)) == 5
+    assert checks(street, stamps, speed_mps=0.0) == []
+    assert len(checks(street, stamps, speed_mps=None)) == 5
 
 
 def test_sensor_time_that_steps_back_starts_anew(street: Window) -> None:
-    made = looks(street, [100.0 + 0.5 * i for i in range(9)] + [50.0 + 0.5 * i for i in range(12)])
+    made = checks(street, [100.0 + 0.5 * i for i in range(9)] + [50.0 + 0.5 * i for i in range(12)])
     assert made == [[50.0, 51.0, 52.0, 53.0, 54.0]]

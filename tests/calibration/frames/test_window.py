@@ -20,10 +20,10 @@ class Inspector:
 
     def __init__(self, see: Callable[[int], ImageQuality] = lambda _: replace(SHARP, digest=0)) -> None:
         self._see = see
-        self.looks = 0
+        self.checks = 0
 
     def inspect(self, frame: CameraFrame) -> ImageQuality:
-        self.looks += 1
+        self.checks += 1
         quality = self._see(frame.stamp_ns)
         return quality if quality.digest else replace(quality, digest=frame.stamp_ns)
 
@@ -50,7 +50,7 @@ def test_one_pair_of_each_bin_and_the_rest_is_not_looked_at(street: Window) -> N
     inspector = Inspector()
     events = drive(WindowCutter(CONFIG, street.rig, inspector), street, [i * 0.5 for i in range(100)])
     assert selected_s(events) == [0.0, 10.0, 20.0, 30.0, 40.0]
-    assert inspector.looks == 5
+    assert inspector.checks == 5
 
 
 def test_the_slice_ends_by_sensor_time_and_the_next_begins(street: Window) -> None:
@@ -142,7 +142,7 @@ def test_a_pair_out_of_view_is_refused_before_its_image_is_decoded(street: Windo
     cutter = WindowCutter(CONFIG.model_copy(update={"min_points_in_view": 10**6}), street.rig, inspector)
     drive(cutter, street, [0.0])
     assert cutter.rejections == {"out_of_view": 1}
-    assert inspector.looks == 0
+    assert inspector.checks == 0
 
 
 def test_an_image_that_cannot_be_decoded_is_counted_by_its_reason(street: Window) -> None:

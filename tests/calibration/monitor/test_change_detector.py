@@ -1,4 +1,4 @@
-"""The sequential decision: what looks add up to."""
+"""The sequential decision: what checks add up to."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coec.adapters.images.codec import GreyImages
-from coec.calibration.monitor.change_detector import MonitorState, Observation, Outcome, after_observation, diagnose
+from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation, after_observation, diagnose
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, observe
 from coec.calibration.monitor.sensor_faults import BENT_MOUNT, DARK, LENS_DIRTY, TIME_OFFSET, Cause
 from coec.calibration.ports import DepthModel
@@ -47,48 +47,48 @@ def after(*observations: Observation) -> MonitorState:
 
 
 def fresh(number: int, **how: object) -> Observation:
-    """A look whose pairs no other look holds."""
+    """A check whose pairs no other look holds."""
     return seen(range(10 * number, 10 * number + 5), **how)  # type: ignore[arg-type]
 
 
 class TestEvidence:
     def test_nothing_seen_is_unknown(self) -> None:
-        assert MonitorState().outcome is Outcome.UNKNOWN
+        assert MonitorState().outcome is Finding.UNKNOWN
         assert diagnose(MonitorState()) is None
 
-    def test_one_look_decides_nothing(self) -> None:
+    def test_one_check_decides_nothing(self) -> None:
         state = after(fresh(0))
-        assert state.outcome is Outcome.CLEAR
+        assert state.outcome is Finding.CLEAR
         assert diagnose(state) is None
 
-    def test_two_looks_are_a_suspicion_and_three_a_certainty(self) -> None:
-        assert after(fresh(0), fresh(1)).outcome is Outcome.SUSPECT
+    def test_two_checks_are_a_suspicion_and_three_a_certainty(self) -> None:
+        assert after(fresh(0), fresh(1)).outcome is Finding.SUSPECT
         state = after(fresh(0), fresh(1), fresh(2))
-        assert state.outcome is Outcome.CONFIRMED
+        assert state.outcome is Finding.CONFIRMED
         assert diagnose(state) == BENT_MOUNT
         assert state.offset == pytest.approx(tuple(OFFSET))
 
-    def test_looks_at_the_same_pairs_are_one_look(self) -> None:
-        assert after(*[seen([1, 2, 3, 4])] * 10).outcome is Outcome.CLEAR
+    def test_checks_at_the_same_pairs_are_one_check(self) -> None:
+        assert after(*[seen([1, 2, 3, 4])] * 10).outcome is Finding.CLEAR
 
-    def test_one_bad_pair_in_overlapping_looks_decides_nothing(self) -> None:
-        # Six pairs to a look, three of them new; the bad pair is in two looks.
-        looks = [seen(range(3 * k, 3 * k + 6), flagged=k in (4, 5)) for k in range(10)]
-        states = [after(*looks[: k + 1]) for k in range(len(looks))]
-        assert {state.outcome for state in states} == {Outcome.CLEAR}
+    def test_one_bad_pair_in_overlapping_checks_decides_nothing(self) -> None:
+        # Six pairs to a check, three of them new; the bad pair is in two checks.
+        checks = [seen(range(3 * k, 3 * k + 6), flagged=k in (4, 5)) for k in range(10)]
+        states = [after(*checks[: k + 1]) for k in range(len(checks))]
+        assert {state.outcome for state in states} == {Finding.CLEAR}
 
     def test_clears_with_hysteresis(self) -> None:
         confirmed = [fresh(k) for k in range(3)]
         right = [fresh(10 + k, flagged=False) for k in range(3)]
-        assert after(*confirmed, right[0]).outcome is Outcome.CONFIRMED
-        assert after(*confirmed, *right[:2]).outcome is Outcome.CONFIRMED
-        assert after(*confirmed, *right).outcome is Outcome.CLEAR
+        assert after(*confirmed, right[0]).outcome is Finding.CONFIRMED
+        assert after(*confirmed, *right[:2]).outcome is Finding.CONFIRMED
+        assert after(*confirmed, *right).outcome is Finding.CLEAR
 
     def test_faint_edges_suspect_and_never_confirm(self) -> None:
         state = after(*[fresh(k, weak=True) for k in range(40)])
-        assert state.outcome is Outcome.SUSPECT
+        assert state.outcome is Finding.SUSPECT
 
-    def test_a_faint_look_at_a_right_pose_is_no_evidence_for_it(self) -> None:
+    def test_a_faint_check_at_a_right_pose_is_no_evidence_for_it(self) -> None:
         suspect = after(fresh(0), fresh(1))
         assert after_observation(suspect, fresh(2, flagged=False, weak=True)).evidence == suspect.evidence
 
@@ -97,7 +97,7 @@ class TestEvidence:
         read = json.loads(json.dumps(asdict(state)))
         again = MonitorState(
             evidence=read["evidence"],
-            outcome=Outcome(read["outcome"]),
+            outcome=Finding(read["outcome"]),
             blind=read["blind"],
             dirt=read["dirt"],
             offset=tuple(read["offset"]),
@@ -112,7 +112,7 @@ class TestCauses:
         assert state.evidence == 0.0
         assert diagnose(state) == LENS_DIRTY
 
-    def test_one_look_with_a_cause_is_not_believed(self) -> None:
+    def test_one_check_with_a_cause_is_not_believed(self) -> None:
         assert diagnose(after(fresh(0, flagged=False), fresh(1, causes=(DARK,)))) is None
 
     def test_what_hides_others_comes_first(self) -> None:
@@ -128,24 +128,24 @@ class TestCauses:
 class TestDirt:
     SPOT = tuple(range(40, 52))
 
-    def looks(self, *dirty: tuple[int, ...], textured: int = 400) -> MonitorState:
+    def checks(self, *dirty: tuple[int, ...], textured: int = 400) -> MonitorState:
         return after(*[replace(fresh(k, flagged=False), dirty=seen, textured=textured) for k, seen in enumerate(dirty)])
 
     def test_is_what_stays_where_it_is(self) -> None:
-        assert diagnose(self.looks(*[self.SPOT] * 4)) is None
-        assert diagnose(self.looks(*[self.SPOT] * 5)) == LENS_DIRTY
+        assert diagnose(self.checks(*[self.SPOT] * 4)) is None
+        assert diagnose(self.checks(*[self.SPOT] * 5)) == LENS_DIRTY
 
     def test_a_sky_that_changes_is_none(self) -> None:
-        assert diagnose(self.looks(*[tuple(range(20 * k, 20 * k + 30)) for k in range(12)])) is None
+        assert diagnose(self.checks(*[tuple(range(20 * k, 20 * k + 30)) for k in range(12)])) is None
 
     def test_one_exposure_with_contrast_clears_a_block(self) -> None:
-        assert diagnose(self.looks(*[self.SPOT] * 3, (), *[self.SPOT] * 4)) is None
+        assert diagnose(self.checks(*[self.SPOT] * 3, (), *[self.SPOT] * 4)) is None
 
     def test_a_few_blocks_are_no_dirty_lens(self) -> None:
-        assert diagnose(self.looks(*[self.SPOT[:4]] * 10)) is None
+        assert diagnose(self.checks(*[self.SPOT[:4]] * 10)) is None
 
     def test_goes_away_when_it_was_cleaned(self) -> None:
-        assert diagnose(self.looks(*[self.SPOT] * 8, *[()] * 3)) is None
+        assert diagnose(self.checks(*[self.SPOT] * 8, *[()] * 3)) is None
 
     def test_a_night_is_no_cleaning(self) -> None:
         day = [replace(fresh(k, flagged=False), dirty=self.SPOT, textured=400) for k in range(5)]
@@ -153,10 +153,10 @@ class TestDirt:
         assert after(*day, *night).dirt.keys() == {str(block) for block in self.SPOT}
 
 
-class TestLook:
+class TestCheck:
     def test_needs_some_pairs(self, street: Window, stereo: DepthModel) -> None:
         short = replace(street, pairs=street.pairs[: MIN_PAIRS - 1])
-        with pytest.raises(CalibrationError, match="a look needs 4 pairs, there are 3"):
+        with pytest.raises(CalibrationError, match="a check needs 4 pairs, there are 3"):
             observe(short, stereo, GreyImages(LimitsConfig()), CalibrationConfig(), None)
 
     def test_flags_a_turn_of_two_degrees_and_not_the_truth(self, sharp_street: Window, stereo: DepthModel) -> None:
@@ -171,7 +171,7 @@ class TestLook:
         # The offset leads back to the truth: minus the turn, within the tolerance of an uncommissioned rig.
         np.testing.assert_allclose(np.degrees(wrong.offset[:3]), [-1.2, 1.2, -1.0], atol=0.35)
 
-    def test_same_pairs_same_look(self, street: Window, stereo: DepthModel) -> None:
+    def test_same_pairs_same_check(self, street: Window, stereo: DepthModel) -> None:
         images, config = GreyImages(LimitsConfig()), CalibrationConfig()
         a, b = (observe(street, stereo, images, config, None) for _ in range(2))
         assert a.metrics == b.metrics

@@ -1,4 +1,4 @@
-"""The figures of a look: the paper's derivatives on every axis, and the edges that a pose keeps."""
+"""The figures of a check: the paper's derivatives on every axis, and the edges that a pose keeps."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
-from coec.calibration.estimators import look
-from coec.calibration.monitor.check import Evidence, Look, gather, look_at
+from coec.calibration.estimators import sight_of
+from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
 from coec.calibration.monitor.check_verdict import over_limits
 from coec.calibration.objective.curvature import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
@@ -51,24 +51,24 @@ def test_are_those_of_the_curvature() -> None:
 
 
 @pytest.fixture(scope="module")
-def evidence(sharp_street: Window, stereo: DepthModel) -> Evidence:
-    return gather(look(sharp_street, stereo, GreyImages(LimitsConfig()), CONFIG, Silence()))
+def evidence(sharp_street: Window, stereo: DepthModel) -> CheckInput:
+    return gather(sight_of(sharp_street, stereo, GreyImages(LimitsConfig()), CONFIG, Silence()))
 
 
 class TestEdgesKept:
-    def test_are_kept_at_the_right_pose_and_lost_to_its_left(self, evidence: Evidence, sharp_street: Window) -> None:
+    def test_are_kept_at_the_right_pose_and_lost_to_its_left(self, evidence: CheckInput, sharp_street: Window) -> None:
         right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
-        kept = look_at(evidence, right, CONFIG).edges_kept
-        beside = look_at(evidence, se3.perturb(right, xi), CONFIG).edges_kept
+        kept = check_at(evidence, right, CONFIG).edges_kept
+        beside = check_at(evidence, se3.perturb(right, xi), CONFIG).edges_kept
         assert kept > 0.9
         assert beside < 0.7 * kept
 
-    def test_are_looked_for_where_the_bias_puts_them(self, evidence: Evidence, sharp_street: Window) -> None:
+    def test_are_looked_for_where_the_bias_puts_them(self, evidence: CheckInput, sharp_street: Window) -> None:
         right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
-        assert look_at(evidence, se3.perturb(right, xi), CONFIG, -xi).edges_kept > 0.9
+        assert check_at(evidence, se3.perturb(right, xi), CONFIG, -xi).edges_kept > 0.9
 
 
-A_LOOK = Look(
+A_CHECK = Check(
     pairs=1,
     T_rotation=np.eye(4),
     T_pose=np.eye(4),
@@ -93,11 +93,11 @@ class TestOverLimits:
 
     @pytest.mark.parametrize(("kept", "flagged"), [(0.9, False), (0.7, True)])
     def test_a_quarter_of_the_distance_is_too_far_where_the_edges_are_lost(self, kept: float, flagged: bool) -> None:
-        seen = replace(A_LOOK, offset_rotation=np.array([0.002, 0, 0, 0, 0, 0]), edges_kept=kept)
+        seen = replace(A_CHECK, offset_rotation=np.array([0.002, 0, 0, 0, 0, 0]), edges_kept=kept)
         of_rotation, of_pose = over_limits(seen, self.ACCURACY, self.ACCURACY, self.LIMITS)
         assert (of_rotation > 1.0) is flagged
         assert of_pose == 0.0
 
     def test_lost_edges_alone_flag_nothing(self) -> None:
-        of_rotation, _ = over_limits(replace(A_LOOK, edges_kept=0.1), self.ACCURACY, self.ACCURACY, self.LIMITS)
+        of_rotation, _ = over_limits(replace(A_CHECK, edges_kept=0.1), self.ACCURACY, self.ACCURACY, self.LIMITS)
         assert of_rotation == 0.0

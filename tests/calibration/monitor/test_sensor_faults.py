@@ -16,8 +16,8 @@ from coec.adapters.depth.maps import CachedDepth, open_depth
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Baseline
 from coec.calibration.commissioning.learning import learn_accuracy
-from coec.calibration.estimators import look
-from coec.calibration.monitor.change_detector import MonitorState, Outcome, after_observation, diagnose
+from coec.calibration.estimators import sight_of
+from coec.calibration.monitor.change_detector import Finding, MonitorState, after_observation, diagnose
 from coec.calibration.monitor.check import gather
 from coec.calibration.monitor.check_verdict import UNCOMMISSIONED, observe
 from coec.calibration.monitor.sensor_faults import (
@@ -55,7 +55,7 @@ def drive(sample_data: Path) -> Drive:
     whole = windows.load(f"kitti360:{sample_data / 'kitti360'}?camera=image_00", None, 25, lambda *_: None).window
     depth = CachedDepth(open_depth(DepthConfig(model="stereo"), LimitsConfig()), 10)
     learned = replace(whole, pairs=whole.pairs[::2])
-    evidence = gather(look(learned, depth, GreyImages(LimitsConfig()), CalibrationConfig(), Silence()))
+    evidence = gather(sight_of(learned, depth, GreyImages(LimitsConfig()), CalibrationConfig(), Silence()))
     right = whole.rig.T_camera_lidar_nominal
     rotation, pose = learn_accuracy(evidence, right, CalibrationConfig())
     baseline = Baseline(
@@ -95,12 +95,12 @@ def unchanged(window: Window, rng: np.random.Generator) -> Window:
     return window
 
 
-def states(drive: Drive, change: Change, looks: int = 6) -> list[MonitorState]:
+def states(drive: Drive, change: Change, checks: int = 6) -> list[MonitorState]:
     """What looks at the changed drive add up to, each at pairs that were not seen before."""
     changed = change(drive.window, np.random.default_rng(1))
     seen = observe(changed, drive.depth, GreyImages(LimitsConfig()), CalibrationConfig(), drive.baseline)
     state, after = MonitorState(), []
-    for number in range(looks):
+    for number in range(checks):
         fresh = tuple(stamp + number * 10**12 for stamp in seen.pair_stamps_ns)
         state = after_observation(state, replace(seen, pair_stamps_ns=fresh))
         after.append(state)
@@ -145,12 +145,12 @@ class TestScenarios:
     def test_what_happens_on_every_drive_is_no_cause(self, drive: Drive, change: Change) -> None:
         state = states(drive, change)[-1]
         assert diagnose(state) is None
-        assert state.outcome is Outcome.CLEAR
+        assert state.outcome is Finding.CLEAR
 
     @pytest.mark.parametrize("change", [turned((5.0, -5.0, 3.0)), scenarios.images_of_other_frames])
-    def test_what_no_look_can_explain_is_suspect_and_never_certain(self, drive: Drive, change: Change) -> None:
-        after = states(drive, change, looks=8)
-        assert after[-1].outcome is Outcome.SUSPECT
+    def test_what_no_check_can_explain_is_suspect_and_never_certain(self, drive: Drive, change: Change) -> None:
+        after = states(drive, change, checks=8)
+        assert after[-1].outcome is Finding.SUSPECT
         assert diagnose(after[-1]) is None
 
 

@@ -25,7 +25,7 @@ from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, Search
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
-from coec.geometry.edges.charts import significances as charted_significances
+from coec.geometry.edges.charts import charted_significances
 
 FUSED = CalibrationConfig(objective=ObjectiveConfig(kind="fused"))
 SIX = CalibrationConfig(objective=ObjectiveConfig(kind="fused"), search=SearchConfig(dof=6))

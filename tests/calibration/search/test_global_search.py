@@ -15,7 +15,7 @@ from coec.calibration.search.global_search import AT_RIM, FINE, ROUNDS, at_rim, 
 from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import se3
-from coec.geometry.edges.charts import significances
+from coec.geometry.edges.charts import charted_significances
 
 START = se3.perturbation(np.array([0.4, -0.3, 1.2, 0.5, -1.0, 2.0]))
 TURN = SearchBox(np.radians(28.0), 0.0)
@@ -111,7 +111,7 @@ def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, shar
     z = [basin.significance for basin in basins]
     assert z == sorted(z, reverse=True)
     poses = np.stack([basin.T_camera_lidar for basin in basins])
-    assert z == significances(sharp_edges.charts[FINE], poses).tolist()
+    assert z == charted_significances(sharp_edges.charts[FINE], poses).tolist()
     for index, a in enumerate(basins):
         for b in basins[:index]:
             assert angle_deg(a.T_camera_lidar, b.T_camera_lidar) >= np.degrees(ROUNDS[-1].apart_rad) - 1e-6

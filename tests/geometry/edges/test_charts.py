@@ -16,10 +16,10 @@ from coec.geometry.edges.charts import (
     MAX_FIELD_RAD,
     WEIGHT_STEPS,
     EdgeCharts,
+    charted_significances,
     climb,
     edge_charts,
     keep_apart,
-    significances,
 )
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, VOID
 from coec.geometry.projection import project, unproject
@@ -146,7 +146,7 @@ def test_the_sums_of_as_many_points_as_are_allowed_fit() -> None:
     xyz_m = np.tile(np.array([[0.0], [0.0], [9.0]], np.float32), (1, count))
     maps, weight = np.full((1, HEIGHT, WIDTH), 127, np.int8), np.full(count, np.sqrt(3.0), np.float32)
     charts = edge_charts(camera, maps, blur_rad(camera), xyz_m, weight, np.zeros(count, np.int64))
-    z = significances(charts, np.eye(4)[None])[0]
+    z = charted_significances(charts, np.eye(4)[None])[0]
     assert z == pytest.approx(127 / STRENGTH_STEPS * np.sqrt(count), rel=1e-6)
 
 
@@ -161,7 +161,7 @@ def test_the_frames_of_the_points_are_known() -> None:
 def test_every_camera_model_agrees_with_the_plain_form_exactly(model: str) -> None:
     charts, _, _ = both(CAMERAS[model], (700, 0, 1, 500))
     poses = np.stack([POSE, np.eye(4), se3.inverse(POSE)])
-    assert significances(charts, poses).tolist() == [plain_z(charts, pose) for pose in poses]
+    assert charted_significances(charts, poses).tolist() == [plain_z(charts, pose) for pose in poses]
 
 
 @pytest.mark.parametrize("model", CAMERAS)
@@ -170,7 +170,7 @@ def test_every_camera_model_agrees_with_the_sum_through_the_lens(model: str) -> 
     point is rounded on its own and the lens is sharper towards its rim than a chart."""
     charts, frames, _ = both(CAMERAS[model], (3000, 3000), blank=0.0)
     poses = np.concatenate([turned(POSE, angle, 40) for angle in (0.1, 0.5, 1.0)])
-    on_chart, exact = significances(charts, poses), through_the_lens(frames, poses)
+    on_chart, exact = charted_significances(charts, poses), through_the_lens(frames, poses)
     assert np.std(exact) > 0.7
     assert np.corrcoef(on_chart, exact)[0, 1] > 0.9
     assert np.std(on_chart - exact) < 0.45 * np.std(exact)
@@ -195,7 +195,7 @@ def test_points_behind_at_the_camera_and_without_a_number_count_for_nothing() ->
     def z_of(points: NDArray[np.float32]) -> float:
         weight, frame = np.ones(len(points), np.float32), np.zeros(len(points), np.int64)
         charts = edge_charts(camera, maps, blur_rad(camera), np.ascontiguousarray(points.T), weight, frame)
-        return float(significances(charts, np.eye(4)[None])[0])
+        return float(charted_significances(charts, np.eye(4)[None])[0])
 
     assert z_of(good) == 1.0
     assert z_of(bad) == 0.0
@@ -204,7 +204,7 @@ def test_points_behind_at_the_camera_and_without_a_number_count_for_nothing() ->
 
 def test_masked_pixels_count_for_nothing() -> None:
     charts, _, _ = both(CAMERAS["pinhole"], (500,), blank=1.0)
-    assert significances(charts, np.stack([POSE, np.eye(4)])).tolist() == [0.0, 0.0]
+    assert charted_significances(charts, np.stack([POSE, np.eye(4)])).tolist() == [0.0, 0.0]
 
 
 def test_weights_are_kept_to_a_step() -> None:
@@ -216,7 +216,7 @@ def test_the_order_of_the_points_does_not_matter_to_the_bit() -> None:
     charts, _, _ = both(CAMERAS["kannala_brandt"], (2000, 1500))
     shuffled = charts.of_points(np.random.default_rng(0).permutation(3500))
     poses = turned(POSE, 0.3, 30)
-    assert significances(charts, poses).tobytes() == significances(shuffled, poses).tobytes()
+    assert charted_significances(charts, poses).tobytes() == charted_significances(shuffled, poses).tobytes()
 
 
 @pytest.fixture
@@ -233,7 +233,7 @@ def test_the_number_of_threads_does_not_matter_to_the_bit(threads: tuple[int, ..
     for count in threads:
         numba.set_num_threads(count)
         ends, z = climb(charts, poses, steps, 2, POSE, ANYWHERE)
-        found.append((significances(charts, poses).tobytes(), ends.tobytes(), z.tobytes()))
+        found.append((charted_significances(charts, poses).tobytes(), ends.tobytes(), z.tobytes()))
     assert found[0] == found[1]
 
 
@@ -280,8 +280,8 @@ def test_a_climb_never_ends_below_its_start_and_says_where_it_is() -> None:
     before = starts.copy()
     ends, z = climb(charts, starts, ALL_AXES, 4, np.eye(4), ANYWHERE)
     assert (starts == before).all()
-    assert (z >= significances(charts, starts)).all()
-    assert z.tolist() == significances(charts, ends).tolist()
+    assert (z >= charted_significances(charts, starts)).all()
+    assert z.tolist() == charted_significances(charts, ends).tolist()
     assert all(se3.is_rigid(end) for end in ends)
 
 
@@ -300,7 +300,7 @@ def test_no_further_step_of_the_last_size_leads_up() -> None:
         around = [
             stepped(end, axis, sign * ALL_AXES[axis] * 0.5**halvings) for axis in range(6) for sign in (-1.0, 1.0)
         ]
-        assert significances(charts, np.stack(around)).max() <= reached
+        assert charted_significances(charts, np.stack(around)).max() <= reached
 
 
 def test_a_climb_stays_within_reach() -> None:
@@ -308,7 +308,7 @@ def test_a_climb_stays_within_reach() -> None:
     away = se3.perturb(POSE, np.array([np.radians(2.0), 0.0, 0.0, 0.2, 0.0, 0.0]))
     ends, z = climb(charts, away[None], ALL_AXES, 3, away, reach)
     moved = ends[0] @ se3.inverse(away)
-    assert z[0] > significances(charts, away[None])[0]
+    assert z[0] > charted_significances(charts, away[None])[0]
     assert 0.5 * reach[0] < se3.rotation_angle_rad(moved) <= reach[0] + 1e-9
     assert np.linalg.norm(moved[:3, 3]) <= reach[1] + 1e-5
 

@@ -1,17 +1,17 @@
-"""The looks that are kept: over a restart, within bounds, and whatever a power cut left of them."""
+"""The checks that are kept: over a restart, within bounds, and whatever a power cut left of them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from coec.runtime.decisions.check_log import LookLog
-from coec.schemas.replies import LookReply, MetricReply
+from coec.runtime.decisions.check_log import CheckLog
+from coec.schemas.replies import CheckReply, MetricReply
 
 NONE = (None,) * 6
 
 
-def look(stamp_ns: int) -> LookReply:
-    return LookReply(
+def check(stamp_ns: int) -> CheckReply:
+    return CheckReply(
         stamp_ns=stamp_ns,
         pair_stamps_ns=(stamp_ns - 1, stamp_ns),
         flagged=False,
@@ -31,31 +31,31 @@ def look(stamp_ns: int) -> LookReply:
     )
 
 
-def test_a_restart_finds_the_same_looks_and_goes_on(tmp_path: Path) -> None:
-    log = LookLog(tmp_path / "looks", 10)
+def test_a_restart_finds_the_same_checks_and_goes_on(tmp_path: Path) -> None:
+    log = CheckLog(tmp_path / "checks", 10)
     for stamp_ns in range(3):
-        log.append(look(stamp_ns))
-    again = LookLog(tmp_path / "looks", 10)
-    assert again.looks() == log.looks() == tuple(look(stamp_ns) for stamp_ns in range(3))
-    again.append(look(3))
-    assert LookLog(tmp_path / "looks", 10).looks() == again.looks()
+        log.append(check(stamp_ns))
+    again = CheckLog(tmp_path / "checks", 10)
+    assert again.checks() == log.checks() == tuple(check(stamp_ns) for stamp_ns in range(3))
+    again.append(check(3))
+    assert CheckLog(tmp_path / "checks", 10).checks() == again.checks()
 
 
 def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
-    log = LookLog(tmp_path / "looks", 3)
+    log = CheckLog(tmp_path / "checks", 3)
     for stamp_ns in range(20):
-        log.append(look(stamp_ns))
-    assert [one.stamp_ns for one in log.looks()] == [17, 18, 19]
-    assert len((tmp_path / "looks").read_bytes().splitlines()) <= 6
-    assert LookLog(tmp_path / "looks", 3).looks() == log.looks()
+        log.append(check(stamp_ns))
+    assert [one.stamp_ns for one in log.checks()] == [17, 18, 19]
+    assert len((tmp_path / "checks").read_bytes().splitlines()) <= 6
+    assert CheckLog(tmp_path / "checks", 3).checks() == log.checks()
 
 
 def test_what_cannot_be_read_is_left_out(tmp_path: Path) -> None:
-    log = LookLog(tmp_path / "looks", 10)
+    log = CheckLog(tmp_path / "checks", 10)
     for stamp_ns in range(3):
-        log.append(look(stamp_ns))
-    first, second, third = (tmp_path / "looks").read_bytes().splitlines(keepends=True)
-    (tmp_path / "looks").write_bytes(first + b"\xff{\n" + second + third[:40])
-    again = LookLog(tmp_path / "looks", 10)
-    again.append(look(7))
-    assert [one.stamp_ns for one in LookLog(tmp_path / "looks", 10).looks()] == [0, 1, 7]
+        log.append(check(stamp_ns))
+    first, second, third = (tmp_path / "checks").read_bytes().splitlines(keepends=True)
+    (tmp_path / "checks").write_bytes(first + b"\xff{\n" + second + third[:40])
+    again = CheckLog(tmp_path / "checks", 10)
+    again.append(check(7))
+    assert [one.stamp_ns for one in CheckLog(tmp_path / "checks", 10).checks()] == [0, 1, 7]

@@ -9,7 +9,7 @@ import pytest
 
 from coec.adapters.files.conversions import transform_of
 from coec.errors import NotFoundError
-from coec.runtime.decisions.incidents import POINTS_AFTER, POINTS_KEPT, Evidence
+from coec.runtime.decisions.incidents import POINTS_AFTER, POINTS_KEPT, Incidents
 from coec.schemas.replies import EvidenceEvent, MetricsPoint, Reason
 
 
@@ -32,7 +32,7 @@ def point(stamp: int) -> MetricsPoint:
 
 
 def test_an_event_holds_the_figures_before_and_after_it(tmp_path: Path) -> None:
-    evidence = Evidence(tmp_path, "front", 3)
+    evidence = Incidents(tmp_path, "front", 3)
     for stamp in range(POINTS_KEPT + 10):
         evidence.note(point(stamp))
     evidence.begin(event(1000))
@@ -44,7 +44,7 @@ def test_an_event_holds_the_figures_before_and_after_it(tmp_path: Path) -> None:
 
 
 def test_windows_pictures_and_the_end_are_added_and_survive_a_restart(tmp_path: Path) -> None:
-    evidence = Evidence(tmp_path, "front", 3)
+    evidence = Incidents(tmp_path, "front", 3)
     evidence.begin(event(1000))
     assert evidence.awaiting is not None
     evidence.add_window_after("front-2")
@@ -53,7 +53,7 @@ def test_windows_pictures_and_the_end_are_added_and_survive_a_restart(tmp_path: 
     evidence.add_overlay("front-1000", "after", b"jpeg")
     evidence.resolve(2000, "healthy: corrected")
     evidence.resolve(3000, "again")
-    again = Evidence(tmp_path, "front", 3)
+    again = Incidents(tmp_path, "front", 3)
     kept = again.event("front-1000")
     assert (kept.window_before, kept.window_after, kept.overlays) == ("front-1", "front-2", ("after",))
     assert (kept.resolved_stamp_ns, kept.resolution) == (2000, "healthy: corrected")
@@ -66,25 +66,25 @@ def test_windows_pictures_and_the_end_are_added_and_survive_a_restart(tmp_path: 
 
 
 def test_the_oldest_goes_when_there_are_too_many(tmp_path: Path) -> None:
-    evidence = Evidence(tmp_path, "front", 2)
+    evidence = Incidents(tmp_path, "front", 2)
     for stamp in (1000, 900, 30_000):
         evidence.begin(event(stamp, f"front-{stamp - 1}"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["front-30000", "front-900"]
     assert evidence.window_ids == {"front-899", "front-29999"}
-    assert [e.event_id for e in Evidence(tmp_path, "front", 2).listing("test").events] == ["front-900", "front-30000"]
+    assert [e.event_id for e in Incidents(tmp_path, "front", 2).listing("test").events] == ["front-900", "front-30000"]
 
 
 def test_damaged_and_foreign_folders_are_passed_over(tmp_path: Path) -> None:
-    Evidence(tmp_path, "front", 2).begin(event(1000))
+    Incidents(tmp_path, "front", 2).begin(event(1000))
     (tmp_path / "front-2000").mkdir()
     (tmp_path / "front-2000" / "event.json").write_text("{")
     (tmp_path / "front-1000").rename(tmp_path / "front-3000")
-    assert Evidence(tmp_path, "front", 2).listing("test").events == ()
+    assert Incidents(tmp_path, "front", 2).listing("test").events == ()
 
 
 def test_a_disk_that_cannot_be_written_costs_evidence_only(tmp_path: Path) -> None:
     (tmp_path / "evidence").write_text("a file")
-    evidence = Evidence(tmp_path / "evidence", "front", 2)
+    evidence = Incidents(tmp_path / "evidence", "front", 2)
     evidence.begin(event(1000))
     assert evidence.lost == 1
     assert evidence.event("front-1000").window_before == "front-1"

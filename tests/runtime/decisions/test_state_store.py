@@ -21,15 +21,15 @@ from coec.calibration.lifecycle import (
     held,
     initial_state,
 )
-from coec.calibration.monitor.change_detector import MonitorState, Outcome
+from coec.calibration.monitor.change_detector import Finding, MonitorState
 from coec.calibration.types import Decision, Reason, Rig
-from coec.config import FusionConfig, PolicyConfig
+from coec.config import PolicyConfig, TrackerConfig
 from coec.errors import StateError
 from coec.runtime.decisions.state_store import Clocks, StateStore
 from estimates import RIG, estimate
 
-RULES = Rules(PolicyConfig(apply="always"), FusionConfig())
-NEVER = Rules(PolicyConfig(apply="never"), FusionConfig())
+RULES = Rules(PolicyConfig(apply="always"), TrackerConfig())
+NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig())
 CLOCKS = Clocks(77, 88, 99)
 
 
@@ -59,7 +59,7 @@ def test_a_state_comes_back_bit_for_bit_and_says_that_it_was_restored(tmp_path: 
 
 def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> None:
     state = held(after_estimate(initial_state(RIG), estimate(1), 0, NEVER))
-    monitor = MonitorState(1 / 3, Outcome.SUSPECT, {"dark": 0.1}, {"40": 2.5}, (0.1, 0.2), (5, 6))
+    monitor = MonitorState(1 / 3, Finding.SUSPECT, {"dark": 0.1}, {"40": 2.5}, (0.1, 0.2), (5, 6))
     state = replace(state, monitor=monitor, flagged_since_ns=4, changes=(Change(3, (0.1,) * 6),))
     StateStore(tmp_path, "test").remember(RIG, state, CLOCKS)
     first = (tmp_path / "state.json").read_bytes()

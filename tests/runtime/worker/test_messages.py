@@ -1,4 +1,4 @@
-"""A look on its way to the worker and back: nothing is lost, to the bit."""
+"""A check on its way to the worker and back: nothing is lost, to the bit."""
 
 import msgpack
 import numpy as np

@@ -27,7 +27,7 @@ class FaultySolver:
         raise self._fault
 
 
-LOOK = {"kind": "observe", "pair": "front", "pose": [], "frames": []}
+CHECK = {"kind": "check", "pair": "front", "pose": [], "frames": []}
 OVERLAY = {"kind": "overlay", "path": "w", "pose": [], "title": ""}
 SOLVE = {"kind": "solve", "pair": "front", "path": "w"}
 
@@ -36,14 +36,14 @@ def answer(fault: Exception, message: dict[str, Any]) -> dict[str, Any]:
     return process._answer(cast("Solver", FaultySolver(fault)), message)
 
 
-@pytest.mark.parametrize("message", [LOOK, OVERLAY])
+@pytest.mark.parametrize("message", [CHECK, OVERLAY])
 def test_a_fault_of_the_program_is_an_answer(message: dict[str, Any]) -> None:
     told = answer(ZeroDivisionError("division by zero"), message)
     assert (told["kind"], told["code"]) == ("refused", "internal_error")
     assert "ZeroDivisionError: division by zero" in told["text"]
 
 
-@pytest.mark.parametrize("message", [LOOK, OVERLAY, SOLVE])
+@pytest.mark.parametrize("message", [CHECK, OVERLAY, SOLVE])
 def test_what_is_wrong_with_the_data_is_told_under_its_own_code(message: dict[str, Any]) -> None:
     told = answer(CalibrationError("no pairs"), message)
     assert (told["kind"], told["code"], told["text"]) == ("refused", CalibrationError.reply_code, "no pairs")
@@ -56,4 +56,4 @@ def test_a_window_that_the_program_fails_on_ends_the_process() -> None:
 
 def test_without_memory_the_process_ends() -> None:
     with pytest.raises(MemoryError):
-        answer(MemoryError(), LOOK)
+        answer(MemoryError(), CHECK)

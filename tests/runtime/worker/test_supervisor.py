@@ -17,8 +17,8 @@ from coec.config import WorkerConfig
 from coec.runtime.worker import link
 from coec.runtime.worker.supervisor import (
     BUSY,
+    CHECKS_WAITING,
     ERRANDS_WAITING,
-    LOOKS_WAITING,
     PREFETCHES_WAITING,
     SUPERSEDED,
     Errand,
@@ -173,13 +173,13 @@ def test_an_errand_comes_back_with_its_answer(tmp_path: Path) -> None:
     assert answer["echo"] == {"kind": "overlay", "pair": "front", "number": 7}
 
 
-def test_of_the_looks_of_a_pair_the_newest_are_taken_and_errands_are_bounded(tmp_path: Path) -> None:
+def test_of_the_checks_of_a_pair_the_newest_are_taken_and_errands_are_bounded(tmp_path: Path) -> None:
     told: queue.SimpleQueue[object] = queue.SimpleQueue()
     outcomes = Outcomes()
     worker = Worker(LIMITS, "{}", outcomes.events.put, outcomes.on_failed, fake_worker_command("none", tmp_path / "m"))
-    worker.look(errand("observe", told, 0, "rear"))
-    for number in range(1, 2 + LOOKS_WAITING):
-        worker.look(errand("observe", told, number))
+    worker.check(errand("check", told, 0, "rear"))
+    for number in range(1, 2 + CHECKS_WAITING):
+        worker.check(errand("check", told, number))
     assert told.get_nowait() is SUPERSEDED
     for number in range(ERRANDS_WAITING):
         worker.run_errand(errand("overlay", told, 100 + number))
@@ -188,13 +188,13 @@ def test_of_the_looks_of_a_pair_the_newest_are_taken_and_errands_are_bounded(tmp
     worker.solve(job("a"))
     worker.start()
     try:
-        answers = [told.get(timeout=DEADLINE_S) for _ in range(1 + LOOKS_WAITING + ERRANDS_WAITING)]
+        answers = [told.get(timeout=DEADLINE_S) for _ in range(1 + CHECKS_WAITING + ERRANDS_WAITING)]
         assert outcomes.solved().job == job("a")
     finally:
         worker.request_stop()
         assert worker.thread.join(DEADLINE_S)
     numbers = [answer["echo"]["number"] for answer in answers if isinstance(answer, dict)]
-    assert numbers == [0, *range(2, 2 + LOOKS_WAITING), *range(100, 100 + ERRANDS_WAITING)]
+    assert numbers == [0, *range(2, 2 + CHECKS_WAITING), *range(100, 100 + ERRANDS_WAITING)]
 
 
 @pytest.mark.parametrize("fault", ["sick", "sick-refuse"])
@@ -209,17 +209,17 @@ def test_an_errand_that_fails_is_answered_and_not_tried_again(tmp_path: Path, fa
         assert outcomes.solved().job == job("a")
 
 
-def test_looks_that_kill_do_not_keep_the_worker_from_its_windows(tmp_path: Path) -> None:
+def test_checks_that_kill_do_not_keep_the_worker_from_its_windows(tmp_path: Path) -> None:
     outcomes = Outcomes()
     order: queue.SimpleQueue[str] = queue.SimpleQueue()
     command = fake_worker_command("sick", tmp_path / "m")
     worker = Worker(LIMITS, "{}", lambda solved: order.put(solved.job.window_id), outcomes.on_failed, command)
     for number in range(3):
-        worker.look(Errand("observe", "front", {"number": number}, lambda _: order.put("look"), timeout_s=1.0))
+        worker.check(Errand("check", "front", {"number": number}, lambda _: order.put("check"), timeout_s=1.0))
     worker.solve(job("a"))
     worker.start()
     try:
-        assert [order.get(timeout=DEADLINE_S) for _ in range(4)] == ["look", "a", "look", "look"]
+        assert [order.get(timeout=DEADLINE_S) for _ in range(4)] == ["check", "a", "check", "check"]
     finally:
         worker.request_stop()
         assert worker.thread.join(DEADLINE_S)

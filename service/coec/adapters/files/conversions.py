@@ -128,10 +128,10 @@ def metric_of(metric: Metric) -> replies.MetricReply:
     )
 
 
-def look_of(observation: Observation, after: PairState) -> replies.LookReply:
-    """A look, and the state of the pair after it."""
+def check_of(observation: Observation, after: PairState) -> replies.CheckReply:
+    """A check, and the state of the pair after it."""
     drift = observation.drift
-    return replies.LookReply(
+    return replies.CheckReply(
         stamp_ns=observation.stamp_ns,
         pair_stamps_ns=observation.pair_stamps_ns,
         flagged=observation.flagged,

@@ -15,11 +15,11 @@ from coec.geometry import se3
 from coec.geometry.cameras import Camera, pixel_rad
 
 FLOOR = np.array([radians(0.02)] * 3 + [0.004] * 3)
-"""Standard deviation that no look is trusted to be below: what the interpolation of the edge maps leaves (rad, m)."""
+"""Standard deviation that no check is trusted to be below: what the interpolation of the edge maps leaves (rad, m)."""
 
 PRIOR_SPREAD_ROTATION = np.array([radians(0.08), radians(0.07), radians(0.15), np.nan, np.nan, np.nan])
 PRIOR_SPREAD_POSE = np.array([radians(0.20), radians(0.10), radians(0.25), 0.02, 0.04, 0.04])
-"""Spread of a look at one pair over three and six degrees of freedom, on the widest of the 64-beam recordings tried
+"""Spread of a check at one pair over three and six degrees of freedom, on the widest of the 64-beam recordings tried
 (rad, m)."""
 
 UNCOMMISSIONED_BIAS = np.array([radians(0.12)] * 3 + [0.03] * 3)
@@ -36,14 +36,14 @@ PIXEL_RANGE_M = 8.0
 
 
 FIGURES = "edges-kept"
-"""Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a look at
+"""Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a check at
 the same pairs gives other figures: limits of the old ones would not fit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:
-    """How far the local optimum of a look lies from a right pose: `bias` (6,), known to `bias_sigma` (6,), and
-    `spread` (6,) of a look at one pair (rad, m). NaN on axes that the look does not search."""
+    """How far the local optimum of a check lies from a right pose: `bias` (6,), known to `bias_sigma` (6,), and
+    `spread` (6,) of a check at one pair (rad, m). NaN on axes that the check does not search."""
 
     bias: NDArray[np.float64]
     bias_sigma: NDArray[np.float64]
@@ -55,7 +55,7 @@ class Accuracy:
         return np.nan_to_num(self.bias)
 
     def sigma(self, pairs: int) -> NDArray[np.float64]:
-        """(6,) standard deviation of the offset of a look at so many pairs, less the bias."""
+        """(6,) standard deviation of the offset of a check at so many pairs, less the bias."""
         variance = self.spread**2 / max(pairs, 1) + self.bias_sigma**2 + FLOOR**2
         return np.asarray(np.sqrt(variance))
 
@@ -75,13 +75,13 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True)
 class MonitorLimits:
-    """Where a look turns bad. The paper's three refuse nothing until they were learned.
+    """Where a check turns bad. The paper's three refuse nothing until they were learned.
 
     Attributes:
         max_distance2_rotation: of the local optimum over rotations, in standard deviations, squared.
         max_farthest2_pose: the same over six degrees of freedom, of the axis that is farthest off.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
-        min_edges_kept: see `Look`; where fewer are kept, a quarter of the distance over rotations is too far.
+        min_edges_kept: see `Check`; where fewer are kept, a quarter of the distance over rotations is too far.
         max_agreement_rad: between the local optima of the two witnesses.
         min_overlap: points in view over the most that any pose within reach sees.
         min_mi, max_f1, min_f2: equation (2) of Borer et al. 2023: nats, per radian, per radian².
@@ -99,13 +99,13 @@ class MonitorLimits:
 
 
 def pixel_floor(camera: Camera) -> NDArray[np.float64]:
-    """(6,) standard deviation that the pixels of a camera leave to any look, however many pairs it has (rad, m)."""
+    """(6,) standard deviation that the pixels of a camera leave to any check, however many pairs it has (rad, m)."""
     off_rad = PIXEL_SHARE * pixel_rad(camera)
     return np.array([off_rad] * 3 + [off_rad * PIXEL_RANGE_M] * 3)
 
 
 def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:
-    """What to expect of looks over three and six degrees of freedom on a rig of which only its camera is known."""
+    """What to expect of checks over three and six degrees of freedom on a rig of which only its camera is known."""
     bias_sigma = np.sqrt(UNCOMMISSIONED_BIAS**2 + pixel_floor(camera) ** 2)
     rotation = Accuracy(np.array([0.0] * 3 + [np.nan] * 3), bias_sigma, PRIOR_SPREAD_ROTATION)
     return rotation, Accuracy(np.zeros(6), bias_sigma, PRIOR_SPREAD_POSE)
@@ -117,13 +117,13 @@ class Baseline:
 
     Attributes:
         T_camera_lidar: (4, 4) the reference: workshop calibration, or what was current when it was commissioned.
-        rotation, pose: how looks over three and six degrees of freedom lie about the reference.
+        rotation, pose: how checks over three and six degrees of freedom lie about the reference.
         dof: of the calibrations of this rig; decides which of the two is `bias`.
         limits: learned limits, by the names of `VerdictConfig`.
-        monitor: learned limits of a look.
-        false_alarm_rate: share of looks at a right pose that the limits were chosen to flag at most.
+        monitor: learned limits of a check.
+        false_alarm_rate: share of checks at a right pose that the limits were chosen to flag at most.
         windows, pairs: from how many it was learned.
-        detected: share of looks that were flagged after the reference had been moved, by amount, as `0.5 deg`.
+        detected: share of checks that were flagged after the reference had been moved, by amount, as `0.5 deg`.
         sensors: what identifies the sensors, by stream: serial numbers where known, else frame ids.
         depth_identity, config_hash: of the calibrations that it holds for.
     """

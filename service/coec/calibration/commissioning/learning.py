@@ -27,8 +27,8 @@ from coec.calibration.commissioning.baseline import (
     pixel_floor,
 )
 from coec.calibration.commissioning.verdict_limits import verdict_limits
-from coec.calibration.estimators import look
-from coec.calibration.monitor.check import POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
+from coec.calibration.estimators import sight_of
+from coec.calibration.monitor.check import POSE_DOF, ROTATION_DOF, Check, CheckInput, check_at, gather
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, edges_per_pair, over_limits
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
@@ -50,19 +50,19 @@ PRIOR_BLOCKS = 6
 """Blocks that the spread known from other rigs counts for."""
 
 OUTLIER = 4.0
-"""Times the median deviation beyond which the look at a half counts for no more (2.7 standard deviations)."""
+"""Times the median deviation beyond which the check at a half counts for no more (2.7 standard deviations)."""
 
-LOOK_PAIRS = 6
-"""Pairs of a look from which limits are learned: about as many as the monitor takes."""
+CHECK_PAIRS = 6
+"""Pairs of a check from which limits are learned: about as many as the monitor takes."""
 
-LOOKS, FAR_LOOKS = 12, 5
-"""Looks at the right pose and after every move, and far off."""
+CHECKS, FAR_CHECKS = 12, 5
+"""Checks at the right pose and after every move, and far off."""
 
 SMALL_RAD, SMALL_M = radians(0.5), 0.10
 """The smallest moves that have to be seen."""
 
 FAR_RAD = radians(12.0)
-"""A move beyond the reach of a look: what is found there is no optimum."""
+"""A move beyond the reach of a check: what is found there is no optimum."""
 
 MOVES = (
     ("0.5 deg", SMALL_RAD, 0.0),
@@ -75,8 +75,8 @@ MOVES = (
 SEED = 20_230_617
 
 MOST_KEPT = 0.88
-"""Limit of the edges that a look keeps, at most. Right looks kept 0.91 and more on other pairs than those that the bias
-was learned from; after half a degree they kept 0.2 to 0.8."""
+"""Limit of the edges that a check keeps, at most. Right checks kept 0.91 and more on other pairs than those that the
+bias was learned from; after half a degree they kept 0.2 to 0.8."""
 
 AGREEMENT_RAD = radians(0.5)
 """Least limit of the witnesses' disagreement: a quarter of the hill of the depth witness."""
@@ -99,7 +99,7 @@ def commission(
         windows: of one rig, in which the extrinsic is right.
         sensors: what identifies the sensors, by stream; the frame ids are added.
         reference: (4, 4) the right extrinsic; None = the workshop calibration of the rig.
-        false_alarm_rate: share of looks at a right pose that may be flagged.
+        false_alarm_rate: share of checks at a right pose that may be flagged.
 
     Raises:
         CalibrationError: too few pairs, or the windows do not show the reference: nothing is learned from a rig that is
@@ -109,13 +109,13 @@ def commission(
     whole = _merged(windows)
     rig = whole.rig
     right = rig.T_camera_lidar_nominal if reference is None else reference
-    evidence = gather(look(replace(whole, T_camera_lidar_start=right), depth, images, config, heard))
+    evidence = gather(sight_of(replace(whole, T_camera_lidar_start=right), depth, images, config, heard))
     rotation, pose = _accuracies(evidence, right, config, heard)
     _check(rotation)
-    looks = _Looks(evidence, right, config, rotation.expected, heard)
-    clean = looks.moved(0.0, 0.0, "right", LOOKS)
-    moved = {name: looks.moved(turn_rad, shift_m, name, LOOKS) for name, turn_rad, shift_m in MOVES}
-    far = looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS)
+    checks = _Checks(evidence, right, config, rotation.expected, heard)
+    clean = checks.moved(0.0, 0.0, "right", CHECKS)
+    moved = {name: checks.moved(turn_rad, shift_m, name, CHECKS) for name, turn_rad, shift_m in MOVES}
+    far = checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS)
     monitor = _monitor_limits(clean, moved, far, rotation, pose, false_alarm_rate)
     accuracy = rotation if config.search.dof == ROTATION_DOF else pose
     expected = se3.perturb(right, accuracy.expected)
@@ -142,25 +142,30 @@ def commission(
     )
 
 
-def is_flagged(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> bool:
-    """Whether a look puts the local optimum too far from where it should be."""
+def is_flagged(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> bool:
+    """Whether a check puts the local optimum too far from where it should be."""
     return max(over_limits(seen, rotation, pose, limits)) > 1.0
 
 
-def learn_accuracy(evidence: Evidence, right: Matrix4, config: CalibrationConfig) -> tuple[Accuracy, Accuracy]:
-    """How looks over three and over six degrees of freedom lie about the right pose (4, 4)."""
+def learn_accuracy(evidence: CheckInput, right: Matrix4, config: CalibrationConfig) -> tuple[Accuracy, Accuracy]:
+    """How checks over three and over six degrees of freedom lie about the right pose (4, 4)."""
     return _accuracies(evidence, right, config, Silence())
 
 
 def learn_limits(
-    evidence: Evidence, right: Matrix4, config: CalibrationConfig, accuracies: tuple[Accuracy, Accuracy], rate: float
+    evidence: CheckInput, right: Matrix4, config: CalibrationConfig, accuracies: tuple[Accuracy, Accuracy], rate: float
 ) -> MonitorLimits:
-    """The limits of looks, at a false-alarm rate."""
+    """The limits of checks, at a false-alarm rate."""
     rotation, pose = accuracies
-    looks = _Looks(evidence, right, config, rotation.expected, Silence())
-    moved = {name: looks.moved(turn_rad, shift_m, name, LOOKS) for name, turn_rad, shift_m in MOVES[::3]}
+    checks = _Checks(evidence, right, config, rotation.expected, Silence())
+    moved = {name: checks.moved(turn_rad, shift_m, name, CHECKS) for name, turn_rad, shift_m in MOVES[::3]}
     return _monitor_limits(
-        looks.moved(0.0, 0.0, "right", LOOKS), moved, looks.moved(FAR_RAD, 0.0, "far", FAR_LOOKS), rotation, pose, rate
+        checks.moved(0.0, 0.0, "right", CHECKS),
+        moved,
+        checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS),
+        rotation,
+        pose,
+        rate,
     )
 
 
@@ -178,15 +183,15 @@ def _merged(windows: Sequence[Window]) -> Window:
 
 
 def _accuracies(
-    evidence: Evidence, right: Matrix4, config: CalibrationConfig, heard: Progress
+    evidence: CheckInput, right: Matrix4, config: CalibrationConfig, heard: Progress
 ) -> tuple[Accuracy, Accuracy]:
-    """The bias from all pairs, the spread of one pair from looks at halves of them."""
+    """The bias from all pairs, the spread of one pair from checks of halves of them."""
     count = len(evidence.pairs)
-    whole = look_at(evidence, right, config)
+    whole = check_at(evidence, right, config)
     halves = _halves(count)
     of_halves = []
     for number, half in enumerate(halves, start=1):
-        of_halves.append(look_at(evidence.of(half), right, config))
+        of_halves.append(check_at(evidence.of(half), right, config))
         heard.step("spread", number, len(halves))
     at_rotation = np.array([seen.offset_rotation for seen in of_halves])
     at_pose = np.array([seen.offset_pose for seen in of_halves])
@@ -221,13 +226,13 @@ def _accuracy(
     count: int,
     pixels: NDArray[np.float64],
 ) -> Accuracy:
-    """From a look at all pairs (6,) and at halves of them (H, 6), which vary about it by `share` (H,) of the variance
+    """From a check at all pairs (6,) and at halves of them (H, 6), which vary about it by `share` (H,) of the variance
     of one pair, and what is known of other rigs: the variance of few blocks is uncertain itself (the posterior mean
     under an inverse gamma prior of `PRIOR_BLOCKS` degrees of freedom). The bias is that of the streets that were
     driven; on others it is another share of a pixel (`pixels`, (6,))."""
     free = min(count, BLOCKS) - 1
     apart = np.abs(of_halves - whole)
-    # One look that ended in another basin must not make the rig look blind.
+    # One check that ended in another basin must not make the rig look blind.
     apart = np.minimum(apart, OUTLIER * np.median(apart, axis=0) + FLOOR)
     variance = (apart**2 / share[:, None]).mean(axis=0)
     spread = np.sqrt((PRIOR_BLOCKS * prior**2 + free * variance) / (PRIOR_BLOCKS + free))
@@ -247,12 +252,12 @@ MAX_BIAS_RAD = radians(1.0)
 """More than this is no bias of the estimator, but a wrong reference."""
 
 
-class _Looks:
-    """Looks at seeded subsets of the pairs, near the right pose moved by a known amount in seeded directions."""
+class _Checks:
+    """Checks at seeded subsets of the pairs, near the right pose moved by a known amount in seeded directions."""
 
     def __init__(
         self,
-        evidence: Evidence,
+        evidence: CheckInput,
         right: Matrix4,
         config: CalibrationConfig,
         bias: NDArray[np.float64],
@@ -264,11 +269,11 @@ class _Looks:
         self._bias = bias
         self._heard = heard
 
-    def moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[Look]:
+    def moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[Check]:
         """`count` looks after a turn and a shift."""
         rng = np.random.default_rng([SEED, round(turn_rad * 1e6), round(shift_m * 1e6)])
         pairs = len(self._evidence.pairs)
-        size = min(LOOK_PAIRS, pairs - 1)
+        size = min(CHECK_PAIRS, pairs - 1)
         seen = []
         for number in range(1, count + 1):
             # Neighbours, as the monitor sees them.
@@ -276,7 +281,7 @@ class _Looks:
             indices = sorted((first + step) % pairs for step in range(size))
             xi = np.concatenate([turn_rad * _direction(rng), shift_m * _direction(rng)])
             moved = se3.perturb(self._right, xi)
-            seen.append(look_at(self._evidence.of(indices), moved, self._config, self._bias))
+            seen.append(check_at(self._evidence.of(indices), moved, self._config, self._bias))
             self._heard.step(name, number, count)
         return seen
 
@@ -287,9 +292,9 @@ def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _monitor_limits(
-    clean: Sequence[Look],
-    moved: dict[str, list[Look]],
-    far: Sequence[Look],
+    clean: Sequence[Check],
+    moved: dict[str, list[Check]],
+    far: Sequence[Check],
     rotation: Accuracy,
     pose: Accuracy,
     rate: float,
@@ -315,7 +320,7 @@ def _monitor_limits(
 
 
 def _between(right: float, wrong: float) -> float:
-    """Half-way, in ratio, from what right looks do not exceed to the least of the moved ones, and no nearer to these
+    """Half-way, in ratio, from what right checks do not exceed to the least of the moved ones, and no nearer to these
     than at a quarter of it; where the two come close the false-alarm rate decides."""
     return max(right, min(sqrt(right * wrong), 0.25 * wrong))
 

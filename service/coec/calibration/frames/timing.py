@@ -29,11 +29,11 @@ SCALES = (-1.0, 0.0, 0.33, 0.5, 2.0, 3.0)
 """Factors on the ego-motion that are tried: a wrong sign, a missing signal, wrong units and gains."""
 
 AS_GOOD, BETTER = 0.97, 1.08
-"""Of a flagged look: the share of the significance of the moved extrinsic that a hypothesis must reach without moving
+"""Of a flagged check: the share of the significance of the moved extrinsic that a hypothesis must reach without moving
 it (its grid is coarser than the peak), and by which it must exceed that of the extrinsic as it was."""
 
 GAIN, FRAMES_AGREE = 0.01, 0.6
-"""Of any look: what a hypothesis must gain at the local optimum, and the share of pairs that must gain. On real drives
+"""Of any check: what a hypothesis must gain at the local optimum, and the share of pairs that must gain. On real drives
 a right clock and ego-motion lose 2 % by each of them; a wrong sign or a factor of three leaves 2 to 7 % to gain."""
 
 FINE_PIXEL_RAD = radians(0.15)
@@ -50,7 +50,7 @@ def explained_by_motion(
     be tried for want of motion.
 
     Args:
-        pairs: of a look.
+        pairs: of a check.
         level: their range edges and edge maps, on one level.
         expected: (4, 4) where the local optimum should be.
         found: (4, 4) where it is.

@@ -24,8 +24,8 @@ CELLS = 180
 """Of the table of directions that are in view, from the optical axis to its opposite and all around it: 1° and 2°."""
 
 LOOKS_PER_BIN = 16
-"""Pairs of a bin that are looked at before it stays empty: a look decodes an image, and a camera that is dirty, dark or
-standing for an hour must not cost a decode of every frame."""
+"""Pairs of a bin that are looked at before it stays empty: looking decodes an image, and a camera that is dirty, dark
+or standing for an hour must not cost a decode of every frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,12 +24,12 @@ def page() -> str:
         "Rows: what happens. Columns: the state in which it happens. · means that nothing changes.\n\n"
         f"{markdown()}\n"
         "## What the monitor needs\n\n"
-        "Looks add up: a flagged look at pairs that were not counted yet adds 1, a clear one takes 1 off, a flagged\n"
+        "Checks add up: a flagged check of pairs that were not counted yet adds 1, a clear one takes 1 off, a flagged\n"
         f"one with faint edges adds {change_detector.WEAK_SHARE:g}.\n"
         f"`suspect` from {change_detector.SUSPECT_AT:g} on, `miscalibrated` from {change_detector.CONFIRMED_AT:g} on, "
         f"clear again below {change_detector.CLEAR_BELOW:g}; never more than {change_detector.MOST:g}.\n"
         f"A cause in the data is believed from {change_detector.BLIND_AT:g} on; dirt is one after the same blocks\n"
-        f"of the image have shown no contrast for {sensor_faults.DIRTY_LOOKS:g} looks.\n\n"
+        f"of the image have shown no contrast for {sensor_faults.DIRTY_CHECKS:g} checks.\n\n"
         f"## Causes\n\n{told}"
     )
 

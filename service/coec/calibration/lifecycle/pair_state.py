@@ -1,4 +1,4 @@
-"""The state of a pair and every step it can take: windows, looks of the monitor, age, commands of people.
+"""The state of a pair and every step it can take: windows, checks of the monitor, age, commands of people.
 
 An estimate that was not accepted is never served as current; a pair that was not looked at is never healthy; what a
 person froze does not move. Each function returns the next state whole; `PairState` is all that survives a restart.
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from coec.calibration.lifecycle import policy
 from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
-from coec.calibration.monitor.change_detector import MonitorState, Observation, Outcome, diagnose
-from coec.calibration.monitor.change_detector import after_observation as look_taken
+from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation, diagnose
+from coec.calibration.monitor.change_detector import after_observation as check_taken
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
 from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
-from coec.config import FusionConfig, PolicyConfig
+from coec.config import PolicyConfig, TrackerConfig
 from coec.errors import CoecError
 from coec.geometry import se3
 
@@ -85,7 +85,7 @@ class Rules:
     """What the owner of the vehicle has laid down."""
 
     policy: PolicyConfig
-    fusion: FusionConfig
+    tracker: TrackerConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,8 +102,8 @@ class PairState:
         pending: what waits for `apply`.
         frozen: whether a person holds the extrinsic.
         proven: whether a window, or commissioning, has confirmed what is served.
-        track: the fusion of accepted windows since the extrinsic last jumped; None before the first.
-        monitor: what the looks since then add up to.
+        track: the combination of accepted windows since the extrinsic last jumped; None before the first.
+        monitor: what the checks since then add up to.
         flagged_since_ns: sensor time since which the monitor has something against the pairs, None while it has not. A
             window that began earlier mixes two mounts: it neither corrects nor acquits.
         changes: steps of the last day that nobody ordered.
@@ -200,13 +200,13 @@ def _fused(state: PairState, estimate: Estimate, rules: Rules) -> Track:
     pose = estimate.optimum.T_camera_lidar
     track = state.track
     if track is None or _accused_elsewhere(state, estimate, rules):
-        track = Track.initial(pose, prior_sigma(rules.fusion), estimate.data_stamp_ns)
-    return absorb(track, measurement, rules.fusion)
+        track = Track.initial(pose, prior_sigma(rules.tracker), estimate.data_stamp_ns)
+    return absorb(track, measurement, rules.tracker)
 
 
 def _accused_elsewhere(state: PairState, estimate: Estimate, rules: Rules) -> bool:
     """Whether the monitor speaks against what is served, and the estimate is too far from it for both to be right."""
-    accused = state.monitor.outcome in (Outcome.SUSPECT, Outcome.CONFIRMED)
+    accused = state.monitor.outcome in (Finding.SUSPECT, Finding.CONFIRMED)
     return accused and not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
 
 
@@ -254,28 +254,28 @@ def _confirmed(state: PairState) -> PairState:
 
 
 def after_observation(state: PairState, observation: Observation) -> PairState:
-    """The monitor had a look at the served extrinsic. One look decides nothing: `MonitorState` adds them up."""
-    monitor = look_taken(state.monitor, observation)
+    """The monitor checked the served extrinsic. One check decides nothing: `MonitorState` adds them up."""
+    monitor = check_taken(state.monitor, observation)
     since_ns = state.flagged_since_ns
     if observation.flagged and not observation.causes:
         if since_ns is None:
-            # Without a clear look before, nothing says that earlier pairs were any better.
-            was_clear = state.monitor.outcome is Outcome.CLEAR
+            # Without a clear check before, nothing says that earlier pairs were any better.
+            was_clear = state.monitor.outcome is Finding.CLEAR
             since_ns = observation.pair_stamps_ns[0] if was_clear else state.valid_from_ns
-    elif monitor.outcome in (Outcome.CLEAR, Outcome.UNKNOWN):
+    elif monitor.outcome in (Finding.CLEAR, Finding.UNKNOWN):
         since_ns = None
     state = replace(state, monitor=monitor, flagged_since_ns=since_ns)
     cause = diagnose(monitor)
     if cause is not None and cause.code != BENT_MOUNT:
         return _unless_red(state, Event.DATA_CAUSE, cause.as_reason())
-    if monitor.outcome is Outcome.CONFIRMED:
+    if monitor.outcome is Finding.CONFIRMED:
         why = () if cause is None else (cause.as_reason(),)
         return happened(state, Event.MOUNT_MOVED, *(why or (Reason(BENT_MOUNT, "The mount has moved."),)))
-    if monitor.outcome is Outcome.SUSPECT:
+    if monitor.outcome is Finding.SUSPECT:
         text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to tell."
         return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
     # Against an accepted window that contradicts what is served the word of the monitor is not enough.
-    if monitor.outcome is Outcome.CLEAR and (state.pending is None or not state.pending.contradicts):
+    if monitor.outcome is Finding.CLEAR and (state.pending is None or not state.pending.contradicts):
         if state.proven:
             return happened(state, Event.CLEAR)
         after = happened(state, Event.NO_OBJECTION, NOT_EVALUATED)
@@ -284,7 +284,7 @@ def after_observation(state: PairState, observation: Observation) -> PairState:
 
 
 def aged(state: PairState, age_s: float | None, stale_after_s: float) -> PairState:
-    """Time has passed since the last look (None: nobody knows when that was)."""
+    """Time has passed since the last check (None: nobody knows when that was)."""
     if age_s is None:
         return state if state.health is HealthState.UNKNOWN else happened(state, Event.REPLACED, NOT_EVALUATED)
     if age_s <= stale_after_s or TRANSITIONS[state.health, Event.AGED] is state.health:
@@ -307,7 +307,7 @@ def apply_pending(state: PairState, rules: Rules) -> PairState:
         raise CommandRefusedError("nothing_pending", "No candidate waits.")
     pose, estimate, track = state.pending.T_camera_lidar, state.pending.estimate, state.track
     if track is None or not np.array_equal(track.T_camera_lidar, pose):
-        track = Track.initial(pose, prior_sigma(rules.fusion), estimate.data_stamp_ns)
+        track = Track.initial(pose, prior_sigma(rules.tracker), estimate.data_stamp_ns)
     return replace(_served(state, pose, estimate), track=track)
 
 
@@ -325,7 +325,7 @@ def rolled_back(state: PairState, pose: Matrix4, estimate: Estimate, rules: Rule
         valid_from_ns=estimate.data_stamp_ns,
         accepted=estimate,
         proven=True,
-        track=Track.initial(pose, prior_sigma(rules.fusion), estimate.data_stamp_ns),
+        track=Track.initial(pose, prior_sigma(rules.tracker), estimate.data_stamp_ns),
     )
 
 

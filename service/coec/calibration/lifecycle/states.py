@@ -62,8 +62,8 @@ MEANING: Mapping[Event, str] = MappingProxyType(
         Event.SUSPECTED: "the monitor suspects that the mount has moved",
         Event.MOUNT_MOVED: "the monitor is certain that the mount has moved",
         Event.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
-        Event.AGED: "the last look is older than `stale_after_s`",
-        Event.REPLACED: "a person replaced the extrinsic (rollback, reset), or the time of the last look is lost",
+        Event.AGED: "the last check is older than `stale_after_s`",
+        Event.REPLACED: "a person replaced the extrinsic (rollback, reset), or the time of the last check is lost",
     }
 )
 

@@ -1,7 +1,7 @@
-"""Is the extrinsic that is served still right? A sequential decision over short looks, one every few seconds.
+"""Is the extrinsic that is served still right? A sequential decision over short checks, one every few seconds.
 
-It adds up the evidence of looks at pairs that were not counted yet (Page 1954, "Continuous inspection schemes"): one
-bad frame decides nothing. Each look was judged by itself (`judging`).
+It adds up the evidence of checks of pairs that were not counted yet (Page 1954, "Continuous inspection schemes"): one
+bad frame decides nothing. Each check was judged by itself (`check_verdict`).
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.baseline import Drift
-from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, DIRTY_LOOKS, DIRTY_SHARE, LENS_DIRTY, Cause
+from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, DIRTY_CHECKS, DIRTY_SHARE, LENS_DIRTY, Cause
 from coec.calibration.types import Metric
 
 SUSPECT_AT, CONFIRMED_AT, CLEAR_BELOW, MOST = 1.5, 2.5, 0.5, 3.5
-"""Evidence in independent looks: to become suspect and confirmed, below which it clears again, and at most, so that a
-repaired mount clears within three looks, too. A bad frame is in at most one look and its overlap with the next."""
+"""Evidence in independent checks: to become suspect and confirmed, below which it clears again, and at most, so that a
+repaired mount clears within three checks, too. A bad frame is in at most one check and its overlap with the next."""
 
 WEAK_SHARE = 0.5
-"""A flagged look whose edges are faint counts half, and confirms nothing: a full solve has to."""
+"""A flagged check whose edges are faint counts half, and confirms nothing: a full solve has to."""
 
 BLIND_AT = 1.2
-"""Evidence by which a cause in the data is believed: more than one look."""
+"""Evidence by which a cause in the data is believed: more than one check."""
 
 
 def _unknown() -> NDArray[np.float64]:
     return np.full(6, np.nan)
 
 
-class Outcome(StrEnum):
-    """What the looks so far say. `unknown`: nothing was seen that could tell."""
+class Finding(StrEnum):
+    """What the checks so far say. `unknown`: nothing was seen that could tell."""
 
     UNKNOWN = "unknown"
     CLEAR = "clear"
@@ -43,7 +43,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """One look at the current extrinsic, judged.
+    """One check of the current extrinsic, judged.
 
     Attributes:
         stamp_ns: of the last pair.
@@ -55,7 +55,7 @@ class Observation:
         flagged: the pose is wrong, or the data are.
         weak: the edges at the local optimum are fainter than they should be.
         flagged_by_paper: equation (2) with learned limits; None until the rig is commissioned.
-        causes: what is wrong with the data, those that hide others first; such a look says nothing of the pose.
+        causes: what is wrong with the data, those that hide others first; such a check says nothing of the pose.
         first_derivative, second_derivative: (6,) ∂MI/∂ξ and -∂²MI/∂ξ² at the pose: the paper's f' and f'' on each axis
             (nats per rad or m, and per rad² or m²).
         drift: of the local optimum from the commissioned calibration; None until the rig is commissioned.
@@ -82,19 +82,19 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class MonitorState:
-    """What the looks so far add up to: plain values that go through JSON as they are.
+    """What the checks so far add up to: plain values that go through JSON as they are.
 
     Attributes:
-        evidence: in independent looks that say the mount is bent, floor 0.
+        evidence: in independent checks that say the mount is bent, floor 0.
         outcome: see there.
         blind: the same for every cause in the data, by code.
-        dirt: the same for every block of the image that was dirty in all looks since, by its number.
+        dirt: the same for every block of the image that was dirty in all checks since, by its number.
         offset: running mean of the flagged offsets (rad, m); empty without one.
-        last_stamps_ns: of the pairs of the last look.
+        last_stamps_ns: of the pairs of the last check.
     """
 
     evidence: float = 0.0
-    outcome: Outcome = Outcome.UNKNOWN
+    outcome: Finding = Finding.UNKNOWN
     blind: Mapping[str, float] = field(default_factory=dict)
     dirt: Mapping[str, float] = field(default_factory=dict)
     offset: tuple[float, ...] = ()
@@ -102,12 +102,12 @@ class MonitorState:
 
 
 def after_observation(state: MonitorState, observation: Observation) -> MonitorState:
-    """The state after one more look. It counts by the share of its pairs that the last one did not hold."""
+    """The state after one more check. It counts by the share of its pairs that the last one did not hold."""
     counted = set(state.last_stamps_ns)
     fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
     dirt = _dirt_after(state.dirt, observation, fresh)
     codes = {cause.code for cause in observation.causes}
-    if sum(run >= DIRTY_LOOKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
+    if sum(run >= DIRTY_CHECKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
         codes.add(LENS_DIRTY.code)
     blind = {
         code: min(max(state.blind.get(code, 0.0) + (fresh if code in codes else -fresh), 0.0), MOST)
@@ -134,26 +134,26 @@ def diagnose(state: MonitorState) -> Cause | None:
     for code, cause in CAUSES.items():
         if state.blind.get(code, 0.0) >= BLIND_AT:
             return cause
-    return BENT_MOUNT if state.outcome is Outcome.CONFIRMED else None
+    return BENT_MOUNT if state.outcome is Finding.CONFIRMED else None
 
 
 def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: float) -> dict[str, float]:
-    """Whatever shows contrast once is not dirty; a look that cannot tell changes nothing."""
+    """Whatever shows contrast once is not dirty; a check that cannot tell changes nothing."""
     if observation.textured == 0:
         return dict(dirt)
     dirty = {str(block) for block in observation.dirty}
-    return {block: min(dirt.get(block, 0.0) + fresh, DIRTY_LOOKS + 1.0) for block in sorted(dirty)}
+    return {block: min(dirt.get(block, 0.0) + fresh, DIRTY_CHECKS + 1.0) for block in sorted(dirty)}
 
 
-def _outcome(before: Outcome, evidence: float) -> Outcome:
+def _outcome(before: Finding, evidence: float) -> Finding:
     """With hysteresis: what was suspected stays so until little speaks for it."""
     if evidence >= CONFIRMED_AT:
-        return Outcome.CONFIRMED
-    if before is Outcome.CONFIRMED and evidence >= CLEAR_BELOW:
+        return Finding.CONFIRMED
+    if before is Finding.CONFIRMED and evidence >= CLEAR_BELOW:
         return before
-    if evidence >= SUSPECT_AT or (before is Outcome.SUSPECT and evidence >= CLEAR_BELOW):
-        return Outcome.SUSPECT
-    return Outcome.CLEAR
+    if evidence >= SUSPECT_AT or (before is Finding.SUSPECT and evidence >= CLEAR_BELOW):
+        return Finding.SUSPECT
+    return Finding.CLEAR
 
 
 def _mean(before: tuple[float, ...], offset: NDArray[np.float64], share: float) -> tuple[float, ...]:

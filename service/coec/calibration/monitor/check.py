@@ -1,6 +1,6 @@
-"""A short look at a few pairs: where both witnesses put the extrinsic near a pose, and how good the pose itself is.
+"""A short check of a few pairs: where both witnesses put the extrinsic near a pose, and how good the pose itself is.
 
-What a full calibration does within tens of degrees, a look does within `REACH_RAD` of the pose it is asked about, and
+What a full calibration does within tens of degrees, a check does within `REACH_RAD` of the pose it is asked about, and
 in all six degrees of freedom whatever the calibration searches: a shifted mount must be seen even where only rotations
 are estimated.
 """
@@ -36,7 +36,7 @@ from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significa
 from coec.geometry.edges.charts import EdgeCharts
 
 REACH_RAD = radians(4.0)
-"""How far about the pose a look searches. A pose further off leaves the local optimum at the rim, or nowhere: both are
+"""How far about the pose a check searches. A pose further off leaves the local optimum at the rim, or nowhere: both are
 far beyond any limit."""
 
 BASINS = 2
@@ -48,7 +48,7 @@ NO_BIAS = np.zeros(6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class CheckInput:
     """Some pairs with everything decoded and inferred that looks at any pose need. Entries are per pair, in order."""
 
     rig: Rig
@@ -57,9 +57,9 @@ class Evidence:
     edges: EdgeWitness
     scenes: tuple[SceneFacts, ...]
 
-    def of(self, indices: Sequence[int]) -> Evidence:
+    def of(self, indices: Sequence[int]) -> CheckInput:
         """The same of some of the pairs."""
-        return Evidence(
+        return CheckInput(
             self.rig,
             tuple(self.pairs[i] for i in indices),
             tuple(self.features[i] for i in indices),
@@ -69,8 +69,8 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
-    """What a look at a pose tells. Derivatives are those of mutual information (Borer et al. 2023), at the pose, over
+class Check:
+    """What a check at a pose tells. Derivatives are those of mutual information (Borer et al. 2023), at the pose, over
     rx ry rz tx ty tz; equation (2) looks at the rotations.
 
     Attributes:
@@ -116,7 +116,7 @@ class Look:
         return float(np.min(self.second_derivative[:ROTATION_DOF]))
 
 
-def gather(sight: Sight) -> Evidence:
+def gather(sight: Sight) -> CheckInput:
     """Decodes and infers everything that looks at the pairs of `sight` need.
 
     Raises:
@@ -130,11 +130,13 @@ def gather(sight: Sight) -> Evidence:
     scenes = [
         scene_facts(pair, grey, int(count)) for pair, grey, count in zip(window.pairs, greys, counts, strict=True)
     ]
-    return Evidence(window.rig, window.pairs, tuple(features), edges, tuple(scenes))
+    return CheckInput(window.rig, window.pairs, tuple(features), edges, tuple(scenes))
 
 
-def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig, bias: NDArray[np.float64] = NO_BIAS) -> Look:
-    """A look at `pose` (4, 4), from which the optimum over rotations is expected at ξ = `bias` (6,).
+def check_at(
+    evidence: CheckInput, pose: Matrix4, config: CalibrationConfig, bias: NDArray[np.float64] = NO_BIAS
+) -> Check:
+    """A check at `pose` (4, 4), from which the optimum over rotations is expected at ξ = `bias` (6,).
 
     Raises:
         CalibrationError: no point can come into view.
@@ -161,7 +163,7 @@ def look_at(evidence: Evidence, pose: Matrix4, config: CalibrationConfig, bias: 
     T_edges, T_depth = polished([of_edges], T_rotation), polished([depth], T_rotation)
     at_pose = fusion.settling[0].evaluate(pose)
     first_derivative, second_derivative = axis_derivatives(depth, pose)
-    return Look(
+    return Check(
         pairs=len(evidence.pairs),
         T_rotation=T_rotation,
         T_pose=T_pose,

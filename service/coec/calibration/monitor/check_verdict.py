@@ -1,4 +1,4 @@
-"""A look, judged: its figures against the limits of the rig, and what is wrong with its data.
+"""A check, judged: its figures against the limits of the rig, and what is wrong with its data.
 
 The figures are the paper's three, equation (2), and next to them a sharper question: how many standard deviations lie
 between the pose and the local optimum of both witnesses.
@@ -18,10 +18,10 @@ from coec.calibration.commissioning.baseline import (
     chi2_quantile,
     uncommissioned,
 )
-from coec.calibration.estimators import look
+from coec.calibration.estimators import sight_of
 from coec.calibration.frames.timing import explained_by_motion
 from coec.calibration.monitor.change_detector import Observation
-from coec.calibration.monitor.check import NO_BIAS, POSE_DOF, ROTATION_DOF, Evidence, Look, gather, look_at
+from coec.calibration.monitor.check import NO_BIAS, POSE_DOF, ROTATION_DOF, Check, CheckInput, check_at, gather
 from coec.calibration.monitor.sensor_faults import data_causes, dirty_blocks
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Matrix4, Metric, Window
@@ -30,7 +30,7 @@ from coec.errors import CalibrationError
 from coec.geometry import se3
 
 FALSE_ALARM_RATE = 0.01
-"""Share of looks at a right pose that may be flagged: the limit of an uncommissioned rig, and what commissioning aims
+"""Share of checks at a right pose that may be flagged: the limit of an uncommissioned rig, and what commissioning aims
 at unless told otherwise."""
 
 MIN_PAIRS = 4
@@ -51,21 +51,21 @@ UNCOMMISSIONED = MonitorLimits(
 def observe(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
 ) -> Observation:
-    """A look at the extrinsic at which `window` starts, with all its pairs: five to ten of the latest, in motion.
+    """A check of the extrinsic at which `window` starts, with all its pairs: five to ten of the latest, in motion.
 
     Raises:
         CalibrationError: fewer than `MIN_PAIRS` pairs, or an image or its depth cannot be decoded.
     """
     if len(window.pairs) < MIN_PAIRS:
-        raise CalibrationError(f"a look needs {MIN_PAIRS} pairs, there are {len(window.pairs)}")
-    evidence = gather(look(window, depth, images, config, Silence()))
+        raise CalibrationError(f"a check needs {MIN_PAIRS} pairs, there are {len(window.pairs)}")
+    evidence = gather(sight_of(window, depth, images, config, Silence()))
     pose = window.T_camera_lidar_start
     bias = NO_BIAS if baseline is None else baseline.rotation.expected
-    return judge_look(evidence, look_at(evidence, pose, config, bias), pose, baseline)
+    return judge_check(evidence, check_at(evidence, pose, config, bias), pose, baseline)
 
 
-def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline | None) -> Observation:
-    """A look at `pose` (4, 4) against the limits of the rig, and the causes of what is wrong with it."""
+def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Baseline | None) -> Observation:
+    """A check at `pose` (4, 4) against the limits of the rig, and the causes of what is wrong with it."""
     limits = UNCOMMISSIONED if baseline is None else baseline.monitor
     camera = evidence.rig.camera
     rotation, accuracy = uncommissioned(camera) if baseline is None else (baseline.rotation, baseline.pose)
@@ -104,9 +104,9 @@ def judge_look(evidence: Evidence, seen: Look, pose: Matrix4, baseline: Baseline
     )
 
 
-def over_limits(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> tuple[float, float]:
-    """Squared distances of the local optima over three and six degrees of freedom, over their limits: a look is flagged
-    above 1."""
+def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> tuple[float, float]:
+    """Squared distances of the local optima over three and six degrees of freedom, over their limits: a check is
+    flagged above 1."""
     within = limits.max_distance2_rotation * (LOST_EDGES_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0)
     return (
         rotation.distance2(seen.offset_rotation, seen.pairs) / within,
@@ -114,23 +114,23 @@ def over_limits(seen: Look, rotation: Accuracy, pose: Accuracy, limits: MonitorL
     )
 
 
-def by_equation_2(seen: Look, limits: MonitorLimits) -> bool:
+def by_equation_2(seen: Check, limits: MonitorLimits) -> bool:
     """Equation (2) of Borer et al. 2023: failed if MI < MI_lim or f' > f'_lim or f'' < f''_lim."""
     return seen.mi < limits.min_mi or seen.f1 > limits.max_f1 or seen.f2 < limits.min_f2
 
 
-def edges_per_pair(seen: Look) -> float:
+def edges_per_pair(seen: Check) -> float:
     """Significance of the edges at the local optimum over the root of the number of pairs."""
     return seen.edges_at_best / float(np.sqrt(max(seen.pairs, 1)))
 
 
-def _drift(seen: Look, baseline: Baseline) -> Drift:
-    """How far the local optimum of a look lies from the commissioned calibration, over six degrees of freedom."""
+def _drift(seen: Check, baseline: Baseline) -> Drift:
+    """How far the local optimum of a check lies from the commissioned calibration, over six degrees of freedom."""
     value = se3.difference(seen.T_pose, baseline.T_camera_lidar) - baseline.pose.bias
     return Drift(value, baseline.pose.sigma(seen.pairs))
 
 
-def _metrics(seen: Look, of_rotation: float, of_pose: float, limits: MonitorLimits) -> tuple[Metric, ...]:
+def _metrics(seen: Check, of_rotation: float, of_pose: float, limits: MonitorLimits) -> tuple[Metric, ...]:
     return (
         Metric("mi", seen.mi, limits.min_mi, at_least=True),
         Metric("f1", seen.f1, limits.max_f1, at_least=False),

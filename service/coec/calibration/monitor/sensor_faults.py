@@ -1,8 +1,8 @@
-"""Why a look at the extrinsic went wrong: a bent mount, or data that cannot tell.
+"""Why a check of the extrinsic went wrong: a bent mount, or data that cannot tell.
 
 Only a bent mount is a wrong calibration. Everything else is told apart from it by what it does to the frames
 themselves: a covered lens has no gradients, a lost beam no points, a wrong clock moves every sweep along the motion of
-the vehicle. Each cause needs most pairs of a look, so that one bad frame is none.
+the vehicle. Each cause needs most pairs of a check, so that one bad frame is none.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ TEXTURED_GRADIENT = 2.0
 
 DIRTY_RATIO, DIRTY_SHARE = 0.4, 0.012
 """A block looks dirty when its sharpest exposure has less than this share of the gradient that it had when the rig was
-commissioned; so many of the textured blocks make a dirty lens, if it is the same blocks in `DIRTY_LOOKS` looks running.
-Another street does the same to 6 % of them for 5 s, and to less than 0.6 % for 20 s: dirt stays where it is."""
+commissioned; so many of the textured blocks make a dirty lens, if it is the same blocks in `DIRTY_CHECKS` checks
+running. Another street does the same to 6 % of them for 5 s, and to less than 0.6 % for 20 s: dirt stays where it
+is."""
 
-DIRTY_LOOKS = 3.5
+DIRTY_CHECKS = 3.5
 """Independent looks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
 
 THUMBNAIL_CELL_PX = 8
@@ -61,7 +62,7 @@ SECTORS = 36
 """Sectors of azimuth of 10°, of the same points."""
 
 LOST_RATIO, LOST_SHARE = 0.2, 0.08
-"""A band or sector is lost when no sweep of a look has this share of the points it had when the rig was commissioned;
+"""A band or sector is lost when no sweep of a check has this share of the points it had when the rig was commissioned;
 so many of them make a sensor that lost beams: five of 64."""
 
 FEW_POINTS = 30
@@ -178,7 +179,7 @@ def scene_baseline(scenes: Sequence[SceneFacts]) -> SceneBaseline:
 
 def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) -> tuple[Cause, ...]:
     """Every reason in the frames themselves not to believe a look at them, those that hide others first. Lost beams are
-    seen against a commissioned rig only, dirt only over several looks."""
+    seen against a commissioned rig only, dirt only over several checks."""
     gradient = np.array([scene.gradient for scene in scenes])
     causes = []
     dark = float(np.median([scene.bright for scene in scenes])) < DARK_LEVEL

@@ -1,7 +1,7 @@
 """How peaked and how flat the objective is at an optimum, and how far the optimum may be off by chance.
 
 The numerical first and second derivative of the paper (METHOD, section 1), and a covariance that needs no model of the
-noise: the frames of a window are independent looks at one truth, so the scatter of their gradients is the noise of the
+noise: the frames of a window are independent checks at one truth, so the scatter of their gradients is the noise of the
 sum (the sandwich estimator of maximum-likelihood theory, Huber 1967: J⁻¹·V·J⁻¹).
 """
 

@@ -17,7 +17,7 @@ from coec.calibration.objective.mutual_information import Evaluation, MutualInfo
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
-from coec.geometry.edges.charts import significances as charted_significances
+from coec.geometry.edges.charts import charted_significances
 
 OTHER_POSES = 64
 """Poses within reach from which the mean and the standard deviation of a score are taken: known to an eighth."""

@@ -16,7 +16,7 @@ from coec.calibration.objective.edges import EdgeWitness
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from coec.geometry.edges.charts import EdgeCharts, climb, keep_apart, significances
+from coec.geometry.edges.charts import EdgeCharts, charted_significances, climb, keep_apart
 from coec.geometry.vectors import lengths
 
 COVER_RAD = radians(0.9)
@@ -94,7 +94,7 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
     poses = _promising(edges.thinned[ROUNDS[0].chart], start, reach)
     for number in ROUNDS:
         charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
-        poses = poses[_apart(poses, significances(charts, poses), number.poses, number.apart_rad)]
+        poses = poses[_apart(poses, charted_significances(charts, poses), number.poses, number.apart_rad)]
         poses, z = _climbed(charts, poses, number, start, reach)
     if reach.translation_m > 0.0:
         more = _shifted(poses[np.argsort(-z, kind="stable")[:SHIFTED_POSES]])
@@ -136,10 +136,10 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     count = int(min(max(volume, MIN_COVER), MAX_COVER))
     cover = _Cover(start, reach, count)
     blocks = np.array_split(np.arange(count), -(-count // BLOCK))
-    z = np.concatenate([significances(charts, cover.poses(block)) for block in blocks])
+    z = np.concatenate([charted_significances(charts, cover.poses(block)) for block in blocks])
     best = np.argsort(-z, kind="stable")[:CANDIDATES]
     poses = np.concatenate([start[None], cover.poses(best)])
-    z = np.concatenate([significances(charts, start[None]), z[best]])
+    z = np.concatenate([charted_significances(charts, start[None]), z[best]])
     return poses[_apart(poses, z, ROUNDS[0].poses, ROUNDS[0].apart_rad)]
 
 

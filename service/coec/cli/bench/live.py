@@ -152,7 +152,7 @@ def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
         "pairs": pair["pairs"],
         "windows": pair["windows"],
         "solved": pair["solved"],
-        "looks": pair["looks"],
+        "checks": pair["checks"],
     }
 
 

@@ -41,7 +41,7 @@ SOLVES: Mapping[str, CalibrationConfig] = {
 
 def measure(folder: Path, frames: int, heard: Callable[[str], None]) -> dict[str, Any]:
     """Starts a worker for each of `SOLVES` and gives it a window of `frames` frames, with all that belongs to it:
-    reading, depth inference, the solve, writing the result into the file. One more gets a look of the monitor at once.
+    reading, depth inference, the solve, writing the result into the file. One more gets a check of the monitor at once.
 
     Raises:
         CalibrationError: the worker came to no result.
@@ -98,10 +98,10 @@ def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
 def _first_result_s(name: str, window: Path, config: Config) -> float:
     answers: Answers = queue.SimpleQueue()
     pairs = read_window(window)[0].pairs[: config.pairs[0].monitor.pairs]
-    look = {"pose": pack_pose(scene.T_TRUE), "frames": pack_pairs(pairs)}
+    check = {"pose": pack_pose(scene.T_TRUE), "frames": pack_pairs(pairs)}
     with _worker(config, answers) as worker:
         begin = time.perf_counter()
-        worker.look(Errand("observe", name, look, answers.put))
+        worker.check(Errand("check", name, check, answers.put))
         worker.start()
         _expected(answers.get(timeout=TIMEOUT_S), dict)
         return time.perf_counter() - begin

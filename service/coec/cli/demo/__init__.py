@@ -21,7 +21,7 @@ from coec.adapters.zenoh.client import connected
 from coec.calibration.types import Matrix4
 from coec.cli.demo import report, story
 from coec.cli.demo.daemon import Daemon, DemoError, free_endpoint, running
-from coec.cli.demo.outcome import Outcome, outcome_of
+from coec.cli.demo.outcome import Ending, outcome_of
 from coec.cli.demo.pace import Pace
 from coec.cli.demo.screen import Screen
 from coec.cli.demo.vehicle import NS_PER_S, Vehicle
@@ -117,7 +117,7 @@ def _until_running(watch: Watch, daemon: Daemon, screen: Screen) -> None:
         time.sleep(POLL_S)
 
 
-def _watch(watch: Watch, vehicle: Vehicle, daemon: Daemon, screen: Screen) -> tuple[Seen, Outcome]:
+def _watch(watch: Watch, vehicle: Vehicle, daemon: Daemon, screen: Screen) -> tuple[Seen, Ending]:
     """Until the story is told, or the drive is over; what was seen last, and what became of it."""
     deadline_s = time.monotonic() + DRIVE_S
     try:
@@ -153,7 +153,7 @@ def _fetch(watch: Watch, seen: Seen, output: Path) -> tuple[Path | None, Matrix4
     return path, blamed
 
 
-def _document(watch: Watch, outcome: Outcome, left: report.Left, started_s: float) -> dict[str, object]:
+def _document(watch: Watch, outcome: Ending, left: report.Left, started_s: float) -> dict[str, object]:
     last = watch.timeline[-1]
     return {
         "timeline": [asdict(moment) for moment in watch.timeline],

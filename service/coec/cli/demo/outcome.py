@@ -11,7 +11,7 @@ ALARM = "miscalibrated"
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class Ending:
     """What became of the drive; seconds of driving, None for what did not happen.
 
     Attributes:
@@ -49,7 +49,7 @@ class Outcome:
         return tuple(said)
 
 
-def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float) -> Outcome:
+def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float) -> Ending:
     """The outcome of a timeline that is not empty.
 
     Args:
@@ -66,7 +66,7 @@ def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float)
         for moment in late
         if alarm_s is not None and moment.drive_s >= alarm_s and is_repaired(moment, max_error_deg)
     )
-    return Outcome(
+    return Ending(
         knock_s=knock_s,
         false_alarm_s=early,
         alarm_s=alarm_s,

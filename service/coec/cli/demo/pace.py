@@ -9,10 +9,10 @@ from coec.schemas import replies
 NS_PER_S = 1_000_000_000
 
 LEAD_NS = 7 * NS_PER_S
-"""The drive waits while it is so far ahead of what the service has judged: a look of the monitor, and a little."""
+"""The drive waits while it is so far ahead of what the service has judged: a check of the monitor, and a little."""
 
 STEP_NS = 2 * NS_PER_S
-"""A service that has nothing to do with all that it got (no looks are taken soon after a window) gets so much more."""
+"""A service that has nothing to do with all that it got (no checks are taken soon after a window) gets so much more."""
 
 ON_THE_WAY = 1
 """Pictures that may still be under way, or lost without a trace, when the service is said to have them all."""

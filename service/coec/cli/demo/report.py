@@ -17,7 +17,7 @@ from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Matrix4, Window
 from coec.cli.demo import story
-from coec.cli.demo.outcome import ALARM, Outcome, is_repaired
+from coec.cli.demo.outcome import ALARM, Ending, is_repaired
 from coec.cli.demo.watch import Moment, Seen, Watch
 from coec.config import LimitsConfig
 from coec.geometry import cameras
@@ -45,7 +45,7 @@ class Left:
     result: replies.CalibrationResult | None
 
 
-def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen: Seen, outcome: Outcome) -> Left:
+def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen: Seen, outcome: Ending) -> Left:
     """All of it into the folder.
 
     Args:
@@ -72,7 +72,7 @@ def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen
     return Left(tuple(written), result)
 
 
-def show(moments: Sequence[Moment], outcome: Outcome, left: Left) -> None:
+def show(moments: Sequence[Moment], outcome: Ending, left: Left) -> None:
     """The summary in the terminal."""
     steps = console.table("elapsed", "drive", "health", "extrinsic", "error", "", right=(0, 1, 4))
     for moment, what in zip(moments, _happenings(moments, outcome), strict=True):
@@ -131,12 +131,12 @@ def _title() -> str:
     return f"A mount that is knocked by {story.KNOCK_DEG:g}° while the vehicle drives"
 
 
-def _marks(outcome: Outcome) -> list[tuple[float, str]]:
+def _marks(outcome: Ending) -> list[tuple[float, str]]:
     named = ((outcome.knock_s, "knock"), (outcome.alarm_s, "alarm"), (outcome.repaired_s, "repair"))
     return [(second, what) for second, what in named if second is not None]
 
 
-def _happenings(moments: Sequence[Moment], outcome: Outcome) -> list[str]:
+def _happenings(moments: Sequence[Moment], outcome: Ending) -> list[str]:
     """A remark for each moment, empty for some."""
     firsts: tuple[tuple[str, Callable[[Moment], bool]], ...] = (
         ("the service starts", lambda moment: moment.service == "starting"),
@@ -154,7 +154,7 @@ def _happenings(moments: Sequence[Moment], outcome: Outcome) -> list[str]:
     return remarks
 
 
-def _summary(outcome: Outcome, moments: Sequence[Moment]) -> list[tuple[str, str]]:
+def _summary(outcome: Ending, moments: Sequence[Moment]) -> list[tuple[str, str]]:
     last = moments[-1]
     early = [moment for moment in moments if moment.drive_s < outcome.knock_s and moment.provenance == "estimated"]
 
@@ -180,7 +180,7 @@ def _summary(outcome: Outcome, moments: Sequence[Moment]) -> list[tuple[str, str
 def page(
     shown: Mapping[str, Path],
     moments: Sequence[Moment],
-    outcome: Outcome,
+    outcome: Ending,
     result: replies.CalibrationResult | None,
     window: Path | None,
 ) -> str:
@@ -214,7 +214,7 @@ def page(
     return "\n".join(parts) + "\n"
 
 
-def _timeline(moments: Sequence[Moment], outcome: Outcome) -> str:
+def _timeline(moments: Sequence[Moment], outcome: Ending) -> str:
     rows = [
         (
             f"{moment.t_s:.0f} s",

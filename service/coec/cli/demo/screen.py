@@ -21,7 +21,7 @@ BAR_WIDTH = 48
 CURVE_WIDTH = 72
 
 FIGURES = ("distance_rotation", "distance_pose", "edges_per_pair", "overlap", "mi")
-"""Of the latest look of the monitor: what it decides by, and mutual information."""
+"""Of the latest check of the monitor: what it decides by, and mutual information."""
 
 
 class Screen:
@@ -68,7 +68,7 @@ def view(watch: Watch, seen: Seen) -> RenderableType:
     rows.add_row("extrinsic", f"{moment.provenance}, latest window {moment.status}")
     rows.add_row("correction", "  ".join(f"{value:+.3f}°" for value in moment.correction_deg) + "  pitch, yaw, roll")
     rows.add_row("next window", _window(pair.selected))
-    rows.add_row("so far", f"{pair.pairs} pairs, {pair.looks} looks, {pair.solved} windows solved ({_worker(seen)})")
+    rows.add_row("so far", f"{pair.pairs} pairs, {pair.checks} checks, {pair.solved} windows solved ({_worker(seen)})")
     return Panel(Group(rows, Text(), _figures(seen)), title=f"coec demo  {moment.t_s:.0f} s", width=CURVE_WIDTH + 30)
 
 
@@ -106,7 +106,7 @@ def _reason(seen: Seen) -> str:
         return seen.health.reasons[0].text
     figures = (seen.health.metrics.get(name) for name in FIGURES)
     if any(figure is not None and not figure.passed for figure in figures):
-        return "The latest look speaks against it; one look alone is not believed."
+        return "The latest check speaks against it; one check alone is not believed."
     return "The monitor finds nothing wrong."
 
 
@@ -122,7 +122,7 @@ def _window(selected: int) -> RenderableType:
 
 
 def _figures(seen: Seen) -> Table:
-    table = console.table("figure of the latest look", "value", "limit", "", right=(1,))
+    table = console.table("figure of the latest check", "value", "limit", "", right=(1,))
     for name in FIGURES:
         metric = seen.health.metrics.get(name)
         if metric is None:

@@ -36,7 +36,7 @@ KNOCK_S, KNOCK_DEG = 36.0, 3.0
 """When and how far the mount is bent, in pitch: after the first window has been judged."""
 
 REST_S = 12.0
-"""Of driving after the repair: two more looks of the monitor."""
+"""Of driving after the repair: two more checks of the monitor."""
 
 CLOSE_UP_PX = (170, 285, 400, 170)
 """Left, top, width and height of the part of the picture in which cars and kerbs are."""

@@ -144,7 +144,7 @@ def _extent(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return plane.min(axis=0) - 0.02, plane.max(axis=0) + 0.02
 
 
-def significances(charts: EdgeCharts, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def charted_significances(charts: EdgeCharts, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4): (K,)."""
     return _significances(*_arguments(charts), poses)
 

@@ -48,7 +48,7 @@ def render(status: StatusReply, health: Mapping[str, HealthReply], worker_rss_by
                 for state in HealthState
             ),
         ),
-        _Family("coec_look_age_seconds", "gauge", "Since data were last judged.", tuple(_ages(health))),
+        _Family("coec_check_age_seconds", "gauge", "Since data were last judged.", tuple(_ages(health))),
         *_diagnosis(health),
         _Family("coec_samples_received", "counter", "Samples that came.", tuple(_streams(pairs, "received"))),
         _Family("coec_frames_accepted", "counter", "Frames made of samples.", tuple(_streams(pairs, "accepted"))),
@@ -57,7 +57,7 @@ def render(status: StatusReply, health: Mapping[str, HealthReply], worker_rss_by
         _Family("coec_window_pairs", "gauge", "Pairs in the open window.", _per_pair(pairs, "selected")),
         _Family("coec_windows_recorded", "counter", "Windows recorded.", _per_pair(pairs, "windows")),
         _Family("coec_windows_evaluated", "counter", "Windows evaluated.", _per_pair(pairs, "solved")),
-        _Family("coec_looks", "counter", "Looks of the monitor.", _per_pair(pairs, "looks")),
+        _Family("coec_checks", "counter", "Checks of the monitor.", _per_pair(pairs, "checks")),
         _Family("coec_health_changes", "counter", "States entered.", tuple(_counts(pairs, "transitions", "to"))),
         _Family("coec_commands", "counter", "Commands, by outcome.", tuple(_counts(pairs, "commands", "command"))),
         _Family("coec_worker_restarts", "counter", "Workers replaced.", (({}, status.worker.restarts),)),
@@ -84,18 +84,18 @@ def _diagnosis(health: Mapping[str, HealthReply]) -> Iterable[_Family]:
             if value is not None
         )
 
-    def of_look(name: str) -> Callable[[HealthReply], Maybe6 | None]:
-        return lambda reply: getattr(reply.look, name, None)
+    def of_check(name: str) -> Callable[[HealthReply], Maybe6 | None]:
+        return lambda reply: getattr(reply.check, name, None)
 
     values = told((pair, name, one.value) for pair, name, one in figures)
     limits = told((pair, name, one.limit) for pair, name, one in figures)
     return (
         _Family("coec_diagnosis", "gauge", "Figures of self-diagnosis.", values),
         _Family("coec_diagnosis_limit", "gauge", "Their limits.", limits),
-        _Family("coec_look_offset", "gauge", "From the pose to the local optimum.", by_axis(of_look("offset"))),
-        _Family("coec_look_offset_sigma", "gauge", "Its standard deviation.", by_axis(of_look("sigma"))),
-        _Family("coec_look_drift", "gauge", "Local optimum from commissioned.", by_axis(of_look("drift"))),
-        _Family("coec_look_drift_sigma", "gauge", "Its standard deviation.", by_axis(of_look("drift_sigma"))),
+        _Family("coec_check_offset", "gauge", "From the pose to the local optimum.", by_axis(of_check("offset"))),
+        _Family("coec_check_offset_sigma", "gauge", "Its standard deviation.", by_axis(of_check("sigma"))),
+        _Family("coec_check_drift", "gauge", "Local optimum from commissioned.", by_axis(of_check("drift"))),
+        _Family("coec_check_drift_sigma", "gauge", "Its standard deviation.", by_axis(of_check("drift_sigma"))),
         _Family("coec_drift", "gauge", "Served from commissioned.", by_axis(lambda reply: reply.drift)),
         _Family("coec_drift_sigma", "gauge", "Its standard deviation.", by_axis(lambda reply: reply.drift_sigma)),
         _Family("coec_result_drift", "gauge", "Last window from commissioned.", by_axis(lambda r: r.result_drift)),
@@ -104,13 +104,13 @@ def _diagnosis(health: Mapping[str, HealthReply]) -> Iterable[_Family]:
             "coec_mi_first_derivative",
             "gauge",
             "Nats per rad or m, at what is served.",
-            _without_unit(by_axis(of_look("first_derivative"))),
+            _without_unit(by_axis(of_check("first_derivative"))),
         ),
         _Family(
             "coec_mi_second_derivative",
             "gauge",
             "Negative, nats per rad2 or m2, at what is served.",
-            _without_unit(by_axis(of_look("second_derivative"))),
+            _without_unit(by_axis(of_check("second_derivative"))),
         ),
     )
 

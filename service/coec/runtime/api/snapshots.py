@@ -18,7 +18,7 @@ from coec.adapters.zenoh.bus import JSON, MSGPACK, Answer
 from coec.calibration.lifecycle import PairState, Status
 from coec.calibration.lifecycle.policy import step_between
 from coec.calibration.types import Reason, Rig
-from coec.config import FusionConfig
+from coec.config import TrackerConfig
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.base import to_json, to_msgpack
@@ -86,7 +86,7 @@ def extrinsic_of(
     accepted: CalibrationResult | None,
     percent_complete: float,
     config_hash: str,
-    fusion: FusionConfig,
+    tracker: TrackerConfig,
 ) -> replies.ExtrinsicReply:
     """What to use now. `accepted` is `state.accepted` in its wire form; `config_hash` is said while there is none."""
     return replies.ExtrinsicReply(
@@ -98,7 +98,7 @@ def extrinsic_of(
         provenance=state.provenance.value,
         status=state.status.value,
         percent_complete=percent_complete,
-        axes=axes_of_served(state, rig, accepted, fusion),
+        axes=axes_of_served(state, rig, accepted, tracker),
         valid_from_ns=state.valid_from_ns,
         data_stamp_ns=accepted.data_stamp_ns if accepted else None,
         window_id=accepted.window_id if accepted else None,
@@ -129,14 +129,14 @@ def degrees_and_metres(rad_m: NDArray[np.float64]) -> replies.Vector6:
 
 
 def axes_of_served(
-    state: PairState, rig: Rig, accepted: CalibrationResult | None, fusion: FusionConfig
+    state: PairState, rig: Rig, accepted: CalibrationResult | None, tracker: TrackerConfig
 ) -> replies.Axes:
     """Correction and spread per axis of what is served: the track's where it holds more than one window."""
     axes = axes_of(accepted, Status.ACCEPTED)
     if accepted is None or state.track is None or state.track.windows <= 1:
         return axes
     correction = degrees_and_metres(step_between(rig.T_camera_lidar_nominal, state.T_camera_lidar))
-    sigma = degrees_and_metres(state.track.sigma(fusion))
+    sigma = degrees_and_metres(state.track.sigma(tracker))
     told = {
         name: getattr(axes, name).model_copy(
             update={"correction": correction[index], "sigma": sigma[index] if accepted.solved[index] else None}

@@ -21,15 +21,15 @@ from coec.schemas.replies import EvidenceEvent, EvidenceReply, MetricsPoint
 _log = logging.getLogger(__name__)
 
 POINTS_KEPT = 240
-"""Looks of the monitor whose figures are remembered: 20 minutes at one in 5 s."""
+"""Checks of the monitor whose figures are remembered: 20 minutes at one in 5 s."""
 
 POINTS_AFTER = 60
-"""Looks after the beginning of an event that are added to it: five minutes."""
+"""Checks after the beginning of an event that are added to it: five minutes."""
 
 Side = Literal["before", "after"]
 
 
-class Evidence:
+class Incidents:
     """Red events of one pair. Safe to use from several threads; a fault of the disk costs evidence, never the service.
 
     Attributes:
@@ -72,7 +72,7 @@ class Evidence:
             return newest if newest is not None and newest.window_after is None else None
 
     def note(self, point: MetricsPoint) -> None:
-        """Figures of one look."""
+        """Figures of one check."""
         with self._lock:
             self._points.append(point)
             newest = self.newest

@@ -23,13 +23,13 @@ from coec.calibration.lifecycle import HealthState, PairState, Provenance, aged,
 from coec.calibration.types import Matrix4, Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
-from coec.runtime.decisions.check_log import LookLog
+from coec.runtime.decisions.check_log import CheckLog
 from coec.runtime.decisions.history import GENESIS, History, Kept
-from coec.runtime.decisions.incidents import Evidence
+from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.state_store import Clocks, StateStore
 from coec.runtime.recording.window_store import WindowFolder
 from coec.schemas import replies
-from coec.schemas.replies import CalibrationResult, EvidenceEvent, HistoryEntry, LookReply, MetricsPoint
+from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, MetricsPoint
 
 _log = logging.getLogger(__name__)
 
@@ -93,8 +93,8 @@ class Ledger:
         self._epoch = 0
         self._state, head = self._recall()
         self.history = History(config.directory / f"history-{rig.pair}.jsonl", config.history, head)
-        self.evidence = Evidence(config.directory / "evidence", rig.pair, config.evidence)
-        self._looks = LookLog(config.directory / f"looks-{rig.pair}.jsonl", config.looks)
+        self.evidence = Incidents(config.directory / "evidence", rig.pair, config.evidence)
+        self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
         folder.protect(rig.pair, self.evidence.window_ids)
         if self.history.damage is not None:
             losses.add("storage", "history_damaged", detail=self.history.damage)
@@ -126,7 +126,7 @@ class Ledger:
 
     @property
     def age_s(self) -> float | None:
-        """Since the last look; None before the first."""
+        """Since the last check; None before the first."""
         return None if self._evaluated_s is None else time.monotonic() - self._evaluated_s
 
     def update(
@@ -171,18 +171,18 @@ class Ledger:
         entry = _entry("estimate", result.verdict.decision, text, result.data_stamp_ns)
         self._write(entry.model_copy(update={"window_id": result.window_id}), result)
 
-    def note_look(self, look: LookReply) -> None:
-        """The monitor had a look."""
-        values = {name: metric.value for name, metric in look.metrics.items()}
-        self.evidence.note(MetricsPoint(stamp_ns=look.stamp_ns, state=look.state, metrics=values))
+    def note_check(self, check: CheckReply) -> None:
+        """The monitor made a check."""
+        values = {name: metric.value for name, metric in check.metrics.items()}
+        self.evidence.note(MetricsPoint(stamp_ns=check.stamp_ns, state=check.state, metrics=values))
         try:
-            self._looks.append(look)
+            self._checks.append(check)
         except StateError as error:
-            self._losses.add("storage", "look_not_saved", detail=str(error))
+            self._losses.add("storage", "check_not_saved", detail=str(error))
 
-    def looks(self) -> tuple[LookReply, ...]:
-        """The looks of the monitor that are kept, oldest first."""
-        return self._looks.looks()
+    def checks(self) -> tuple[CheckReply, ...]:
+        """The checks of the monitor that are kept, oldest first."""
+        return self._checks.checks()
 
     def note_command(self, name: str, code: str, text: str, sender: str, *, accepted: bool) -> None:
         """A command was carried out or refused. Of equal refusals in a row only the first is written down: whoever

@@ -33,7 +33,7 @@ class Question:
     taken: bool = False
 
 
-class Judgements:
+class DecisionQueue:
     """The questions of one pair. One thread asks and lets answers take effect; any thread may answer."""
 
     def __init__(self) -> None:

@@ -17,7 +17,7 @@ from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import rig_to_json
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState, Provenance, Status, restored
-from coec.calibration.monitor.change_detector import MonitorState, Outcome
+from coec.calibration.monitor.change_detector import Finding, MonitorState
 from coec.calibration.tracker import track_from_dict, track_to_dict
 from coec.calibration.types import Reason, Rig
 from coec.errors import CoecError, StateError
@@ -221,5 +221,5 @@ def _state_of(stored: StoredPair) -> PairState:
 def _monitor_of(document: dict[str, Any]) -> MonitorState:
     """JSON knows lists only, the state is made of tuples."""
     values: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in document.items()}
-    values["outcome"] = Outcome(values["outcome"])
+    values["outcome"] = Finding(values["outcome"])
     return MonitorState(**values)

@@ -1,4 +1,4 @@
-"""A look of the monitor on its way to the worker and back: pairs as their frames, figures as plain values."""
+"""A check of the monitor on its way to the worker and back: pairs as their frames, figures as plain values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from coec.config import LimitsConfig
 
 def pack_pairs(pairs: Sequence[FramePair]) -> Sequence[list[bytes | None]]:
     """Camera, LiDAR and ego-motion frame of each pair, native msgpack, packed anew whenever an entry is asked for: the
-    pairs of a look have 15 MB, and need not be in memory twice."""
+    pairs of a check have 15 MB, and need not be in memory twice."""
     return _PackedPairs(pairs)
 
 

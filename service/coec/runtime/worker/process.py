@@ -85,14 +85,14 @@ def _solved(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
 
 
 def _errand(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
-    """The answer to work that is done once or not at all. A fault of the program in it is an answer, too: looks come
+    """The answer to work that is done once or not at all. A fault of the program in it is an answer, too: checks come
     every few seconds, and a worker that each of them ended would solve no window any more."""
     try:
         match message["kind"]:
             case "prefetch":
                 solver.prefetch(message["pair"], message["frame"])
                 return {"kind": "done"}
-            case "observe":
+            case "check":
                 return {"kind": "observed", **solver.observe(message["pair"], message["pose"], message["frames"])}
             case "overlay":
                 path, pose = Path(message["path"]), message["pose"]

@@ -40,8 +40,8 @@ PREFETCHES_WAITING = 8
 BACKLOG = 64
 """Unsolved windows of earlier runs that may wait."""
 
-LOOKS_WAITING, WINDOWS_WAITING = 4, 2
-"""Looks, and windows of this run, that may wait per pair. The service waits for answers before it asks more; these are
+CHECKS_WAITING, WINDOWS_WAITING = 4, 2
+"""Checks, and windows of this run, that may wait per pair. The service waits for answers before it asks more; these are
 for a worker that does not answer."""
 
 ERRANDS_WAITING = 8
@@ -84,7 +84,7 @@ class Solved:
 
 @dataclass(frozen=True, slots=True)
 class WorkerStatus:
-    """A look at the worker. `starts` counts processes, `failure` says why the last one was replaced."""
+    """How the worker is. `starts` counts processes, `failure` says why the last one was replaced."""
 
     state: WorkerState
     starts: int
@@ -103,7 +103,7 @@ class Errand:
     """Work that is done once or not at all.
 
     Attributes:
-        kind: `observe`, `overlay` or `commission`, as `process` knows them.
+        kind: `check`, `overlay` or `commission`, as `process` knows them.
         pair: whose.
         body: what the work needs, in values that msgpack knows.
         done: called once, on the supervisor's thread or on the one that asked, with the worker's answer, or why there
@@ -118,8 +118,8 @@ class Errand:
     timeout_s: float | None = None
 
 
-LOOK = "observe"
-"""The kind of a look of the monitor."""
+CHECK = "check"
+"""The kind of a check of the monitor."""
 
 BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
 
@@ -202,9 +202,9 @@ class Worker:
         self._live: deque[SolveJob] = deque()
         self._backlog: deque[SolveJob] = deque()
         self._prefetches: deque[_Prefetch] = deque(maxlen=PREFETCHES_WAITING)
-        self._looks: deque[Errand] = deque()
+        self._checks: deque[Errand] = deque()
         self._errands: deque[Errand] = deque()
-        self._look_was_fatal = False
+        self._check_was_fatal = False
         self._attempts: dict[SolveJob, int] = {}
         self._state = WorkerState.STARTING
         self._starts = 0
@@ -248,11 +248,11 @@ class Worker:
             self._prefetches.append(_Prefetch(pair, frame))
             self._condition.notify_all()
 
-    def look(self, errand: Errand) -> None:
-        """Queue a look of the monitor, in front of everything: it is short. Per pair only the newest wait."""
+    def check(self, errand: Errand) -> None:
+        """Queue a check of the monitor, in front of everything: it is short. Per pair only the newest wait."""
         with self._condition:
-            superseded = _oldest(self._looks, errand.pair, LOOKS_WAITING)
-            self._looks.append(errand)
+            superseded = _oldest(self._checks, errand.pair, CHECKS_WAITING)
+            self._checks.append(errand)
             self._condition.notify_all()
         if superseded is not None:
             superseded.done(SUPERSEDED)
@@ -280,7 +280,7 @@ class Worker:
     def status(self) -> WorkerStatus:
         """How the worker is."""
         with self._condition:
-            waiting = len(self._looks) + len(self._live) + len(self._backlog)
+            waiting = len(self._checks) + len(self._live) + len(self._backlog)
             return WorkerStatus(
                 self._state,
                 self._starts,
@@ -365,13 +365,13 @@ class Worker:
     def _run_errand(self, child: _Child, errand: Errand) -> None:
         try:
             child.link.send({**errand.body, "kind": errand.kind, "pair": errand.pair})
-            errand.body.clear()  # the frames of a look are 15 MB, and are not sent twice
+            errand.body.clear()  # the frames of a check are 15 MB, and are not sent twice
             reply = self._reply(child, errand.timeout_s or self._config.timeout_s)
         except (_ChildError, OSError, EOFError) as error:
-            self._look_was_fatal |= errand.kind == LOOK
+            self._check_was_fatal |= errand.kind == CHECK
             errand.done(Reason("worker_failed", f"The worker {_cause(child, error)}."))
             raise
-        self._look_was_fatal &= errand.kind != LOOK
+        self._check_was_fatal &= errand.kind != CHECK
         if reply is None:
             errand.done(Reason("stopping", "The service is stopping."))
         elif reply["kind"] == "refused":
@@ -412,9 +412,9 @@ class Worker:
         return job
 
     def _take(self) -> SolveJob | Errand | _Prefetch | None:
-        # Looks that kill must not keep every new worker from its windows.
-        if self._looks and not (self._look_was_fatal and self._live):
-            return self._looks.popleft()
+        # Checks that kill must not keep every new worker from its windows.
+        if self._checks and not (self._check_was_fatal and self._live):
+            return self._checks.popleft()
         if self._live:
             return self._live.popleft()
         if self._errands:

@@ -70,7 +70,7 @@ class Solver:
     """Opens the networks of the configuration once and keeps the depth of recent images.
 
     What belongs to window files and results is imported by what reads and writes them: the types of ROS messages and
-    the schemas take 0.15 s, and a look, which comes first, needs none.
+    the schemas take 0.15 s, and a check, which comes first, needs none.
     """
 
     def __init__(self, config: Config, depth_maps_kept: int) -> None:
@@ -95,7 +95,7 @@ class Solver:
             search = pair.calibration.search.model_copy(update={"max_evaluations": WARM_UP_EVALUATIONS})
             configuration = pair.calibration.model_copy(update={"search": search})
             rig = _small(self._rigs[pair.name])
-            # A look runs every kernel that a calibration runs. An invented one need not lead anywhere.
+            # A check runs every kernel that a calibration runs. An invented one need not lead anywhere.
             with contextlib.suppress(CalibrationError, DecodeError):
                 observe(_invented_window(rig), _Ramp(), self._images, configuration, None)
 
@@ -130,7 +130,7 @@ class Solver:
     def observe(
         self, pair: str, pose: Sequence[Sequence[float]], frames: Sequence[Sequence[bytes | None]]
     ) -> dict[str, Any]:
-        """A look of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs
+        """A check of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs
         them; and why the baseline of the rig was not used, if there is one.
 
         Raises:
@@ -138,7 +138,7 @@ class Solver:
         """
         configuration = self._pairs[pair].calibration
         window = Window(
-            f"{pair}-look",
+            f"{pair}-check",
             self._rigs[pair],
             np.array(pose, dtype=np.float64),
             unpack_pairs(frames, self._config.limits),
