@@ -219,7 +219,7 @@ def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.Monk
     monkeypatch.setattr(experiments, "CHECKS", 2)
     arguments = (SMALL.replace("frames=6", "frames=9"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
-    diagnosed = coec("diagnose", *arguments, "--looks", "2", "--json").document
+    diagnosed = coec("diagnose", *arguments, "--checks", "2", "--json").document
     detection = report.document["detection"]
     assert detection == {key: diagnosed[key] for key in ("splits", "pairs", "moves")}
     assert [row["name"] for row in detection["moves"]][:4] == ["right", "0.5 deg", "1 deg", "3 deg"]
