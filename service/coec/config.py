@@ -390,7 +390,7 @@ class Config(Stage):
     worker: WorkerConfig = WorkerConfig()
     limits: LimitsConfig = LimitsConfig()
     stale_after_s: float = Field(
-        default=86_400.0, gt=0, description="age at which a result is no longer called healthy"
+        default=600.0, gt=0, description="age of the last completed check at which a pair is called stale, s"
     )
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     pairs: tuple[PairConfig, ...] = Field(min_length=1, max_length=32)

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -28,13 +28,19 @@ from coec.calibration.types import Reason
 from coec.config import Config, config_hash
 from coec.errors import CoecError, ConfigError
 from coec.runtime.api import metrics
+from coec.runtime.api.health import reasons_of
 from coec.runtime.api.routes import VehicleAnswers
-from coec.runtime.api.snapshots import Snapshot, reasons_of, worker_status_of
+from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.api.status import worker_status_of
+from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
-from coec.runtime.pair import Outside, PairService
+from coec.runtime.ingest.stream import Stream
+from coec.runtime.outside import Outside
+from coec.runtime.pair import Pair
+from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowFolder
-from coec.runtime.worker.supervisor import Solved, SolveJob, Worker, WorkerState
+from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
 
@@ -51,7 +57,8 @@ STALLED_S = 20.0
 """A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed."""
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
-INGEST_STOP_S, RECORDER_STOP_S, WORKER_STOP_S, QUERIES_STOP_S, SESSION_STOP_S = 2.0, 5.0, 2.0, 1.0, 3.0
+INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S = 2.0, 4.0, 2.0
+QUERIES_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 3.0, 1.0
 
 
 def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
@@ -95,10 +102,10 @@ class Daemon:
         self._fault: Reason | None = None
         self._keys = Keys(config.prefix, config.vehicle)
         self._folder = WindowFolder(config.state.directory / "windows", config.state)
-        self._worker = Worker(config.worker, config.model_dump_json(), self._on_solved, self._on_failed)
+        self._worker = Worker(config.worker, config.model_dump_json())
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
-        self._pairs = {pair.name: PairService(pair, config, outside) for pair in config.pairs}
+        self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         self._bus = Bus(open_session(config.zenoh, config.limits))
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
@@ -125,13 +132,8 @@ class Daemon:
     # --- start, tick, stop ------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
-        for pair in self._pairs.values():
-            pair.refresh()
-        for thread in (
-            self._bus.thread,
-            self._bus.drawing_thread,
-            *(pair.recorder.thread for pair in self._pairs.values()),
-        ):
+        deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
+        for thread in (self._bus.thread, self._bus.drawing_thread, *deciding):
             thread.start()
         self._worker.start()
         config = Snapshot.of_document(
@@ -144,7 +146,7 @@ class Daemon:
         VehicleAnswers(self._keys, self._pairs, lambda: self._status, self._metrics, config).declare(self._bus)
         for pair_config in self._config.pairs:
             pair = self._pairs[pair_config.name]
-            pair.ingest.start()
+            pair.stream.thread.start()
             streams = {CAMERA: pair_config.camera, LIDAR: pair_config.lidar, EGO: pair_config.ego}
             for stream, stream_config in streams.items():
                 if stream_config is not None:
@@ -168,6 +170,8 @@ class Daemon:
         if self._fault is not None:
             self._state = "failing"
             _log.error(self._fault.text, extra={"fields": {"code": self._fault.code}})
+            for pair in self._pairs.values():
+                pair.answers.fail(self._fault)
         self._renew()
         if self._fault is not None:
             return EXIT_THREAD_DIED if dead else CoecError.exit_code
@@ -176,34 +180,42 @@ class Daemon:
         return 0
 
     def _stop(self) -> bool:
-        """The orderly end; False when the session did not close in time."""
-        self._notifier.stopping()
+        """The orderly end; False when the session did not close in time. A step that raises does not skip the next."""
         _log.info("stopping")
         if self._state != "failing":
             self._state = "stopping"
-        self._renew()
-        self._bus.undeclare_inputs()
-        self._worker.request_stop()
         pairs = self._pairs.values()
-        for pair in pairs:
-            pair.request_stop()
-        ingested = [pair for pair in pairs if _joined([pair.ingest], INGEST_STOP_S)]
-        for pair in pairs:
-            if pair in ingested:
-                pair.finish_window()
-            pair.recorder.request_stop()
-        _joined([pair.recorder.thread for pair in pairs], RECORDER_STOP_S)
-        for pair in pairs:
-            pair.save()
         answering = (self._bus.thread, self._bus.drawing_thread)
-        for thread in answering:
-            thread.request_stop()
-        _joined(answering, QUERIES_STOP_S)
-        self._bus.undeclare_queryables()
-        closed = self._bus.close(SESSION_STOP_S)
-        _joined([self._worker.thread], WORKER_STOP_S)
+        steps: tuple[tuple[str, Callable[[], object]], ...] = (
+            ("announce", self._notifier.stopping),
+            ("tell", self._renew),
+            ("take no more samples", self._bus.undeclare_inputs),
+            ("end the streams", lambda: self._end(pairs, lambda pair: pair.stream, INGEST_STOP_S)),
+            ("finish the open windows", self._finish_windows),
+            ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
+            ("end the worker", self._worker.request_stop),
+            ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
+            ("end the answers", lambda: _stopped(answering, QUERIES_STOP_S)),
+            ("take the answers away", self._bus.undeclare_queryables),
+        )
+        for name, step in steps:
+            _attempt(name, step)
+        closed = _attempt("close the session", lambda: self._bus.close(SESSION_STOP_S))
+        _attempt("wait for the worker", lambda: _joined([self._worker.thread], WORKER_STOP_S))
         _log.info("stopped", extra={"fields": {"session_closed": closed}})
-        return closed
+        return bool(closed)
+
+    @staticmethod
+    def _end(pairs: Iterable[Pair], part: Callable[[Pair], Stream | Recorder | Decider], within_s: float) -> None:
+        for pair in pairs:
+            part(pair).request_stop()
+        _joined([part(pair).thread for pair in pairs], within_s)
+
+    def _finish_windows(self) -> None:
+        """Of the pairs whose stream has ended: nobody else may touch its open window."""
+        for pair in self._pairs.values():
+            if pair.stream.thread.join(0.0):
+                _attempt("finish a window", pair.finish_window)
 
     def _compare(self, reread: Callable[[], Config] | None) -> None:
         """SIGHUP: validate the configuration, say what differs; it takes effect with the next start."""
@@ -222,12 +234,6 @@ class Daemon:
 
     # --- what the parts ask of the whole ----------------------------------------------------------------------------
 
-    def _on_solved(self, solved: Solved) -> None:
-        self._pairs[solved.job.pair].on_solved(solved)
-
-    def _on_failed(self, job: SolveJob, reason: Reason) -> None:
-        self._pairs[job.pair].on_failed(job, reason)
-
     def _publish(self, key: str, answer: Answer) -> None:
         self._bus.publish(key, answer)
 
@@ -241,12 +247,10 @@ class Daemon:
 
     def _threads(self) -> list[ServiceThread]:
         pairs = self._pairs.values()
-        own = [thread for pair in pairs for thread in (pair.ingest, pair.recorder.thread)]
+        own = [thread for pair in pairs for thread in pair.threads]
         return [self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
 
     def _renew(self) -> None:
-        for pair in self._pairs.values():
-            pair.refresh()
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
 
@@ -260,7 +264,7 @@ class Daemon:
             started_ns=self._started_ns,
             uptime_s=time.monotonic() - self._started_s,
             config_hash=config_hash(self._config),
-            pairs=tuple(pair.status() for pair in self._pairs.values()),
+            pairs=tuple(pair.answers.status() for pair in self._pairs.values()),
             worker=worker_status_of(self._worker),
             storage=replies.StorageStatus(
                 bytes_used=usage.used,
@@ -270,8 +274,23 @@ class Daemon:
         )
 
     def _metrics(self) -> bytes:
-        health = {name: pair.health_reply for name, pair in self._pairs.items()}
+        health = {name: pair.answers.health_reply for name, pair in self._pairs.items()}
         return metrics.render(self._status_reply, health, self._worker.status().rss_bytes)
+
+
+def _attempt(name: str, step: Callable[[], object]) -> object:
+    """A step of the end. What it raises is logged; None then."""
+    try:
+        return step()
+    except Exception:
+        _log.exception("a step of the end failed", extra={"fields": {"step": name}})
+        return None
+
+
+def _stopped(threads: Sequence[ServiceThread], timeout_s: float) -> bool:
+    for thread in threads:
+        thread.request_stop()
+    return _joined(threads, timeout_s)
 
 
 def _joined(threads: Sequence[ServiceThread], timeout_s: float) -> bool:

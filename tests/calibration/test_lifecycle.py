@@ -23,10 +23,12 @@ from coec.calibration.lifecycle import (
     before_estimate,
     held,
     initial_state,
+    overdue,
     released,
     reset,
     restored,
     rolled_back,
+    time_stepped_back,
 )
 from coec.calibration.monitor.change_detector import Finding, Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
@@ -153,14 +155,33 @@ def test_a_failed_estimate_is_never_served(before: PairState) -> None:
     state = solved(before, estimate(3.0, 300, Decision.FAILED))
     np.testing.assert_array_equal(state.T_camera_lidar, before.T_camera_lidar)
     assert (state.provenance, state.status) == (before.provenance, Status.FAILED)
-    assert (state.health, state.reasons) == (HealthState.SUSPECT, (OVERLAP,))
     assert state.pending is None
 
 
-def test_a_window_that_gave_no_estimate_degrades_and_serves_what_was() -> None:
+@pytest.mark.parametrize(
+    "code", ["overlap", "range_edges", "edge_contrast", "runner_up", "mi_over_unrelated", "sigma_deg"]
+)
+@pytest.mark.parametrize("before", [initial_state(RIG), HEALTHY, watched(HEALTHY, *flagged_from(200, 3))])
+def test_a_window_that_cannot_tell_is_no_evidence(before: PairState, code: str) -> None:
+    refused = estimate(3.0, 300, Decision.FAILED)
+    verdict = Verdict(Decision.FAILED, (), (Reason(code, "too little"), Reason("newton_step_deg", "sloped")))
+    state = solved(before, replace(refused, verdict=verdict))
+    assert (state.health, state.reasons) == (before.health, before.reasons)
+
+
+def test_a_refused_window_in_which_another_pose_stands_out_is_a_suspicion() -> None:
+    sloped = Verdict(Decision.FAILED, (), (Reason("newton_step_deg", "not at a maximum"),))
+    elsewhere = replace(estimate(3.0, 300, Decision.FAILED), verdict=sloped)
+    state = solved(HEALTHY, elsewhere)
+    assert (state.health, state.reasons) == (HealthState.SUSPECT, sloped.reasons)
+    here = replace(estimate(0.5, 300, Decision.FAILED), verdict=sloped)
+    assert solved(HEALTHY, here).health is HealthState.HEALTHY
+
+
+def test_a_window_that_gave_no_estimate_says_nothing_of_the_mount() -> None:
     state = after_failure(HEALTHY, CRASH)
     np.testing.assert_array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
-    assert (state.health, state.reasons, state.failures) == (HealthState.DEGRADED, (CRASH,), (CRASH,))
+    assert (state.health, state.status, state.failures) == (HealthState.HEALTHY, Status.FAILED, (CRASH,))
     assert solved(state, estimate(0.5, 300)).health is HealthState.HEALTHY
 
 
@@ -369,7 +390,7 @@ def test_commissioning_confirms_what_is_served_and_nothing_else() -> None:
 def test_what_was_not_looked_at_for_long_is_stale_not_healthy() -> None:
     assert aged(HEALTHY, DAY_S, DAY_S) is HEALTHY
     state = aged(HEALTHY, DAY_S + 1.0, DAY_S)
-    assert (state.health, [reason.code for reason in state.reasons]) == (HealthState.STALE, ["stale"])
+    assert (state.health, [reason.code for reason in state.reasons]) == (HealthState.STALE, ["stale", "last_known"])
     assert aged(state, DAY_S + 2.0, DAY_S) is state
     assert solved(state, estimate(0.5, LATE_NS // S)).health is HealthState.HEALTHY
     red = watched(HEALTHY, *flagged_from(200, 3))
@@ -378,13 +399,40 @@ def test_what_was_not_looked_at_for_long_is_stale_not_healthy() -> None:
     assert aged(nothing, DAY_S + 1.0, DAY_S) is nothing
 
 
-def test_an_age_that_nobody_knows_is_not_healthy() -> None:
-    assert aged(HEALTHY, None, DAY_S).health is HealthState.UNKNOWN
+WORKER = Reason("overdue_worker", "No check has been completed for 16 s: the worker has not answered.")
 
 
-def test_an_estimate_read_back_from_disk_says_so_and_keeps_its_health() -> None:
+def test_without_a_completed_check_green_turns_yellow_and_what_was_known_is_said() -> None:
+    state = overdue(HEALTHY, WORKER)
+    assert state.health is HealthState.DEGRADED
+    assert [reason.code for reason in state.reasons] == ["overdue_worker", "last_known"]
+    assert state.reasons[1].text == "Last known: healthy."
+    old = aged(state, DAY_S + 1.0, DAY_S)
+    assert [reason.text for reason in old.reasons][1:] == ["Last known: healthy."]
+    assert watched(state, check(300)).health is HealthState.HEALTHY
+    red = watched(HEALTHY, *flagged_from(200, 3))
+    assert overdue(red, WORKER) is red
+    suspect = watched(HEALTHY, *flagged_from(200, 2))
+    assert "Last known: suspect. The latest pairs" in overdue(suspect, WORKER).reasons[1].text
+
+
+def test_sensor_time_that_steps_back_leaves_nothing_green_and_no_suspicion_out_of_reach() -> None:
+    state = time_stepped_back(HEALTHY, 10 * S)
+    assert (state.health, state.reasons[0].code) == (HealthState.UNKNOWN, "time_stepped_back")
+    assert watched(state, check(20)).health is HealthState.HEALTHY
+    suspect = watched(HEALTHY, check(190), *flagged_from(200, 2))
+    assert suspect.flagged_since_ns == 196 * S
+    again = time_stepped_back(suspect, 10 * S)
+    assert (again.health, again.flagged_since_ns) == (HealthState.SUSPECT, 10 * S)
+    elsewhere = estimate(3.0, 90)
+    assert solved(again, elsewhere).health is HealthState.HEALTHY, "a window of the new time decides"
+
+
+def test_an_estimate_read_back_from_disk_says_so_and_has_not_been_looked_at() -> None:
     state = restored(HEALTHY)
-    assert (state.provenance, state.health) == (Provenance.RESTORED, HealthState.HEALTHY)
+    assert (state.provenance, state.health) == (Provenance.RESTORED, HealthState.UNKNOWN)
+    assert [reason.code for reason in state.reasons] == ["restarted", "last_known"]
+    assert watched(state, check(300)).health is HealthState.HEALTHY
     assert restored(initial_state(RIG)).provenance is Provenance.NOMINAL
     red = restored(replace(watched(HEALTHY, *flagged_from(200, 3))))
     assert red.health is HealthState.MISCALIBRATED

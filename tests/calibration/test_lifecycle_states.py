@@ -15,15 +15,17 @@ EDGES: dict[Event, tuple[HealthState, ...]] = {
     Event.CONFIRMED_BY_WINDOW: (H, H, H, H, H, H),
     Event.CONTRADICTED: (M, M, M, M, M, M),
     Event.STEP_SUSPECTED: (S, S, S, M, S, S),
-    Event.FAILED: (S, S, S, M, S, S),
-    Event.NO_RESULT: (D, D, D, M, D, D),
+    Event.REFUSED_ELSEWHERE: (S, S, S, M, S, S),
     Event.CLEAR: (H, H, H, S, H, H),
     Event.NO_OBJECTION: (U, H, S, S, U, U),
     Event.SUSPECTED: (S, S, S, M, S, S),
     Event.MOUNT_MOVED: (M, M, M, M, M, M),
     Event.DATA_CAUSE: (D, D, D, M, D, D),
+    Event.OVERDUE: (U, D, D, M, D, A),
     Event.AGED: (U, A, A, M, A, A),
     Event.REPLACED: (U, U, U, U, U, U),
+    Event.TIME_STEPPED_BACK: (U, U, S, M, U, U),
+    Event.RESTARTED: (U, U, S, M, U, U),
 }
 
 
@@ -50,8 +52,14 @@ def test_green_is_only_reached_by_looking() -> None:
 
 
 def test_silence_and_bad_data_hide_no_red() -> None:
-    for event in (Event.AGED, Event.DATA_CAUSE, Event.NO_RESULT, Event.FAILED, Event.SUSPECTED):
+    silent = (Event.OVERDUE, Event.AGED, Event.TIME_STEPPED_BACK, Event.RESTARTED)
+    for event in (*silent, Event.DATA_CAUSE, Event.REFUSED_ELSEWHERE, Event.SUSPECTED):
         assert TRANSITIONS[M, event] is M
+
+
+def test_whoever_has_not_looked_is_not_green() -> None:
+    for event in (Event.OVERDUE, Event.AGED, Event.TIME_STEPPED_BACK, Event.RESTARTED, Event.REPLACED):
+        assert H not in {TRANSITIONS[state, event] for state in HealthState}
 
 
 def test_only_a_moved_mount_is_red() -> None:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from coec.calibration.frames.sampling import CheckSampler
+from coec.calibration.frames.sampling import CheckSampler, stands
 from coec.calibration.types import EgoMotion, FramePair, Window
 from coec.config import MonitorConfig, WindowConfig
 
@@ -17,7 +17,7 @@ def at(street: Window, stamp_ns: int, speed_mps: float | None = 5.0) -> FramePai
 
 
 def checks(street: Window, stamps_s: list[float], speed_mps: float | None = 5.0) -> list[list[float]]:
-    sampler = CheckSampler(CONFIG, WindowConfig())
+    sampler = CheckSampler(CONFIG)
     offered = (sampler.offer(at(street, round(stamp * S), speed_mps)) for stamp in stamps_s)
     return [[pair.stamp_ns / S for pair in check] for check in offered if check is not None]
 
@@ -39,10 +39,19 @@ def test_a_slow_stream_collects_until_there_is_enough(street: Window) -> None:
     ]
 
 
-def test_nothing_new_is_seen_while_standing(street: Window) -> None:
+def test_a_standing_vehicle_is_checked_like_any_other(street: Window) -> None:
     stamps = [100.0 + 0.5 * i for i in range(60)]
-    assert checks(street, stamps, speed_mps=0.0) == []
-    assert len(checks(street, stamps, speed_mps=None)) == 5
+    assert checks(street, stamps, speed_mps=0.0) == checks(street, stamps, speed_mps=5.0)
+    window = WindowConfig(min_speed_mps=0.5)
+    assert [stands(at(street, S, speed), window) for speed in (0.0, 0.4, 0.6, None)] == [True, True, False, False]
+
+
+def test_pairs_hours_apart_are_not_one_check(street: Window) -> None:
+    first = [100.0 + 0.5 * i for i in range(9)]
+    assert checks(street, [*first, 8 * 3600.0]) == []
+    apart = checks(street, [100.0, 131.0, 162.0, 193.0, 224.0, 255.0])
+    assert apart == [], "no four of them lie within six periods"
+    assert checks(street, [100.0, 107.0, 114.0, 121.0, 128.0]) == [[100.0, 107.0, 114.0, 121.0]]
 
 
 def test_sensor_time_that_steps_back_starts_anew(street: Window) -> None:

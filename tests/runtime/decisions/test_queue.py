@@ -14,7 +14,7 @@ def test_answers_are_taken_in_the_order_of_the_questions_and_act_when_they_are_d
     decisions = DecisionQueue()
     taken: list[int] = []
     acted: list[int] = []
-    questions = [decisions.ask(due_ns) for due_ns in (50, 40, 60, 60)]
+    questions = [decisions.ask(due_ns, expires_s=1.0) for due_ns in (50, 40, 60, 60)]
 
     def answer(number: int) -> Effect:
         taken.append(number)
@@ -38,7 +38,7 @@ def test_answers_are_taken_in_the_order_of_the_questions_and_act_when_they_are_d
 def test_only_what_is_due_is_waited_for() -> None:
     decisions = DecisionQueue()
     assert not decisions.waits(10**18)
-    question = decisions.ask(50)
+    question = decisions.ask(50, expires_s=1.0)
     assert not decisions.waits(49)
     assert decisions.waits(50)
     decisions.answer(question, lambda: None)
@@ -48,10 +48,51 @@ def test_only_what_is_due_is_waited_for() -> None:
 def test_an_answer_that_was_not_awaited_acts_on_the_next_pair() -> None:
     decisions = DecisionQueue()
     acted: list[int] = []
-    question = decisions.ask(50)
+    question = decisions.ask(50, expires_s=1.0)
     decisions.settle(55)
     decisions.answer(question, lambda: lambda: acted.append(1))
     assert acted == []
     decisions.settle(56)
     decisions.settle(57)
     assert acted == [1]
+
+
+def test_a_question_without_an_answer_does_not_hold_up_those_behind_it() -> None:
+    decisions = DecisionQueue()
+    acted: list[str] = []
+    lost, other = decisions.ask(50, expires_s=10.0, name="w-1"), decisions.ask(60, expires_s=90.0)
+    decisions.answer(other, lambda: lambda: acted.append("other"))
+    assert decisions.waits(60)
+    assert decisions.expire(9.9, lambda _: lambda: None) == 0
+    told = []
+    assert decisions.expire(10.0, lambda question: told.append(question) or (lambda: lambda: acted.append("lost"))) == 1  # type: ignore[func-returns-value]
+    assert told == [lost]
+    assert not decisions.waits(10**18)
+    decisions.settle(60)
+    assert acted == ["lost", "other"]
+    decisions.answer(lost, lambda: lambda: acted.append("late"))
+    decisions.settle(10**18)
+    assert acted == ["lost", "other"], "the first answer counts"
+
+
+def test_the_question_about_a_window_is_found_until_it_is_answered() -> None:
+    decisions = DecisionQueue()
+    question = decisions.ask(50, 1.0, "w-1")
+    assert decisions.about("w-1") is question
+    assert decisions.about("w-2") is None
+    decisions.answer(question, lambda: None)
+    assert decisions.about("w-1") is None
+
+
+def test_when_sensor_time_steps_back_whatever_waits_is_due_at_once() -> None:
+    decisions = DecisionQueue()
+    acted: list[int] = []
+    questions = [decisions.ask(due_ns, expires_s=1.0) for due_ns in (1000, 2000)]
+    assert not decisions.waits(10)
+    decisions.bring_forward(10)
+    assert decisions.waits(10)
+    for number, question in enumerate(questions):
+        decisions.answer(question, lambda number=number: lambda: acted.append(number))  # type: ignore[misc]
+    decisions.settle(10)
+    assert acted == [0, 1]
+    assert decisions.ask(20, 1.0).due_ns == 20

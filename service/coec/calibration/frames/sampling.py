@@ -1,8 +1,8 @@
 """Choosing the pairs of a check of the monitor while the stream passes: evenly over each period of sensor time.
 
 Periods are counted from the zero of sensor time, not from the first pair: a service that was restarted, and a replay at
-any rate, cut the same checks. Unlike the pairs of a window these are not asked whether they are good: a dirty lens and
-a frozen camera are what the monitor has to see.
+any rate, cut the same checks. Unlike the pairs of a window these are not asked whether they are good: a dirty lens, a
+frozen camera and a mount that is hit while the vehicle stands are what the monitor has to see.
 """
 
 from __future__ import annotations
@@ -12,14 +12,21 @@ from coec.config import MonitorConfig, WindowConfig
 
 NS_PER_S = 1_000_000_000
 
+SPAN_PERIODS = 6
+"""Periods that the pairs of one check may span. The slowest stream that the monitor is of use with, a pair a period,
+fills the four pairs of a check in four; two more allow for losses. Pairs further apart are not one inspection."""
+
+
+def stands(pair: FramePair, window: WindowConfig) -> bool:
+    """Whether the vehicle is known to stand: then nothing is seen that was not seen before."""
+    return pair.motion is not None and pair.motion.speed_mps < window.min_speed_mps
+
 
 class CheckSampler:
     """Keeps the pairs of the next check, at most `MonitorConfig.pairs`."""
 
-    def __init__(self, config: MonitorConfig, window: WindowConfig) -> None:
-        """`window` says when a vehicle stands: then nothing new can be seen."""
+    def __init__(self, config: MonitorConfig) -> None:
         self._config = config
-        self._window = window
         self._period_ns = round(config.period_s * NS_PER_S)
         self._pairs: list[FramePair] = []
         self._period = self._cell = -1
@@ -31,19 +38,16 @@ class CheckSampler:
         if stamp_ns < self._last_ns:  # sensor time stepped back
             self._pairs.clear()
         self._last_ns = stamp_ns
+        oldest_ns = stamp_ns - SPAN_PERIODS * self._period_ns
+        self._pairs = [kept for kept in self._pairs if kept.stamp_ns >= oldest_ns]
         period, cell = stamp_ns // self._period_ns, stamp_ns * self._config.pairs // self._period_ns
         check = None
         if period != self._period and len(self._pairs) >= self._config.min_pairs:
             check = tuple(self._pairs)
             self._pairs.clear()
         self._period = period
-        stands = pair.motion is not None and pair.motion.speed_mps < self._window.min_speed_mps
-        if cell != self._cell and not (self._window.require_motion and stands):
+        if cell != self._cell:
             self._cell = cell
             self._pairs.append(pair)
             del self._pairs[: -self._config.pairs]
         return check
-
-    def clear(self) -> None:
-        """Forget what was kept: the extrinsic has changed, and a check must not mix two."""
-        self._pairs.clear()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.frames.sampling import stands
 from coec.calibration.ports import ImageInspector
 from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
 from coec.config import WindowConfig
@@ -137,8 +138,8 @@ class WindowCutter:
     def _objection(self, pair: FramePair, T_camera_lidar: Matrix4) -> str | None:
         """Why the pair is not fit for a window, cheapest question first; None when it is fit."""
         config = self._config
-        stands = pair.motion is not None and pair.motion.speed_mps < config.min_speed_mps
-        if config.require_motion and stands:
+        standing = stands(pair, config)
+        if config.require_motion and standing:
             return "standing"
         if self._points_in_view(pair, T_camera_lidar) < config.min_points_in_view:
             return "out_of_view"
@@ -154,7 +155,7 @@ class WindowCutter:
             return "clipped"
         if quality.sharpness < config.min_sharpness:
             return "blurred"
-        if previous is not None and previous.digest == quality.digest and not stands:
+        if previous is not None and previous.digest == quality.digest and not standing:
             return "frozen"
         return None
 

@@ -4,20 +4,22 @@
 
 Health, by what happens (rows) and the state it happens in (columns); `states.MEANING` has a sentence for each event:
 
-|                      | unknown       | healthy       | suspect       | miscalibrated | degraded      | stale         |
-| -------------------- | ------------- | ------------- | ------------- | ------------- | ------------- | ------------- |
-| window_agrees        | healthy       | ·             | healthy       | healthy       | healthy       | healthy       |
-| window_contradicts   | miscalibrated | miscalibrated | miscalibrated | ·             | miscalibrated | miscalibrated |
-| window_differs       | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
-| window_refused       | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
-| no_result            | degraded      | degraded      | degraded      | ·             | ·             | degraded      |
-| monitor_clear        | healthy       | ·             | healthy       | suspect       | healthy       | healthy       |
-| monitor_no_objection | ·             | ·             | ·             | suspect       | unknown       | unknown       |
-| monitor_suspects     | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
-| monitor_confirms     | miscalibrated | miscalibrated | miscalibrated | ·             | miscalibrated | miscalibrated |
-| data_cause           | degraded      | degraded      | degraded      | ·             | ·             | degraded      |
-| aged                 | ·             | stale         | stale         | ·             | stale         | ·             |
-| replaced             | ·             | unknown       | unknown       | unknown       | unknown       | unknown       |
+|                          | unknown       | healthy       | suspect       | miscalibrated | degraded      | stale         |
+| ------------------------ | ------------- | ------------- | ------------- | ------------- | ------------- | ------------- |
+| window_agrees            | healthy       | ·             | healthy       | healthy       | healthy       | healthy       |
+| window_contradicts       | miscalibrated | miscalibrated | miscalibrated | ·             | miscalibrated | miscalibrated |
+| window_differs           | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
+| window_refused_elsewhere | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
+| monitor_clear            | healthy       | ·             | healthy       | suspect       | healthy       | healthy       |
+| monitor_no_objection     | ·             | ·             | ·             | suspect       | unknown       | unknown       |
+| monitor_suspects         | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
+| monitor_confirms         | miscalibrated | miscalibrated | miscalibrated | ·             | miscalibrated | miscalibrated |
+| data_cause               | degraded      | degraded      | degraded      | ·             | ·             | degraded      |
+| check_overdue            | ·             | degraded      | degraded      | ·             | ·             | ·             |
+| aged                     | ·             | stale         | stale         | ·             | stale         | ·             |
+| replaced                 | ·             | unknown       | unknown       | unknown       | unknown       | unknown       |
+| time_stepped_back        | ·             | unknown       | ·             | ·             | unknown       | unknown       |
+| restarted                | ·             | unknown       | ·             | ·             | unknown       | unknown       |
 """
 
 from coec.calibration.lifecycle.pair_state import (
@@ -39,10 +41,12 @@ from coec.calibration.lifecycle.pair_state import (
     held,
     initial_state,
     moved,
+    overdue,
     released,
     reset,
     restored,
     rolled_back,
+    time_stepped_back,
 )
 from coec.calibration.lifecycle.policy import Change
 from coec.calibration.lifecycle.states import MEANING, TRANSITIONS, Event, HealthState, markdown
@@ -72,8 +76,10 @@ __all__ = [
     "initial_state",
     "markdown",
     "moved",
+    "overdue",
     "released",
     "reset",
     "restored",
     "rolled_back",
+    "time_stepped_back",
 ]

@@ -20,12 +20,18 @@ from coec.calibration.monitor.change_detector import after_observation as check_
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
 from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
+from coec.calibration.verdict import cannot_tell
 from coec.config import PolicyConfig, TrackerConfig
 from coec.errors import CoecError
 from coec.geometry import se3
 
 BENT_MOUNT = "bent_mount"
 """The one cause of `diagnose` that is the calibration's; every other is the data's."""
+
+LAST_KNOWN = "last_known"
+"""Code of the reason that says what was known before nobody could look."""
+
+RESTARTED = Reason("restarted", "The service was started again; nothing has been looked at since.")
 
 NOT_EVALUATED = Reason("not_evaluated", "No window has been evaluated yet.")
 
@@ -133,10 +139,11 @@ def initial_state(rig: Rig) -> PairState:
 
 
 def restored(state: PairState) -> PairState:
-    """The state after a restart: an estimate that was read back from disk says so."""
+    """The state after a restart: an estimate that was read back from disk says so, and whatever the clock claims,
+    nothing has been looked at since. A suspicion, and an alarm, outlive the restart."""
     if state.provenance is Provenance.ESTIMATED:
-        return replace(state, provenance=Provenance.RESTORED)
-    return state
+        state = replace(state, provenance=Provenance.RESTORED)
+    return _unseen(state, Event.RESTARTED, RESTARTED)
 
 
 def moved(estimate: Estimate, pose: Matrix4, rig: Rig) -> Estimate:
@@ -172,11 +179,14 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     state = replace(state, latest=estimate, failures=())
     if estimate.verdict.decision is Decision.FAILED:
         state = replace(state, status=Status.FAILED)
-        return _unless_red(state, Event.FAILED, *estimate.verdict.reasons)
+        elsewhere = not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
+        if cannot_tell(estimate.verdict) or not elsewhere:
+            return state
+        return _unless_red(state, Event.REFUSED_ELSEWHERE, *estimate.verdict.reasons)
     state = replace(state, status=Status.ACCEPTED)
     if state.flagged_since_ns is not None and window_start_ns < state.flagged_since_ns:
         return state
-    track = _fused(state, estimate, rules)
+    track = _tracked(state, estimate, rules)
     state = replace(state, track=track)
     if track.step is StepState.SUSPECTED and track.candidate is not None:
         step = policy.step_between(state.T_camera_lidar, track.candidate.T_camera_lidar)
@@ -189,11 +199,12 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
 
 
 def after_failure(state: PairState, reason: Reason) -> PairState:
-    """A window from which no estimate could be made: the served extrinsic stays."""
-    return _unless_red(replace(state, status=Status.FAILED, failures=(reason,)), Event.NO_RESULT, reason)
+    """A window from which no estimate could be made: the served extrinsic stays, and so does its health, of which that
+    says nothing."""
+    return replace(state, status=Status.FAILED, failures=(reason,))
 
 
-def _fused(state: PairState, estimate: Estimate, rules: Rules) -> Track:
+def _tracked(state: PairState, estimate: Estimate, rules: Rules) -> Track:
     """The track with the estimate in it. It starts again from the estimate when there is none yet, and when the monitor
     already speaks against what is served: then two witnesses agree that the mount has moved."""
     measurement = Measurement.of(estimate)
@@ -283,14 +294,35 @@ def after_observation(state: PairState, observation: Observation) -> PairState:
     return state
 
 
-def aged(state: PairState, age_s: float | None, stale_after_s: float) -> PairState:
-    """Time has passed since the last check (None: nobody knows when that was)."""
-    if age_s is None:
-        return state if state.health is HealthState.UNKNOWN else happened(state, Event.REPLACED, NOT_EVALUATED)
-    if age_s <= stale_after_s or TRANSITIONS[state.health, Event.AGED] is state.health:
+def overdue(state: PairState, why: Reason) -> PairState:
+    """No check has been completed in time, for this reason; what was last known is said with it."""
+    return _unseen(state, Event.OVERDUE, why)
+
+
+def aged(state: PairState, age_s: float, stale_after_s: float) -> PairState:
+    """Time has passed since a check was last completed."""
+    if age_s <= stale_after_s:
         return state
-    text = f"The last evaluation is {age_s:.0f} s old, more than {stale_after_s:.0f} s."
-    return happened(state, Event.AGED, Reason("stale", text))
+    text = f"No check has been completed for {age_s:.0f} s, more than {stale_after_s:.0f} s."
+    return _unseen(state, Event.AGED, Reason("stale", text))
+
+
+def _unseen(state: PairState, event: Event, why: Reason) -> PairState:
+    if TRANSITIONS[state.health, event] is state.health:
+        return state
+    known = [reason for reason in state.reasons if reason.code == LAST_KNOWN]
+    told = "; ".join(reason.text for reason in state.reasons)
+    known = known or [Reason(LAST_KNOWN, f"Last known: {state.health.value}{'. ' if told else '.'}{told}")]
+    return happened(state, event, why, *known)
+
+
+def time_stepped_back(state: PairState, stamp_ns: int) -> PairState:
+    """The clock of the sensors stepped back, to this time. What was suspected of pairs since some time of the old clock
+    is suspected of every pair of the new one."""
+    since_ns = None if state.flagged_since_ns is None else stamp_ns
+    state = replace(state, flagged_since_ns=since_ns, monitor=replace(state.monitor, last_stamps_ns=()))
+    why = Reason("time_stepped_back", "The clock of the sensors stepped back; nothing has been looked at since.")
+    return _unseen(state, Event.TIME_STEPPED_BACK, why)
 
 
 # --- commands -------------------------------------------------------------------------------------------------------

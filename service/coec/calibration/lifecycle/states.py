@@ -28,7 +28,7 @@ STATES: Mapping[HealthState, str] = MappingProxyType(
         HealthState.SUSPECT: "something speaks against what is served; a window is being taken to tell",
         HealthState.MISCALIBRATED: "what is served is wrong",
         HealthState.DEGRADED: "the data, or the service, do not allow to tell",
-        HealthState.STALE: "what was healthy has not been looked at for longer than `stale_after_s`",
+        HealthState.STALE: "nothing has been looked at for longer than `stale_after_s`",
     }
 )
 
@@ -39,15 +39,17 @@ class Event(StrEnum):
     CONFIRMED_BY_WINDOW = "window_agrees"
     CONTRADICTED = "window_contradicts"
     STEP_SUSPECTED = "window_differs"
-    FAILED = "window_refused"
-    NO_RESULT = "no_result"
+    REFUSED_ELSEWHERE = "window_refused_elsewhere"
     CLEAR = "monitor_clear"
     NO_OBJECTION = "monitor_no_objection"
     SUSPECTED = "monitor_suspects"
     MOUNT_MOVED = "monitor_confirms"
     DATA_CAUSE = "data_cause"
+    OVERDUE = "check_overdue"
     AGED = "aged"
     REPLACED = "replaced"
+    TIME_STEPPED_BACK = "time_stepped_back"
+    RESTARTED = "restarted"
 
 
 MEANING: Mapping[Event, str] = MappingProxyType(
@@ -55,37 +57,42 @@ MEANING: Mapping[Event, str] = MappingProxyType(
         Event.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
         Event.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
         Event.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
-        Event.FAILED: "the verdict on a window was negative",
-        Event.NO_RESULT: "a window came to nothing: the worker failed, or there was too little in it",
+        Event.REFUSED_ELSEWHERE: "a window was refused, yet the pose that stands out in it is not what is served",
         Event.CLEAR: "the monitor sees nothing wrong with an extrinsic that a window has confirmed",
         Event.NO_OBJECTION: "the monitor sees nothing wrong with an extrinsic that no window has confirmed",
         Event.SUSPECTED: "the monitor suspects that the mount has moved",
         Event.MOUNT_MOVED: "the monitor is certain that the mount has moved",
         Event.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
-        Event.AGED: "the last check is older than `stale_after_s`",
-        Event.REPLACED: "a person replaced the extrinsic (rollback, reset), or the time of the last check is lost",
+        Event.OVERDUE: "no check has been completed for three periods of the monitor",
+        Event.AGED: "no check has been completed for `stale_after_s`",
+        Event.REPLACED: "a person replaced the extrinsic (rollback, reset)",
+        Event.TIME_STEPPED_BACK: "the clock of the sensors stepped back: nothing of the new time has been looked at",
+        Event.RESTARTED: "the service was started again: nothing has been looked at since",
     }
 )
 
 _U, _H, _S, _M, _D, _A = HealthState
 
 # Rows: what happens. Columns: the state it happens in, in the order of `HealthState`.
-#   Green is only ever reached by looking (CONFIRMED_BY_WINDOW, CLEAR). Red is left only by a window that agrees, by a
-#   person, or step by step by a monitor that stays clear; neither silence nor bad data hides it.
+#   Green is only ever reached by looking (CONFIRMED_BY_WINDOW, CLEAR), and kept by looking. Red is left only by a
+#   window that agrees, by a person, or step by step by a monitor that stays clear; neither silence nor bad data hides
+#   it. A window that cannot tell, or came to nothing, is no event: it says nothing of the mount.
 _ROWS: Mapping[Event, tuple[HealthState, ...]] = {
     #                            unknown healthy suspect miscal. degraded stale
     Event.CONFIRMED_BY_WINDOW: (_H, _H, _H, _H, _H, _H),
     Event.CONTRADICTED: (_M, _M, _M, _M, _M, _M),
     Event.STEP_SUSPECTED: (_S, _S, _S, _M, _S, _S),
-    Event.FAILED: (_S, _S, _S, _M, _S, _S),
-    Event.NO_RESULT: (_D, _D, _D, _M, _D, _D),
+    Event.REFUSED_ELSEWHERE: (_S, _S, _S, _M, _S, _S),
     Event.CLEAR: (_H, _H, _H, _S, _H, _H),
     Event.NO_OBJECTION: (_U, _H, _S, _S, _U, _U),
     Event.SUSPECTED: (_S, _S, _S, _M, _S, _S),
     Event.MOUNT_MOVED: (_M, _M, _M, _M, _M, _M),
     Event.DATA_CAUSE: (_D, _D, _D, _M, _D, _D),
+    Event.OVERDUE: (_U, _D, _D, _M, _D, _A),
     Event.AGED: (_U, _A, _A, _M, _A, _A),
     Event.REPLACED: (_U, _U, _U, _U, _U, _U),
+    Event.TIME_STEPPED_BACK: (_U, _U, _S, _M, _U, _U),
+    Event.RESTARTED: (_U, _U, _S, _M, _U, _U),
 }
 
 TRANSITIONS: Mapping[tuple[HealthState, Event], HealthState] = MappingProxyType(

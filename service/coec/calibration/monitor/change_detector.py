@@ -61,6 +61,8 @@ class Observation:
         drift: of the local optimum from the commissioned calibration; None until the rig is commissioned.
         dirty: blocks of the image, by number, that have no contrast in any pair; for commissioned rigs in daylight.
         textured: blocks that could be, 0 where it is not known.
+        standing_stamps_ns: of the pairs that were taken while the vehicle stood: they show what was seen before, and
+            are evidence neither for nor against the mount.
     """
 
     stamp_ns: int
@@ -78,6 +80,7 @@ class Observation:
     drift: Drift | None = None
     dirty: tuple[int, ...] = ()
     textured: int = 0
+    standing_stamps_ns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +105,12 @@ class MonitorState:
 
 
 def after_observation(state: MonitorState, observation: Observation) -> MonitorState:
-    """The state after one more check. It counts by the share of its pairs that the last one did not hold."""
-    counted = set(state.last_stamps_ns)
-    fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
+    """The state after one more check. It counts by the share of its pairs that the last one did not hold; of the mount
+    only those say something new that were taken in motion."""
+    counted, standing = set(state.last_stamps_ns), set(observation.standing_stamps_ns)
+    new = [stamp for stamp in observation.pair_stamps_ns if stamp not in counted]
+    fresh = len(new) / len(observation.pair_stamps_ns)
+    moving = sum(stamp not in standing for stamp in new) / len(observation.pair_stamps_ns)
     dirt = _dirt_after(state.dirt, observation, fresh)
     codes = {cause.code for cause in observation.causes}
     if sum(run >= DIRTY_CHECKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
@@ -118,9 +124,9 @@ def after_observation(state: MonitorState, observation: Observation) -> MonitorS
     if codes:
         # Neither for nor against: the data cannot tell.
         return after
-    if not observation.flagged and observation.weak:
+    if moving == 0.0 or (not observation.flagged and observation.weak):
         return after
-    step = fresh * (WEAK_SHARE if observation.weak else 1.0)
+    step = moving * (WEAK_SHARE if observation.weak else 1.0)
     most = max(state.evidence, SUSPECT_AT) if observation.weak else MOST
     evidence = min(max(state.evidence + (step if observation.flagged else -step), 0.0), most)
     offset = (

@@ -1,71 +1,190 @@
-"""Commands of people, before anything is done: what a payload may say, and how a sender is written down."""
+"""Commands of people: each is carried out whole by the thread that owns what it changes, or not at all; either is
+acknowledged, logged and written down."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
-from typing import Any, Final
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
-import msgpack
+from coec.adapters.files.conversions import estimate_of, matrix_of
+from coec.calibration import lifecycle
+from coec.calibration.types import Rig
+from coec.config import PairConfig
+from coec.errors import NotFoundError
+from coec.runtime.decisions.decider import Decider
+from coec.runtime.decisions.mailbox import Mailbox
+from coec.runtime.decisions.pair_store import PairStore
+from coec.runtime.decisions.questions import Questions
+from coec.runtime.handover import BusyError
+from coec.runtime.ingest.chooser import Chooser
+from coec.runtime.ingest.stream import Stream
+from coec.runtime.recording.recorder import Recorder
+from coec.runtime.recording.window_store import WindowFolder
+from coec.schemas.replies import Acknowledgement
 
-from coec.errors import UsageError
+_log = logging.getLogger(__name__)
 
-NAMES: Final = ("calibrate", "apply", "rollback", "reset", "commission", "hold")
-"""Of CONTRACT."""
+TIMEOUT_S = 4.0
+"""To begin a command, and again to end it: together below the 10 s after which clients give up."""
 
-ARGUMENTS: Final[Mapping[str, Mapping[str, type]]] = {"rollback": {"to": str}, "hold": {"release": bool}}
-"""What a payload may hold, by command; the others take none."""
-
-MAX_SENDER: Final = 96
-"""Characters of a sender in log and history."""
-
-MAX_ATTACHMENT: Final = 4096
-"""Bytes of an attachment that are looked at."""
-
-_HARMLESS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789 ._:/@+-=,")
-
-
-def parse(name: str, payload: bytes) -> dict[str, Any]:
-    """The arguments of a command: nothing, or a map in msgpack or JSON.
-
-    Raises:
-        UsageError: no such command, or its payload is not what it takes.
-    """
-    if name not in NAMES:
-        raise UsageError(f"no such command; known: {', '.join(NAMES)}")
-    known = ARGUMENTS.get(name, {})
-    document = _document(payload)
-    for key, value in document.items():
-        if key not in known:
-            takes = ", ".join(known) or "no arguments"
-            raise UsageError(f"`{name}` takes {takes}")
-        if not isinstance(value, known[key]):
-            raise UsageError(f"argument `{key}` of `{name}` must be of type {known[key].__name__}")
-    return document
+COMMISSIONING_WINDOWS = 8
+"""Windows that a rig is commissioned from, the newest: 200 pairs."""
 
 
-def sender_of(attachment: bytes | None) -> str:
-    """The attachment of a query as one short harmless line; what is not readable text is told by its hash."""
-    if not attachment:
-        return "anonymous"
-    start = attachment[:MAX_ATTACHMENT]
-    text = start.decode("ascii", errors="replace")
-    cleaned = "".join(character if character in _HARMLESS else "_" for character in text)
-    if 2 * cleaned.count("_") > len(cleaned):
-        return f"{len(attachment)} bytes, sha256 {hashlib.sha256(start).hexdigest()[:16]}"
-    return cleaned[:MAX_SENDER]
+class Commands:
+    """Those of one pair. Any thread."""
 
+    def __init__(
+        self,
+        pair: PairConfig,
+        vehicle: str,
+        rig: Rig,
+        decider: Decider,
+        mailbox: Mailbox,
+        store: PairStore,
+        stream: Stream,
+        chooser: Chooser,
+        recorder: Recorder,
+        folder: WindowFolder,
+        questions: Questions,
+    ) -> None:
+        self._pair = pair
+        self._vehicle = vehicle
+        self._rig = rig
+        self._rules = lifecycle.Rules(pair.policy, pair.tracker)
+        self._decider = decider
+        self._mailbox = mailbox
+        self._store = store
+        self._stream = stream
+        self._chooser = chooser
+        self._recorder = recorder
+        self._folder = folder
+        self._questions = questions
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
 
-def _document(payload: bytes) -> dict[str, Any]:
-    if not payload:
-        return {}
-    try:
-        document = (
-            json.loads(payload) if payload[:1] == b"{" else msgpack.unpackb(payload, max_map_len=8, max_str_len=256)
+    @property
+    def counts(self) -> dict[str, int]:
+        """Commands since the start, by name and whether they were accepted."""
+        with self._lock:
+            return dict(self._counts)
+
+    def carry_out(self, name: str, arguments: dict[str, Any], sender: str) -> Acknowledgement:
+        """Carry out a command of `payloads.NAMES`, or say why not."""
+        decided: dict[str, Callable[[], Acknowledgement]] = {
+            "apply": self._apply,
+            "rollback": partial(self._roll_back, arguments.get("to")),
+            "reset": self._reset,
+            "commission": self._commission,
+            "hold": partial(self._hold, release=bool(arguments.get("release", False))),
+        }
+        try:
+            if name == "calibrate":
+                acknowledged = self._stream.ask(self._calibrate, TIMEOUT_S)
+                # It is done: what cannot be waited for any more is written down all the same.
+                self._mailbox.post(partial(self._write_down, acknowledged, sender))
+            else:
+                acknowledged = self._mailbox.ask(partial(self._decide, name, decided[name], sender), TIMEOUT_S)
+        except BusyError as error:
+            acknowledged = self._acknowledge(name, error.reply_code, str(error), accepted=False)
+        with self._lock:
+            self._counts[f"{name}_{'accepted' if acknowledged.accepted else 'refused'}"] += 1
+        return acknowledged
+
+    # --- on the thread that decides ---------------------------------------------------------------------------------
+
+    def _decide(self, name: str, command: Callable[[], Acknowledgement], sender: str) -> Acknowledgement:
+        try:
+            acknowledged = command()
+        except lifecycle.CommandRefusedError as error:
+            acknowledged = self._acknowledge(name, error.code, str(error), accepted=False)
+        except NotFoundError as error:
+            acknowledged = self._acknowledge(name, error.reply_code, str(error), accepted=False)
+        self._write_down(acknowledged, sender)
+        return acknowledged
+
+    def _write_down(self, done: Acknowledgement, sender: str) -> None:
+        fields = {"pair": self._pair.name, "command": done.command, "sender": sender}
+        _log.info("a command came", extra={"fields": {**fields, "accepted": done.accepted, "code": done.code}})
+        self._store.note_command(done.command, done.code, done.text, sender, accepted=done.accepted)
+        self._store.save()
+        self._decider.tell_now()
+
+    def _apply(self) -> Acknowledgement:
+        self._store.update(partial(lifecycle.apply_pending, rules=self._rules), None, completed=False)
+        return self._replaced("apply", "applied", "The candidate is served from now on.")
+
+    def _roll_back(self, to: str | None) -> Acknowledgement:
+        kept, result = self._store.served_before(to)
+        assert kept.entry.camera_from_lidar is not None  # `served_before` returns no other
+        pose, estimate = matrix_of(kept.entry.camera_from_lidar), estimate_of(result)
+        self._store.update(
+            lambda state: lifecycle.rolled_back(state, pose, estimate, self._rules), None, completed=False
         )
-    except (ValueError, RecursionError, msgpack.UnpackException) as error:
-        raise UsageError("the payload is neither a map in msgpack nor in JSON") from error
-    if not isinstance(document, dict) or not all(isinstance(key, str) for key in document):
-        raise UsageError("the payload must be a map of names to values")
-    return document
+        text = f"The calibration {kept.sha256[:16]} is served again; the next accepted window may move it: see `hold`."
+        return self._replaced("rollback", "rolled_back", text, result.window_id)
+
+    def _reset(self) -> Acknowledgement:
+        self._store.update(lambda state: lifecycle.reset(state, self._rig), None, completed=False)
+        text = "The workshop calibration is served; the next accepted window may move it: see `hold`."
+        return self._replaced("reset", "reset", text)
+
+    def _hold(self, *, release: bool) -> Acknowledgement:
+        self._store.update(lifecycle.released if release else lifecycle.held, None, completed=False)
+        if release:
+            return self._acknowledge("hold", "released", "Accepted estimates may be applied again.")
+        return self._acknowledge("hold", "held", "The extrinsic stays as it is until it is released.")
+
+    def _replaced(self, name: str, code: str, text: str, window_id: str | None = None) -> Acknowledgement:
+        self._decider.replaced()
+        return self._acknowledge(name, code, text, window_id=window_id)
+
+    def _commission(self) -> Acknowledgement:
+        """Have the worker learn the baseline from the windows that agree with what is served."""
+        pose = self._store.state.T_camera_lidar
+        agreeing = [
+            self._folder.path(result.window_id)
+            for result in self._store.history.results()
+            if result.status == "accepted"
+            and self._folder.path(result.window_id).exists()
+            and lifecycle.agrees(pose, estimate_of(result).optimum.T_camera_lidar, self._pair.policy)
+        ]
+        paths = list(dict.fromkeys(agreeing))[-COMMISSIONING_WINDOWS:]
+        if not paths:
+            text = "No recorded window agrees with what is served: calibrate first."
+            return self._acknowledge("commission", "too_few_windows", text, accepted=False)
+        self._questions.commission(pose, paths, self._decider.commissioned)
+        text = f"The rig is being commissioned from {len(paths)} windows; `history` will say how it went."
+        return self._acknowledge("commission", "commissioning", text, window_id=paths[-1].stem)
+
+    # --- on the stream's thread -------------------------------------------------------------------------------------
+
+    def _calibrate(self) -> Acknowledgement:
+        """Finish the open window now if it has enough pairs, and solve it; else solve the latest window again."""
+        lacking = self._pair.window.min_pairs - self._chooser.chosen.selected
+        if lacking <= 0 and (ended := self._chooser.finish()) is not None:
+            text = f"The window of {ended.pairs} pairs is being solved."
+            return self._acknowledge("calibrate", "window_finished", text, window_id=ended.window_id)
+        latest = self._recorder.latest
+        if latest is not None and latest.exists():
+            self._questions.solve(latest.stem, latest, True)
+            text = f"The latest window is being solved again; {lacking} more pairs are needed for a new one."
+            return self._acknowledge("calibrate", "window_again", text, window_id=latest.stem)
+        return self._acknowledge("calibrate", "too_few_pairs", f"{lacking} more pairs needed.", accepted=False)
+
+    def _acknowledge(
+        self, name: str, code: str, text: str, *, accepted: bool = True, window_id: str | None = None
+    ) -> Acknowledgement:
+        return Acknowledgement(
+            vehicle=self._vehicle,
+            pair=self._pair.name,
+            command=name,
+            accepted=accepted,
+            code=code,
+            text=text,
+            window_id=window_id,
+        )

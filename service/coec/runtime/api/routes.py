@@ -9,10 +9,11 @@ from pydantic import BaseModel
 
 from coec.adapters.zenoh.bus import Answer, Bus, Request, Route
 from coec.errors import UsageError
-from coec.runtime.api import commands
 from coec.runtime.api import metrics as metrics_text
+from coec.runtime.api import payloads
+from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.snapshots import Snapshot, answer_of
-from coec.runtime.pair import PairService
+from coec.runtime.pair import Pair
 from coec.schemas.keys import (
     Format,
     Keys,
@@ -33,7 +34,7 @@ class VehicleAnswers:
     def __init__(
         self,
         keys: Keys,
-        pairs: Mapping[str, PairService],
+        pairs: Mapping[str, Pair],
         status: Callable[[], Snapshot],
         metrics: Callable[[], bytes],
         config: Snapshot,
@@ -46,7 +47,7 @@ class VehicleAnswers:
             keys.config: Route(keys.config, lambda request: config.answer(_format(request)), quick=True),
             keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), quick=False),
         }
-        self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
+        self._pair_routes = {name: self._readable(pair.answers) for name, pair in pairs.items()}
 
     def declare(self, bus: Bus) -> None:
         """Serve everything on the bus. The last queryable is there for the keys of pairs that are not: it does not
@@ -76,11 +77,11 @@ class VehicleAnswers:
             return matching if key.endswith("/overlay") else [route for route in matching if not route.draws]
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
-            return [Route(key, self._window(self._pairs[pair], address.argument), quick=False)]
+            return [Route(key, self._window(self._pairs[pair].answers, address.argument), quick=False)]
         if address.resource == "command":
             return [Route(key, self._command(self._pairs[pair], str(address.argument)), quick=False)]
         if address.resource == "evidence" and address.argument is not None:
-            return [Route(key, self._evidence(self._pairs[pair], address.argument), quick=False)]
+            return [Route(key, self._evidence(self._pairs[pair].answers, address.argument), quick=False)]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_unknown(self, key: str) -> Sequence[Route]:
@@ -94,49 +95,49 @@ class VehicleAnswers:
             return []
         raise UsageError(f"no such pair or resource; pairs served here: {', '.join(self._pairs)}")
 
-    def _readable(self, pair: PairService) -> dict[str, Route]:
+    def _readable(self, pair: PairAnswers) -> dict[str, Route]:
         keys, name = self._keys, pair.name
         routes = (
             Route(keys.extrinsic(name), lambda request: pair.extrinsic(_format(request)), quick=True),
             Route(keys.health(name), lambda request: pair.health(_format(request)), quick=True),
             Route(keys.history(name), lambda request: _history(pair, request), quick=False),
             Route(keys.windows(name), lambda request: _in_format(request, pair.windows), quick=False),
-            Route(keys.evidence(name), lambda request: _in_format(request, pair.evidence), quick=False),
+            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), quick=False),
             Route(keys.overlay(name), lambda request: _overlay(pair, request), quick=False, draws=True),
         )
         return {route.key: route for route in routes}
 
-    def _window(self, pair: PairService, window_id: str) -> Callable[[Request], Answer]:
+    def _window(self, pair: PairAnswers, window_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
             chosen = parse_range_selector(request.parameters)
             return Answer(pair.read_window(window_id, chosen.offset, chosen.length), OCTETS)
 
         return answer
 
-    def _evidence(self, pair: PairService, event_id: str) -> Callable[[Request], Answer]:
+    def _evidence(self, pair: PairAnswers, event_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
             chosen = parse_evidence_selector(request.parameters)
             if chosen.overlay is not None:
-                return Answer(pair.ledger.evidence.overlay(event_id, chosen.overlay), JPEG)
-            return answer_of(pair.ledger.evidence.event(event_id), chosen.format)
+                return Answer(pair.event_overlay(event_id, chosen.overlay), JPEG)
+            return answer_of(pair.event(event_id), chosen.format)
 
         return answer
 
-    def _command(self, pair: PairService, name: str) -> Callable[[Request], Answer]:
+    def _command(self, pair: Pair, name: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
             form = _format(request)
-            arguments = commands.parse(name, request.payload)
-            return answer_of(pair.command(name, arguments, commands.sender_of(request.attachment)), form)
+            arguments = payloads.parse(name, request.payload)
+            return answer_of(pair.command(name, arguments, payloads.sender_of(request.attachment)), form)
 
         return answer
 
 
-def _overlay(pair: PairService, request: Request) -> Answer:
+def _overlay(pair: PairAnswers, request: Request) -> Answer:
     chosen = parse_overlay_selector(request.parameters)
     return Answer(pair.overlay(chosen.window_id, nominal=chosen.at == "nominal"), JPEG)
 
 
-def _history(pair: PairService, request: Request) -> Answer:
+def _history(pair: PairAnswers, request: Request) -> Answer:
     chosen = parse_history_selector(request.parameters)
     return answer_of(pair.history(chosen.since_ns, chosen.until_ns, chosen.limit), chosen.format)
 

@@ -1,14 +1,13 @@
-"""The books of a pair: its state, its history, its evidence, and when it was last looked at.
+"""The books of a pair: its state, its history, its incidents, and when a check of it was last completed.
 
 Every change of the state passes through `update`, which works out from the state before and after what has to be
 written down: a line of the history for every extrinsic and every state of health, evidence for every red one. Then it
-is all put on the disk. Safe to use from several threads.
+is all put on the disk. One thread changes it, the one that decides about the pair; what others read is immutable.
 """
 
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -19,14 +18,15 @@ import numpy as np
 
 from coec.adapters.files.conversions import transform_of
 from coec.adapters.system.logs import LossCounter
-from coec.calibration.lifecycle import HealthState, PairState, Provenance, aged, initial_state
-from coec.calibration.types import Matrix4, Reason, Rig
+from coec.calibration.lifecycle import HealthState, PairState, Provenance, aged, initial_state, overdue, restored
+from coec.calibration.types import Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
 from coec.runtime.decisions.check_log import CheckLog
 from coec.runtime.decisions.history import GENESIS, History, Kept
 from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.state_store import Clocks, StateStore
+from coec.runtime.ingest.chooser import Served
 from coec.runtime.recording.window_store import WindowFolder
 from coec.schemas import replies
 from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, MetricsPoint
@@ -37,19 +37,14 @@ NS_PER_S = 1_000_000_000
 
 EntryKind = Literal["estimate", "extrinsic", "state", "command", "commissioned", "chain"]
 
+MIN_HASH = 8
+"""Characters of a hash that name a line of the history."""
+
 WORDS = {
     HealthState.HEALTHY: "What is served has been looked at and agrees with the data.",
     HealthState.UNKNOWN: "What is served has not been looked at.",
 }
 """Where a state comes without reasons."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Served:
-    """An extrinsic (4, 4) that is or was served; `epoch` counts them."""
-
-    epoch: int
-    T_camera_lidar: Matrix4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,11 +56,11 @@ class Taken:
     served: Served
 
 
-class Ledger:
+class PairStore:
     """Keeps the books of one pair.
 
     Attributes:
-        history, evidence: what is kept.
+        history, incidents: what is kept.
         damage: why what was found on the disk could not all be used; None when it could.
         transitions: changes of health, by the state that was entered.
     """
@@ -84,24 +79,27 @@ class Ledger:
         self._store = store
         self._folder = folder
         self._losses = losses
-        self._lock = threading.RLock()
-        self._evaluated_s: float | None = None
-        self._evaluated_stamp_ns: int | None = None
+        self._completed_s: float | None = None
+        self._completed_stamp_ns: int | None = None
         self._since_ns = time.time_ns()
         self.damage: Reason | None = None
         self.transitions: Counter[str] = Counter()
         self._epoch = 0
-        self._state, head = self._recall()
+        remembered, head = self._recall()
+        self._state = restored(remembered)
         self.history = History(config.directory / f"history-{rig.pair}.jsonl", config.history, head)
-        self.evidence = Incidents(config.directory / "evidence", rig.pair, config.evidence)
+        self.incidents = Incidents(config.directory / "evidence", rig.pair, config.evidence)
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
-        folder.protect(rig.pair, self.evidence.window_ids)
+        folder.protect(rig.pair, self.incidents.window_ids)
         if self.history.damage is not None:
             losses.add("storage", "history_damaged", detail=self.history.damage)
             text = f"The chain of the history is broken: {self.history.damage}. It is kept aside."
             self.damage = self.damage or Reason("history_damaged", text)
             self._write(_entry("chain", "broken", text))
             self.save()
+        if self._state.health is not remembered.health:
+            self._since_ns = time.time_ns()
+            self._note_health(remembered, self._state, None)
 
     @property
     def state(self) -> PairState:
@@ -111,8 +109,7 @@ class Ledger:
     @property
     def served(self) -> Served:
         """What is served now."""
-        with self._lock:
-            return Served(self._epoch, self._state.T_camera_lidar)
+        return Served(self._epoch, self._state.T_camera_lidar)
 
     @property
     def since_ns(self) -> int:
@@ -120,49 +117,42 @@ class Ledger:
         return self._since_ns
 
     @property
-    def evaluated_stamp_ns(self) -> int | None:
-        """Sensor time of the last pair that was looked at, in a window or by the monitor."""
-        return self._evaluated_stamp_ns
+    def completed_stamp_ns(self) -> int | None:
+        """Sensor time of the last pair of the check, or accepted window, that was completed last."""
+        return self._completed_stamp_ns
 
     @property
     def age_s(self) -> float | None:
-        """Since the last check; None before the first."""
-        return None if self._evaluated_s is None else time.monotonic() - self._evaluated_s
+        """Since a check was last completed, or a window accepted; None when that is not known."""
+        return None if self._completed_s is None else time.monotonic() - self._completed_s
 
     def update(
         self,
         step: Callable[[PairState], PairState],
         stamp_ns: int | None,
         *,
-        looked: bool,
+        completed: bool,
         epoch: int | None = None,
     ) -> Taken | None:
         """Take a step. None when the extrinsic has changed since `epoch`.
 
         Args:
             stamp_ns: sensor time of the data behind it.
-            looked: whether data were judged, so that the age begins anew.
+            completed: whether a check was completed or a window accepted, so that the age begins anew.
 
         Raises:
             CommandRefusedError: as `step` does; nothing has changed then.
         """
-        with self._lock:
-            if epoch is not None and epoch != self._epoch:
-                return None
-            before = self._state
-            after = self._state = step(before)
-            if looked:
-                self._evaluated_s, self._evaluated_stamp_ns = time.monotonic(), stamp_ns
-                self.damage = None if self.history.damage is None else self.damage
-            self._note(before, after, stamp_ns)
-            self.save()
-            return Taken(before, after, self.served)
-
-    def age(self, stale_after_s: float) -> None:
-        """Time has passed."""
-        with self._lock:
-            if aged(self._state, self.age_s, stale_after_s) is not self._state:
-                self.update(lambda state: aged(state, self.age_s, stale_after_s), None, looked=False)
+        if epoch is not None and epoch != self._epoch:
+            return None
+        before = self._state
+        after = self._state = step(before)
+        if completed:
+            self._completed_s, self._completed_stamp_ns = time.monotonic(), stamp_ns
+            self.damage = None if self.history.damage is None else self.damage
+        self._note(before, after, stamp_ns)
+        self.save()
+        return Taken(before, after, self.served)
 
     def note_result(self, result: CalibrationResult) -> None:
         """A window was solved."""
@@ -174,7 +164,7 @@ class Ledger:
     def note_check(self, check: CheckReply) -> None:
         """The monitor made a check."""
         values = {name: metric.value for name, metric in check.metrics.items()}
-        self.evidence.note(MetricsPoint(stamp_ns=check.stamp_ns, state=check.state, metrics=values))
+        self.incidents.note(MetricsPoint(stamp_ns=check.stamp_ns, state=check.state, metrics=values))
         try:
             self._checks.append(check)
         except StateError as error:
@@ -187,65 +177,74 @@ class Ledger:
     def note_command(self, name: str, code: str, text: str, sender: str, *, accepted: bool) -> None:
         """A command was carried out or refused. Of equal refusals in a row only the first is written down: whoever
         floods the service with them must not push the calibrations out of the history."""
-        with self._lock:
-            last = next(reversed(self.history.entries()), None)
-            told = f"{name}: {text}"
-            if (
-                not accepted
-                and last is not None
-                and (last.entry.kind, last.entry.code, last.entry.text)
-                == (
-                    "command",
-                    code,
-                    told,
-                )
-            ):
+        last = next(reversed(self.history.entries()), None)
+        told = f"{name}: {text}"
+        if not accepted and last is not None:
+            entry = last.entry
+            if (entry.kind, entry.code, entry.text) == ("command", code, told):
                 return
-            self._write(_entry("command", code, told).model_copy(update={"sender": sender}))
+        self._write(_entry("command", code, told).model_copy(update={"sender": sender}))
 
     def note_commissioned(self, text: str) -> None:
         """The rig has a baseline."""
         self._write(_entry("commissioned", "commissioned", text))
 
-    def accepted_calibration(self, name: str | None) -> tuple[Kept, CalibrationResult]:
-        """An accepted calibration of the history by its sha256 (or its beginning), or its window; without a name the
-        one before what is served. With the result that it rests on.
+    def served_before(self, name: str | None) -> tuple[Kept, CalibrationResult]:
+        """A calibration that was served, as the history holds it, and the accepted result that it rested on.
+
+        Args:
+            name: id of an accepted window, or the beginning of the sha256 of its line or of that of an extrinsic: what
+                was served once that was known. None for the calibration before the one that is served now.
 
         Raises:
             NotFoundError: there is none of this name, or the name is ambiguous.
         """
-        entries = self.history.entries()
-        results = {kept.result.window_id: kept.result for kept in entries if kept.result and _is_accepted(kept.result)}
         served = transform_of(self._state.T_camera_lidar).matrix
-        found = []
-        for kept in entries:
-            pose = kept.entry.camera_from_lidar or (kept.result.camera_from_lidar if kept.result else None)
-            if pose is None or kept.entry.window_id not in results:
+        results: dict[str, CalibrationResult] = {}
+        found: dict[str, Kept] = {}
+        in_force: Kept | None = None
+        asked_by_window: str | None = None
+        for kept in self.history.entries():
+            entry = kept.entry
+            if kept.result is not None and kept.result.status == "accepted":
+                results[kept.result.window_id] = kept.result
+                asked_by_window = kept.result.window_id if _is_named(kept, name) else asked_by_window
+                if in_force is not None and _is_named(kept, name):
+                    found[kept.result.window_id] = in_force
+            if entry.kind != "extrinsic" or entry.camera_from_lidar is None or entry.window_id not in results:
                 continue
-            if kept.result is not None and not _is_accepted(kept.result):
-                continue
+            in_force = kept
             if name is None:
-                wanted = kept.entry.kind == "extrinsic" and pose.matrix != served
-            else:
-                wanted = name == kept.entry.window_id or (len(name) >= 8 and kept.sha256.startswith(name))
-            if wanted:
-                found.append(kept)
+                if entry.camera_from_lidar.matrix != served:
+                    found = {entry.window_id: kept}
+            elif _is_named(kept, name) or entry.window_id == asked_by_window:
+                found[entry.window_id] = kept
         if not found:
-            raise NotFoundError("no such accepted calibration in `history`; `reset` returns to nominal")
-        if name is not None and len({kept.entry.window_id for kept in found}) > 1:
+            raise NotFoundError("no such served calibration in `history`; `reset` returns to nominal")
+        if len(found) > 1:
             raise NotFoundError("the beginning of the hash is ambiguous: give more of it")
-        return found[-1], results[str(found[-1].entry.window_id)]
+        (line,) = found.values()
+        return line, results[str(line.entry.window_id)]
 
     def save(self) -> None:
         """Put the state on the disk; a failure is counted."""
-        with self._lock:
-            age_s = self.age_s
-            evaluated_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
-            clocks = Clocks(evaluated_ns, self._evaluated_stamp_ns, self._since_ns)
-            try:
-                self._store.remember(self._rig, self._state, clocks, self.history.head)
-            except StateError as error:
-                self._losses.add("storage", "state_not_saved", detail=str(error))
+        age_s = self.age_s
+        completed_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
+        clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
+        try:
+            self._store.remember(self._rig, self._state, clocks, self.history.head)
+        except StateError as error:
+            self._losses.add("storage", "state_not_saved", detail=str(error))
+
+    def age(self, why_overdue: Reason | None, silent_s: float, stale_after_s: float) -> None:
+        """Time has passed: no check has been completed in time, for a reason, or for `silent_s` at all."""
+
+        def passed(state: PairState) -> PairState:
+            late = state if why_overdue is None else overdue(state, why_overdue)
+            return aged(late, silent_s, stale_after_s)
+
+        if passed(self._state) is not self._state:
+            self.update(passed, None, completed=False)
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
@@ -262,11 +261,13 @@ class Ledger:
         if remembered is None:
             return initial_state(self._rig), None
         clocks = remembered.clocks
-        if clocks.evaluated_wall_ns is not None:
-            self._evaluated_s = time.monotonic() - max(time.time_ns() - clocks.evaluated_wall_ns, 0) / NS_PER_S
-            self._evaluated_stamp_ns = clocks.evaluated_stamp_ns
-        if clocks.since_wall_ns is not None:
+        now_ns = time.time_ns()
+        if clocks.since_wall_ns is not None and clocks.since_wall_ns <= now_ns:
             self._since_ns = clocks.since_wall_ns
+        # A clock that was set back since, or has not been set yet, does not tell how old that is.
+        if clocks.completed_wall_ns is not None and clocks.completed_wall_ns <= now_ns:
+            self._completed_s = time.monotonic() - (now_ns - clocks.completed_wall_ns) / NS_PER_S
+            self._completed_stamp_ns = clocks.completed_stamp_ns
         return remembered.state, remembered.history_head
 
     def _note(self, before: PairState, after: PairState, stamp_ns: int | None) -> None:
@@ -277,20 +278,22 @@ class Ledger:
             entry = _entry("extrinsic", after.provenance.value, _ORIGIN[after.provenance], stamp_ns)
             served = {"camera_from_lidar": transform_of(after.T_camera_lidar), "window_id": window_id}
             self._write(entry.model_copy(update=served))
-        if before.health is after.health:
-            return
-        self._since_ns = time.time_ns()
+        if before.health is not after.health:
+            self._since_ns = time.time_ns()
+            self._note_health(before, after, stamp_ns)
+
+    def _note_health(self, before: PairState, after: PairState, stamp_ns: int | None) -> None:
         self.transitions[after.health.value] += 1
         text = "; ".join(reason.text for reason in after.reasons) or WORDS.get(after.health, "")
         self._write(_entry("state", after.health.value, text, stamp_ns))
         fields = {"pair": self._rig.pair, "from": before.health.value, "to": after.health.value, "why": text}
         _log.info("the health of a pair changed", extra={"fields": fields})
         if after.health is HealthState.MISCALIBRATED:
-            self._begin_evidence(after, stamp_ns)
+            self._begin_incident(after, stamp_ns)
         elif before.health is HealthState.MISCALIBRATED:
-            self.evidence.resolve(stamp_ns, f"{after.health.value}: {text}")
+            self.incidents.resolve(stamp_ns, f"{after.health.value}: {text}")
 
-    def _begin_evidence(self, state: PairState, stamp_ns: int | None) -> None:
+    def _begin_incident(self, state: PairState, stamp_ns: int | None) -> None:
         at_ns = stamp_ns if stamp_ns is not None else time.time_ns()
         since_ns = state.flagged_since_ns if state.flagged_since_ns is not None else at_ns
         by_window = state.pending is not None and state.latest is state.pending.estimate
@@ -303,7 +306,7 @@ class Ledger:
             and result.data_stamp_ns < since_ns
             and self._folder.path(result.window_id).exists()
         ]
-        self.evidence.begin(
+        self.incidents.begin(
             EvidenceEvent(
                 event_id=f"{self._rig.pair}-{at_ns}",
                 vehicle=self._vehicle,
@@ -321,13 +324,19 @@ class Ledger:
 
     def protect(self) -> None:
         """Tell the window folder what is evidence."""
-        self._folder.protect(self._rig.pair, self.evidence.window_ids)
+        self._folder.protect(self._rig.pair, self.incidents.window_ids)
 
     def _write(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> None:
         try:
             self.history.append(entry, result)
         except StateError as error:
             self._losses.add("storage", "history_not_saved", detail=str(error))
+
+
+def _is_named(kept: Kept, name: str | None) -> bool:
+    if name is None:
+        return False
+    return name == kept.entry.window_id or (len(name) >= MIN_HASH and kept.sha256.startswith(name))
 
 
 _ORIGIN = {
@@ -343,7 +352,3 @@ def _entry(kind: EntryKind, code: str, text: str, stamp_ns: int | None = None) -
     return HistoryEntry(
         sequence=0, previous_sha256=GENESIS, kind=kind, code=code, text=text, wall_ns=time.time_ns(), stamp_ns=stamp_ns
     )
-
-
-def _is_accepted(result: CalibrationResult) -> bool:
-    return result.status == "accepted"

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import rig_to_json
 from coec.adapters.files.state_file import StateFile
-from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState, Provenance, Status, restored
+from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState, Provenance, Status
 from coec.calibration.monitor.change_detector import Finding, MonitorState
 from coec.calibration.tracker import track_from_dict, track_to_dict
 from coec.calibration.types import Reason, Rig
@@ -48,8 +48,8 @@ class StoredChange(Part):
 
 
 class StoredPair(Part):
-    """`PairState` on the disk; when (wall clock) it was looked at and since when it is in its state of health; and the
-    last hash of its history. What is not in a file of an earlier version is as at the first start."""
+    """`PairState` on the disk; when (wall clock) a check was last completed and since when it is in its state of
+    health; and the last hash of its history. What is not in a file of an earlier version is as at the first start."""
 
     rig_sha256: str
     T_camera_lidar: Rows
@@ -59,7 +59,7 @@ class StoredPair(Part):
     latest: CalibrationResult | None
     accepted: CalibrationResult | None
     failures: tuple[replies.Reason, ...]
-    evaluated_wall_ns: int | None
+    completed_wall_ns: int | None
     health: replies.HealthState = "unknown"
     reasons: tuple[replies.Reason, ...] = ()
     pending: StoredCandidate | None = None
@@ -70,16 +70,17 @@ class StoredPair(Part):
     flagged_since_ns: int | None = None
     changes: tuple[StoredChange, ...] = ()
     since_wall_ns: int | None = None
-    evaluated_stamp_ns: int | None = None
+    completed_stamp_ns: int | None = None
     history_head: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """When the pair was last looked at (wall clock and sensor time), and since when (wall clock) it is in its state."""
+    """When a check was last completed (wall clock and sensor time), and since when (wall clock) the pair is in its
+    state of health."""
 
-    evaluated_wall_ns: int | None
-    evaluated_stamp_ns: int | None
+    completed_wall_ns: int | None
+    completed_stamp_ns: int | None
     since_wall_ns: int | None
 
 
@@ -125,8 +126,8 @@ class StateStore:
                     extra={"fields": {"pair": rig.pair}},
                 )
                 return None
-            clocks = Clocks(stored.evaluated_wall_ns, stored.evaluated_stamp_ns, stored.since_wall_ns)
-            return Remembered(restored(_state_of(stored)), clocks, stored.history_head)
+            clocks = Clocks(stored.completed_wall_ns, stored.completed_stamp_ns, stored.since_wall_ns)
+            return Remembered(_state_of(stored), clocks, stored.history_head)
         except (ValidationError, CoecError, ValueError, TypeError) as error:
             raise StateError(f"the state of pair {rig.pair} cannot be used: it has another form") from error
 
@@ -145,7 +146,7 @@ class StateStore:
             latest=result_of(state.latest, rig, self._vehicle) if state.latest else None,
             accepted=result_of(state.accepted, rig, self._vehicle) if state.accepted else None,
             failures=_told(state.failures),
-            evaluated_wall_ns=clocks.evaluated_wall_ns,
+            completed_wall_ns=clocks.completed_wall_ns,
             health=state.health.value,
             reasons=_told(state.reasons),
             pending=self._candidate(state.pending, rig) if state.pending else None,
@@ -156,7 +157,7 @@ class StateStore:
             flagged_since_ns=state.flagged_since_ns,
             changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
             since_wall_ns=clocks.since_wall_ns,
-            evaluated_stamp_ns=clocks.evaluated_stamp_ns,
+            completed_stamp_ns=clocks.completed_stamp_ns,
             history_head=history_head,
         )
         with self._lock:

@@ -42,6 +42,12 @@ class SensorClock:
             return None
         return (len(self._seen) - 1) * NS_PER_S / (self._seen[-1][0] - self._seen[0][0])
 
+    @property
+    def pace(self) -> float | None:
+        """Seconds of sensor time that pass in a second of the steady clock, over the recent pairs; None before the
+        second."""
+        return self._ratio() if len(self._seen) >= 2 else None
+
     def is_silent(self, monotonic_s: float) -> bool:
         """Whether no pair came for much longer than the recent ones were apart."""
         if not self._seen:

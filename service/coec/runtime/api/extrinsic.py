@@ -1,0 +1,109 @@
+"""What `extrinsic` says: from the state of a pair to the reply."""
+
+from __future__ import annotations
+
+from math import degrees
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.adapters.files.conversions import transform_of
+from coec.calibration.lifecycle import PairState, Status
+from coec.calibration.lifecycle.policy import step_between
+from coec.calibration.types import Rig
+from coec.config import TrackerConfig
+from coec.schemas import replies
+from coec.schemas.replies import CalibrationResult
+
+AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+UNITS: tuple[Literal["deg", "m"], ...] = ("deg", "deg", "deg", "m", "m", "m")
+
+
+def axes_of(result: CalibrationResult | None, status: Status) -> replies.Axes:
+    """Correction and spread per axis, of a result or of the nominal calibration (None)."""
+
+    def axis(index: int) -> replies.AxisReply:
+        if result is None:
+            return replies.AxisReply(status="not_accepted", sigma=None, correction=0.0, unit=UNITS[index])
+        return replies.AxisReply(
+            status=_axis_status(result, index, status),
+            sigma=result.sigma[index],
+            correction=result.correction[index],
+            unit=UNITS[index],
+        )
+
+    return replies.Axes(rx=axis(0), ry=axis(1), rz=axis(2), tx=axis(3), ty=axis(4), tz=axis(5))
+
+
+def _axis_status(result: CalibrationResult, index: int, status: Status) -> replies.AxisStatus:
+    if result.unobservable[index]:
+        return "not_observable"
+    return status.value if result.solved[index] else "not_solved"
+
+
+def extrinsic_of(
+    vehicle: str,
+    rig: Rig,
+    state: PairState,
+    accepted: CalibrationResult | None,
+    percent_complete: float,
+    config_hash: str,
+    tracker: TrackerConfig,
+) -> replies.ExtrinsicReply:
+    """What to use now. `accepted` is `state.accepted` in its wire form; `config_hash` is said while there is none."""
+    return replies.ExtrinsicReply(
+        vehicle=vehicle,
+        pair=rig.pair,
+        camera_frame=rig.camera_frame,
+        lidar_frame=rig.lidar_frame,
+        camera_from_lidar=transform_of(state.T_camera_lidar),
+        provenance=state.provenance.value,
+        status=state.status.value,
+        percent_complete=percent_complete,
+        axes=axes_of_served(state, rig, accepted, tracker),
+        valid_from_ns=state.valid_from_ns,
+        data_stamp_ns=accepted.data_stamp_ns if accepted else None,
+        window_id=accepted.window_id if accepted else None,
+        config_hash=accepted.config_hash if accepted else config_hash,
+        pending=candidate_of(state) if state.pending else None,
+        held=state.frozen,
+    )
+
+
+def candidate_of(state: PairState) -> replies.Candidate | None:
+    """What waits for `apply`; None when nothing does."""
+    if state.pending is None:
+        return None
+    pending = state.pending
+    return replies.Candidate(
+        window_id=pending.estimate.window_id,
+        data_stamp_ns=pending.estimate.data_stamp_ns,
+        camera_from_lidar=transform_of(pending.T_camera_lidar),
+        step=degrees_and_metres(step_between(state.T_camera_lidar, pending.T_camera_lidar)),
+        waits=replies.Reason(code=pending.waits.code, text=pending.waits.text),
+    )
+
+
+def degrees_and_metres(rad_m: NDArray[np.float64]) -> replies.Vector6:
+    """(6,) in the units of the wire."""
+    a, b, c, x, y, z = (float(value) for value in rad_m)
+    return degrees(a), degrees(b), degrees(c), x, y, z
+
+
+def axes_of_served(
+    state: PairState, rig: Rig, accepted: CalibrationResult | None, tracker: TrackerConfig
+) -> replies.Axes:
+    """Correction and spread per axis of what is served: the track's where it holds more than one window."""
+    axes = axes_of(accepted, Status.ACCEPTED)
+    if accepted is None or state.track is None or state.track.windows <= 1:
+        return axes
+    correction = degrees_and_metres(step_between(rig.T_camera_lidar_nominal, state.T_camera_lidar))
+    sigma = degrees_and_metres(state.track.sigma(tracker))
+    told = {
+        name: getattr(axes, name).model_copy(
+            update={"correction": correction[index], "sigma": sigma[index] if accepted.solved[index] else None}
+        )
+        for index, name in enumerate(AXES)
+    }
+    return replies.Axes(**told)

@@ -1,0 +1,150 @@
+"""What `health` says: the state of a pair with every reason and figure that anyone may want beside it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from coec.adapters.files.conversions import degrees_or_null, result_of
+from coec.calibration.commissioning.baseline import Drift
+from coec.calibration.lifecycle import Health, HealthState
+from coec.calibration.types import Decision, Estimate, Reason, Rig
+from coec.config import PairConfig
+from coec.runtime.api.extrinsic import axes_of
+from coec.runtime.decisions.decider import HELD, Known
+from coec.runtime.ingest.decoder import EGO
+from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.schemas import replies
+
+OLD_S = 5.0
+"""Age of a reply above which the thread that makes one every second must be stuck: then it is not the truth any
+more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A reply, and when (steady clock) it was made."""
+
+    reply: replies.HealthReply
+    monotonic_s: float
+
+    def now(self) -> replies.HealthReply:
+        """The reply, if it is not too old; else one that says so, and is not green."""
+        age_s = time.monotonic() - self.monotonic_s
+        if age_s <= OLD_S:
+            return self.reply
+        state = self.reply.state if self.reply.state != HealthState.HEALTHY.value else HealthState.DEGRADED.value
+        text = (
+            f"What the service knows of this pair has not been renewed for {age_s:.0f} s: a disk or a thread is stuck."
+        )
+        stuck = replies.Reason(code="service_stuck", text=text)
+        return self.reply.model_copy(
+            update={"state": state, "level": replies.ROS_LEVELS[state], "reasons": (*self.reply.reasons, stuck)}
+        )
+
+
+def health_of(
+    known: Known,
+    report: StreamReport,
+    losses: Mapping[tuple[str, str], int],
+    troubles: tuple[Reason, ...],
+    pair: PairConfig,
+    rig: Rig,
+    vehicle: str,
+) -> replies.HealthReply:
+    """
+    Args:
+        losses: of the pair, by place and cause.
+        troubles: what ails more than this pair, or the part that writes its windows.
+    """
+    latest = known.state.latest
+    result = None if latest is None else result_of(latest, rig, vehicle)
+    health = with_troubles(Health(known.state.health, known.state.reasons), (*known.troubles, *troubles))
+    drift, result_drift = known.drift, known.result_drift
+    return replies.HealthReply(
+        vehicle=vehicle,
+        pair=pair.name,
+        state=health.state.value,
+        level=replies.ROS_LEVELS[health.state.value],
+        reasons=reasons_of(health.reasons),
+        metrics={**(result.metrics if result else {}), **(known.check.metrics if known.check else {})},
+        axes=axes_of(result, known.state.status),
+        drift=_value(drift),
+        drift_sigma=_sigma(drift),
+        result_drift=_value(result_drift),
+        result_drift_sigma=_sigma(result_drift),
+        check=known.check,
+        needs=needs_of(report, pair, latest),
+        data_quality=data_quality_of(report, losses),
+        since_ns=known.since_ns,
+        evaluated_ns=known.completed_stamp_ns,
+        age_s=known.age_s,
+    )
+
+
+def with_troubles(health: Health, troubles: tuple[Reason, ...]) -> Health:
+    """What ails the service makes a healthy pair degraded, and is said in every state."""
+    if not troubles:
+        return health
+    worse = health.state is HealthState.HEALTHY and any(reason.code != HELD for reason in troubles)
+    return Health(HealthState.DEGRADED if worse else health.state, (*health.reasons, *troubles))
+
+
+def needs_of(report: StreamReport, pair: PairConfig, latest: Estimate | None) -> tuple[str, ...]:
+    """What is still missing, one sentence each. `latest` is the last estimate."""
+    needs = []
+    lacking = pair.window.min_pairs - report.chosen.selected
+    if lacking > 0:
+        needs.append(f"{lacking} more pairs")
+    if latest is not None and latest.verdict.decision is Decision.FAILED:
+        needs += [f"a window that can tell: {reason.text}" for reason in latest.verdict.reasons]
+    if pair.calibration.motion_compensation:
+        ego = report.streams.get(EGO)
+        if pair.ego is None or (report.pairs and (ego is None or not ego.accepted)):
+            needs.append("motion compensation has no ego-motion")
+        elif latest is not None and latest.compensation.get("no_point_time", 0):
+            needs.append("motion compensation has no point times")
+    return tuple(needs)
+
+
+def data_quality_of(report: StreamReport, losses: Mapping[tuple[str, str], int]) -> replies.DataQuality:
+    """What the streams are like."""
+    chosen, quality = report.chosen, report.chosen.quality
+    drops = drops_of(losses, report.unpaired)
+    if chosen.rejections:
+        drops["pairs"] = dict(chosen.rejections)
+    return replies.DataQuality(
+        pair_rate_hz=report.rate_hz,
+        sync_error_s=report.sync_error_s,
+        drops=drops,
+        sharpness=quality.sharpness if quality else None,
+        mean_level=quality.mean_level if quality else None,
+        clipped=quality.clipped if quality else None,
+        frozen_image=chosen.frozen,
+    )
+
+
+def reasons_of(reasons: tuple[Reason, ...]) -> tuple[replies.Reason, ...]:
+    """Reasons in their wire form."""
+    return tuple(replies.Reason(code=reason.code, text=reason.text) for reason in reasons)
+
+
+def drops_of(losses: Mapping[tuple[str, str], int], unpaired: Mapping[str, int]) -> dict[str, dict[str, int]]:
+    """Losses by place, then by cause. `unpaired` is the pairer's count by `<stream>_<cause>`."""
+    drops: dict[str, dict[str, int]] = {}
+    for (place, cause), count in losses.items():
+        drops.setdefault(place, {})[cause] = count
+    for name, count in unpaired.items():
+        stream, _, cause = name.partition("_")
+        place = "ego" if stream == "motion" else stream
+        drops.setdefault(place, {})[cause] = drops.get(place, {}).get(cause, 0) + count
+    return drops
+
+
+def _value(drift: Drift | None) -> replies.Maybe6 | None:
+    return None if drift is None else degrees_or_null(drift.value)
+
+
+def _sigma(drift: Drift | None) -> replies.Maybe6 | None:
+    return None if drift is None else degrees_or_null(drift.sigma)

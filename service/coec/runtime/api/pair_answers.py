@@ -1,0 +1,199 @@
+"""What is answered about one pair: from snapshots that the deciding thread made, and from the disk. Any thread."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from coec.adapters.files.conversions import result_of
+from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.bus import Answer
+from coec.calibration.lifecycle import Health, HealthState
+from coec.calibration.types import Reason, Rig
+from coec.config import Config, PairConfig, config_hash
+from coec.errors import NotFoundError
+from coec.runtime.api.extrinsic import extrinsic_of
+from coec.runtime.api.health import Told, health_of, reasons_of, with_troubles
+from coec.runtime.api.overlays import Overlays
+from coec.runtime.api.snapshots import Snapshot, answer_of
+from coec.runtime.api.status import pair_status_of
+from coec.runtime.decisions.decider import Known
+from coec.runtime.decisions.incidents import Side
+from coec.runtime.decisions.pair_store import PairStore
+from coec.runtime.ingest.stream import Stream
+from coec.runtime.outside import Outside
+from coec.runtime.recording.recorder import Recorder
+from coec.runtime.recording.window_store import WindowFolder
+from coec.schemas import replies
+from coec.schemas.keys import Format
+
+
+class PairAnswers:
+    """Of one pair."""
+
+    def __init__(
+        self,
+        pair: PairConfig,
+        config: Config,
+        rig: Rig,
+        store: PairStore,
+        folder: WindowFolder,
+        recorder: Recorder,
+        stream: Stream,
+        losses: LossCounter,
+        outside: Outside,
+        commands: Callable[[], dict[str, int]],
+    ) -> None:
+        """Nothing can be asked before `hear` was called once. `commands()` counts those that came."""
+        self.name = pair.name
+        self._pair = pair
+        self._vehicle = config.vehicle
+        self._config_hash = config_hash(pair.calibration)
+        self._rig = rig
+        self._store = store
+        self._folder = folder
+        self._recorder = recorder
+        self._stream = stream
+        self._losses = losses
+        self._outside = outside
+        self._commands = commands
+        self._overlays = Overlays(pair.name, outside.worker)
+        self._known: Known
+        self._health: Told
+        self._snapshots: dict[str, Snapshot] = {}
+        self._published: dict[str, object] = {}
+
+    # --- on the thread that decides; `fail` on the main thread --------------------------------------------------------
+
+    def hear(self, known: Known) -> None:
+        """Serialise what is served anew, and publish what changed."""
+        report, rig = self._stream.report, self._rig
+        accepted = None if known.state.accepted is None else result_of(known.state.accepted, rig, self._vehicle)
+        extrinsic = extrinsic_of(
+            self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash, self._pair.tracker
+        )
+        own = () if self._recorder.trouble is None else (self._recorder.trouble,)
+        troubles = (*own, *self._outside.vehicle_troubles())
+        health = health_of(known, report, self._losses.snapshot(), troubles, self._pair, rig, self._vehicle)
+        self._known, self._health = known, Told(health, time.monotonic())
+        self._snapshots = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
+        changed = {
+            "extrinsic": extrinsic.model_copy(update={"percent_complete": 0.0}),
+            "health": (health.state, tuple(reason.code for reason in health.reasons), health.needs, known.solved),
+        }
+        for name, essence in changed.items():
+            if self._published.get(name) != essence:
+                self._published[name] = essence
+                key = f"{self._outside.keys.root}/{self.name}/{name}"
+                self._outside.publish(key, self._snapshots[name].answer("msgpack"))
+
+    def fail(self, reason: Reason) -> None:
+        """The service is about to end, for this reason: say it, whatever the thread that decides is doing."""
+        reply = self._health.reply
+        health = with_troubles(Health(HealthState(reply.state), ()), (reason,))
+        update = {
+            "state": health.state.value,
+            "level": replies.ROS_LEVELS[health.state.value],
+            "reasons": (*reply.reasons, *reasons_of(health.reasons)),
+        }
+        failed = reply.model_copy(update=update)
+        self._health = Told(failed, time.monotonic())
+        self._snapshots = {**self._snapshots, "health": Snapshot.of(failed)}
+        self._outside.publish(f"{self._outside.keys.root}/{self.name}/health", self.health("msgpack"))
+
+    # --- on any -----------------------------------------------------------------------------------------------------
+
+    @property
+    def health_reply(self) -> replies.HealthReply:
+        """What `health` serves."""
+        return self._health.now()
+
+    @property
+    def percent_complete(self) -> float:
+        """Of the open window."""
+        return 100.0 * min(self._stream.report.chosen.selected / self._pair.window.pairs, 1.0)
+
+    def extrinsic(self, form: Format) -> Answer:
+        """The current calibration, serialised before."""
+        return self._snapshots["extrinsic"].answer(form)
+
+    def health(self, form: Format) -> Answer:
+        """The health, serialised at most a second ago; what is older is answered as what it is."""
+        told, reply = self._health, self._health.now()
+        return self._snapshots["health"].answer(form) if reply is told.reply else answer_of(reply, form)
+
+    def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
+        """Past results and other entries with a sensor stamp in the bounds, the newest `limit` of each; entries that
+        have none are dated by the wall clock."""
+        entries, results = self._store.history.entries(), self._store.history.results()
+
+        def inside(kept: replies.HistoryEntry) -> bool:
+            return since_ns <= (kept.wall_ns if kept.stamp_ns is None else kept.stamp_ns) <= until_ns
+
+        return replies.HistoryReply(
+            vehicle=self._vehicle,
+            pair=self.name,
+            total=len(results),
+            results=tuple(result for result in results if since_ns <= result.data_stamp_ns <= until_ns)[-limit:],
+            entries=tuple(kept.chained for kept in entries if inside(kept.entry))[-limit:],
+            checks=tuple(check for check in self._store.checks() if since_ns <= check.stamp_ns <= until_ns)[-limit:],
+        )
+
+    def windows(self) -> replies.WindowsReply:
+        """The recorded windows."""
+        return replies.WindowsReply(vehicle=self._vehicle, pair=self.name, windows=self._folder.listing(self.name))
+
+    def read_window(self, window_id: str, offset: int, length: int) -> bytes:
+        """Bytes of one window's file.
+
+        Raises:
+            NotFoundError: no such window of this pair.
+            UsageError: the offset lies behind its end.
+        """
+        return self._folder.read(self.name, window_id, offset, length)
+
+    def events(self) -> replies.EvidenceReply:
+        """Red events that are kept."""
+        return self._store.incidents.listing(self._vehicle)
+
+    def event(self, event_id: str) -> replies.EvidenceEvent:
+        """One of them, with its figures.
+
+        Raises:
+            NotFoundError: no such event.
+        """
+        return self._store.incidents.event(event_id)
+
+    def event_overlay(self, event_id: str, side: Side) -> bytes:
+        """JPEG of the window before or after an event.
+
+        Raises:
+            NotFoundError: no such event, or it has no such picture.
+        """
+        return self._store.incidents.overlay(event_id, side)
+
+    def overlay(self, window_id: str | None, *, nominal: bool) -> bytes:
+        """JPEG of a window's (None: the latest one's) points at the current, or the nominal, extrinsic.
+
+        Raises:
+            NotFoundError: no such window.
+            NotDrawnError: the worker has no time, or cannot.
+        """
+        latest = self._recorder.latest
+        if window_id is None and (latest is None or not latest.exists()):
+            raise NotFoundError(f"pair {self.name} has no window yet")
+        path = latest if window_id is None and latest else self._folder.existing(self.name, str(window_id))
+        pose = self._rig.T_camera_lidar_nominal if nominal else self._known.served.T_camera_lidar
+        return self._overlays.jpeg(path, pose, f"{path.stem}  {'nominal' if nominal else 'current'}")
+
+    def status(self) -> replies.PairStatus:
+        """Counters since the start."""
+        return pair_status_of(
+            self.name,
+            self._known,
+            self._stream.report,
+            self._losses.snapshot(),
+            self._recorder.recorded,
+            self._commands(),
+            has_ego=self._pair.ego is not None,
+        )

@@ -1,0 +1,71 @@
+"""Commands of people, before anything is done: what a payload may say, and how a sender is written down."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any, Final
+
+import msgpack
+
+from coec.errors import UsageError
+
+NAMES: Final = ("calibrate", "apply", "rollback", "reset", "commission", "hold")
+"""Of CONTRACT."""
+
+ARGUMENTS: Final[Mapping[str, Mapping[str, type]]] = {"rollback": {"to": str}, "hold": {"release": bool}}
+"""What a payload may hold, by command; the others take none."""
+
+MAX_SENDER: Final = 96
+"""Characters of a sender in log and history."""
+
+MAX_ATTACHMENT: Final = 4096
+"""Bytes of an attachment that are looked at."""
+
+_HARMLESS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789 ._:/@+-=,")
+
+
+def parse(name: str, payload: bytes) -> dict[str, Any]:
+    """The arguments of a command: nothing, or a map in msgpack or JSON.
+
+    Raises:
+        UsageError: no such command, or its payload is not what it takes.
+    """
+    if name not in NAMES:
+        raise UsageError(f"no such command; known: {', '.join(NAMES)}")
+    known = ARGUMENTS.get(name, {})
+    document = _document(payload)
+    for key, value in document.items():
+        if key not in known:
+            takes = ", ".join(known) or "no arguments"
+            raise UsageError(f"`{name}` takes {takes}")
+        if not isinstance(value, known[key]):
+            raise UsageError(f"argument `{key}` of `{name}` must be of type {known[key].__name__}")
+    return document
+
+
+def sender_of(attachment: bytes | None) -> str:
+    """The attachment of a query as one short harmless line; what is not readable text is told by its hash."""
+    if not attachment:
+        return "anonymous"
+    start = attachment[:MAX_ATTACHMENT]
+    text = start.decode("ascii", errors="replace")
+    cleaned = "".join(character if character in _HARMLESS else "_" for character in text)
+    if 2 * cleaned.count("_") > len(cleaned):
+        return f"{len(attachment)} bytes, sha256 {hashlib.sha256(start).hexdigest()[:16]}"
+    return cleaned[:MAX_SENDER]
+
+
+def _document(payload: bytes) -> dict[str, Any]:
+    if not payload:
+        return {}
+    try:
+        document = (
+            json.loads(payload) if payload[:1] == b"{" else msgpack.unpackb(payload, max_map_len=8, max_str_len=256)
+        )
+    except (ValueError, RecursionError, msgpack.UnpackException) as error:
+        raise UsageError("the payload is neither a map in msgpack nor in JSON") from error
+    if not isinstance(document, dict) or not all(isinstance(key, str) for key in document):
+        raise UsageError("the payload must be a map of names to values")
+    return document

@@ -1,0 +1,73 @@
+"""What `status` says of each pair and of the worker: counters since the start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from coec.runtime.api.health import drops_of
+from coec.runtime.decisions.decider import Known
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, StreamCounts
+from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.runtime.worker.jobs import Fate
+from coec.runtime.worker.supervisor import Worker, WorkerState
+from coec.schemas import replies
+
+
+def pair_status_of(
+    name: str,
+    known: Known,
+    report: StreamReport,
+    losses: Mapping[tuple[str, str], int],
+    recorded: int,
+    commands: dict[str, int],
+    *,
+    has_ego: bool,
+) -> replies.PairStatus:
+    """`losses` are those of the pair by place and cause, `recorded` its windows on the disk."""
+    drops, chosen = drops_of(losses, report.unpaired), report.chosen
+
+    def stream(name: str) -> replies.StreamStatus:
+        counts = report.streams.get(name, StreamCounts(0, 0))
+        return replies.StreamStatus(received=counts.received, accepted=counts.accepted, losses=drops.get(name, {}))
+
+    return replies.PairStatus(
+        name=name,
+        camera=stream(CAMERA),
+        lidar=stream(LIDAR),
+        ego=stream(EGO) if has_ego else None,
+        pairs=report.pairs,
+        held=report.held,
+        selected=chosen.selected,
+        rejections=dict(chosen.rejections),
+        losses={**drops.get("window", {}), **drops.get("storage", {}), **drops.get("monitor", {})},
+        windows=recorded,
+        solved=known.solved,
+        checks=known.checks,
+        transitions=dict(known.transitions),
+        commands=commands,
+    )
+
+
+def worker_status_of(worker: Worker) -> replies.WorkerStatus:
+    """The worker as `status` tells it."""
+    status = worker.status()
+    states: dict[WorkerState, Literal["starting", "idle", "busy", "stopped"]] = {
+        WorkerState.STARTING: "starting",
+        WorkerState.READY: "idle",
+        WorkerState.BUSY: "busy",
+        WorkerState.STOPPED: "stopped",
+    }
+    job = status.in_progress
+    return replies.WorkerStatus(
+        state=states[status.state],
+        pid=worker.pid,
+        restarts=max(status.starts - 1, 0),
+        queued=sum(status.waiting.values()),
+        waiting=dict(status.waiting),
+        job=None if job is None else job.kind,
+        job_age_s=None if job is None else job.age_s,
+        outcomes={fate.value: status.outcomes.get(fate, 0) for fate in Fate},
+        losses=dict(status.losses),
+        faults={fault.value: count for fault, count in status.faults.items()},
+    )

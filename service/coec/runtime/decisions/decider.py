@@ -1,0 +1,422 @@
+"""The thread that decides about a pair: takes every answer, command and lapse of time, one after the other, and says
+what is served from then on.
+
+It alone changes what a pair has decided. Answers come through the mailbox and count in the order in which they were
+asked for (`queue`); what they change in the choice of further pairs goes to the stream as an effect.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from coec.adapters.files.conversions import check_of, estimate_of
+from coec.adapters.system.logs import LossCounter
+from coec.adapters.system.threads import ServiceThread
+from coec.calibration import lifecycle
+from coec.calibration.commissioning.baseline import Drift
+from coec.calibration.lifecycle import HealthState, PairState, Rules
+from coec.calibration.monitor.change_detector import Finding
+from coec.calibration.types import Decision, Reason
+from coec.config import CalibrationConfig, PairConfig
+from coec.runtime.decisions.incident_pictures import IncidentPictures
+from coec.runtime.decisions.mailbox import Mailbox
+from coec.runtime.decisions.pair_store import PairStore, Taken
+from coec.runtime.decisions.progress import Progress
+from coec.runtime.decisions.queue import DecisionQueue, Effect, Question, Take
+from coec.runtime.decisions.rig_baseline import RigBaseline
+from coec.runtime.ingest.chooser import Served
+from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.runtime.recording.window_store import start_ns_of
+from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved
+from coec.schemas.replies import CalibrationResult, CheckReply
+
+_log = logging.getLogger(__name__)
+
+TICK_S = 1.0
+"""Longest time between two looks at the clocks; health is never older than that while the thread lives."""
+
+IN_VAIN = 3
+"""Checks, or windows, in a row that came to nothing, from which on health says so."""
+
+
+class StreamSide(Protocol):
+    """The stream of the pair. What decisions change for the pairs to come is called on its thread."""
+
+    @property
+    def report(self) -> StreamReport:
+        """What it last told of itself."""
+
+    def call(self, effect: Effect) -> None:
+        """Have an effect run on its thread."""
+
+    def adopt(self, served: Served) -> None:
+        """Another extrinsic is served."""
+
+    def alarm(self, since_ns: int) -> None:
+        """A window is wanted soon, of pairs since this sensor time."""
+
+    def calm(self) -> None:
+        """There is no suspicion any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """All that is known of a pair at one moment, for whoever tells it.
+
+    Attributes:
+        state: of the pair.
+        served: what is served.
+        check: the latest check of it.
+        troubles: what ails the service itself, or holds the extrinsic.
+        drift, result_drift: of what is served and of the latest result, from commissioned; None before commissioning.
+        since_ns: wall clock when the state of health began.
+        completed_stamp_ns, age_s: sensor time and age of the check that was completed last; None when not known.
+        checks, solved: how many were completed.
+        transitions: changes of health, by the state that was entered.
+    """
+
+    state: PairState
+    served: Served
+    check: CheckReply | None
+    troubles: tuple[Reason, ...]
+    drift: Drift | None
+    result_drift: Drift | None
+    since_ns: int
+    completed_stamp_ns: int | None
+    age_s: float | None
+    checks: int
+    solved: int
+    transitions: tuple[tuple[str, int], ...]
+
+
+class Decider:
+    """Decides about one pair. `mailbox` is for any thread; everything else belongs to `thread`."""
+
+    def __init__(
+        self,
+        pair: PairConfig,
+        stale_after_s: float,
+        store: PairStore,
+        baseline: RigBaseline,
+        queue: DecisionQueue,
+        pictures: IncidentPictures,
+        stream: StreamSide,
+        mailbox: Mailbox,
+        losses: LossCounter,
+        calibrate_with: Callable[[CalibrationConfig], None],
+        tell: Callable[[Known], None],
+    ) -> None:
+        """`calibrate_with` says how the next windows are to be calibrated; `tell` hears what is known, whenever
+        something may have changed and once a second."""
+        self.thread = ServiceThread(f"decisions-{pair.name}", self._run)
+        self._rules = Rules(pair.policy, pair.tracker)
+        self._stale_after_s = stale_after_s
+        self._store = store
+        self._baseline = baseline
+        self._queue = queue
+        self._pictures = pictures
+        self._stream = stream
+        self._mailbox = mailbox
+        self._losses = losses
+        self._calibrate_with = calibrate_with
+        self._tell = tell
+        self._progress = Progress(pair.monitor.period_s, time.monotonic(), stream.report)
+        self._looked_s = time.monotonic()
+        self._latest_check: CheckReply | None = None
+        self._checks = 0
+        self._solved = 0
+        self._checks_in_vain = 0
+        self._windows_in_vain = 0
+        self._blind: Reason | None = None
+        self._unsolved: Reason | None = None
+        self._overdue: Reason | None = None
+
+    def request_stop(self) -> None:
+        """Take what has come, and end the thread."""
+        self.thread.request_stop()
+        self._mailbox.wake()
+
+    def known(self) -> Known:
+        """What is known now."""
+        state, latest = self._store.state, self._store.state.latest
+        accepted = None if state.accepted is None else state.accepted.sigma
+        return Known(
+            state=state,
+            served=self._store.served,
+            check=self._latest_check,
+            troubles=self._troubles(),
+            drift=self._baseline.drift(state.T_camera_lidar, accepted),
+            result_drift=None if latest is None else self._baseline.drift(latest.optimum.T_camera_lidar, latest.sigma),
+            since_ns=self._store.since_ns,
+            completed_stamp_ns=self._store.completed_stamp_ns,
+            age_s=self._store.age_s,
+            checks=self._checks,
+            solved=self._solved,
+            transitions=tuple(self._store.transitions.items()),
+        )
+
+    # --- the thread -------------------------------------------------------------------------------------------------
+
+    def _run(self, thread: ServiceThread) -> None:
+        while not thread.stopping:
+            thread.beat()
+            self.work(TICK_S)
+        self.finish()
+
+    def finish(self) -> None:
+        """Take what has come, and put the state on the disk; for the end of the service."""
+        while (item := self._mailbox.take(0.0)) is not None:
+            item()
+        self._store.save()
+
+    def work(self, timeout_s: float) -> bool:
+        """Do the next piece of work, or look at the clocks when there is none for so long; whether there was one."""
+        item = self._mailbox.take(timeout_s)
+        if item is not None:
+            item()
+        now_s = time.monotonic()
+        if item is not None or now_s - self._looked_s >= TICK_S:
+            self.look_at_clocks(now_s)
+        return item is not None
+
+    def tell_now(self) -> None:
+        """Tell what is known, without waiting for the clock."""
+        self._tell(self.known())
+
+    def look_at_clocks(self, monotonic_s: float) -> None:
+        """Give up what waits for too long, age what is known, tell it."""
+        self._looked_s = monotonic_s
+        lost = self._queue.expire(monotonic_s, self._lost_question)
+        if lost:
+            self._losses.add("monitor", "unanswered", lost)
+        self._overdue = self._progress.overdue(self._stream.report, monotonic_s)
+        self._store.age(self._overdue, self._progress.silent_s(monotonic_s), self._stale_after_s)
+        self._tell(self.known())
+
+    # --- answers ----------------------------------------------------------------------------------------------------
+
+    def checked(self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
+        """A check has ended; it was of the extrinsic of `epoch`, and some of its pairs were taken standing."""
+        self._queue.answer(question, partial(self._take_check, epoch, standing_ns, outcome))
+
+    def solved(self, window_id: str, outcome: JobOutcome, *, live: bool) -> None:
+        """The solve of a window has ended."""
+        question = self._queue.about(window_id) if live else None
+        take: Take = (
+            partial(self._take_result, outcome.answer, live)
+            if isinstance(outcome.answer, Solved)
+            else partial(self._take_failure, outcome.reason or _NO_ANSWER, live)
+        )
+        if question is not None:
+            self._queue.answer(question, take)
+        elif (effect := take()) is not None:
+            # Nobody waits for it: a window that was asked for by command, or one of an earlier run.
+            self._stream.call(effect)
+
+    def lost(self, window_id: str) -> None:
+        """A window ended and came to nothing."""
+        question = self._queue.about(window_id)
+        if question is not None:
+            self._queue.answer(question, partial(self._take_failure, _NOT_RECORDED, True))
+
+    def time_stepped_back(self, stamp_ns: int) -> None:
+        """The clock of the sensors has stepped back, to this stamp."""
+        self._progress.time_stepped_back()
+        self._latest_check = None
+        taken = self._store.update(
+            lambda state: lifecycle.time_stepped_back(state, stamp_ns), stamp_ns, completed=False
+        )
+        if taken is not None and taken.after.flagged_since_ns is not None:
+            since_ns = taken.after.flagged_since_ns
+            self._stream.call(lambda: self._stream.alarm(since_ns))
+
+    def replaced(self) -> None:
+        """A person has replaced the extrinsic: nothing that was seen is of it."""
+        self._latest_check = None
+        served = self._store.served
+
+        def start_over() -> None:
+            self._stream.adopt(served)
+            self._stream.calm()
+
+        self._stream.call(start_over)
+
+    def commissioned(self, outcome: JobOutcome) -> None:
+        """A commissioning has ended."""
+        answer = outcome.answer
+        if not isinstance(answer, Commissioned):
+            reason = outcome.reason or _NO_ANSWER
+            self._losses.add("window", "commissioning_failed", detail=reason.text)
+            self._store.note_command("commission", reason.code, f"failed: {reason.text}", "service", accepted=False)
+            self._store.save()
+            return
+        self._baseline.load()
+        self._calibrate_with(self._baseline.calibration)
+        text = f"Commissioned from {answer.windows} windows, {answer.pairs} pairs; baseline {answer.baseline_hash}."
+        self._store.note_commissioned(text)
+        pose = answer.pose
+        effect = self._step(lambda state: lifecycle.after_commissioning(state, pose), None, completed=False)
+        if effect is not None:
+            self._stream.call(effect)
+
+    # --- taking them, in order --------------------------------------------------------------------------------------
+
+    def _take_check(self, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> Effect | None:
+        answer = outcome.answer
+        if not isinstance(answer, Checked):
+            self._check_in_vain(outcome.reason or _NO_ANSWER)
+            return None
+        if answer.baseline_not_used is not None and self._baseline.refuse(answer.baseline_not_used):
+            self._calibrate_with(self._baseline.calibration)
+        observation = replace(answer.observation, standing_stamps_ns=standing_ns)
+        effect = self._step(
+            lambda state: lifecycle.after_observation(state, observation),
+            observation.stamp_ns,
+            completed=True,
+            epoch=epoch,
+            by_check=True,
+        )
+        if effect is None:
+            self._losses.add("monitor", "check_overtaken")
+            return None
+        self._checks_in_vain, self._blind = 0, None
+        self._checks += 1
+        self._latest_check = check_of(observation, self._store.state)
+        self._store.note_check(self._latest_check)
+        return effect
+
+    def _check_in_vain(self, reason: Reason) -> None:
+        """Whoever cannot look must not go on saying that all is well."""
+        self._losses.add("monitor", f"check_{reason.code}", detail=reason.text)
+        self._progress.failed(reason)
+        self._checks_in_vain += 1
+        if self._checks_in_vain >= IN_VAIN:
+            text = f"The last {self._checks_in_vain} checks came to nothing. {reason.text}"
+            self._blind = Reason("monitor_blind", text)
+
+    def _take_result(self, answer: Solved, live: bool) -> Effect | None:
+        result = answer.result
+        fields = {"window": result.window_id, "decision": result.verdict.decision}
+        _log.info("a window was solved", extra={"fields": fields})
+        if answer.note is not None:
+            self._losses.add("window", "result_not_written", detail=answer.note.text)
+        if not self._baseline.fits_network(result.depth_identity):
+            self._baseline.refuse("It was made with another depth network.")
+            self._calibrate_with(self._baseline.calibration)
+        self._store.note_result(result)
+        self._solved += 1
+        self._windows_in_vain, self._unsolved = 0, None
+        latest = self._store.state.latest
+        # A window of an earlier run is old news when a newer one has been evaluated.
+        if live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
+            return self._judge(result)
+        self._store.save()
+        return None
+
+    def _judge(self, result: CalibrationResult) -> Effect | None:
+        estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)
+        told = estimate.verdict.decision is not Decision.FAILED
+        self._step(
+            lambda state: lifecycle.before_estimate(state, estimate, start_ns, self._rules),
+            result.data_stamp_ns,
+            completed=False,
+        )
+        self._add_window_after(result.window_id)
+        return self._step(
+            lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules),
+            result.data_stamp_ns,
+            completed=told,
+        )
+
+    def _take_failure(self, reason: Reason, live: bool) -> Effect | None:
+        if reason.code == STOPPING:
+            return None  # the window stays on the disk, and is solved after the next start
+        self._losses.add("window", reason.code, detail=reason.text)
+        if not live:
+            return None
+        self._windows_in_vain += 1
+        if self._windows_in_vain >= IN_VAIN:
+            text = f"The last {self._windows_in_vain} windows came to nothing. {reason.text}"
+            self._unsolved = Reason("windows_in_vain", text)
+        return self._step(lambda state: lifecycle.after_failure(state, reason), None, completed=False)
+
+    def _lost_question(self, question: Question) -> Take:
+        if question.name:
+            return partial(self._take_failure, _NO_ANSWER, True)
+
+        def take() -> None:
+            self._check_in_vain(_NO_ANSWER)
+
+        return take
+
+    def _step(
+        self,
+        step: Callable[[PairState], PairState],
+        stamp_ns: int | None,
+        *,
+        completed: bool,
+        epoch: int | None = None,
+        by_check: bool = False,
+    ) -> Effect | None:
+        """Take the step, draw what a red event needs. What it changes for the pairs to come; None when the step was
+        meant for another extrinsic."""
+        taken = self._store.update(step, stamp_ns, completed=completed, epoch=epoch)
+        if taken is None:
+            return None
+        if completed:
+            self._progress.completed(stamp_ns, time.monotonic(), self._stream.report)
+        before, after = taken.before, taken.after
+        if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
+            self._latest_check = None
+        red, event = HealthState.MISCALIBRATED, self._store.incidents.newest
+        if after.health is red and before.health is not red and event is not None:
+            self._pictures.draw_both(event)
+        return partial(self._go_on_with, taken, by_check)
+
+    def _add_window_after(self, window_id: str) -> None:
+        """The first window that began after a red event did is part of its evidence."""
+        waiting, since_ns = self._store.incidents.awaiting, self._store.state.flagged_since_ns
+        if waiting is None or start_ns_of(window_id) < (waiting.stamp_ns if since_ns is None else since_ns):
+            return
+        self._store.incidents.add_window_after(window_id)
+        self._store.protect()
+        self._pictures.draw(waiting, window_id, "after")
+
+    # --- on the stream's thread -------------------------------------------------------------------------------------
+
+    def _go_on_with(self, taken: Taken, by_check: bool) -> None:
+        """What a step changes for the pairs to come: the extrinsic at which they are looked at, and how soon a window
+        is wanted: soon when the monitor's word has become worse, or a window did not settle it."""
+        self._stream.adopt(taken.served)
+        before, after = taken.before, taken.after
+        if after.monitor.outcome not in (Finding.SUSPECT, Finding.CONFIRMED) or after.flagged_since_ns is None:
+            self._stream.calm()
+            return
+        waiting = after.pending is not None and after.pending.contradicts
+        if not waiting and not (by_check and before.monitor.outcome is after.monitor.outcome):
+            self._stream.alarm(after.flagged_since_ns)
+
+    # --- what ails --------------------------------------------------------------------------------------------------
+
+    def _troubles(self) -> tuple[Reason, ...]:
+        own = (self._store.damage, self._baseline.trouble, self._blind, self._unsolved, self._overdue)
+        said = {reason.code for reason in self._store.state.reasons}
+        held = Reason(HELD, "The extrinsic is held by command.") if self._store.state.frozen else None
+        return tuple(reason for reason in (*own, held) if reason is not None and reason.code not in said)
+
+
+STOPPING = "stopping"
+"""Code of the reason of a job that the end of the service ended."""
+
+HELD = "held"
+"""Code of the reason that ails nothing."""
+
+_NO_ANSWER = Reason("unanswered", "No answer came.")
+_NOT_RECORDED = Reason("not_recorded", "The window did not get to the disk.")

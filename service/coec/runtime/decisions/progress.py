@@ -1,0 +1,106 @@
+"""Proof of progress: when a check was last completed, on both clocks, and why none has been since.
+
+Health is green because something was looked at, never because nobody complained. Whatever fault keeps checks from being
+completed, known or not, is seen here as the same thing: none comes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from coec.calibration.types import Reason
+from coec.runtime.decisions.questions import WINDOW_PERIODS
+from coec.runtime.ingest.decoder import CAMERA, LIDAR
+from coec.runtime.ingest.stream_statistics import StreamReport
+
+NS_PER_S = 1_000_000_000
+
+PERIODS = 3
+"""Periods of the monitor without a completed check after which a pair is not green any more (ARCHITECTURE)."""
+
+SLOWEST_PACE = 0.1
+"""Of a replay, in seconds of sensor time a second: a slower one counts as standing still."""
+
+DEPTH_CODES = frozenset({"bad_model", "depth_missing"})
+"""Codes of failures that are the depth network's, or its maps'."""
+
+WORKER_CODES = frozenset(
+    {"worker_failed", "superseded", "deadline_passed", "internal_error", "stray_answer", "malformed_answer", "busy"}
+)
+"""Codes of failures that are the worker's."""
+
+
+@dataclass(slots=True)
+class _Last:
+    """The last completed check: steady clock, sensor time, and what the streams had brought by then."""
+
+    monotonic_s: float
+    stamp_ns: int | None
+    report: StreamReport
+
+
+class Progress:
+    """Of the checks of one pair. Belongs to the thread that decides."""
+
+    def __init__(self, period_s: float, monotonic_s: float, report: StreamReport) -> None:
+        self._period_s = period_s
+        self._last = _Last(monotonic_s, None, report)
+        self._failure: Reason | None = None
+
+    def completed(self, stamp_ns: int | None, monotonic_s: float, report: StreamReport) -> None:
+        """A check was completed, of pairs up to this sensor time; or a window, which is more."""
+        self._last = _Last(monotonic_s, stamp_ns, report)
+        self._failure = None
+
+    def failed(self, reason: Reason) -> None:
+        """A check came to nothing."""
+        self._failure = reason
+
+    def time_stepped_back(self) -> None:
+        """Stamps of before tell nothing any more."""
+        self._last.stamp_ns = None
+
+    def silent_s(self, monotonic_s: float) -> float:
+        """Since the last completed check, or the start."""
+        return monotonic_s - self._last.monotonic_s
+
+    def overdue(self, report: StreamReport, monotonic_s: float) -> Reason | None:
+        """Why no check was completed for `PERIODS` periods, on the steady clock or on that of the sensors; None while
+        there was one. A replay that is slower than the drive has as much longer."""
+        pace = 1.0 if report.pace is None else min(max(report.pace, SLOWEST_PACE), 1.0)
+        silent_s = self.silent_s(monotonic_s)
+        unseen_s = 0.0
+        if self._last.stamp_ns is not None and report.chosen.last_ns is not None:
+            unseen_s = (report.chosen.last_ns - self._last.stamp_ns) / NS_PER_S
+        late = silent_s > PERIODS * self._period_s / pace
+        # By so much the stream may run ahead of an answer.
+        late |= unseen_s > (PERIODS + WINDOW_PERIODS) * self._period_s
+        if not late:
+            return None
+        code, why = self._cause(report)
+        return Reason(f"overdue_{code}", f"No check has been completed for {max(silent_s, unseen_s):.0f} s: {why}")
+
+    def _cause(self, now: StreamReport) -> tuple[str, str]:
+        """What has stood still since the last completed check, first in the order of a frame's way."""
+        then = self._last.report
+        for stream in (CAMERA, LIDAR):
+            before, after = then.streams.get(stream), now.streams.get(stream)
+            received = (after.received if after else 0) - (before.received if before else 0)
+            accepted = (after.accepted if after else 0) - (before.accepted if before else 0)
+            if received == 0:
+                return "data", f"no {stream} frames come."
+            if accepted == 0:
+                return "data", f"every {stream} frame is refused; `data_quality.drops` says why."
+        if now.pairs == then.pairs:
+            return "pairing", "camera and LiDAR frames come, but none belong together in time."
+        if self._failure is not None:
+            return self._kind_of(self._failure), self._failure.text
+        if now.chosen.checks == then.chosen.checks:
+            return "data", "too few pairs come, or they are too far apart, for a check."
+        return "worker", "the worker has not answered."
+
+    @staticmethod
+    def _kind_of(failure: Reason) -> str:
+        if failure.code in DEPTH_CODES:
+            return "depth"
+        return "worker" if failure.code in WORKER_CODES else "data"

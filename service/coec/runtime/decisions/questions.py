@@ -1,0 +1,124 @@
+"""What the stream of a pair asks, on its way to the worker and back to the thread that decides."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+from coec.calibration.frames.sampling import stands
+from coec.calibration.types import FramePair, Matrix4
+from coec.config import PairConfig
+from coec.runtime.decisions.mailbox import Mailbox
+from coec.runtime.decisions.queue import DecisionQueue, Question
+from coec.runtime.ingest.chooser import Served
+from coec.runtime.worker import jobs
+from coec.runtime.worker.jobs import JobOutcome
+from coec.runtime.worker.supervisor import Worker
+
+_log = logging.getLogger(__name__)
+
+NS_PER_S = 1_000_000_000
+
+WINDOW_PERIODS = 2
+"""Periods of the monitor after the end of a window from which on its result counts in the choice of further pairs: at
+10 s more than a solve takes, so that a live stream does not wait. The result of a check counts after one period."""
+
+GRACE_S = 30.0
+"""Beyond the deadline that the worker keeps: how long an answer may take from there to here, and a window to the disk,
+before it is given up as lost."""
+
+
+class Decides(Protocol):
+    """Who takes the answers, on the thread that decides about the pair; see `runtime.decisions.decider`."""
+
+    def checked(self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
+        """A check has ended; it was of the extrinsic of `epoch`, and some of its pairs were taken standing."""
+
+    def solved(self, window_id: str, outcome: JobOutcome, *, live: bool) -> None:
+        """The solve of a window has ended."""
+
+    def lost(self, window_id: str) -> None:
+        """A window ended and came to nothing."""
+
+    def time_stepped_back(self, stamp_ns: int) -> None:
+        """The clock of the sensors has stepped back, to this stamp."""
+
+
+class Questions:
+    """Asks for one pair: for its stream (`ingest.chooser.Asks`) and for its recorder. Any thread."""
+
+    def __init__(self, pair: PairConfig, queue: DecisionQueue, worker: Worker, mailbox: Mailbox) -> None:
+        self._pair = pair
+        self._queue = queue
+        self._worker = worker
+        self._mailbox = mailbox
+        self._period_ns = round(pair.monitor.period_s * NS_PER_S)
+        self._decides: Decides
+
+    def answer_to(self, decides: Decides) -> None:
+        """Who takes the answers; to be called once, before anything is asked."""
+        self._decides = decides
+
+    # --- for the stream ---------------------------------------------------------------------------------------------
+
+    def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
+        """Is `served` right, by these pairs? Asked at a sensor time."""
+        standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
+        question = self._queue.ask(stamp_ns + self._period_ns, self._expires_s(jobs.Kind.CHECK))
+        ended = partial(self._decides.checked, question, served.epoch, standing)
+        self._worker.ask(jobs.check(self._pair.name, served.T_camera_lidar, pairs, self._post(ended)))
+
+    def window(self, window_id: str, stamp_ns: int) -> None:
+        """What does a window say that ends at a sensor time? It is on its way to the disk."""
+        self._queue.ask(stamp_ns + WINDOW_PERIODS * self._period_ns, self._expires_s(jobs.Kind.SOLVE), window_id)
+
+    def prefetch(self, frame: bytes) -> None:
+        """The depth of a camera frame (native msgpack) will be needed."""
+        self._worker.prefetch(self._pair.name, frame)
+
+    def waits(self, stamp_ns: int) -> bool:
+        """Whether an answer is due before a pair of this stamp, and has not come."""
+        return self._queue.waits(stamp_ns)
+
+    def settle(self, stamp_ns: int) -> None:
+        """Let the answers take effect that are due before a pair of this stamp."""
+        self._queue.settle(stamp_ns)
+
+    def bring_forward(self, stamp_ns: int) -> None:
+        """Whatever waits is due before a pair of this stamp: the first of a new time."""
+        self._queue.bring_forward(stamp_ns)
+
+    def time_stepped_back(self, stamp_ns: int) -> None:
+        """The clock of the sensors has stepped back, to this stamp."""
+        self._mailbox.post(partial(self._decides.time_stepped_back, stamp_ns))
+
+    # --- for the recorder, and for whoever wants a window solved again -----------------------------------------------
+
+    def solve(self, window_id: str, path: Path, live: bool) -> None:
+        """A window is on the disk. `live` is False for one of an earlier run."""
+        ended = partial(self._decides.solved, window_id, live=live)
+        self._worker.ask(jobs.solve(self._pair.name, path, window_id, self._post(ended), live))
+
+    def lost(self, window_id: str) -> None:
+        """A window ended and came to nothing."""
+        self._mailbox.post(partial(self._decides.lost, window_id))
+
+    # --- for the decider --------------------------------------------------------------------------------------------
+
+    def overlay(self, path: Path, pose: Matrix4, title: str, done: Callable[[JobOutcome], None]) -> None:
+        """Draw a window at an extrinsic (4, 4)."""
+        self._worker.ask(jobs.overlay(self._pair.name, path, pose, title, self._post(done)))
+
+    def commission(self, pose: Matrix4, paths: list[Path], done: Callable[[JobOutcome], None]) -> None:
+        """Learn the baseline of the rig at an extrinsic (4, 4) from windows."""
+        self._worker.ask(jobs.commission(self._pair.name, pose, paths, self._post(done)))
+
+    def _post(self, ended: Callable[[JobOutcome], None]) -> Callable[[JobOutcome], None]:
+        return lambda outcome: self._mailbox.post(partial(ended, outcome))
+
+    def _expires_s(self, kind: jobs.Kind) -> float:
+        return time.monotonic() + jobs.DEADLINE_S[kind] + GRACE_S

@@ -1,0 +1,85 @@
+"""The baseline of a commissioned rig, as long as it fits: its limits, its bias, and why it is not used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.adapters.files.baseline_file import BASELINES, load_baseline
+from coec.calibration import lifecycle
+from coec.calibration.commissioning.baseline import Baseline, Drift, drift, learned_hash, mismatch
+from coec.calibration.types import Estimate, Matrix4, Reason, Rig
+from coec.config import CalibrationConfig, PairConfig
+from coec.errors import StateError
+from coec.geometry import se3
+
+
+class RigBaseline:
+    """Belongs to the thread that decides about the pair.
+
+    Attributes:
+        trouble: why there is a baseline that is not used; None otherwise.
+    """
+
+    def __init__(self, pair: PairConfig, rig: Rig, state_folder: Path) -> None:
+        self._pair = pair
+        self._rig = rig
+        self._path = state_folder / BASELINES
+        self._baseline: Baseline | None = None
+        self.trouble: Reason | None = None
+        self.load()
+
+    def load(self) -> None:
+        """Read it from the disk, where the worker puts it."""
+        self._baseline, self.trouble = None, None
+        try:
+            baseline = load_baseline(self._path, self._pair.name)
+        except StateError as error:
+            self.trouble = Reason("baseline_damaged", f"The baseline of the rig cannot be used: {error}")
+            return
+        if baseline is None:
+            return
+        wrong = mismatch(baseline, self._rig, baseline.depth_identity, learned_hash(self._pair.calibration))
+        if wrong is None:
+            self._baseline = baseline
+        else:
+            self.trouble = _mismatched(wrong)
+
+    def refuse(self, why: str) -> bool:
+        """It does not fit after all; whether it was in use until now."""
+        if self._baseline is None:
+            return False
+        self._baseline, self.trouble = None, _mismatched(why)
+        return True
+
+    def fits_network(self, depth_identity: str) -> bool:
+        """Whether it was made with the network that the worker has opened."""
+        return self._baseline is None or self._baseline.depth_identity == depth_identity
+
+    @property
+    def calibration(self) -> CalibrationConfig:
+        """How windows are calibrated: with the limits that were learned on this rig, if they were."""
+        configured = self._pair.calibration
+        if self._baseline is None:
+            return configured
+        return configured.model_copy(update={"verdict": self._baseline.verdict(configured.verdict)})
+
+    def unbiased(self, estimate: Estimate) -> Estimate:
+        """What an estimate says once the estimator's bias on this rig is taken out."""
+        if self._baseline is None:
+            return estimate
+        return lifecycle.moved(estimate, self._baseline.unbiased(estimate.optimum.T_camera_lidar), self._rig)
+
+    def drift(self, T_camera_lidar: Matrix4, sigma: NDArray[np.float64] | None) -> Drift | None:
+        """From the commissioned calibration to a pose (4, 4) that has had its bias taken out, of which `sigma` (6,) is
+        known; None before commissioning."""
+        if self._baseline is None:
+            return None
+        known = np.full(6, np.nan) if sigma is None else sigma
+        return drift(se3.perturb(T_camera_lidar, self._baseline.bias), known, self._baseline)
+
+
+def _mismatched(text: str) -> Reason:
+    return Reason("baseline_mismatch", f"The baseline of the rig is not used: {text}")

@@ -1,0 +1,54 @@
+"""Work that one thread wants done on another: begun in time, or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from typing import Generic, TypeVar
+
+from coec.errors import CoecError
+
+T = TypeVar("T")
+
+
+class BusyError(CoecError):
+    """The other thread did not get to it in time; nothing was done."""
+
+    reply_code = "busy"
+
+
+class Handover(Generic[T]):
+    """One piece of work. Whoever owns the state calls `run`, whoever wants it done waits for `result`."""
+
+    def __init__(self, work: Callable[[], T]) -> None:
+        self._work = work
+        self._future: Future[T] = Future()
+
+    def run(self) -> None:
+        """Do it, unless nobody waits for it any more. What it raises is raised in `result`."""
+        if not self._future.set_running_or_notify_cancel():
+            return
+        try:
+            self._future.set_result(self._work())
+        except BaseException as error:
+            self._future.set_exception(error)
+            if not isinstance(error, Exception):
+                raise
+
+    def result(self, timeout_s: float) -> T:
+        """What the work returned. Work that has begun is waited for once more.
+
+        Raises:
+            BusyError: it was not begun within `timeout_s`, and will not be; or it was begun and has not ended.
+        """
+        try:
+            return self._future.result(timeout_s)
+        except TimeoutError:
+            if self._future.cancel():
+                raise BusyError("The service is busy; nothing was done. Ask again.") from None
+        except CancelledError:
+            raise BusyError("The service is stopping; nothing was done.") from None
+        try:
+            return self._future.result(timeout_s)
+        except TimeoutError:
+            raise BusyError("The work was begun and has not ended; `history` will say how it went.") from None

@@ -1,0 +1,225 @@
+"""What becomes of each pair, one after the other: part of a window, part of a check, or nothing.
+
+Sensor time alone decides, and what was asked earlier: before a pair is looked at, every answer that is due by its stamp
+has taken effect. So a drive that is replayed, at any rate, on any machine, cuts the same windows and checks.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Protocol
+
+from coec.adapters.depth.maps import STEREO
+from coec.adapters.frames.msgpack_frames import encode_camera
+from coec.adapters.images.codec import Inspector
+from coec.adapters.system.logs import LossCounter
+from coec.calibration.frames.sampling import CheckSampler
+from coec.calibration.frames.window import PairSelected, SliceEnded, WindowCutter
+from coec.calibration.monitor.urgency import Urgency
+from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
+from coec.config import LimitsConfig, PairConfig
+from coec.runtime.ingest.sensor_clock import SensorClock
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Served:
+    """An extrinsic (4, 4) that is or was served; `epoch` counts them."""
+
+    epoch: int
+    T_camera_lidar: Matrix4
+
+
+class Asks(Protocol):
+    """What the chooser wants to know of others; see `runtime.decisions.questions`."""
+
+    def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
+        """Is `served` right, by these pairs? Asked at a sensor time."""
+
+    def window(self, window_id: str, stamp_ns: int) -> None:
+        """What does a window say that ends at a sensor time?"""
+
+    def prefetch(self, frame: bytes) -> None:
+        """The depth of a camera frame (native msgpack) will be needed."""
+
+    def waits(self, stamp_ns: int) -> bool:
+        """Whether an answer is due before a pair of this stamp, and has not come."""
+
+    def settle(self, stamp_ns: int) -> None:
+        """Let the answers take effect that are due before a pair of this stamp."""
+
+    def bring_forward(self, stamp_ns: int) -> None:
+        """Whatever waits is due before a pair of this stamp: the first of a new time."""
+
+    def time_stepped_back(self, stamp_ns: int) -> None:
+        """The clock of the sensors has stepped back, to this stamp."""
+
+
+class Writes(Protocol):
+    """What the chooser hands to the recorder."""
+
+    def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
+        """A pair was chosen."""
+
+    def end(self, ended: SliceEnded) -> None:
+        """A slice ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """What was chosen so far.
+
+    Attributes:
+        selected: pairs in the open slice.
+        rejections: pairs that were looked at for a window and refused, by reason.
+        quality: of the image looked at last; None before the first.
+        frozen: whether images have repeated since the last that was chosen.
+        checks: checks that were asked for.
+        last_ns: stamp of the pair looked at last; None before the first.
+        steps_back: how often sensor time has stepped back.
+    """
+
+    selected: int = 0
+    rejections: tuple[tuple[str, int], ...] = ()
+    quality: ImageQuality | None = None
+    frozen: bool = False
+    checks: int = 0
+    last_ns: int | None = None
+    steps_back: int = 0
+
+
+class Chooser:
+    """Belongs to the ingest thread of a pair."""
+
+    def __init__(
+        self,
+        pair: PairConfig,
+        limits: LimitsConfig,
+        rig: Rig,
+        served: Served,
+        asks: Asks,
+        recorder: Writes,
+        losses: LossCounter,
+    ) -> None:
+        """`served` is the extrinsic at which pairs are looked at until another is adopted."""
+        self._asks = asks
+        self._recorder = recorder
+        self._losses = losses
+        self._served = served
+        self._infers = pair.calibration.depth.model != STEREO
+        self._cutter = WindowCutter(pair.window, rig, Inspector(limits))
+        self._sampler = CheckSampler(pair.monitor)
+        self._urgency = Urgency(pair.monitor, pair.window)
+        self._pace = SensorClock()
+        self._last_ns: int | None = None
+        self._frozen = False
+        self._checks = 0
+        self._steps_back = 0
+
+    @property
+    def chosen(self) -> Chosen:
+        """What was chosen so far."""
+        return Chosen(
+            self._cutter.selected,
+            tuple((cause, count) for cause, count in self._cutter.rejections.items() if count),
+            self._cutter.last_quality,
+            self._frozen,
+            self._checks,
+            self._last_ns,
+            self._steps_back,
+        )
+
+    @property
+    def slice_end_ns(self) -> int | None:
+        """Sensor time at which the open slice ends; None when none is open."""
+        return self._cutter.slice_end_ns
+
+    def must_wait(self, stamp_ns: int) -> bool:
+        """Whether a pair of this stamp may not be looked at yet. With the first pair of a new time whatever waits in
+        the old one is due."""
+        if self._has_stepped_back(stamp_ns):
+            self._asks.bring_forward(stamp_ns)
+        return self._asks.waits(stamp_ns)
+
+    def choose(self, pair: FramePair) -> None:
+        """Look at the next pair: is it one for the window, one for a check?"""
+        stepped_back = self._has_stepped_back(pair.stamp_ns)
+        if stepped_back:
+            self._asks.bring_forward(pair.stamp_ns)
+        if self._asks.waits(pair.stamp_ns):
+            self._losses.add("monitor", "not_awaited")
+        self._asks.settle(pair.stamp_ns)
+        if stepped_back:
+            self._begin_new_time(pair.stamp_ns)
+        self._last_ns = pair.stamp_ns
+        # The steady clock plays no part: this one only tells at which rate pairs come.
+        self._pace.observe(pair.stamp_ns, 0.0)
+        for ended in self._urgency.heed(self._cutter, self._pace.rate_hz):
+            self._end(ended, pair.stamp_ns)
+        frozen_before = self._cutter.rejections["frozen"]
+        T_camera_lidar = self._served.T_camera_lidar
+        for event in self._cutter.offer(pair, T_camera_lidar):
+            if isinstance(event, PairSelected):
+                self._frozen = False
+                self._select(event, T_camera_lidar)
+            else:
+                self._end(event, pair.stamp_ns)
+                self._urgency.ended(event, self._cutter, self._pace.rate_hz)
+        self._frozen |= self._cutter.rejections["frozen"] > frozen_before
+        check = self._sampler.offer(pair)
+        if check is not None:
+            self._checks += 1
+            self._asks.check(check, self._served, pair.stamp_ns)
+
+    def advance(self, now_ns: int, end_ns: int) -> None:
+        """The streams are silent, and it would be `now_ns` by now: the slice that ends at `end_ns` is over."""
+        for event in self._cutter.advance(now_ns):
+            self._end(event, end_ns)
+
+    def finish(self) -> SliceEnded | None:
+        """End the open slice here and now."""
+        for event in self._cutter.finish():
+            self._end(event, self._last_ns or 0)
+            return event
+        return None
+
+    # --- effects of answers -----------------------------------------------------------------------------------------
+
+    def adopt(self, served: Served) -> None:
+        """Pairs are looked at with another extrinsic from now on."""
+        if served.epoch > self._served.epoch:
+            self._served = served
+
+    def alarm(self, since_ns: int) -> None:
+        """A window is wanted soon, of pairs since this sensor time."""
+        self._urgency.alarm(since_ns)
+
+    def calm(self) -> None:
+        """There is no suspicion any more."""
+        self._urgency.calm()
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    def _begin_new_time(self, stamp_ns: int) -> None:
+        self._steps_back += 1
+        self._losses.add("monitor", "time_stepped_back", detail="the clock of the sensors stepped back")
+        self._urgency.calm()
+        self._asks.time_stepped_back(stamp_ns)
+
+    def _has_stepped_back(self, stamp_ns: int) -> bool:
+        return self._last_ns is not None and stamp_ns < self._last_ns
+
+    def _select(self, event: PairSelected, T_camera_lidar: Matrix4) -> None:
+        self._recorder.add(event.window_id, event.pair, T_camera_lidar)
+        if self._infers:
+            self._asks.prefetch(encode_camera(event.pair.camera))
+
+    def _end(self, event: SliceEnded, stamp_ns: int) -> None:
+        """A slice ended, at this sensor time: what it holds goes to the disk, and from there to the worker."""
+        if event.complete:
+            self._asks.window(event.window_id, stamp_ns)
+        fields = {"window": event.window_id, "pairs": event.pairs, "complete": event.complete}
+        _log.info("a slice ended", extra={"fields": fields})
+        self._recorder.end(event)

@@ -1,0 +1,25 @@
+"""What the pairs of a vehicle have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from coec.adapters.zenoh.bus import Answer
+from coec.calibration.types import Reason
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.worker.supervisor import Worker
+from coec.schemas.keys import Keys
+
+
+@dataclass(frozen=True, slots=True)
+class Outside:
+    """Everything that a pair shares. `publish(key, answer)` and `vehicle_troubles()` may be called from any thread."""
+
+    keys: Keys
+    store: StateStore
+    folder: WindowFolder
+    worker: Worker
+    publish: Callable[[str, Answer], None]
+    vehicle_troubles: Callable[[], tuple[Reason, ...]]

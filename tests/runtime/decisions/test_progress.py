@@ -1,0 +1,88 @@
+"""Whoever does not look is seen not to look, and the first thing on a frame's way that stands still is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from coec.calibration.types import Reason
+from coec.runtime.decisions.progress import Progress
+from coec.runtime.ingest.chooser import Chosen
+from coec.runtime.ingest.decoder import CAMERA, LIDAR, StreamCounts
+from coec.runtime.ingest.stream_statistics import StreamReport
+
+S = 1_000_000_000
+PERIOD_S = 5.0
+
+
+def report(camera: int = 0, lidar: int = 0, refused: int = 0, pairs: int = 0, checks: int = 0) -> StreamReport:
+    streams = {CAMERA: StreamCounts(camera, camera - refused), LIDAR: StreamCounts(lidar, lidar)}
+    return StreamReport(streams=streams, pairs=pairs, chosen=Chosen(checks=checks, last_ns=1000 * S), pace=1.0)
+
+
+BEGIN = report()
+ALL = report(camera=100, lidar=100, pairs=100, checks=3)
+
+
+def begun() -> Progress:
+    progress = Progress(PERIOD_S, 0.0, BEGIN)
+    progress.completed(1000 * S, 100.0, BEGIN)
+    return progress
+
+
+def test_three_periods_on_the_steady_clock() -> None:
+    progress = begun()
+    assert progress.overdue(ALL, 115.0) is None
+    late = progress.overdue(ALL, 115.1)
+    assert late is not None
+    assert late.code == "overdue_worker"
+    progress.completed(1015 * S, 116.0, ALL)
+    assert progress.overdue(ALL, 117.0) is None
+
+
+def test_on_the_clock_of_the_sensors_a_replay_may_run_ahead_of_the_answers_by_two_periods_more() -> None:
+    progress = begun()
+    ahead = replace(ALL, pace=10.0, chosen=replace(ALL.chosen, last_ns=1025 * S))
+    assert progress.overdue(ahead, 101.0) is None
+    late = replace(ahead, chosen=replace(ahead.chosen, last_ns=1025 * S + 1))
+    assert progress.overdue(late, 101.0) is not None
+    progress.time_stepped_back()
+    assert progress.overdue(late, 101.0) is None, "stamps of before tell nothing any more"
+
+
+def test_a_replay_slower_than_the_drive_has_as_much_longer() -> None:
+    half = replace(ALL, pace=0.5)
+    assert begun().overdue(half, 130.0) is None
+    assert begun().overdue(half, 130.1) is not None
+    crawling = replace(ALL, pace=1e-6)
+    assert begun().overdue(crawling, 100.0 + 150.1) is not None, "slower than a tenth is standing still"
+
+
+@pytest.mark.parametrize(
+    ("now", "code", "word"),
+    [
+        (report(lidar=100), "data", "no camera frames"),
+        (report(camera=100), "data", "no lidar frames"),
+        (report(camera=100, refused=100, lidar=100), "data", "every camera frame is refused"),
+        (report(camera=100, lidar=100), "pairing", "none belong together"),
+        (report(camera=100, lidar=100, pairs=2), "data", "too few pairs"),
+        (ALL, "worker", "has not answered"),
+    ],
+)
+def test_the_first_thing_that_stands_still_is_named(now: StreamReport, code: str, word: str) -> None:
+    late = begun().overdue(now, 116.0)
+    assert late is not None
+    assert late.code == f"overdue_{code}"
+    assert word in late.text
+
+
+@pytest.mark.parametrize(
+    ("failure", "code"), [("bad_model", "depth"), ("worker_failed", "worker"), ("bad_input", "data")]
+)
+def test_a_failure_is_named_by_whose_it_is(failure: str, code: str) -> None:
+    progress = begun()
+    progress.failed(Reason(failure, "It went wrong."))
+    late = progress.overdue(ALL, 116.0)
+    assert late is not None
+    assert (late.code, late.text) == (f"overdue_{code}", "No check has been completed for 16 s: It went wrong.")
