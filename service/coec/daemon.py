@@ -34,7 +34,7 @@ from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.runtime.pair import Outside, PairService
 from coec.runtime.recording.window_store import WindowFolder
-from coec.runtime.worker.supervisor import Solved, SolveJob, Worker, WorkerState
+from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
 
@@ -95,7 +95,7 @@ class Daemon:
         self._fault: Reason | None = None
         self._keys = Keys(config.prefix, config.vehicle)
         self._folder = WindowFolder(config.state.directory / "windows", config.state)
-        self._worker = Worker(config.worker, config.model_dump_json(), self._on_solved, self._on_failed)
+        self._worker = Worker(config.worker, config.model_dump_json())
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: PairService(pair, config, outside) for pair in config.pairs}
@@ -221,12 +221,6 @@ class Daemon:
         _log.info(f"the configuration on the disk is valid; {text}")
 
     # --- what the parts ask of the whole ----------------------------------------------------------------------------
-
-    def _on_solved(self, solved: Solved) -> None:
-        self._pairs[solved.job.pair].on_solved(solved)
-
-    def _on_failed(self, job: SolveJob, reason: Reason) -> None:
-        self._pairs[job.pair].on_failed(job, reason)
 
     def _publish(self, key: str, answer: Answer) -> None:
         self._bus.publish(key, answer)

@@ -37,9 +37,9 @@ from coec.runtime.ingest.inbox import Call
 from coec.runtime.pair import Outside, PairService
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowFolder, start_ns_of
-from coec.runtime.worker.messages import pack_observation, unpack_pairs
-from coec.runtime.worker.supervisor import Errand, Solved, SolveJob, Worker
-from coec.schemas.base import to_msgpack
+from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutcome, Kind, Solved
+from coec.runtime.worker.messages import unpack_pairs
+from coec.runtime.worker.supervisor import Worker
 from coec.schemas.keys import Keys
 from coec.schemas.replies import HistoryEntry
 from estimates import estimate
@@ -113,12 +113,26 @@ class KnowingWorker:
     fault: Reason | None = None
     estimates: dict[str, Estimate] = field(default_factory=dict)
 
-    def check(self, errand: Errand) -> None:
-        if self.fault is not None:
-            errand.done(self.fault)
-            return
-        pairs = unpack_pairs(errand.body["frames"], LimitsConfig())
-        wrong = [se3.difference(np.array(errand.body["pose"]), truth(pair.stamp_ns)) for pair in pairs]
+    def ask(self, job: Job) -> None:
+        end = self.answer(job)
+        reason = end if isinstance(end, Reason) else None
+        answer = None if isinstance(end, Reason) else end
+        job.done(JobOutcome(Fate.FAILED if reason else Fate.RESULT, answer, reason, 0.1))
+
+    def answer(self, job: Job) -> Answer | Reason:
+        match job.kind:
+            case Kind.CHECK:
+                return self.fault or self.check(job.body)
+            case Kind.SOLVE:
+                return Solved(result_of(self.estimates[job.subject], self.service()._rig, "test"), None)
+            case Kind.OVERLAY:
+                return Drawn(b"jpeg")
+            case Kind.COMMISSION:
+                return Reason("no", "not here")
+
+    def check(self, body: dict[str, Any]) -> Checked:
+        pairs = unpack_pairs(body["frames"], LimitsConfig())
+        wrong = [se3.difference(np.array(body["pose"]), truth(pair.stamp_ns)) for pair in pairs]
         offset = np.mean(wrong, axis=0)
         observation = Observation(
             stamp_ns=pairs[-1].stamp_ns,
@@ -132,15 +146,7 @@ class KnowingWorker:
             flagged_by_paper=None,
             causes=() if self.cause is None else (CAUSES[self.cause],),
         )
-        errand.done({"kind": "observed", **pack_observation(observation), "baseline_not_used": self.baseline_not_used})
-
-    def run_errand(self, errand: Errand) -> None:
-        errand.done({"kind": "drawn", "jpeg": b"jpeg"} if errand.kind == "overlay" else Reason("no", "not here"))
-
-    def solve(self, job: SolveJob) -> None:
-        service = self.service()
-        result = result_of(self.estimates[job.window_id], service._rig, "test")
-        service.on_solved(Solved(job, to_msgpack(result), 0.1, None))
+        return Checked(observation, self.baseline_not_used)
 
 
 @dataclass
@@ -150,11 +156,11 @@ class SlowWorker(KnowingWorker):
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     waiting: list[Callable[[], None]] = field(default_factory=list)
 
-    def check(self, errand: Errand) -> None:
-        self.waiting.append(partial(super().check, errand))
-
-    def solve(self, job: SolveJob) -> None:
-        self.waiting.append(partial(super().solve, job))
+    def ask(self, job: Job) -> None:
+        if job.kind is Kind.OVERLAY:
+            super().ask(job)
+        else:
+            self.waiting.append(partial(super().ask, job))
 
     def work(self, share: float) -> None:
         """Answer this share of the questions that wait."""

@@ -53,10 +53,11 @@ from coec.runtime.ingest.sensor_clock import NS_PER_S, SensorClock
 from coec.runtime.ingest.stream_statistics import StreamReport
 from coec.runtime.recording.recorder import Recorder, RecordingPlan
 from coec.runtime.recording.window_store import WindowFolder, start_ns_of
-from coec.runtime.worker.messages import pack_pairs, pack_pose, unpack_observation
-from coec.runtime.worker.supervisor import SUPERSEDED, Errand, Solved, SolveJob, Worker
+from coec.runtime.worker import jobs
+from coec.runtime.worker.jobs import Checked, Commissioned, Fate, JobOutcome, Solved
+from coec.runtime.worker.queue import STOPPING
+from coec.runtime.worker.supervisor import Worker
 from coec.schemas import replies
-from coec.schemas.base import from_msgpack
 from coec.schemas.keys import Format, Keys
 from coec.schemas.replies import CalibrationResult, EvidenceEvent
 
@@ -83,9 +84,6 @@ CHECKS_IN_VAIN = 3
 
 COMMISSIONING_WINDOWS = 8
 """Windows that a rig is commissioned from, the newest: 200 pairs."""
-
-COMMISSIONING_TIMEOUT_S = 900.0
-"""A commissioning calibrates its windows many times over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,10 +366,7 @@ class PairService:
         if not paths:
             text = "No recorded window agrees with what is served: calibrate first."
             return self._acknowledge("commission", "too_few_windows", text, accepted=False)
-        body = {"paths": [str(path) for path in paths], "pose": pack_pose(state.T_camera_lidar)}
-        self._outside.worker.run_errand(
-            Errand("commission", self.name, body, self._on_commissioned, COMMISSIONING_TIMEOUT_S)
-        )
+        self._outside.worker.ask(jobs.commission(self.name, state.T_camera_lidar, paths, self._on_commissioned))
         text = f"The rig is being commissioned from {len(paths)} windows; `history` will say how it went."
         return self._acknowledge("commission", "commissioning", text, window_id=paths[-1].stem)
 
@@ -486,9 +481,8 @@ class PairService:
         they would be judged at what is no longer served."""
         for pairs in self._unasked:
             question = self._decisions.ask(stamp_ns + self._period_ns)
-            body = {"pose": pack_pose(self._view.T_camera_lidar), "frames": pack_pairs(pairs)}
             done = partial(self._on_observed, question, self._view.epoch)
-            self._outside.worker.check(Errand("check", self.name, body, done))
+            self._outside.worker.ask(jobs.check(self.name, self._view.T_camera_lidar, pairs, done))
         self._unasked.clear()
 
     def _end_in_silence(self) -> None:
@@ -516,7 +510,7 @@ class PairService:
             return self._acknowledge("calibrate", "window_finished", text, window_id=ended.window_id)
         latest = self.recorder.latest
         if latest is not None and latest.exists():
-            self._outside.worker.solve(SolveJob(self.name, latest.stem, latest))
+            self._on_recorded(latest.stem, latest, True)
             text = f"The latest window is being solved again; {lacking} more pairs are needed for a new one."
             return self._acknowledge("calibrate", "window_again", text, window_id=latest.stem)
         return self._acknowledge("calibrate", "too_few_pairs", f"{lacking} more pairs needed.", accepted=False)
@@ -539,19 +533,24 @@ class PairService:
     # --- on the recorder's and the supervisor's threads -------------------------------------------------------------
 
     def _on_recorded(self, window_id: str, path: Path, live: bool) -> None:
-        self._outside.worker.solve(SolveJob(self.name, window_id, path, live))
+        done = partial(self._on_window, window_id, live)
+        self._outside.worker.ask(jobs.solve(self.name, path, window_id, done, live))
 
     def _on_lost(self, window_id: str) -> None:
         self._answer(self._asked.pop(window_id, None), lambda: None)
 
-    def on_solved(self, solved: Solved) -> None:
-        """A window was solved: keep the result, serve it, publish it."""
-        question = self._asked.pop(solved.job.window_id, None) if solved.job.live else None
-        self._answer(question, partial(self._take_result, solved))
+    def _on_window(self, window_id: str, live: bool, outcome: JobOutcome) -> None:
+        """A window was solved: keep the result, serve it, publish it; or it came to nothing."""
+        question = self._asked.pop(window_id, None) if live else None
+        match outcome:
+            case JobOutcome(answer=Solved() as solved, elapsed_s=elapsed_s):
+                self._answer(question, partial(self._take_result, solved, live, elapsed_s))
+            case JobOutcome(fate=fate, reason=Reason() as reason):
+                self._take_failure(question, live, fate, reason)
 
-    def _take_result(self, solved: Solved) -> Effect | None:
-        result = from_msgpack(CalibrationResult, solved.result)
-        fields = {"window": result.window_id, "decision": result.verdict.decision, "elapsed_s": solved.elapsed_s}
+    def _take_result(self, solved: Solved, live: bool, elapsed_s: float) -> Effect | None:
+        result = solved.result
+        fields = {"window": result.window_id, "decision": result.verdict.decision, "elapsed_s": elapsed_s}
         _log.info("a window was solved", extra={"fields": fields})
         if solved.note is not None:
             self.losses.add("window", "result_not_written", detail=solved.note.text)
@@ -560,7 +559,7 @@ class PairService:
         self._solved += 1
         latest = self.ledger.state.latest
         # A window of an earlier run is old news when a newer one has been evaluated.
-        if solved.job.live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
+        if live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
             estimate, start_ns = self._unbiased(estimate_of(result)), start_ns_of(result.window_id)
             self._step(
                 lambda state: lifecycle.before_estimate(state, estimate, start_ns, self._rules), result.data_stamp_ns
@@ -572,30 +571,30 @@ class PairService:
         self.ledger.save()
         return None
 
-    def on_failed(self, job: SolveJob, reason: Reason) -> None:
-        """A window came to nothing."""
+    def _take_failure(self, question: Question | None, live: bool, fate: Fate, reason: Reason) -> None:
+        """A window came to nothing; one that the end of the service cut short is solved after the next start."""
         self.losses.add("window", reason.code, detail=reason.text)
-        if not job.live:
+        if not live:
             return
 
         def take() -> Effect | None:
-            if reason is SUPERSEDED:
+            if fate is Fate.SUPERSEDED or reason is STOPPING:
                 return None
             return self._step(lambda state: lifecycle.after_failure(state, reason), None)
 
-        self._answer(self._asked.pop(job.window_id, None), take)
+        self._answer(question, take)
 
-    def _on_observed(self, question: Question, epoch: int, answer: dict[str, Any] | Reason) -> None:
-        self._answer(question, partial(self._take_check, epoch, answer))
+    def _on_observed(self, question: Question, epoch: int, outcome: JobOutcome) -> None:
+        self._answer(question, partial(self._take_check, epoch, outcome))
 
-    def _take_check(self, epoch: int, answer: dict[str, Any] | Reason) -> Effect | None:
-        if isinstance(answer, Reason):
-            self._note_check_in_vain(answer)
+    def _take_check(self, epoch: int, outcome: JobOutcome) -> Effect | None:
+        if not isinstance(checked := outcome.answer, Checked):
+            self._note_check_in_vain(outcome)
             return None
         self._checks_in_vain, self._monitor_trouble = 0, None
-        if (why_not := answer["baseline_not_used"]) is not None:
-            self._refuse_baseline(why_not)
-        observation = unpack_observation(answer)
+        if checked.baseline_not_used is not None:
+            self._refuse_baseline(checked.baseline_not_used)
+        observation = checked.observation
         effect = self._step(
             lambda state: lifecycle.after_observation(state, observation), observation.stamp_ns, observation, epoch
         )
@@ -607,11 +606,12 @@ class PairService:
         self.ledger.note_check(self._latest_check)
         return effect
 
-    def _note_check_in_vain(self, reason: Reason) -> None:
+    def _note_check_in_vain(self, outcome: JobOutcome) -> None:
         """Whoever cannot look must not go on saying that all is well."""
-        self.losses.add("monitor", f"check_{reason.code}", detail=reason.text)
-        if reason is SUPERSEDED:
+        reason = outcome.reason
+        if reason is None or reason is STOPPING:
             return
+        self.losses.add("monitor", f"check_{reason.code}", detail=reason.text)
         self._checks_in_vain += 1
         if self._checks_in_vain >= CHECKS_IN_VAIN:
             text = f"The last {self._checks_in_vain} checks came to nothing. {reason.text}"
@@ -746,17 +746,20 @@ class PairService:
             return estimate
         return lifecycle.moved(estimate, self._baseline.unbiased(estimate.optimum.T_camera_lidar), self._rig)
 
-    def _on_commissioned(self, answer: dict[str, Any] | Reason) -> None:
-        if isinstance(answer, Reason):
-            self.losses.add("window", "commissioning_failed", detail=answer.text)
-            self.ledger.note_command("commission", answer.code, f"failed: {answer.text}", "service", accepted=False)
+    def _on_commissioned(self, outcome: JobOutcome) -> None:
+        commissioned, reason = outcome.answer, outcome.reason
+        if reason is not None:
+            self.losses.add("window", "commissioning_failed", detail=reason.text)
+            self.ledger.note_command("commission", reason.code, f"failed: {reason.text}", "service", accepted=False)
             self.ledger.save()
+        if not isinstance(commissioned, Commissioned):
             return
         self._baseline = self._load_baseline()
         self.recorder.use(self._calibration())
-        text = f"Commissioned from {answer['windows']} windows, {answer['pairs']} pairs; baseline {answer['hash']}."
+        learned = f"{commissioned.windows} windows, {commissioned.pairs} pairs"
+        text = f"Commissioned from {learned}; baseline {commissioned.baseline_hash}."
         self.ledger.note_commissioned(text)
-        pose = np.array(answer["pose"], dtype=np.float64)
+        pose = commissioned.pose
         stamp_ns = self.ledger.evaluated_stamp_ns
         self._answer(None, lambda: self._step(lambda state: lifecycle.after_commissioning(state, pose), stamp_ns))
 

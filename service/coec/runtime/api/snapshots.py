@@ -19,6 +19,7 @@ from coec.calibration.lifecycle import PairState, Status
 from coec.calibration.lifecycle.policy import step_between
 from coec.calibration.types import Reason, Rig
 from coec.config import TrackerConfig
+from coec.runtime.worker.jobs import Fate
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.base import to_json, to_msgpack
@@ -172,11 +173,16 @@ def worker_status_of(worker: Worker) -> replies.WorkerStatus:
         WorkerState.BUSY: "busy",
         WorkerState.STOPPED: "stopped",
     }
-    dropped = status.prefetches_dropped
+    job = status.in_progress
     return replies.WorkerStatus(
         state=states[status.state],
         pid=worker.pid,
         restarts=max(status.starts - 1, 0),
-        queued=status.waiting,
-        losses={"prefetch_dropped": dropped} if dropped else {},
+        queued=sum(status.waiting.values()),
+        waiting=dict(status.waiting),
+        job=None if job is None else job.kind,
+        job_age_s=None if job is None else job.age_s,
+        outcomes={fate.value: status.outcomes.get(fate, 0) for fate in Fate},
+        losses=dict(status.losses),
+        faults={fault.value: count for fault, count in status.faults.items()},
     )
