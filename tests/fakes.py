@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import msgpack
 
 from coec.runtime.worker.link import Link
+
+RESULT = "result.msgpack"
+"""File in the fake worker's folder: a `CalibrationResult`, the answer to every window but for the window's id."""
+
+LET_GO = "let-go"
+"""File in the fake worker's folder: a worker that is `late` waits for it."""
 
 
 def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
@@ -22,54 +32,178 @@ def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0
         time.sleep(0.005)
 
 
-def fake_worker_command(fault: str, marker: Path) -> list[str]:
-    """Command of a worker that answers every job with its window's name, except for one fault.
+def fake_worker_command(fault: str, folder: Path, at: str = "solve") -> list[str]:
+    """Command of a worker that answers every question as documented, except for one fault.
 
-    `fault` is `none`, or one of crash, hang, grow, half (half a message), refuse: done at every solve; with the suffix
-    `-once`, only at the first (the file `marker` remembers over processes); `unusable` or `stillborn`: at the start;
-    `sick` (dies) or `sick-refuse`: at whatever is no solve.
+    Args:
+        fault: `none`; `unusable`, `stillborn`, `dumb` (says nonsense): at the start; `babble` (says something that
+            nobody asked) or `deaf` (reads nothing more): as soon as it is ready; else a key of `FAULTS`, done at every
+            question of the kind `at`. With the suffix `-once`, only by the first process that comes to it.
+        folder: where it finds `RESULT` and remembers that it has done its fault.
+        at: a kind of question.
     """
-    return [sys.executable, __file__, fault, str(marker)]
+    return [sys.executable, __file__, fault, at, str(folder)]
 
 
-def _serve(fault: str, marker: Path, link: Link) -> None:
-    link.receive()
-    if fault == "unusable":
-        link.send({"kind": "unusable", "code": "bad_model", "text": "no such network"})
-        return
-    if fault == "stillborn":
-        sys.exit(3)
-    link.send({"kind": "ready"})
-    hoard: list[bytearray] = []
+def _answer(folder: Path, question: dict[str, Any]) -> Any:
+    """Packed by hand, after what `coec.runtime.worker.answers` documents."""
+    match question["kind"]:
+        case "prefetch":
+            result: Any = None
+        case "solve":
+            estimate = msgpack.unpackb((folder / RESULT).read_bytes())
+            estimate["window_id"] = Path(question["path"]).stem
+            result = {"result": msgpack.packb(estimate), "note": None}
+        case "check":
+            result = {"observation": _OBSERVATION, "baseline_not_used": f"{len(question['frames'])} pairs"}
+        case "overlay":
+            result = {"jpeg": question["title"].encode()}
+        case _:
+            pose = _array([4, 4], [float(value) for row in question["pose"] for value in row])
+            result = {"pose": pose, "baseline_hash": "b" * 16, "windows": len(question["paths"]), "pairs": 7}
+    return {"id": question["id"], "result": result}
+
+
+def _array(shape: list[int], values: list[float]) -> msgpack.ExtType:
+    return msgpack.ExtType(1, msgpack.packb([shape, struct.pack(f"<{len(values)}d", *values)]))
+
+
+_OBSERVATION = {
+    "stamp_ns": 7,
+    "pair_stamps_ns": [5, 7],
+    "metrics": [{"name": "mi", "value": 0.5, "limit": 0.1, "at_least": True}],
+    "offset": _array([6], [0.25, 0.0, 0.0, 0.0, 0.0, float("nan")]),
+    "sigma": _array([6], [0.5] * 6),
+    "distance2": 0.125,
+    "flagged": False,
+    "weak": False,
+    "flagged_by_paper": None,
+    "causes": [],
+    "first_derivative": _array([6], [0.0] * 6),
+    "second_derivative": _array([6], [0.0] * 6),
+    "drift": None,
+    "dirty": [],
+    "textured": 0,
+}
+
+
+def _crash(*_: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _hang(*_: object) -> None:
+    signal.pause()
+
+
+def _drop(*_: object) -> None:
+    """Goes on to the next question."""
+
+
+def _grow(*_: object) -> None:
+    hoard = []
     while True:
-        message = link.receive()
-        if message["kind"] != "solve":
-            if fault == "sick":
-                os.kill(os.getpid(), signal.SIGKILL)
-            refusal = {"kind": "refused", "code": "bad_window", "text": "empty"}
-            link.send(refusal if fault == "sick-refuse" else {"kind": "done", "echo": message})
-            continue
-        kind, _, once = fault.partition("-")
-        if once and marker.exists():
-            kind = "none"
+        hoard.append(bytearray(b"x" * 2**24))
+
+
+def _half(*_: object) -> None:
+    os.write(int(sys.argv[-2]), b"\0\0\1\0half")
+    signal.pause()
+
+
+def _half_and_die(*_: object) -> None:
+    os.write(int(sys.argv[-2]), b"\0\0\1\0half")
+    _crash()
+
+
+def _noise(*_: object) -> None:
+    os.write(int(sys.argv[-2]), b"\0\0\0\1\xc1\0\0\0\0")
+
+
+def _huge(link: Link, right: dict[str, Any], folder: Path) -> None:
+    del folder
+    link.send({**right, "result": {"jpeg": bytes(2**26 + 1)}})
+
+
+def _twice(link: Link, right: dict[str, Any], folder: Path) -> None:
+    del folder
+    link.send(right)
+    link.send(right)
+
+
+def _leave(link: Link, right: dict[str, Any], folder: Path) -> None:
+    del folder
+    link.send(right)
+    sys.exit(0)
+
+
+def _late(link: Link, right: dict[str, Any], folder: Path) -> None:
+    wait_until((folder / LET_GO).exists, "the word to go on", 60.0)
+    link.send(right)
+
+
+def _instead(wrong: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Link, dict[str, Any], Path], None]:
+    return lambda link, right, _: link.send(wrong(right))
+
+
+FAULTS: dict[str, Callable[[Link, dict[str, Any], Path], None]] = {
+    "crash": _crash,
+    "hang": _hang,
+    "drop": _drop,
+    "grow": _grow,
+    "half": _half,
+    "half-and-die": _half_and_die,
+    "noise": _noise,
+    "huge": _huge,
+    "twice": _twice,
+    "leave": _leave,
+    "late": _late,
+    "refuse": _instead(lambda right: {"id": right["id"], "refused": {"code": "bad_window", "text": "empty"}}),
+    "other": _instead(lambda right: {**right, "id": right["id"] + 1}),
+    "empty": _instead(lambda _: {}),
+    "no-number": _instead(lambda right: {**right, "id": str(right["id"])}),
+    "both": _instead(lambda right: {**right, "refused": {"code": "bad_window", "text": "empty"}}),
+    "neither": _instead(lambda right: {"id": right["id"]}),
+    "list": _instead(lambda right: {"id": right["id"], "result": [1, 2]}),
+    "other-kind": _instead(lambda right: {"id": right["id"], "result": {"code": "a", "text": "b"}}),
+    "wrong-types": _instead(lambda right: {"id": right["id"], "result": dict.fromkeys(right["result"], 1.5)}),
+    "missing": _instead(lambda right: {"id": right["id"], "result": dict(list(right["result"].items())[1:])}),
+}
+
+
+def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
+    once = fault.endswith("-once")
+    fault, marker = fault.removesuffix("-once"), folder / "done"
+
+    def at_fault() -> bool:
+        wrong = not (once and marker.exists())
         marker.touch()
-        if kind == "crash":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if kind == "hang":
-            signal.pause()
-        if kind == "half":
-            os.write(int(sys.argv[-2]), b"\0\0\1\0half")
-            signal.pause()
-        while kind == "grow":
-            hoard.append(bytearray(b"x" * 2**24))
-        if kind == "refuse":
-            link.send({"kind": "refused", "code": "bad_window", "text": "empty"})
+        return wrong
+
+    link.receive()
+    match fault:
+        case "unusable":
+            link.send({"kind": "unusable", "code": "bad_model", "text": "no such network"})
+            return
+        case "stillborn":
+            sys.exit(3)
+        case "dumb" if at_fault():
+            link.send({"kind": "ready?"})
+    link.send({"kind": "ready"})
+    if fault == "babble" and at_fault():
+        link.send({"id": 1, "result": None})
+    if fault == "deaf" and at_fault():
+        signal.pause()
+    while True:
+        question = link.receive()
+        right = _answer(folder, question)
+        if fault in FAULTS and question["kind"] == at and at_fault():
+            FAULTS[fault](link, right, folder)
         else:
-            link.send({"kind": "solved", "result": message["path"].encode(), "note": None})
+            link.send(right)
 
 
 if __name__ == "__main__":
     try:
-        _serve(sys.argv[1], Path(sys.argv[2]), Link(int(sys.argv[3])))
+        _serve(sys.argv[1], sys.argv[2], Path(sys.argv[3]), Link(int(sys.argv[4])))
     except (EOFError, OSError):
         sys.exit(0)

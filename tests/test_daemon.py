@@ -27,7 +27,7 @@ from coec.adapters.zenoh.bus import MSGPACK, open_session
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.config import Config, LimitsConfig, ZenohConfig
 from coec.daemon import EXIT_THREAD_DIED, Daemon, Signals
-from coec.runtime.pair import PairService
+from coec.runtime.ingest.stream import Stream
 from coec.schemas.keys import Keys
 from coec.sources import open_source
 from fakes import wait_until
@@ -251,13 +251,13 @@ def has_ended(pid: int) -> bool:
 def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     tmp_path: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(_: PairService) -> None:
+    def fail(_: Stream) -> None:
         raise RuntimeError("broken")
 
-    monkeypatch.setattr(PairService, "_end_in_silence", fail)
+    monkeypatch.setattr(Stream, "_end_in_silence", fail)
     daemon = Daemon(Config.model_validate(configuration(tmp_path, endpoint)), Notifier(None))
     assert daemon.serve(Signals(), None) == EXIT_THREAD_DIED
-    health = json.loads(daemon._pairs["front"].health("json").payload)
+    health = json.loads(daemon._pairs["front"].answers.health("json").payload)
     assert [reason["code"] for reason in health["reasons"]] == ["not_evaluated", "thread_died"]
     assert "broken" in health["reasons"][1]["text"]
 

@@ -2,7 +2,6 @@
 
 import pytest
 
-from coec.calibration import lifecycle
 from coec.calibration.lifecycle import MEANING, TRANSITIONS, Event, HealthState, markdown
 from coec.calibration.lifecycle.page import page
 from coec.calibration.lifecycle.states import STATES
@@ -71,10 +70,6 @@ def test_every_state_can_be_reached_and_left() -> None:
     for state in HealthState:
         assert any(after is state for (before, _), after in TRANSITIONS.items() if before is not state)
         assert any(after is not state for (before, _), after in TRANSITIONS.items() if before is state)
-
-
-def test_the_documentation_shows_the_table() -> None:
-    assert markdown() in (lifecycle.__doc__ or "")
 
 
 def test_the_page_of_the_documentation_is_that_of_the_code() -> None:

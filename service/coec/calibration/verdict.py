@@ -40,7 +40,8 @@ whether there is one. Every other reason says that the window cannot tell."""
 
 def cannot_tell(verdict: Verdict) -> bool:
     """Whether a refused window says nothing of where the camera is: too little to see, or more than one answer."""
-    return any(reason.code not in ELSEWHERE for reason in verdict.reasons)
+    codes = {reason.code for reason in verdict.reasons}
+    return not codes or not codes <= ELSEWHERE
 
 
 def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictConfig) -> tuple[Metric, ...]:

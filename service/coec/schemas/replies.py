@@ -357,8 +357,19 @@ class WorkerStatus(Part):
     state: Literal["starting", "idle", "busy", "stopped"]
     pid: int | None = None
     restarts: Count = 0
-    queued: Count = 0
-    losses: Counts = Field(default_factory=dict, description="workers or jobs lost, by cause")
+    queued: Count = Field(default=0, description="jobs that wait")
+    waiting: Counts = Field(
+        default_factory=dict, description="jobs that wait by kind, `backlog`: windows of an earlier run"
+    )
+    job: str | None = Field(default=None, description="kind of what is with the worker; null when nothing is")
+    job_age_s: float | None = Field(default=None, ge=0, description="how long it has been there, s")
+    outcomes: Counts = Field(
+        default_factory=dict, description="jobs that have ended: result, failed, superseded, deadline_passed"
+    )
+    losses: Counts = Field(
+        default_factory=dict, description="jobs without a result, and inferences ahead that were dropped, by cause"
+    )
+    faults: Counts = Field(default_factory=dict, description="worker processes that were replaced, by cause")
 
 
 class StorageStatus(Part):

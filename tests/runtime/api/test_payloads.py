@@ -4,7 +4,7 @@ import msgpack
 import pytest
 
 from coec.errors import UsageError
-from coec.runtime.api.commands import MAX_SENDER, NAMES, parse, sender_of
+from coec.runtime.api.payloads import MAX_SENDER, NAMES, parse, sender_of
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,249 +1,474 @@
-"""The supervisor: jobs come back, a worker that crashes, hangs, grows or babbles is replaced, its job tried again."""
+"""The supervisor: every job has one outcome, a worker that crashes, hangs, grows or says what nobody asked is replaced,
+and nothing that it does ends the thread that looks after it."""
 
 from __future__ import annotations
 
 import os
 import queue
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from coec.calibration.types import Reason
+from coec.adapters.files.conversions import result_of
+from coec.adapters.system.threads import ServiceThread
+from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Reason
 from coec.config import WorkerConfig
-from coec.runtime.worker import link
-from coec.runtime.worker.supervisor import (
-    BUSY,
-    CHECKS_WAITING,
-    ERRANDS_WAITING,
-    PREFETCHES_WAITING,
-    SUPERSEDED,
-    Errand,
-    Solved,
-    SolveJob,
-    Worker,
-    WorkerState,
-)
-from fakes import fake_worker_command, wait_until
+from coec.runtime.worker import jobs, link
+from coec.runtime.worker.child import Child, ChildError, Fault
+from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Fate, Job, JobOutcome, Kind, Solved
+from coec.runtime.worker.supervisor import Worker, WorkerState
+from coec.schemas.base import to_msgpack
+from estimates import RIG, estimate
+from fakes import LET_GO, RESULT, fake_worker_command, wait_until
 
 DEADLINE_S = 30.0
-LIMITS = WorkerConfig(timeout_s=1.0, max_memory_bytes=2**28, attempts=2)
+LIMITS = WorkerConfig(timeout_s=3600.0, max_memory_bytes=2**28, attempts=2)
+IMPATIENT = LIMITS.model_copy(update={"timeout_s": 1.5})
+"""For workers that give no answer; long enough for those that do, on a busy machine."""
+
+POSE = np.arange(16.0).reshape(4, 4)
 
 
 @dataclass
-class Outcomes:
-    """What the supervisor reported, in order."""
+class Bench:
+    """A worker, and what became of the jobs that it was given."""
 
-    events: queue.SimpleQueue[Solved | tuple[SolveJob, Reason]] = field(default_factory=queue.SimpleQueue)
+    worker: Worker
+    folder: Path
+    told: queue.SimpleQueue[tuple[str, JobOutcome]] = field(default_factory=queue.SimpleQueue)
+    jobs: list[str] = field(default_factory=list)
 
-    def on_failed(self, job: SolveJob, reason: Reason) -> None:
-        self.events.put((job, reason))
+    def done(self, name: str) -> Callable[[JobOutcome], None]:
+        self.jobs.append(name)
+        return lambda outcome: self.told.put((name, outcome))
 
-    def solved(self) -> Solved:
-        event = self.events.get(timeout=DEADLINE_S)
-        assert isinstance(event, Solved), event
-        return event
+    def solve(self, name: str, pair: str = "front", live: bool = True) -> None:
+        self.worker.ask(jobs.solve(pair, Path("/windows") / name, name, self.done(name), live))
 
-    def failed(self) -> tuple[SolveJob, Reason]:
-        event = self.events.get(timeout=DEADLINE_S)
-        assert not isinstance(event, Solved), event
-        return event
+    def check(self, name: str, pairs: Sequence[FramePair] = ()) -> None:
+        self.worker.ask(jobs.check("front", POSE, pairs, self.done(name)))
 
+    def overlay(self, name: str, deadline_s: float | None = None) -> None:
+        self.worker.ask(jobs.overlay("front", Path("/windows/w"), POSE, name, self.done(name), deadline_s))
 
-def job(name: str, pair: str = "front", live: bool = True) -> SolveJob:
-    return SolveJob(pair, name, Path("/windows") / name, live)
+    def outcome(self) -> tuple[str, JobOutcome]:
+        """The next one that is told."""
+        return self.told.get(timeout=DEADLINE_S)
+
+    def answer(self) -> tuple[str, Any]:
+        """The next outcome, which is a result: whose, and the id of its window or what else was answered."""
+        name, outcome = self.outcome()
+        assert outcome.fate is Fate.RESULT, (name, outcome)
+        answer = outcome.answer
+        return name, answer.result.window_id if isinstance(answer, Solved) else answer
+
+    def failure(self) -> tuple[str, Reason]:
+        name, outcome = self.outcome()
+        assert outcome.fate is Fate.FAILED, (name, outcome)
+        assert outcome.reason is not None
+        return name, outcome.reason
+
+    def faults(self) -> dict[Fault, int]:
+        return dict(self.worker.status().faults)
+
+    def finish(self) -> None:
+        """Stop; whatever happened, the thread has lived, and every job has had one outcome."""
+        self.worker.request_stop()
+        assert self.worker.thread.join(DEADLINE_S)
+        assert self.worker.thread.failure is None
+        assert self.worker.status().state is WorkerState.STOPPED
+        status = self.worker.status()
+        assert sum(status.outcomes.values()) == len(self.jobs)
+        assert status.waiting == {}
 
 
 @contextmanager
-def running(fault: str, folder: Path, config: WorkerConfig = LIMITS) -> Iterator[tuple[Worker, Outcomes]]:
-    outcomes = Outcomes()
-    command = fake_worker_command(fault, folder / "marker")
-    worker = Worker(config, "{}", outcomes.events.put, outcomes.on_failed, command)
-    worker.start()
+def bench(command: Sequence[str], folder: Path, config: WorkerConfig = LIMITS, start: bool = True) -> Iterator[Bench]:
+    (folder / RESULT).write_bytes(to_msgpack(result_of(estimate(1), RIG, "test")))
+    made = Bench(Worker(config, "{}", command), folder)
+    if start:
+        made.worker.start()
     try:
-        yield worker, outcomes
+        yield made
     finally:
-        worker.request_stop()
-        assert worker.thread.join(DEADLINE_S)
-        assert worker.thread.failure is None
+        made.finish()
 
 
-def test_a_job_comes_back_with_its_result(tmp_path: Path) -> None:
-    with running("none", tmp_path) as (worker, outcomes):
-        worker.solve(job("a"))
-        solved = outcomes.solved()
-        assert solved.job == job("a")
-        assert solved.result == b"/windows/a"
-        wait_until(lambda: worker.status().state is WorkerState.READY, "ready")
-        assert worker.status().starts == 1
+@contextmanager
+def running(fault: str, folder: Path, config: WorkerConfig = LIMITS, at: str = "solve") -> Iterator[Bench]:
+    with bench(fake_worker_command(fault, folder, at), folder, config) as made:
+        yield made
 
 
-@pytest.mark.parametrize("fault", ["crash", "hang", "grow", "half"])
-def test_after_one_fault_another_worker_solves_the_window(
-    tmp_path: Path, fault: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(link, "TRANSFER_TIMEOUT_S", 1)
-    with running(f"{fault}-once", tmp_path) as (worker, outcomes):
-        worker.solve(job("a"))
-        assert outcomes.solved().result == b"/windows/a"
-        status = worker.status()
-        assert status.starts == 2
-        assert status.failure is not None
-        assert status.failure.code == "worker_failed"
+def limits_for(fault: str) -> WorkerConfig:
+    return IMPATIENT if fault in ("hang", "drop") else LIMITS
 
 
-@pytest.mark.parametrize(("fault", "word"), [("crash", "signal 9"), ("hang", "no answer"), ("grow", "memory")])
-def test_a_window_that_kills_every_worker_is_given_up_and_the_service_goes_on(
-    tmp_path: Path, fault: str, word: str
-) -> None:
-    with running(fault, tmp_path) as (worker, outcomes):
-        worker.solve(job("a"))
-        failed, reason = outcomes.failed()
-        assert failed == job("a")
-        assert reason.code == "worker_failed"
-        assert "2 times" in reason.text
-        assert word in reason.text
-        wait_until(lambda: worker.status().state is WorkerState.READY, "a fresh worker")
+@contextmanager
+def waiting(fault: str, folder: Path, at: str = "solve") -> Iterator[Bench]:
+    """Not started yet."""
+    with bench(fake_worker_command(fault, folder, at), folder, start=False) as made:
+        yield made
 
 
-def test_an_idle_worker_that_is_killed_is_replaced(tmp_path: Path) -> None:
-    with running("none", tmp_path) as (worker, outcomes):
-        wait_until(lambda: worker.status().state is WorkerState.READY, "ready")
-        first = worker.pid
-        assert first is not None
-        os.kill(first, signal.SIGKILL)
-        wait_until(lambda: worker.status().starts == 2, "a second worker")
-        worker.solve(job("a"))
-        assert outcomes.solved().result == b"/windows/a"
+# --- jobs come back ---------------------------------------------------------------------------------------------------
+
+
+def test_each_kind_comes_back_with_its_answer(tmp_path: Path) -> None:
+    with running("none", tmp_path) as it:
+        it.solve("a")
+        assert it.answer() == ("a", "a")
+        it.check("c")
+        name, checked = it.answer()
+        assert (name, type(checked), checked.observation.offset[0]) == ("c", Checked, 0.25)
+        assert checked.baseline_not_used == "0 pairs"
+        it.overlay("picture")
+        assert it.answer() == ("picture", Drawn(b"picture"))
+        it.worker.ask(jobs.commission("front", POSE, [Path("a"), Path("b")], it.done("rig")))
+        name, rig = it.answer()
+        assert (name, type(rig), rig.windows, rig.pairs, rig.baseline_hash) == ("rig", Commissioned, 2, 7, "b" * 16)
+        np.testing.assert_array_equal(rig.pose, POSE)
+        wait_until(lambda: it.worker.status().state is WorkerState.READY, "ready")
+        status = it.worker.status()
+        assert (status.starts, status.faults, status.losses) == (1, {}, {})
+        assert status.outcomes == {Fate.RESULT: 4}
+        assert status.rss_bytes > 0
 
 
 def test_a_refusal_is_an_answer_not_a_fault(tmp_path: Path) -> None:
-    with running("refuse", tmp_path) as (worker, outcomes):
-        worker.solve(job("a"))
-        assert outcomes.failed() == (job("a"), Reason("bad_window", "empty"))
-        assert worker.status().starts == 1
+    with running("refuse", tmp_path) as it:
+        it.solve("a")
+        assert it.failure() == ("a", Reason("bad_window", "empty"))
+        assert (it.worker.status().starts, it.worker.status().losses) == (1, {"bad_window": 1})
 
 
-def test_the_newest_windows_of_a_pair_win_and_pairs_do_not_push_each_other_out(tmp_path: Path) -> None:
-    outcomes = Outcomes()
-    worker = Worker(LIMITS, "{}", outcomes.events.put, outcomes.on_failed, fake_worker_command("none", tmp_path / "m"))
-    worker.solve(job("old"))
-    worker.solve(job("left-1", "left"))
-    worker.solve(job("left-0", "left", live=False))
-    worker.solve(job("new"))
-    worker.solve(job("newest"))
-    failed, reason = outcomes.failed()
-    assert (failed, reason.code) == (job("old"), "superseded")
-    worker.start()
-    try:
-        assert [outcomes.solved().job.window_id for _ in range(4)] == ["left-1", "new", "newest", "left-0"]
-    finally:
-        worker.request_stop()
-        assert worker.thread.join(DEADLINE_S)
+def test_what_comes_first_and_what_is_superseded(tmp_path: Path) -> None:
+    with waiting("none", tmp_path) as it:
+        for _ in range(11):
+            it.worker.prefetch("front", bytes(1000))
+        it.solve("old")
+        it.solve("left-1", "left")
+        it.solve("left-0", "left", live=False)
+        it.solve("new")
+        it.solve("newest")
+        name, outcome = it.outcome()
+        assert (name, outcome.fate) == ("old", Fate.SUPERSEDED)
+        it.overlay("picture")
+        it.check("c")
+        status = it.worker.status()
+        assert status.waiting == {"solve": 3, "backlog": 1, "overlay": 1, "check": 1}
+        assert status.losses == {"superseded": 1, "prefetch_dropped": 3}
+        it.worker.start()
+        assert [it.answer()[0] for _ in range(6)] == ["c", "left-1", "new", "newest", "picture", "left-0"]
 
 
-def test_prefetches_are_bounded_and_give_way_to_windows(tmp_path: Path) -> None:
-    outcomes = Outcomes()
-    worker = Worker(LIMITS, "{}", outcomes.events.put, outcomes.on_failed, fake_worker_command("none", tmp_path / "m"))
-    for _ in range(PREFETCHES_WAITING + 3):
-        worker.prefetch("front", bytes(1000))
-    assert worker.status().prefetches_dropped == 3
-    worker.start()
-    try:
-        worker.solve(job("a"))
-        assert outcomes.solved().job == job("a")
-    finally:
-        worker.request_stop()
-        assert worker.thread.join(DEADLINE_S)
+# --- a worker with a fault is replaced --------------------------------------------------------------------------------
 
 
-def errand(kind: str, told: queue.SimpleQueue[object], number: int = 0, pair: str = "front") -> Errand:
-    return Errand(kind, pair, {"number": number}, told.put, timeout_s=1.0)
+IN_A_JOB = {
+    "crash": Fault.DIED,
+    "half-and-die": Fault.DIED,
+    "half": Fault.DISCONNECTED,
+    "hang": Fault.TIMED_OUT,
+    "drop": Fault.TIMED_OUT,
+    "grow": Fault.TOO_LARGE,
+    "other": Fault.STRAY_ANSWER,
+    "huge": Fault.MALFORMED_ANSWER,
+    **dict.fromkeys(
+        ["noise", "empty", "no-number", "both", "neither", "list", "other-kind", "wrong-types", "missing"],
+        Fault.MALFORMED_ANSWER,
+    ),
+}
 
 
-def test_an_errand_comes_back_with_its_answer(tmp_path: Path) -> None:
-    told: queue.SimpleQueue[object] = queue.SimpleQueue()
-    with running("none", tmp_path) as (worker, _):
-        worker.run_errand(errand("overlay", told, 7))
-        answer = told.get(timeout=DEADLINE_S)
-    assert isinstance(answer, dict)
-    assert answer["echo"] == {"kind": "overlay", "pair": "front", "number": 7}
+@pytest.mark.parametrize(("fault", "counted"), IN_A_JOB.items())
+def test_after_one_fault_another_worker_solves_the_window(
+    tmp_path: Path, fault: str, counted: Fault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link, "TRANSFER_TIMEOUT_S", 1)
+    with running(f"{fault}-once", tmp_path, limits_for(fault)) as it:
+        it.solve("a")
+        assert it.answer() == ("a", "a")
+        status = it.worker.status()
+        assert status.starts == 2
+        assert status.failure is not None
+        assert status.failure.code == "worker_failed"
+        assert it.faults() == {counted: 1}
 
 
-def test_of_the_checks_of_a_pair_the_newest_are_taken_and_errands_are_bounded(tmp_path: Path) -> None:
-    told: queue.SimpleQueue[object] = queue.SimpleQueue()
-    outcomes = Outcomes()
-    worker = Worker(LIMITS, "{}", outcomes.events.put, outcomes.on_failed, fake_worker_command("none", tmp_path / "m"))
-    worker.check(errand("check", told, 0, "rear"))
-    for number in range(1, 2 + CHECKS_WAITING):
-        worker.check(errand("check", told, number))
-    assert told.get_nowait() is SUPERSEDED
-    for number in range(ERRANDS_WAITING):
-        worker.run_errand(errand("overlay", told, 100 + number))
-    worker.run_errand(errand("overlay", told, 999))
-    assert told.get_nowait() is BUSY
-    worker.solve(job("a"))
-    worker.start()
-    try:
-        answers = [told.get(timeout=DEADLINE_S) for _ in range(1 + CHECKS_WAITING + ERRANDS_WAITING)]
-        assert outcomes.solved().job == job("a")
-    finally:
-        worker.request_stop()
-        assert worker.thread.join(DEADLINE_S)
-    numbers = [answer["echo"]["number"] for answer in answers if isinstance(answer, dict)]
-    assert numbers == [0, *range(2, 2 + CHECKS_WAITING), *range(100, 100 + ERRANDS_WAITING)]
+@pytest.mark.parametrize("fault", ["crash", "half-and-die", "drop", "other", "empty", "wrong-types", "missing"])
+def test_a_check_on_which_the_worker_fails_is_answered_once_and_the_next_one_is_made(
+    tmp_path: Path, fault: str
+) -> None:
+    with running(f"{fault}-once", tmp_path, limits_for(fault), at="check") as it:
+        it.check("lost")
+        it.check("next")
+        name, reason = it.failure()
+        assert (name, reason.code) == ("lost", "worker_failed")
+        assert it.answer()[0] == "next"
+        assert it.faults() == {IN_A_JOB[fault]: 1}
 
 
-@pytest.mark.parametrize("fault", ["sick", "sick-refuse"])
-def test_an_errand_that_fails_is_answered_and_not_tried_again(tmp_path: Path, fault: str) -> None:
-    told: queue.SimpleQueue[object] = queue.SimpleQueue()
-    with running(fault, tmp_path) as (worker, outcomes):
-        worker.run_errand(errand("overlay", told))
-        answer = told.get(timeout=DEADLINE_S)
-        assert isinstance(answer, Reason)
-        assert answer.code == ("bad_window" if fault == "sick-refuse" else "worker_failed")
-        worker.solve(job("a"))
-        assert outcomes.solved().job == job("a")
+@pytest.mark.parametrize(
+    ("fault", "word"), [("crash", "signal 9"), ("drop", "no answer"), ("other", "another question")]
+)
+def test_a_window_that_no_worker_survives_is_given_up_and_the_service_goes_on(
+    tmp_path: Path, fault: str, word: str
+) -> None:
+    with running(fault, tmp_path, limits_for(fault)) as it:
+        it.solve("a")
+        name, reason = it.failure()
+        assert (name, reason.code) == ("a", "worker_failed")
+        assert "2 times" in reason.text
+        assert word in reason.text
+        it.check("c")
+        assert it.answer()[0] == "c"
+
+
+def test_what_is_said_twice_answers_no_other_question(tmp_path: Path) -> None:
+    with running("twice-once", tmp_path, at="overlay") as it:
+        for name in "abc":
+            it.overlay(name)
+        told = dict(it.outcome() for _ in range(3))
+        assert told["a"].answer == Drawn(b"a")
+        for name in "bc":
+            answer, reason = told[name].answer, told[name].reason
+            assert answer == Drawn(name.encode()) or (reason is not None and reason.code == "worker_failed")
+        assert it.faults() == {Fault.STRAY_ANSWER: 1}
+
+
+def test_a_worker_that_babbles_is_replaced(tmp_path: Path) -> None:
+    with running("babble-once", tmp_path) as it:
+        wait_until(lambda: it.worker.status().starts == 2, "a second worker")
+        it.check("c")
+        assert it.answer()[0] == "c"
+        assert it.faults() == {Fault.STRAY_ANSWER: 1}
+
+
+def test_a_worker_that_goes_after_its_answer_takes_no_job_along(tmp_path: Path) -> None:
+    """Whether it is seen to have gone before the next job is taken, or is sent one and gives no answer."""
+    with running("leave", tmp_path) as it:
+        for pair in ("front", "left", "rear"):
+            it.solve(pair, pair)
+        assert [it.answer() for _ in range(3)] == [(pair, pair) for pair in ("front", "left", "rear")]
+        assert set(it.faults()) == {Fault.DIED}
+        wait_until(lambda: it.worker.status().starts == 4, "a fresh worker")
+        it.check("c")
+        assert it.answer()[0] == "c"
+
+
+def test_an_idle_worker_that_is_killed_is_replaced(tmp_path: Path) -> None:
+    with running("none", tmp_path) as it:
+        wait_until(lambda: it.worker.status().state is WorkerState.READY, "ready")
+        first = it.worker.pid
+        assert first is not None
+        os.kill(first, signal.SIGKILL)
+        wait_until(lambda: it.worker.status().starts == 2, "a second worker")
+        it.check("c")
+        assert it.answer()[0] == "c"
+        assert it.faults() == {Fault.DIED: 1}
+
+
+def a_pair(stamp_ns: int) -> FramePair:
+    image = EncodedImage(ImageFormat.MONO8, 1000, 1000, bytes(1_000_000))
+    cloud = np.zeros((10, 3), dtype=np.float32)
+    return FramePair(CameraFrame(stamp_ns, "camera", image), LidarFrame(stamp_ns, "lidar", cloud), None)
+
+
+def test_a_check_that_a_worker_does_not_take_goes_to_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link, "TRANSFER_TIMEOUT_S", 1)
+    with running("deaf-once", tmp_path) as it:
+        it.check("c", [a_pair(number) for number in range(5)])
+        name, checked = it.answer()
+        assert (name, checked.baseline_not_used) == ("c", "5 pairs")
+        assert it.faults() == {Fault.DISCONNECTED: 1}
+
+
+def test_a_job_that_cannot_be_put_into_bytes_fails_alone(tmp_path: Path) -> None:
+    with running("none", tmp_path) as it:
+        it.worker.ask(Job(Kind.OVERLAY, "front", "odd", {"path": object()}, it.done("odd")))
+        name, reason = it.failure()
+        assert (name, reason.code) == ("odd", "unsendable")
+        it.overlay("next")
+        assert it.answer() == ("next", Drawn(b"next"))
+        assert it.faults() == {Fault.UNSENDABLE_JOB: 1}
 
 
 def test_checks_that_kill_do_not_keep_the_worker_from_its_windows(tmp_path: Path) -> None:
-    outcomes = Outcomes()
-    order: queue.SimpleQueue[str] = queue.SimpleQueue()
-    command = fake_worker_command("sick", tmp_path / "m")
-    worker = Worker(LIMITS, "{}", lambda solved: order.put(solved.job.window_id), outcomes.on_failed, command)
-    for number in range(3):
-        worker.check(Errand("check", "front", {"number": number}, lambda _: order.put("check"), timeout_s=1.0))
-    worker.solve(job("a"))
-    worker.start()
-    try:
-        assert [order.get(timeout=DEADLINE_S) for _ in range(4)] == ["check", "a", "check", "check"]
-    finally:
-        worker.request_stop()
-        assert worker.thread.join(DEADLINE_S)
-    assert worker.status().starts >= 3
+    with waiting("crash", tmp_path, at="check") as it:
+        for name in ("c0", "c1", "c2"):
+            it.check(name)
+        it.solve("a")
+        it.worker.start()
+        assert [it.outcome()[0] for _ in range(4)] == ["c0", "a", "c1", "c2"]
+        assert it.worker.status().outcomes == {Fate.FAILED: 3, Fate.RESULT: 1}
 
 
-def test_a_configuration_that_cannot_work_is_told(tmp_path: Path) -> None:
-    with running("unusable", tmp_path) as (worker, _):
-        wait_until(lambda: worker.unusable is not None, "the refusal")
-        assert worker.unusable == Reason("bad_model", "no such network")
+# --- deadlines, stops, and who asks -----------------------------------------------------------------------------------
 
 
-def test_a_worker_that_dies_at_the_start_is_started_again(tmp_path: Path) -> None:
-    with running("stillborn", tmp_path) as (worker, _):
-        wait_until(lambda: worker.status().starts >= 2, "a second start")
-        failure = worker.status().failure
+def test_an_answer_that_is_late_is_no_fault_and_the_worker_goes_on(tmp_path: Path) -> None:
+    with running("late-once", tmp_path, at="overlay") as it:
+        it.overlay("slow", deadline_s=0.2)
+        name, outcome = it.outcome()
+        assert (name, outcome.fate) == ("slow", Fate.LATE)
+        assert outcome.elapsed_s >= 0.2
+        (tmp_path / LET_GO).touch()
+        it.overlay("next")
+        assert it.answer() == ("next", Drawn(b"next"))
+        assert (it.worker.status().starts, it.faults()) == (1, {})
+        assert it.worker.status().losses == {"deadline_passed": 1, "late_answer": 1}
+
+
+def test_what_waits_behind_a_worker_that_hangs_is_answered_in_time(tmp_path: Path) -> None:
+    with running("hang", tmp_path) as it:
+        it.solve("a")
+        wait_until(lambda: it.worker.status().in_progress is not None, "the solve")
+        it.overlay("behind", deadline_s=0.1)
+        name, outcome = it.outcome()
+        assert (name, outcome.fate) == ("behind", Fate.LATE)
+        progress = it.worker.status().in_progress
+        assert progress is not None
+        assert (progress.kind, progress.subject) == ("solve", "a")
+        assert progress.age_s > 0.0
+
+
+def test_a_worker_may_have_less_time_for_one_job_than_for_others(tmp_path: Path) -> None:
+    with running("hang-once", tmp_path) as it:
+        it.worker.ask(replace(jobs.solve("front", Path("a"), "a", it.done("a")), timeout_s=0.2))
+        assert it.answer() == ("a", "a")
+        assert it.faults() == {Fault.TIMED_OUT: 1}
+
+
+def test_jobs_for_a_worker_that_cannot_start_are_answered_in_time(tmp_path: Path) -> None:
+    with running("stillborn", tmp_path) as it:
+        it.overlay("a", deadline_s=0.3)
+        name, outcome = it.outcome()
+        assert (name, outcome.fate) == ("a", Fate.LATE)
+        wait_until(lambda: it.worker.status().starts >= 2, "a second start")
+        failure = it.worker.status().failure
         assert failure is not None
         assert "exit code 3" in failure.text
 
 
-def test_a_stop_does_not_wait_for_a_solve(tmp_path: Path) -> None:
-    with running("hang", tmp_path, WorkerConfig(timeout_s=3600.0)) as (worker, _):
-        worker.solve(job("a"))
-        wait_until(lambda: worker.status().window_id == "a", "the solve")
-        pid = worker.pid
-        assert pid is not None
+def test_a_stop_does_not_wait_for_a_solve_and_answers_all_that_waits(tmp_path: Path) -> None:
+    with running("hang", tmp_path) as it:
+        it.solve("a")
+        wait_until(lambda: it.worker.status().in_progress is not None, "the solve")
+        it.solve("b")
+        it.check("c")
+        pid = it.worker.pid
+        it.worker.request_stop()
+        told = {it.outcome()[0]: None for _ in range(3)}
+        assert set(told) == {"a", "b", "c"}
+        it.solve("too late")
+        name, reason = it.failure()
+        assert (name, reason.code) == ("too late", "stopping")
     assert not Path(f"/proc/{pid}").exists()
+
+
+def test_a_stop_before_the_start_answers_all_that_waits(tmp_path: Path) -> None:
+    it = Bench(Worker(LIMITS, "{}", fake_worker_command("none", tmp_path)), tmp_path)
+    it.solve("a")
+    it.worker.request_stop()
+    assert it.failure() == ("a", Reason("stopping", "The service is stopping."))
+
+
+def test_whoever_fails_to_take_an_outcome_harms_nobody_else(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(_: JobOutcome) -> None:
+        raise ZeroDivisionError("nobody is at home")
+
+    with running("none", tmp_path) as it:
+        it.jobs.append("a")
+        it.worker.ask(jobs.overlay("front", Path("a"), POSE, "a", fail))
+        it.overlay("b")
+        assert it.answer() == ("b", Drawn(b"b"))
+        assert it.worker.status().losses == {"done_raised": 1}
+        assert it.worker.status().outcomes == {Fate.RESULT: 2}
+    assert "nobody is at home" in caplog.text
+
+
+def test_an_outcome_is_told_without_a_lock(tmp_path: Path) -> None:
+    """Whoever is told may ask for more, and so may others while he is told."""
+    statuses: queue.SimpleQueue[WorkerState] = queue.SimpleQueue()
+    with running("none", tmp_path) as it:
+
+        def told(_: JobOutcome) -> None:
+            asker = ServiceThread("asker", lambda _: statuses.put(it.worker.status().state))
+            asker.start()
+            assert asker.join(DEADLINE_S)
+            it.overlay("next")
+
+        it.jobs.append("first")
+        it.worker.ask(jobs.overlay("front", Path("a"), POSE, "first", told))
+        assert it.answer() == ("next", Drawn(b"next"))
+    assert statuses.get_nowait() in (WorkerState.BUSY, WorkerState.READY)
+
+
+# --- the start --------------------------------------------------------------------------------------------------------
+
+
+def test_a_configuration_that_cannot_work_is_told(tmp_path: Path) -> None:
+    with running("unusable", tmp_path) as it:
+        wait_until(lambda: it.worker.unusable is not None, "the refusal")
+        assert it.worker.unusable == Reason("bad_model", "no such network")
+        wait_until(lambda: Fault.UNUSABLE in it.faults(), "the count")
+
+
+def test_a_worker_that_talks_nonsense_at_the_start_is_replaced(tmp_path: Path) -> None:
+    with running("dumb-once", tmp_path) as it:
+        it.solve("a")
+        assert it.answer() == ("a", "a")
+        assert it.faults() == {Fault.MALFORMED_ANSWER: 1}
+
+
+def test_a_program_that_is_not_there_is_a_failure_until_it_is(tmp_path: Path) -> None:
+    program = tmp_path / "program"
+    _, *arguments = fake_worker_command("none", tmp_path)
+    with bench([str(program), *arguments], tmp_path) as it:
+        it.solve("a")
+        wait_until(lambda: it.faults().get(Fault.NOT_STARTED, 0) > 0, "the failure")
+        failure = it.worker.status().failure
+        assert failure is not None
+        assert "could not be started" in failure.text
+        assert it.worker.status().state is WorkerState.STARTING
+        script = tmp_path / "script"
+        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
+        script.chmod(0o755)
+        script.rename(program)
+        assert it.answer() == ("a", "a")
+
+
+def test_a_worker_without_a_socket_is_a_failure_until_there_is_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right, failed = link.Link.pair, list[int]()
+
+    def fail_once() -> Any:
+        if failed:
+            return right()
+        failed.append(1)
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(link.Link, "pair", fail_once)
+    with running("none", tmp_path) as it:
+        it.solve("a")
+        assert it.answer() == ("a", "a")
+        assert it.faults() == {Fault.NOT_STARTED: 1}
+
+
+def test_a_program_that_cannot_be_run_leaves_no_socket_behind(tmp_path: Path) -> None:
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(3):
+        with pytest.raises(ChildError, match="could not be started"):
+            Child([str(tmp_path / "nowhere")], LIMITS)
+    assert len(list(Path("/proc/self/fd").iterdir())) == before

@@ -1,25 +1,7 @@
 """What is served as the extrinsic of a pair, and how healthy it is: pure functions from state to state.
 
 `states` holds the machine and its table, `policy` what may be applied without a person, `pair_state` the flow.
-
-Health, by what happens (rows) and the state it happens in (columns); `states.MEANING` has a sentence for each event:
-
-|                          | unknown       | healthy       | suspect       | miscalibrated | degraded      | stale         |
-| ------------------------ | ------------- | ------------- | ------------- | ------------- | ------------- | ------------- |
-| window_agrees            | healthy       | ·             | healthy       | healthy       | healthy       | healthy       |
-| window_contradicts       | miscalibrated | miscalibrated | miscalibrated | ·             | miscalibrated | miscalibrated |
-| window_differs           | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
-| window_refused_elsewhere | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
-| monitor_clear            | healthy       | ·             | healthy       | suspect       | healthy       | healthy       |
-| monitor_no_objection     | ·             | ·             | ·             | suspect       | unknown       | unknown       |
-| monitor_suspects         | suspect       | suspect       | ·             | ·             | suspect       | suspect       |
-| monitor_confirms         | miscalibrated | miscalibrated | miscalibrated | ·             | miscalibrated | miscalibrated |
-| data_cause               | degraded      | degraded      | degraded      | ·             | ·             | degraded      |
-| check_overdue            | ·             | degraded      | degraded      | ·             | ·             | ·             |
-| aged                     | ·             | stale         | stale         | ·             | stale         | ·             |
-| replaced                 | ·             | unknown       | unknown       | unknown       | unknown       | unknown       |
-| time_stepped_back        | ·             | unknown       | ·             | ·             | unknown       | unknown       |
-| restarted                | ·             | unknown       | ·             | ·             | unknown       | unknown       |
+docs/health.md shows the table.
 """
 
 from coec.calibration.lifecycle.pair_state import (

@@ -61,8 +61,7 @@ class Observation:
         drift: of the local optimum from the commissioned calibration; None until the rig is commissioned.
         dirty: blocks of the image, by number, that have no contrast in any pair; for commissioned rigs in daylight.
         textured: blocks that could be, 0 where it is not known.
-        standing_stamps_ns: of the pairs that were taken while the vehicle stood: they show what was seen before, and
-            are evidence neither for nor against the mount.
+        standing_stamps_ns: of the pairs that were taken while the vehicle stood.
     """
 
     stamp_ns: int
@@ -94,6 +93,7 @@ class MonitorState:
         dirt: the same for every block of the image that was dirty in all checks since, by its number.
         offset: running mean of the flagged offsets (rad, m); empty without one.
         last_stamps_ns: of the pairs of the last check.
+        stood: whether the vehicle stood at the end of the last check.
     """
 
     evidence: float = 0.0
@@ -102,15 +102,17 @@ class MonitorState:
     dirt: Mapping[str, float] = field(default_factory=dict)
     offset: tuple[float, ...] = ()
     last_stamps_ns: tuple[int, ...] = ()
+    stood: bool = False
 
 
 def after_observation(state: MonitorState, observation: Observation) -> MonitorState:
-    """The state after one more check. It counts by the share of its pairs that the last one did not hold; of the mount
-    only those say something new that were taken in motion."""
+    """The state after one more check. It counts by the share of its pairs that the last one did not hold; while the
+    vehicle stands, only the first says something new of the mount."""
     counted, standing = set(state.last_stamps_ns), set(observation.standing_stamps_ns)
-    new = [stamp for stamp in observation.pair_stamps_ns if stamp not in counted]
-    fresh = len(new) / len(observation.pair_stamps_ns)
-    moving = sum(stamp not in standing for stamp in new) / len(observation.pair_stamps_ns)
+    fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
+    stands = observation.pair_stamps_ns[-1] in standing
+    # Of one place there is one independent check, however long the vehicle stands there.
+    told_before = state.stood and standing.issuperset(observation.pair_stamps_ns)
     dirt = _dirt_after(state.dirt, observation, fresh)
     codes = {cause.code for cause in observation.causes}
     if sum(run >= DIRTY_CHECKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
@@ -120,13 +122,13 @@ def after_observation(state: MonitorState, observation: Observation) -> MonitorS
         for code in {*state.blind, *codes}
     }
     blind = {code: blind[code] for code in sorted(blind) if blind[code] > 0.0}
-    after = replace(state, blind=blind, dirt=dirt, last_stamps_ns=observation.pair_stamps_ns)
+    after = replace(state, blind=blind, dirt=dirt, last_stamps_ns=observation.pair_stamps_ns, stood=stands)
     if codes:
         # Neither for nor against: the data cannot tell.
         return after
-    if moving == 0.0 or (not observation.flagged and observation.weak):
+    if told_before or (not observation.flagged and observation.weak):
         return after
-    step = moving * (WEAK_SHARE if observation.weak else 1.0)
+    step = fresh * (WEAK_SHARE if observation.weak else 1.0)
     most = max(state.evidence, SUSPECT_AT) if observation.weak else MOST
     evidence = min(max(state.evidence + (step if observation.flagged else -step), 0.0), most)
     offset = (

@@ -35,7 +35,7 @@ from coec.config import (
     ZenohConfig,
 )
 from coec.errors import NotFoundError
-from coec.runtime.worker.supervisor import PACKAGE_ROOT
+from coec.runtime.worker.child import PACKAGE_ROOT
 from coec.schemas.keys import Keys
 
 VEHICLE, PAIR = "bench", "front"

@@ -6,12 +6,12 @@ import queue
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from coec.adapters.files.rig import intrinsics_config
 from coec.adapters.mcap.windows import WindowWriter, read_window
-from coec.calibration.types import Reason
 from coec.cli.bench import scene
 from coec.cli.bench.process import ProcessReading
 from coec.config import (
@@ -25,8 +25,9 @@ from coec.config import (
     StateConfig,
 )
 from coec.errors import CalibrationError
-from coec.runtime.worker.messages import pack_pairs, pack_pose
-from coec.runtime.worker.supervisor import Errand, Solved, SolveJob, Worker, WorkerState
+from coec.runtime.worker import jobs
+from coec.runtime.worker.jobs import JobOutcome
+from coec.runtime.worker.supervisor import Worker, WorkerState
 
 CAMERA = "double_sphere"
 POLL_S, TIMEOUT_S = 0.005, 300.0
@@ -57,12 +58,12 @@ def measure(folder: Path, frames: int, heard: Callable[[str], None]) -> dict[str
     return document | {"worker_first_result_s": _first_result_s(last, window, _configuration(folder, last))}
 
 
-Answers = queue.SimpleQueue[Solved | dict[str, Any] | Reason]
+Outcomes = queue.SimpleQueue[JobOutcome]
 
 
 @contextmanager
-def _worker(config: Config, answers: Answers) -> Iterator[Worker]:
-    worker = Worker(config.worker, config.model_dump_json(), answers.put, lambda _, reason: answers.put(reason))
+def _worker(config: Config) -> Iterator[Worker]:
+    worker = Worker(config.worker, config.model_dump_json())
     try:
         yield worker
     finally:
@@ -71,8 +72,8 @@ def _worker(config: Config, answers: Answers) -> Iterator[Worker]:
 
 
 def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
-    answers: Answers = queue.SimpleQueue()
-    with _worker(config, answers) as worker:
+    outcomes: Outcomes = queue.SimpleQueue()
+    with _worker(config) as worker:
         begin = time.perf_counter()
         worker.start()
         while (status := worker.status()).state is WorkerState.STARTING:
@@ -84,8 +85,8 @@ def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
         idle_mb = process.resident_mb
         process.reset_peak()
         begin = time.perf_counter()
-        worker.solve(SolveJob(name, window.stem, window))
-        _expected(answers.get(timeout=TIMEOUT_S), Solved)
+        worker.ask(jobs.solve(name, window, window.stem, outcomes.put))
+        _await_result(outcomes)
         solve_s, peak_mb = time.perf_counter() - begin, process.peak_mb
     return {
         f"worker_ready_s_{name}": ready_s,
@@ -96,23 +97,23 @@ def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
 
 
 def _first_result_s(name: str, window: Path, config: Config) -> float:
-    answers: Answers = queue.SimpleQueue()
+    outcomes: Outcomes = queue.SimpleQueue()
     pairs = read_window(window)[0].pairs[: config.pairs[0].monitor.pairs]
-    check = {"pose": pack_pose(scene.T_TRUE), "frames": pack_pairs(pairs)}
-    with _worker(config, answers) as worker:
+    with _worker(config) as worker:
         begin = time.perf_counter()
-        worker.check(Errand("check", name, check, answers.put))
+        worker.ask(replace(jobs.check(name, scene.T_TRUE, pairs, outcomes.put), deadline_s=TIMEOUT_S))
         worker.start()
-        _expected(answers.get(timeout=TIMEOUT_S), dict)
+        _await_result(outcomes)
         return time.perf_counter() - begin
 
 
-def _expected(answer: Solved | dict[str, Any] | Reason, kind: type) -> None:
+def _await_result(outcomes: Outcomes) -> None:
     """Raises:
     CalibrationError: the worker gave a reason instead.
     """
-    if not isinstance(answer, kind):
-        raise CalibrationError(f"the worker could not do the work of the benchmark: {answer}")
+    outcome = outcomes.get(timeout=TIMEOUT_S)
+    if outcome.reason is not None:
+        raise CalibrationError(f"the worker could not do the work of the benchmark: {outcome.reason.text}")
 
 
 def _window(folder: Path, name: str, frames: int) -> Path:

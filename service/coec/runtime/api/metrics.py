@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from coec.calibration.lifecycle import HealthState
-from coec.runtime.api.snapshots import AXES, UNITS
-from coec.schemas.replies import HealthReply, Maybe6, PairStatus, StatusReply
+from coec.runtime.api.extrinsic import AXES, UNITS
+from coec.schemas.replies import HealthReply, Maybe6, PairStatus, StatusReply, WorkerStatus
 
 ENCODING = "application/openmetrics-text"
 
@@ -61,12 +61,29 @@ def render(status: StatusReply, health: Mapping[str, HealthReply], worker_rss_by
         _Family("coec_health_changes", "counter", "States entered.", tuple(_counts(pairs, "transitions", "to"))),
         _Family("coec_commands", "counter", "Commands, by outcome.", tuple(_counts(pairs, "commands", "command"))),
         _Family("coec_worker_restarts", "counter", "Workers replaced.", (({}, status.worker.restarts),)),
+        *_worker(status.worker),
         _Family("coec_worker_memory_bytes", "gauge", "Resident memory.", (({}, float(worker_rss_bytes)),)),
         _Family("coec_storage_used_bytes", "gauge", "Bytes of all windows.", (({}, status.storage.bytes_used),)),
         _Family("coec_storage_free_bytes", "gauge", "Bytes free on the disk.", (({}, status.storage.bytes_free),)),
     )
     lines = [line for family in families for line in family.lines()]
     return "\n".join([*lines, "# EOF", ""]).encode()
+
+
+def _worker(worker: WorkerStatus) -> Iterable[_Family]:
+    """Every question to the worker ends, and is counted here."""
+
+    def by(label: str, counts: Mapping[str, int]) -> tuple[Sample, ...]:
+        return tuple(({label: name}, float(count)) for name, count in counts.items())
+
+    age = () if worker.job_age_s is None else (({"kind": worker.job or ""}, worker.job_age_s),)
+    return (
+        _Family("coec_worker_jobs", "counter", "Jobs that have ended, by fate.", by("fate", worker.outcomes)),
+        _Family("coec_worker_losses", "counter", "Jobs without a result, by cause.", by("cause", worker.losses)),
+        _Family("coec_worker_faults", "counter", "Processes replaced, by cause.", by("cause", worker.faults)),
+        _Family("coec_worker_waiting", "gauge", "Jobs that wait, by kind.", by("kind", worker.waiting)),
+        _Family("coec_worker_job_age_seconds", "gauge", "Of what is with the worker.", age),
+    )
 
 
 def _diagnosis(health: Mapping[str, HealthReply]) -> Iterable[_Family]:

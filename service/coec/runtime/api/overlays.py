@@ -7,12 +7,12 @@ from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
 
 from coec.calibration.types import Matrix4, Reason
 from coec.errors import CoecError
-from coec.runtime.worker.messages import pack_pose
-from coec.runtime.worker.supervisor import Errand, Worker
+from coec.runtime.worker import jobs
+from coec.runtime.worker.jobs import Drawn, JobOutcome
+from coec.runtime.worker.supervisor import Worker
 
 KEPT = 4
 """Pictures, some hundred kB each."""
@@ -48,7 +48,7 @@ class Overlays:
                 self._kept.move_to_end(key)
                 return self._kept[key]
         drawn: Future[bytes | Reason] = Future()
-        self.request(path, T_camera_lidar, title, drawn.set_result)
+        self.request(path, T_camera_lidar, title, drawn.set_result, TIMEOUT_S)
         try:
             picture = drawn.result(TIMEOUT_S)
         except TimeoutError as error:
@@ -61,11 +61,22 @@ class Overlays:
                 self._kept.popitem(last=False)
         return picture
 
-    def request(self, path: Path, T_camera_lidar: Matrix4, title: str, done: Callable[[bytes | Reason], None]) -> None:
-        """The same without waiting: `done` is called with the picture, or with why there is none."""
+    def request(
+        self,
+        path: Path,
+        T_camera_lidar: Matrix4,
+        title: str,
+        done: Callable[[bytes | Reason], None],
+        deadline_s: float | None = None,
+    ) -> None:
+        """The same without waiting: `done` is called once with the picture, or with why there is none: in the worst
+        case after `deadline_s` that the worker was busy with something else (None: the default of pictures)."""
 
-        def answered(answer: dict[str, Any] | Reason) -> None:
-            done(answer if isinstance(answer, Reason) else bytes(answer["jpeg"]))
+        def ended(outcome: JobOutcome) -> None:
+            match outcome:
+                case JobOutcome(answer=Drawn(jpeg)):
+                    done(jpeg)
+                case JobOutcome(reason=Reason() as reason):
+                    done(reason)
 
-        body = {"path": str(path), "pose": pack_pose(T_camera_lidar), "title": title}
-        self._worker.run_errand(Errand("overlay", self._pair, body, answered))
+        self._worker.ask(jobs.overlay(self._pair, path, T_camera_lidar, title, ended, deadline_s))

@@ -31,6 +31,10 @@ TRANSFER_TIMEOUT_S = 10
 """Largest pause inside one transfer; the other end only has to read from its socket buffer."""
 
 
+class NoMessageError(Exception):
+    """What came over the wire is no message; the text says why."""
+
+
 class Link:
     """One end of the wire."""
 
@@ -61,22 +65,34 @@ class Link:
         """Whether a message, or the end of the stream, can be received within `timeout_s`."""
         return self._connection.poll(timeout_s)
 
-    def receive(self) -> dict[str, Any]:
-        """The next message; blocks until it is there.
+    def receive(self, max_bytes: int = MAX_MESSAGE_BYTES) -> dict[str, Any]:
+        """The next message, of at most `max_bytes`; blocks until it is there.
 
         Raises:
+            NoMessageError: what came is too large, not msgpack, or no map.
             OSError, EOFError: the other end is gone, or stopped in the middle of a message.
         """
-        unpacker = msgpack.Unpacker(max_buffer_size=MAX_MESSAGE_BYTES, max_bin_len=MAX_MESSAGE_BYTES)
-        while part := self._connection.recv_bytes(MAX_MESSAGE_BYTES):
+        unpacker = msgpack.Unpacker(max_buffer_size=max_bytes)
+        while part := self._part(max_bytes):
             try:
                 unpacker.feed(part)
             except msgpack.BufferFull:
-                raise OSError("the message is too large") from None
-        message = unpacker.unpack()
+                raise NoMessageError(f"it is larger than {max_bytes} bytes") from None
+        try:
+            message = unpacker.unpack()
+        except (ValueError, msgpack.UnpackException) as error:
+            raise NoMessageError(f"it is not msgpack ({type(error).__name__})") from error
         if not isinstance(message, dict):
-            raise OSError("the message is not a map")
+            raise NoMessageError("it is not a map")
         return message
+
+    def _part(self, max_bytes: int) -> bytes:
+        try:
+            return self._connection.recv_bytes(max_bytes)
+        except OSError:
+            if not self._connection.readable:  # which the library makes it when a part is too large
+                raise NoMessageError(f"it is larger than {max_bytes} bytes") from None
+            raise
 
     def close(self) -> None:
         """Close this end; the other end reads the end of the stream."""
@@ -99,7 +115,7 @@ def _parts(message: dict[str, Any]) -> Iterator[bytes]:
             for key, entry in value.items():
                 packer.pack(key)
                 yield from add(entry)
-        elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        elif isinstance(value, Sequence) and not isinstance(value, str | bytes | msgpack.ExtType):
             packer.pack_array_header(len(value))
             for entry in value:
                 yield from add(entry)

@@ -1,12 +1,9 @@
-"""A check of the monitor on its way to the worker and back: pairs as their frames, figures as plain values."""
+"""What a question to the worker carries, in values that msgpack knows: pairs as their frames, poses as rows."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, overload
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
+from typing import overload
 
 from coec.adapters.frames.msgpack_frames import (
     decode_camera,
@@ -16,10 +13,7 @@ from coec.adapters.frames.msgpack_frames import (
     encode_ego,
     encode_lidar,
 )
-from coec.calibration.commissioning.baseline import Drift
-from coec.calibration.monitor.change_detector import Observation
-from coec.calibration.monitor.sensor_faults import Cause
-from coec.calibration.types import FramePair, Matrix4, Metric
+from coec.calibration.types import FramePair, Matrix4
 from coec.config import LimitsConfig
 
 
@@ -68,50 +62,3 @@ def pack_pose(T: Matrix4) -> list[list[float]]:
     """A transform (4, 4) as rows."""
     rows: list[list[float]] = T.tolist()
     return rows
-
-
-def pack_observation(observation: Observation) -> dict[str, Any]:
-    """Every field in values that msgpack knows; doubles stay the same doubles."""
-    drift = observation.drift
-    return {
-        "stamp_ns": observation.stamp_ns,
-        "pair_stamps_ns": list(observation.pair_stamps_ns),
-        "metrics": [[m.name, float(m.value), float(m.limit), bool(m.at_least)] for m in observation.metrics],
-        "offset": _floats(observation.offset),
-        "sigma": _floats(observation.sigma),
-        "distance2": float(observation.distance2),
-        "flagged": bool(observation.flagged),
-        "weak": bool(observation.weak),
-        "flagged_by_paper": None if observation.flagged_by_paper is None else bool(observation.flagged_by_paper),
-        "causes": [[cause.code, cause.text] for cause in observation.causes],
-        "first_derivative": _floats(observation.first_derivative),
-        "second_derivative": _floats(observation.second_derivative),
-        "dirty": list(observation.dirty),
-        "textured": observation.textured,
-        "drift": None if drift is None else [_floats(drift.value), _floats(drift.sigma)],
-    }
-
-
-def unpack_observation(values: Mapping[str, Any]) -> Observation:
-    """The observation that `pack_observation` packed."""
-    return Observation(
-        stamp_ns=values["stamp_ns"],
-        pair_stamps_ns=tuple(values["pair_stamps_ns"]),
-        metrics=tuple(Metric(name, value, limit, at_least) for name, value, limit, at_least in values["metrics"]),
-        offset=np.array(values["offset"], dtype=np.float64),
-        sigma=np.array(values["sigma"], dtype=np.float64),
-        distance2=values["distance2"],
-        flagged=values["flagged"],
-        weak=values["weak"],
-        flagged_by_paper=values["flagged_by_paper"],
-        causes=tuple(Cause(code, text) for code, text in values["causes"]),
-        first_derivative=np.array(values["first_derivative"], dtype=np.float64),
-        second_derivative=np.array(values["second_derivative"], dtype=np.float64),
-        dirty=tuple(values["dirty"]),
-        textured=values["textured"],
-        drift=None if values["drift"] is None else Drift(*(np.array(v, dtype=np.float64) for v in values["drift"])),
-    )
-
-
-def _floats(values: NDArray[np.float64]) -> list[float]:
-    return [float(value) for value in values]

@@ -1,30 +1,31 @@
-"""The supervisor of the worker process: hands it one job at a time and replaces it when it crashes, hangs or grows.
+"""The supervisor of the worker process: hands it one job at a time and replaces it when it crashes, hangs, grows or
+says what nobody asked.
 
 The worker infers depth and solves windows in a process of its own, so that neither a fault in a network nor a long
-solve can reach the part that answers queries. Jobs wait here, in the service: a worker that dies takes at most the
-job it had with it, and that is tried again on the next one.
+solve can reach the part that answers queries. Jobs wait here, in the service (`queue`): a worker that dies takes at
+most the job it had with it, and whatever happens to it, every job has its outcome.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import subprocess
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import StrEnum
-from pathlib import Path
-from typing import Any, TypeVar
+from enum import IntEnum, StrEnum
+from typing import Any
 
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration.types import Reason
 from coec.config import WorkerConfig
-from coec.runtime.worker.link import Link
+from coec.runtime.worker.answers import MalformedAnswerError, number_of, read_answer
+from coec.runtime.worker.child import Child, ChildError, Fault
+from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, Kind, Prefetch
+from coec.runtime.worker.queue import WORKER_FAILED, InProgress, JobQueue, Ticket
 
 _log = logging.getLogger(__name__)
 
@@ -34,23 +35,9 @@ POLL_S = 0.1
 START_TIMEOUT_S = 300.0
 """A first start compiles every kernel: tens of seconds on a slow machine."""
 
-PREFETCHES_WAITING = 8
-"""Images that may wait for early inference, some MB each; beyond, the solve infers them itself."""
-
-BACKLOG = 64
-"""Unsolved windows of earlier runs that may wait."""
-
-CHECKS_WAITING, WINDOWS_WAITING = 4, 2
-"""Checks, and windows of this run, that may wait per pair. The service waits for answers before it asks more; these are
-for a worker that does not answer."""
-
-ERRANDS_WAITING = 8
-"""Pictures and commissionings that may wait."""
-
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.5, 30.0
-"""Pause before a worker that could not start is started again; doubles from the first to the last."""
-
-PACKAGE_ROOT = Path(__file__).resolve().parents[3]
+"""Pause before a worker that could not start is started again; doubles from the first to the last. One that started
+and ended without a single answer is started again after the first."""
 
 
 class WorkerState(StrEnum):
@@ -63,157 +50,72 @@ class WorkerState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class SolveJob:
-    """A finished window to calibrate. `live` is False for windows left over from an earlier run."""
-
-    pair: str
-    window_id: str
-    path: Path
-    live: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class Solved:
-    """What the worker made of a window: msgpack of a `CalibrationResult`, seconds, and whether the file has it too."""
-
-    job: SolveJob
-    result: bytes
-    elapsed_s: float
-    note: Reason | None
-
-
-@dataclass(frozen=True, slots=True)
 class WorkerStatus:
-    """How the worker is. `starts` counts processes, `failure` says why the last one was replaced."""
+    """How the worker is.
+
+    Attributes:
+        state: see there.
+        starts: processes so far, those that could not be started, too.
+        failure: why the last one was replaced.
+        rss_bytes: resident memory of the process when it was last looked at.
+        in_progress: what is with it.
+        waiting: jobs that wait, by kind; see `JobQueue.waiting`.
+        outcomes: jobs that have ended, by fate.
+        losses: jobs without a result by the code of their reason, and what else was lost; see `JobQueue.causes`.
+            `done_raised`: outcomes at which the asking side failed.
+        faults: processes replaced, by cause.
+    """
 
     state: WorkerState
     starts: int
     failure: Reason | None
-    window_id: str | None
-    waiting: int
     rss_bytes: int
-    prefetches_dropped: int
+    in_progress: InProgress | None
+    waiting: Mapping[str, int]
+    outcomes: Mapping[Fate, int]
+    losses: Mapping[str, int]
+    faults: Mapping[Fault, int]
 
 
-SUPERSEDED = Reason("superseded", "A newer window of the pair came before the worker was free.")
+class _Reached(IntEnum):
+    """How far a worker process came."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Errand:
-    """Work that is done once or not at all.
-
-    Attributes:
-        kind: `check`, `overlay` or `commission`, as `process` knows them.
-        pair: whose.
-        body: what the work needs, in values that msgpack knows.
-        done: called once, on the supervisor's thread or on the one that asked, with the worker's answer, or why there
-            is none.
-        timeout_s: after which the worker is replaced; None for that of a solve.
-    """
-
-    kind: str
-    pair: str
-    body: dict[str, Any]
-    done: Callable[[dict[str, Any] | Reason], None]
-    timeout_s: float | None = None
-
-
-CHECK = "check"
-"""The kind of a check of the monitor."""
-
-BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
-
-
-_Job = TypeVar("_Job", SolveJob, Errand)
-
-
-@dataclass(frozen=True, slots=True)
-class _Prefetch:
-    pair: str
-    frame: bytes
-
-
-class _ChildError(Exception):
-    """The worker process has to be replaced; the message says why."""
-
-
-class _Child:
-    """One worker process."""
-
-    def __init__(self, command: Sequence[str], config: WorkerConfig) -> None:
-        self.link, theirs = Link.pair()
-        with theirs:
-            self._process = subprocess.Popen(
-                [*command, str(theirs.fileno()), str(os.getpid())],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                env=_environment(config.threads),
-            )
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    def exit_text(self, wait_s: float = 0.0) -> str | None:
-        """How the process ended, or None while it lives; it gets `wait_s` to end."""
-        try:
-            code = self._process.wait(wait_s)
-        except subprocess.TimeoutExpired:
-            return None
-        return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-
-    def rss_bytes(self) -> int:
-        """Resident memory; 0 when the process is gone."""
-        with contextlib.suppress(OSError, IndexError, ValueError):
-            pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
-            return pages * os.sysconf("SC_PAGE_SIZE")
-        return 0
-
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.wait()
-        self.link.close()
+    NOTHING = 0
+    READY = 1
+    ANSWER = 2
 
 
 class Worker:
-    """Owns the worker process. `start()` and `stop()` are for the daemon, the rest may be called from any thread.
+    """Owns the worker process. `start` and `request_stop` are for the daemon, the rest may be called from any thread.
 
-    `on_solved` and `on_failed` are called on the supervisor's thread, one at a time.
-    Per pair only the newest live windows wait: an older one that has not been begun is given up, with a call of
-    `on_failed` whose reason is `superseded`.
+    Attributes:
+        thread: the supervisor's, on which most outcomes are told, one at a time.
     """
 
     def __init__(
         self,
         config: WorkerConfig,
         settings: str,
-        on_solved: Callable[[Solved], None],
-        on_failed: Callable[[SolveJob, Reason], None],
         command: Sequence[str] = (sys.executable, "-m", "coec.runtime.worker.process"),
     ) -> None:
         """`settings` is the JSON of the `Config`, handed to every process; `command` starts one, given two more
         arguments: the descriptor of its socket and the id of this process."""
         self._config = config
         self._settings = settings
-        self._on_solved = on_solved
-        self._on_failed = on_failed
         self._command = tuple(command)
         self._condition = threading.Condition()
-        self._live: deque[SolveJob] = deque()
-        self._backlog: deque[SolveJob] = deque()
-        self._prefetches: deque[_Prefetch] = deque(maxlen=PREFETCHES_WAITING)
-        self._checks: deque[Errand] = deque()
-        self._errands: deque[Errand] = deque()
-        self._check_was_fatal = False
-        self._attempts: dict[SolveJob, int] = {}
+        # Under the condition: the queue is everybody's.
+        self._queue = JobQueue(config.attempts)
+        # The supervisor's own, read by all.
         self._state = WorkerState.STARTING
         self._starts = 0
         self._failure: Reason | None = None
         self._unusable: Reason | None = None
-        self._window_id: str | None = None
+        self._was_ready = False
         self._rss_bytes = 0
         self._pid: int | None = None
-        self._prefetches_dropped = 0
+        self._faults: Counter[Fault] = Counter()
+        self._done_raised = 0
         self.thread = ServiceThread("worker-supervisor", self._supervise)
 
     def start(self) -> None:
@@ -221,55 +123,29 @@ class Worker:
         self.thread.start()
 
     def request_stop(self) -> None:
-        """Kill the process, whatever it does, and end the supervisor; windows not solved stay on the disk."""
+        """End the supervisor, which kills the process, whatever it does. All jobs are answered (`stopping`) when this
+        returns; windows not solved stay on the disk."""
         self.thread.request_stop()
-        with self._condition:
+        with self._held() as queue:
+            queue.stop(time.monotonic())
             self._condition.notify_all()
 
-    def solve(self, job: SolveJob) -> None:
-        """Queue a window."""
-        superseded = None
-        with self._condition:
-            if job.live:
-                if job not in self._live:
-                    superseded = _oldest(self._live, job.pair, WINDOWS_WAITING)
-                    self._live.append(job)
-            elif len(self._backlog) < BACKLOG:
-                self._backlog.append(job)
+    def ask(self, job: Job) -> None:
+        """Queue a job; `job.done` will be called once, perhaps before this returns."""
+        with self._held() as queue:
+            queue.ask(job, time.monotonic())
             self._condition.notify_all()
-        if superseded is not None:
-            self._on_failed(superseded, SUPERSEDED)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Queue the depth inference of a camera frame (native msgpack); only a head start, so it may be dropped."""
-        with self._condition:
-            if len(self._prefetches) == PREFETCHES_WAITING:
-                self._prefetches_dropped += 1
-            self._prefetches.append(_Prefetch(pair, frame))
+        with self._held() as queue:
+            queue.prefetch(Prefetch(pair, frame))
             self._condition.notify_all()
-
-    def check(self, errand: Errand) -> None:
-        """Queue a check of the monitor, in front of everything: it is short. Per pair only the newest wait."""
-        with self._condition:
-            superseded = _oldest(self._checks, errand.pair, CHECKS_WAITING)
-            self._checks.append(errand)
-            self._condition.notify_all()
-        if superseded is not None:
-            superseded.done(SUPERSEDED)
-
-    def run_errand(self, errand: Errand) -> None:
-        """Queue other work, behind the windows; when too much waits it is answered with `BUSY` at once."""
-        with self._condition:
-            full = len(self._errands) >= ERRANDS_WAITING
-            if not full:
-                self._errands.append(errand)
-            self._condition.notify_all()
-        if full:
-            errand.done(BUSY)
 
     @property
     def unusable(self) -> Reason | None:
-        """Why no worker can ever start with this configuration, as far as the first one said so (a bad model)."""
+        """Why no worker can ever start with this configuration, as far as one said so before any was ready (a bad
+        model)."""
         return self._unusable
 
     @property
@@ -279,211 +155,202 @@ class Worker:
 
     def status(self) -> WorkerStatus:
         """How the worker is."""
+        raised = {"done_raised": self._done_raised} if self._done_raised else {}
         with self._condition:
-            waiting = len(self._checks) + len(self._live) + len(self._backlog)
             return WorkerStatus(
                 self._state,
                 self._starts,
                 self._failure,
-                self._window_id,
-                waiting,
                 self._rss_bytes,
-                self._prefetches_dropped,
+                self._queue.in_progress(time.monotonic()),
+                self._queue.waiting,
+                self._queue.outcomes,
+                {**self._queue.causes, **raised},
+                dict(self._faults),
             )
+
+    # --- on any thread ----------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _held(self) -> Iterator[JobQueue]:
+        """The queue under its lock; what ends meanwhile is told afterwards, without it."""
+        with self._condition:
+            yield self._queue
+            ended = self._queue.drain()
+        for job, outcome in ended:
+            try:
+                job.done(outcome)
+            except Exception:
+                with self._condition:
+                    self._done_raised += 1
+                fields = {"kind": job.kind.value, "pair": job.pair, "subject": job.subject, "fate": outcome.fate.value}
+                _log.exception("the outcome of a job could not be taken", extra={"fields": fields})
 
     # --- on the supervisor's thread ---------------------------------------------------------------------------------
 
     def _supervise(self, thread: ServiceThread) -> None:
         backoff_s = FIRST_BACKOFF_S
-        while not thread.stopping:
-            self._state = WorkerState.STARTING
-            self._starts += 1
-            child = _Child(self._command, self._config)
-            self._pid = child.pid
-            ready = False
-            try:
-                self._await_ready(child)
-                ready = True
-                backoff_s = FIRST_BACKOFF_S
-                self._serve(child)
-            except (_ChildError, OSError, EOFError) as error:
-                self._note_failure(child, error)
-            finally:
-                self._pid = None
-                child.kill()
-            if not ready and not thread.stopping:
-                self._pause(backoff_s)
-                backoff_s = min(2 * backoff_s, LAST_BACKOFF_S)
-        self._state = WorkerState.STOPPED
-
-    def _await_ready(self, child: _Child) -> None:
-        child.link.send({"kind": "start", "settings": self._settings})
-        reply = self._reply(child, START_TIMEOUT_S)
-        if reply is None:
-            return
-        if reply.get("kind") == "unusable":
-            reason = Reason(str(reply["code"]), str(reply["text"]))
-            if self._starts == 1:
-                self._unusable = reason
-            raise _ChildError(reason.text)
-
-    def _serve(self, child: _Child) -> None:
-        while not self.thread.stopping:
-            job = self._next_job(child)
-            if job is None:
-                continue
-            self._state = WorkerState.BUSY
-            if isinstance(job, SolveJob):
-                self._solve(child, job)
-            elif isinstance(job, Errand):
-                self._run_errand(child, job)
-            else:
-                child.link.send({"kind": "prefetch", "pair": job.pair, "frame": job.frame})
-                self._reply(child, self._config.timeout_s)
-
-    def _solve(self, child: _Child, job: SolveJob) -> None:
-        self._window_id = job.window_id
-        self._attempts[job] = self._attempts.get(job, 0) + 1
-        started_s = time.monotonic()
         try:
-            child.link.send({"kind": "solve", "pair": job.pair, "path": str(job.path)})
-            reply = self._reply(child, self._config.timeout_s)
-        except (_ChildError, OSError, EOFError) as error:
-            self._after_death(job, child, error)
-            raise
+            while not thread.stopping:
+                reached = self._run_child()
+                if reached is not _Reached.NOTHING:
+                    backoff_s = FIRST_BACKOFF_S
+                if reached is not _Reached.ANSWER:
+                    self._pause(backoff_s)
+                if reached is _Reached.NOTHING:
+                    backoff_s = min(2 * backoff_s, LAST_BACKOFF_S)
         finally:
-            self._window_id = None
-        if reply is None:
-            return
-        del self._attempts[job]
-        if reply["kind"] == "solved":
-            note = Reason(*reply["note"]) if reply.get("note") else None
-            self._on_solved(Solved(job, reply["result"], time.monotonic() - started_s, note))
-        else:
-            self._on_failed(job, Reason(str(reply["code"]), str(reply["text"])))
+            self._state = WorkerState.STOPPED
+            with self._held() as queue:
+                queue.stop(time.monotonic())
 
-    def _run_errand(self, child: _Child, errand: Errand) -> None:
+    def _run_child(self) -> _Reached:
+        """One process from its start to its end."""
+        self._state = WorkerState.STARTING
+        self._starts += 1
         try:
-            child.link.send({**errand.body, "kind": errand.kind, "pair": errand.pair})
-            errand.body.clear()  # the frames of a check are 15 MB, and are not sent twice
-            reply = self._reply(child, errand.timeout_s or self._config.timeout_s)
-        except (_ChildError, OSError, EOFError) as error:
-            self._check_was_fatal |= errand.kind == CHECK
-            errand.done(Reason("worker_failed", f"The worker {_cause(child, error)}."))
-            raise
-        self._check_was_fatal &= errand.kind != CHECK
-        if reply is None:
-            errand.done(Reason("stopping", "The service is stopping."))
-        elif reply["kind"] == "refused":
-            errand.done(Reason(str(reply["code"]), str(reply["text"])))
-        else:
-            errand.done(reply)
+            child = Child(self._command, self._config)
+        except ChildError as error:
+            self._note_fault(error, None)
+            return _Reached.NOTHING
+        reached = _Reached.NOTHING
+        self._pid = child.pid
+        try:
+            self._await_ready(child)
+            reached = _Reached.READY
+            while not self.thread.stopping:
+                if self._take_turn(child):
+                    reached = _Reached.ANSWER
+        except ChildError as error:
+            self._note_fault(error, child.pid)
+            with self._held() as queue:
+                queue.died(str(error), time.monotonic())
+        finally:
+            self._pid = None
+            child.kill()
+        return reached
 
-    def _after_death(self, job: SolveJob, child: _Child, error: Exception) -> None:
-        """Put the window back in front, unless it has had its attempts or a newer one of its pair has come."""
-        attempts = self._attempts[job]
-        given_up = None
-        with self._condition:
-            if attempts >= self._config.attempts:
-                text = f"The worker failed on this window {attempts} times; the last one {_cause(child, error)}."
-                given_up = Reason("worker_failed", text)
-            elif not job.live:
-                self._backlog.appendleft(job)
-            elif sum(waiting.pair == job.pair for waiting in self._live) >= WINDOWS_WAITING:
-                given_up = SUPERSEDED
-            else:
-                self._live.appendleft(job)
-        if given_up is not None:
-            del self._attempts[job]
-            self._on_failed(job, given_up)
+    def _await_ready(self, child: Child) -> None:
+        child.send({"kind": "start", "settings": self._settings})
+        message = self._next_message(child, START_TIMEOUT_S)
+        match message:
+            case None:
+                return
+            case {"kind": "ready"}:
+                self._was_ready = True
+                return
+            case {"kind": "unusable", "code": str(code), "text": str(text)}:
+                if not self._was_ready:
+                    self._unusable = Reason(code, text)
+                raise ChildError(Fault.UNUSABLE, f"cannot work with this configuration: {text}")
+        raise ChildError(Fault.MALFORMED_ANSWER, "said something else than that it is ready")
 
-    def _next_job(self, child: _Child) -> SolveJob | Errand | _Prefetch | None:
-        """The next job, or None when there was none for a moment.
+    def _take_turn(self, child: Child) -> bool:
+        """Give the worker its next job, if there is one, once it is known to be well; whether it has answered one."""
+        self._look_after(child)
+        if child.has_spoken(0.0):
+            child.receive()  # its end, perhaps
+            raise ChildError(Fault.STRAY_ANSWER, "answered though nothing was asked")
+        ticket = self._take()
+        if ticket is None:
+            return False
+        kind = ticket.work.kind if isinstance(ticket.work, Job) else None
+        timeout_s = ticket.work.timeout_s if isinstance(ticket.work, Job) else None
+        self._send(child, ticket)
+        message = self._next_message(child, timeout_s or self._config.timeout_s)
+        if message is None:
+            return False
+        answer = _checked_answer(message, ticket.number, kind)
+        with self._held() as queue:
+            queue.answered(answer, time.monotonic())
+        return True
 
-        Raises:
-            _ChildError: the idle worker died or grew too large.
-        """
-        with self._condition:
-            job = self._take()
-            if job is None:
-                self._state = WorkerState.READY
+    def _take(self) -> Ticket | None:
+        """The next job, or None when there was none for a moment."""
+        with self._held() as queue:
+            ticket = queue.take(time.monotonic())
+            self._state = WorkerState.READY if ticket is None else WorkerState.BUSY
+            if ticket is None:
                 self._condition.wait(POLL_S)
-        self._check(child)
-        return job
+        return ticket
 
-    def _take(self) -> SolveJob | Errand | _Prefetch | None:
-        # Checks that kill must not keep every new worker from its windows.
-        if self._checks and not (self._check_was_fatal and self._live):
-            return self._checks.popleft()
-        if self._live:
-            return self._live.popleft()
-        if self._errands:
-            return self._errands.popleft()
-        if self._prefetches:
-            return self._prefetches.popleft()
-        return self._backlog.popleft() if self._backlog else None
+    def _send(self, child: Child, ticket: Ticket) -> None:
+        try:
+            child.send(_question(ticket))
+        except ChildError as error:
+            if error.fault is Fault.UNSENDABLE_JOB:
+                with self._held() as queue:
+                    queue.answered(Reason("unsendable", f"The worker {error}."), time.monotonic())
+            raise
+        if isinstance(ticket.work, Job) and ticket.work.kind is not Kind.SOLVE:
+            ticket.work.body.clear()  # the frames of a check are 15 MB, and are not sent twice
+        with self._held() as queue:
+            queue.sent(time.monotonic())
 
-    def _reply(self, child: _Child, timeout_s: float) -> dict[str, Any] | None:
+    def _next_message(self, child: Child, timeout_s: float) -> dict[str, Any] | None:
         """The worker's next message; None when a stop was requested meanwhile.
 
         Raises:
-            _ChildError: dead, too slow or too large.
+            ChildError: dead, too slow, too large, or not to be understood.
         """
         deadline_s = time.monotonic() + timeout_s
-        while not child.link.poll(POLL_S):
-            self._check(child)
+        while not child.has_spoken(POLL_S):
             if self.thread.stopping:
                 return None
+            self._look_after(child)
             if time.monotonic() > deadline_s:
-                raise _ChildError(f"gave no answer within {timeout_s:g} s")
-        return child.link.receive()
+                raise ChildError(Fault.TIMED_OUT, f"gave no answer within {timeout_s:g} s")
+        return child.receive()
 
-    def _check(self, child: _Child) -> None:
+    def _look_after(self, child: Child) -> None:
+        """What is done many times a second, whatever the worker does.
+
+        Raises:
+            ChildError: dead or too large.
+        """
+        self._keep_time()
+        self._rss_bytes = child.watch()
+
+    def _keep_time(self) -> None:
         self.thread.beat()
-        exit_text = child.exit_text()
-        if exit_text is not None:
-            raise _ChildError(exit_text)
-        self._rss_bytes = child.rss_bytes()
-        if self._rss_bytes > self._config.max_memory_bytes:
-            raise _ChildError(
-                f"used {self._rss_bytes >> 20} MiB of memory; worker.max_memory_bytes allows "
-                f"{self._config.max_memory_bytes >> 20} MiB"
-            )
+        with self._held() as queue:
+            queue.expire(time.monotonic())
 
-    def _note_failure(self, child: _Child, error: Exception) -> None:
+    def _note_fault(self, error: ChildError, pid: int | None) -> None:
         if self.thread.stopping:
             return
-        self._failure = Reason("worker_failed", f"The worker {_cause(child, error)} and is being replaced.")
-        _log.error(self._failure.text, extra={"fields": {"pid": child.pid, "starts": self._starts}})
+        with self._condition:
+            self._faults[error.fault] += 1
+        self._failure = Reason(WORKER_FAILED, f"The worker {error} and is being replaced.")
+        fields = {"pid": pid, "starts": self._starts, "fault": error.fault.value}
+        _log.error(self._failure.text, extra={"fields": fields})
 
     def _pause(self, seconds: float) -> None:
-        deadline_s = time.monotonic() + seconds
-        with self._condition:
-            while not self.thread.stopping and time.monotonic() < deadline_s:
-                self.thread.beat()
+        self._state = WorkerState.STARTING
+        end_s = time.monotonic() + seconds
+        while not self.thread.stopping and time.monotonic() < end_s:
+            self._keep_time()
+            with self._condition:
                 self._condition.wait(POLL_S)
 
 
-def _oldest(waiting: deque[_Job], pair: str, most: int) -> _Job | None:
-    """Takes out the oldest job of a pair if there are `most` of them."""
-    of_pair = [job for job in waiting if job.pair == pair]
-    if len(of_pair) < most:
-        return None
-    waiting.remove(of_pair[0])
-    return of_pair[0]
+def _question(ticket: Ticket) -> dict[str, Any]:
+    """What is sent to the worker."""
+    work = ticket.work
+    if isinstance(work, Prefetch):
+        return {"id": ticket.number, "kind": PREFETCH, "pair": work.pair, "frame": work.frame}
+    return {**work.body, "id": ticket.number, "kind": work.kind.value, "pair": work.pair}
 
 
-def _cause(child: _Child, error: Exception) -> str:
-    """What to say of a failed worker: its exit tells more than the broken pipe that it left."""
-    if isinstance(error, _ChildError):
-        return str(error)
-    return child.exit_text(wait_s=1.0) or f"broke the connection ({type(error).__name__})"
+def _checked_answer(message: Mapping[str, Any], number: int, kind: Kind | None) -> Answer | Reason | None:
+    """The answer to the question of this number and kind.
 
-
-def _environment(threads: int) -> dict[str, str]:
-    inherited = os.environ.get("PYTHONPATH")
-    path = os.pathsep.join([str(PACKAGE_ROOT), *([inherited] if inherited else [])])
-    limits = {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
-    # What is multiplied as matrices is (N, 3) by (3, 3): more threads only spin, for longer than the work takes.
-    limits["OPENBLAS_NUM_THREADS"] = "1"
-    return {**os.environ, **limits, "PYTHONPATH": path}
+    Raises:
+        ChildError: it is to another question, or not of the documented form.
+    """
+    try:
+        if number_of(message) != number:
+            raise ChildError(Fault.STRAY_ANSWER, "answered another question than it was asked")
+        return read_answer(message, kind)
+    except MalformedAnswerError as error:
+        raise ChildError(Fault.MALFORMED_ANSWER, f"gave a malformed answer: {error}") from error

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,10 +37,8 @@ from coec.config import Config, DepthConfig
 from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.cameras import scaled
 from coec.reports.overlay import draw
-from coec.runtime.worker.messages import pack_observation, unpack_pairs
-
-if TYPE_CHECKING:
-    from coec.schemas.replies import CalibrationResult
+from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Solved
+from coec.runtime.worker.messages import unpack_pairs
 
 _log = logging.getLogger(__name__)
 
@@ -56,14 +53,6 @@ WARM_UP_EVALUATIONS = 4
 """Of the searches of the warm-up."""
 
 OVERLAY_JPEG_QUALITY = 88
-
-
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """The result of a window; `note` says why the window file does not hold it, if it does not."""
-
-    result: CalibrationResult
-    note: Reason | None
 
 
 class Solver:
@@ -107,7 +96,7 @@ class Solver:
         """
         self._network(self._pairs[pair].calibration.depth).infer(decode_camera(frame, self._config.limits))
 
-    def solve(self, path: Path) -> Solution:
+    def solve(self, path: Path) -> Solved:
         """Calibrate a finished window by the configuration it carries, and write the result into its file.
 
         Raises:
@@ -124,14 +113,12 @@ class Solver:
         except (RecordingError, WindowError, OSError) as error:
             _log.warning("the result could not be written into its window", extra={"fields": {"window": path.stem}})
             code = error.reply_code if isinstance(error, CoecError) else "recording_failed"
-            return Solution(result, Reason(code, f"The window file does not hold the result: {error}"))
-        return Solution(result, None)
+            return Solved(result, Reason(code, f"The window file does not hold the result: {error}"))
+        return Solved(result, None)
 
-    def observe(
-        self, pair: str, pose: Sequence[Sequence[float]], frames: Sequence[Sequence[bytes | None]]
-    ) -> dict[str, Any]:
+    def observe(self, pair: str, pose: Sequence[Sequence[float]], frames: Sequence[Sequence[bytes | None]]) -> Checked:
         """A check of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs
-        them; and why the baseline of the rig was not used, if there is one.
+        them.
 
         Raises:
             CalibrationError, DecodeError, ModelError: there is no answer.
@@ -148,9 +135,9 @@ class Solver:
         images = CachedGreys(self._images, len(window.pairs))
         with DepthAhead(network, (each.camera for each in window.pairs)) as depth:
             observation = observe(window, depth, images, configuration, baseline)
-        return {**pack_observation(observation), "baseline_not_used": not_used}
+        return Checked(observation, not_used)
 
-    def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> bytes:
+    def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> Drawn:
         """JPEG of the points of a window's last pair on its image, at an extrinsic (rows of the (4, 4) matrix).
 
         Raises:
@@ -163,9 +150,10 @@ class Solver:
         xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
         image = decode_bgr(pair.camera.image, self._config.limits)
         T_camera_lidar = np.array(pose, dtype=np.float64)
-        return encode_jpeg(draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title), OVERLAY_JPEG_QUALITY)
+        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title)
+        return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
 
-    def commission(self, pair: str, pose: Sequence[Sequence[float]], paths: Sequence[Path]) -> dict[str, Any]:
+    def commission(self, pair: str, pose: Sequence[Sequence[float]], paths: Sequence[Path]) -> Commissioned:
         """Learn the baseline of a rig at an extrinsic (rows of the (4, 4) matrix) from recorded windows; write it.
 
         Raises:
@@ -185,8 +173,7 @@ class Solver:
             reference=start,
         )
         saved = save_baseline(self._config.state.directory / BASELINES, baseline)
-        told = {"windows": baseline.windows, "pairs": baseline.pairs, "hash": saved}
-        return {**told, "pose": baseline.T_camera_lidar.tolist()}
+        return Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
 
     def _baseline(self, pair: str, depth_identity: str) -> tuple[Baseline | None, str | None]:
         """What was learned of the rig, if it holds for this configuration and network; else why it does not."""

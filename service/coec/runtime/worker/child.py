@@ -1,0 +1,168 @@
+"""One worker process as the supervisor has it: started, watched, spoken to, ended. All its faults are `ChildError`s."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import subprocess
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from coec.config import WorkerConfig
+from coec.runtime.worker.link import Link, NoMessageError
+
+_log = logging.getLogger(__name__)
+
+PACKAGE_ROOT = Path(__file__).resolve().parents[3]
+
+MAX_ANSWER_BYTES = 2**26
+"""Largest answer: a picture has some MB, every other answer some kB."""
+
+LAST_WORDS_S = 1.0
+"""A process that has broken its connection gets so long to end, so that its exit can be told."""
+
+KILL_S = 5.0
+"""A killed process ends within milliseconds; one that waits for a broken disk may not, and is left behind."""
+
+
+class Fault(StrEnum):
+    """Why a worker process is replaced."""
+
+    NOT_STARTED = "not_started"
+    UNUSABLE = "unusable"
+    DIED = "died"
+    TIMED_OUT = "timed_out"
+    TOO_LARGE = "too_large"
+    DISCONNECTED = "disconnected"
+    STRAY_ANSWER = "stray_answer"
+    MALFORMED_ANSWER = "malformed_answer"
+    UNSENDABLE_JOB = "unsendable_job"
+
+
+class ChildError(Exception):
+    """The worker process has to be replaced. The message goes on where "The worker" begins."""
+
+    def __init__(self, fault: Fault, text: str) -> None:
+        super().__init__(text)
+        self.fault = fault
+
+
+class Child:
+    """One worker process. `kill` must be called in the end."""
+
+    def __init__(self, command: Sequence[str], config: WorkerConfig) -> None:
+        """Start it: `command`, and the descriptor of its socket and the id of this process as further arguments.
+
+        Raises:
+            ChildError: it cannot be started.
+        """
+        self._config = config
+        try:
+            self._link, theirs = Link.pair()
+        except OSError as error:
+            raise ChildError(Fault.NOT_STARTED, f"could not be started: there is no socket for it ({error})") from error
+        with theirs:
+            try:
+                self._process = subprocess.Popen(
+                    [*command, str(theirs.fileno()), str(os.getpid())],
+                    pass_fds=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    env=_environment(config.threads),
+                )
+            except (OSError, subprocess.SubprocessError) as error:
+                self._link.close()
+                raise ChildError(Fault.NOT_STARTED, f"could not be started ({error})") from error
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def watch(self) -> int:
+        """Its resident memory, bytes.
+
+        Raises:
+            ChildError: it has ended, or is too large.
+        """
+        if (exit_text := self._exit_text()) is not None:
+            raise ChildError(Fault.DIED, exit_text)
+        resident, allowed = self._resident_bytes(), self._config.max_memory_bytes
+        if resident > allowed:
+            text = f"used {resident >> 20} MiB of memory; worker.max_memory_bytes allows {allowed >> 20} MiB"
+            raise ChildError(Fault.TOO_LARGE, text)
+        return resident
+
+    def send(self, message: dict[str, Any]) -> None:
+        """Give it a message.
+
+        Raises:
+            ChildError: it has ended or does not read, or the message cannot be put into bytes.
+        """
+        try:
+            self._link.send(message)
+        except OSError as error:
+            raise self._broken(error) from error
+        except Exception as error:  # whatever a lazy sequence fails with: part of the message is with the worker
+            _log.exception("a message for the worker could not be packed")
+            text = f"could not be sent a message ({type(error).__name__}: {error})"
+            raise ChildError(Fault.UNSENDABLE_JOB, text) from error
+
+    def has_spoken(self, within_s: float) -> bool:
+        """Whether a message, or the end of the connection, can be received within this time."""
+        return self._link.poll(within_s)
+
+    def receive(self) -> dict[str, Any]:
+        """Its next message; to be called when it `has_spoken`.
+
+        Raises:
+            ChildError: it has ended, stopped in the middle, or what came is no message.
+        """
+        try:
+            return self._link.receive(MAX_ANSWER_BYTES)
+        except NoMessageError as error:
+            raise ChildError(Fault.MALFORMED_ANSWER, f"sent what is no message: {error}") from error
+        except (OSError, EOFError) as error:
+            raise self._broken(error) from error
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+        self._process.kill()
+        try:
+            self._process.wait(KILL_S)
+        except subprocess.TimeoutExpired:
+            _log.error("a killed worker does not end and is left behind", extra={"fields": {"pid": self.pid}})
+        self._link.close()
+
+    def _broken(self, error: Exception) -> ChildError:
+        """Its exit tells more than the broken pipe that it left."""
+        exit_text = self._exit_text(LAST_WORDS_S)
+        if exit_text is not None:
+            return ChildError(Fault.DIED, exit_text)
+        return ChildError(Fault.DISCONNECTED, f"broke the connection ({type(error).__name__})")
+
+    def _exit_text(self, wait_s: float = 0.0) -> str | None:
+        """How the process ended, or None while it lives."""
+        try:
+            code = self._process.wait(wait_s)
+        except subprocess.TimeoutExpired:
+            return None
+        return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
+
+    def _resident_bytes(self) -> int:
+        """0 when the process is gone."""
+        with contextlib.suppress(OSError, IndexError, ValueError):
+            pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
+            return pages * os.sysconf("SC_PAGE_SIZE")
+        return 0
+
+
+def _environment(threads: int) -> dict[str, str]:
+    inherited = os.environ.get("PYTHONPATH")
+    path = os.pathsep.join([str(PACKAGE_ROOT), *([inherited] if inherited else [])])
+    limits = {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
+    # What is multiplied as matrices is (N, 3) by (3, 3): more threads only spin, for longer than the work takes.
+    limits["OPENBLAS_NUM_THREADS"] = "1"
+    return {**os.environ, **limits, "PYTHONPATH": path}

@@ -1,0 +1,59 @@
+"""A question to the worker becomes work, and its end an answer: a window that cannot be solved is an answer, too."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from coec.calibration.types import Reason
+from coec.errors import CoecError
+from coec.runtime.worker import jobs
+from coec.runtime.worker.answers import pack_answer, pack_refusal
+from coec.runtime.worker.jobs import Answer, Kind
+from coec.runtime.worker.tasks import Solver
+
+_log = logging.getLogger(__name__)
+
+INTERNAL_ERROR = "internal_error"
+"""Code of an answer to work in which the program failed."""
+
+
+def answer(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
+    """The answer to one question, under its number. Of a window what is not a `CoecError` ends the process: the service
+    replaces it and tries again, within bounds."""
+    number = message["id"]
+    try:
+        end = solver.solve(Path(message["path"])) if message["kind"] == Kind.SOLVE else _errand(solver, message)
+    except CoecError as error:
+        end = Reason(error.reply_code, str(error))
+    return pack_refusal(number, end) if isinstance(end, Reason) else pack_answer(number, end)
+
+
+def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
+    """The answer to work that is done once or not at all. A fault of the program in it is an answer, too: checks come
+    every few seconds, and a worker that each of them ended would solve no window any more.
+
+    Raises:
+        CoecError: there is none.
+        MemoryError: this process has had its time.
+    """
+    try:
+        match message["kind"]:
+            case Kind.CHECK:
+                return solver.observe(message["pair"], message["pose"], message["frames"])
+            case Kind.OVERLAY:
+                return solver.overlay(Path(message["path"]), message["pose"], message["title"])
+            case Kind.COMMISSION:
+                paths = [Path(path) for path in message["paths"]]
+                return solver.commission(message["pair"], message["pose"], paths)
+            case jobs.PREFETCH:
+                solver.prefetch(message["pair"], message["frame"])
+                return None
+        raise ValueError(f"there is no work of the kind {message['kind']!r}")
+    except (CoecError, MemoryError):
+        raise
+    except Exception as error:
+        _log.exception("the work failed", extra={"fields": {"kind": message["kind"], "pair": message.get("pair")}})
+        text = f"The program failed ({type(error).__name__}: {error}); the log has the traceback."
+        return Reason(INTERNAL_ERROR, text)

@@ -1,0 +1,193 @@
+"""What the worker may be asked, and how a question ends: plain values that the asking side, the queue and the worker
+share.
+
+Every job ends in exactly one `JobOutcome`: a result, a failure with its reason, superseded by a newer one, or its
+deadline has passed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.types import FramePair, Matrix4, Reason
+from coec.runtime.worker.messages import pack_pairs, pack_pose
+
+if TYPE_CHECKING:
+    from coec.schemas.replies import CalibrationResult
+
+
+class Kind(StrEnum):
+    """What may be asked."""
+
+    SOLVE = "solve"
+    CHECK = "check"
+    OVERLAY = "overlay"
+    COMMISSION = "commission"
+
+
+PREFETCH = "prefetch"
+"""Kind of the messages that are no job, see `Prefetch`."""
+
+
+class Fate(StrEnum):
+    """How a question ends."""
+
+    RESULT = "result"
+    FAILED = "failed"
+    SUPERSEDED = "superseded"
+    LATE = "deadline_passed"
+
+
+DEADLINE_S = {Kind.SOLVE: 600.0, Kind.CHECK: 180.0, Kind.OVERLAY: 60.0, Kind.COMMISSION: 1800.0}
+"""From asking to the last moment of an answer, s. A live window: the two attempts of 120 s that `worker` allows by
+default, behind another window that has them, and two minutes for new processes. A check: the first start of a
+worker, which compiles its kernels for a minute and a half on two busy cores, twice over. A picture: six solves of 10 s.
+A commissioning: twice `COMMISSIONING_TIMEOUT_S`."""
+
+BACKLOG_DEADLINE_S = 86_400.0
+"""Of a window of an earlier run: it waits behind everything else, and is asked for again after the next start."""
+
+COMMISSIONING_TIMEOUT_S = 900.0
+"""Of the worker with a commissioning: it calibrates its eight windows many times over."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """A window was calibrated. `note` says why the window's file does not hold the result, if it does not."""
+
+    result: CalibrationResult
+    note: Reason | None
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """The monitor looked at some pairs. `baseline_not_used` says why it did without the rig's baseline, if there is
+    one."""
+
+    observation: Observation
+    baseline_not_used: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A picture, JPEG."""
+
+    jpeg: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Commissioned:
+    """A baseline was learned from so many windows and pairs and is on the disk; `pose` (4, 4) maps LiDAR to camera."""
+
+    pose: Matrix4
+    baseline_hash: str
+    windows: int
+    pairs: int
+
+
+Answer = Solved | Checked | Drawn | Commissioned
+
+ANSWERS: dict[Kind, type[Answer]] = {
+    Kind.SOLVE: Solved,
+    Kind.CHECK: Checked,
+    Kind.OVERLAY: Drawn,
+    Kind.COMMISSION: Commissioned,
+}
+"""What each kind is answered with."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JobOutcome:
+    """The end of a job.
+
+    Attributes:
+        fate: which.
+        answer: exactly when there is a result.
+        reason: why there is none, exactly when there is none.
+        elapsed_s: from asking, s.
+    """
+
+    fate: Fate
+    answer: Answer | None
+    reason: Reason | None
+    elapsed_s: float
+
+    def __post_init__(self) -> None:
+        """Raises:
+        ValueError: neither, or both, of an answer and a reason; or the wrong one.
+        """
+        if (self.answer is not None) is not (self.fate is Fate.RESULT) or (self.reason is None) is (
+            self.answer is None
+        ):
+            raise ValueError(f"an outcome with the fate {self.fate!r} has either an answer or a reason")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Job:
+    """One question to the worker. The functions below make them.
+
+    Attributes:
+        kind: what is asked.
+        pair: whose.
+        subject: id of a window, or a word, for logs and status.
+        body: what the work needs, in values that msgpack knows or lazy sequences of them; that of a job which is done
+            at most once is emptied when it has been sent.
+        done: called once, with no lock held, on the supervisor's thread or on the one that asks or stops.
+        live: False for a window left over from an earlier run.
+        deadline_s: from asking, after which the job is answered `LATE`; None for the default of its kind.
+        timeout_s: of the worker with this job, after which it is replaced; None for `worker.timeout_s`.
+    """
+
+    kind: Kind
+    pair: str
+    subject: str
+    body: dict[str, Any]
+    done: Callable[[JobOutcome], None]
+    live: bool = True
+    deadline_s: float | None = None
+    timeout_s: float | None = None
+
+    @property
+    def patience_s(self) -> float:
+        """How long the answer is waited for, s."""
+        if self.deadline_s is not None:
+            return self.deadline_s
+        return DEADLINE_S[self.kind] if self.live else BACKLOG_DEADLINE_S
+
+
+@dataclass(frozen=True, slots=True)
+class Prefetch:
+    """Depth inference of a camera frame (native msgpack): a head start that nobody waits for, and no job."""
+
+    pair: str
+    frame: bytes
+
+
+Done = Callable[[JobOutcome], None]
+
+
+def solve(pair: str, path: Path, window_id: str, done: Done, live: bool = True) -> Job:
+    """Calibrate a finished window's file and write the result into it; answered with `Solved`."""
+    return Job(Kind.SOLVE, pair, window_id, {"path": str(path)}, done, live)
+
+
+def check(pair: str, pose: Matrix4, pairs: Sequence[FramePair], done: Done) -> Job:
+    """Have the monitor look at pairs at an extrinsic (4, 4); answered with `Checked`."""
+    return Job(Kind.CHECK, pair, "check", {"pose": pack_pose(pose), "frames": pack_pairs(pairs)}, done)
+
+
+def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadline_s: float | None = None) -> Job:
+    """Draw the last pair of a window's file at an extrinsic (4, 4); answered with `Drawn`."""
+    body = {"path": str(path), "pose": pack_pose(pose), "title": title}
+    return Job(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
+
+
+def commission(pair: str, pose: Matrix4, paths: Sequence[Path], done: Done) -> Job:
+    """Learn the rig's baseline at an extrinsic (4, 4) from windows' files; answered with `Commissioned`."""
+    body = {"pose": pack_pose(pose), "paths": [str(path) for path in paths]}
+    return Job(Kind.COMMISSION, pair, "commissioning", body, done, timeout_s=COMMISSIONING_TIMEOUT_S)

@@ -1,0 +1,305 @@
+"""What waits for the worker, and how each of it ends: a state machine without a thread, a process or a clock.
+
+Every job that comes in goes out exactly once, with its outcome. Waiting room is bounded per pair, so that pairs do not
+push each other out: of checks and of live windows the newest stay, of the rest the oldest.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from coec.calibration.types import Reason
+from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, JobOutcome, Kind, Prefetch
+
+
+class Lane(Enum):
+    """Where a job waits."""
+
+    CHECK = "check"
+    LIVE = "live"
+    ERRAND = "errand"
+    BACKLOG = "backlog"
+
+
+WAITING = {Lane.CHECK: 4, Lane.LIVE: 2, Lane.ERRAND: 8, Lane.BACKLOG: 64}
+"""Jobs that may wait, per pair: checks and windows of this run (the service waits for answers before it asks more;
+these are for a worker that does not answer), pictures and commissionings, unsolved windows of earlier runs."""
+
+SUPERSEDING = frozenset({Lane.CHECK, Lane.LIVE})
+"""Where the newest is worth most."""
+
+PREFETCHES_WAITING = 8
+"""Images that may wait for early inference, some MB each; beyond, the solve infers them itself."""
+
+SUPERSEDED = Reason("superseded", "A newer one of the pair came before the worker was free.")
+BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
+STOPPING = Reason("stopping", "The service is stopping.")
+
+WORKER_FAILED = "worker_failed"
+"""Code of the reason when the worker failed on a job."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ticket:
+    """What the worker is to do next, under a number that no other has had."""
+
+    number: int
+    work: Job | Prefetch
+
+
+@dataclass(frozen=True, slots=True)
+class InProgress:
+    """What is with the worker, and for how long, s; `kind` is a kind of job or `prefetch`."""
+
+    kind: str
+    pair: str
+    subject: str
+    age_s: float
+
+
+@dataclass(slots=True, eq=False)
+class _Entry:
+    """A job on its way. `attempts`: times that it was with a worker; `returned`: it could not be sent once."""
+
+    job: Job
+    asked_s: float
+    attempts: int = 0
+    returned: bool = False
+    settled: bool = False
+
+    @property
+    def deadline_s(self) -> float:
+        return self.asked_s + self.job.patience_s
+
+
+@dataclass(slots=True, eq=False)
+class _InHand:
+    work: _Entry | Prefetch
+    taken_s: float
+    sent: bool = False
+
+
+class JobQueue:
+    """The jobs that wait and the one that is with the worker. Not for several threads at once; times are of one steady
+    clock, s. What has ended lies in the outbox until `drain`."""
+
+    def __init__(self, attempts: int) -> None:
+        """`attempts`: workers that may fail on one window before it is given up."""
+        self._attempts = attempts
+        self._lanes: dict[Lane, deque[_Entry]] = {lane: deque() for lane in Lane}
+        self._prefetches: deque[Prefetch] = deque()
+        self._in_hand: _InHand | None = None
+        self._outbox: list[tuple[Job, JobOutcome]] = []
+        self._number = 0
+        self._check_was_fatal = False
+        self._stopped = False
+        self._outcomes: Counter[Fate] = Counter()
+        self._causes: Counter[str] = Counter()
+
+    # --- from those who ask -----------------------------------------------------------------------------------------
+
+    def ask(self, job: Job, now_s: float) -> None:
+        """A job comes in."""
+        entry = _Entry(job, now_s)
+        if self._stopped:
+            self._end(entry, Fate.FAILED, STOPPING, now_s)
+            return
+        lane = _lane_of(job)
+        if self._is_full(lane, job.pair):
+            if lane not in SUPERSEDING:
+                self._end(entry, Fate.FAILED, BUSY, now_s)
+                return
+            oldest = next(each for each in self._lanes[lane] if each.job.pair == job.pair)
+            self._lanes[lane].remove(oldest)
+            self._end(oldest, Fate.SUPERSEDED, SUPERSEDED, now_s)
+        self._lanes[lane].append(entry)
+
+    def prefetch(self, prefetch: Prefetch) -> None:
+        """An image comes in; the oldest makes room for it."""
+        if self._stopped:
+            return
+        if len(self._prefetches) == PREFETCHES_WAITING:
+            self._prefetches.popleft()
+            self._causes["prefetch_dropped"] += 1
+        self._prefetches.append(prefetch)
+
+    # --- from the worker's side -------------------------------------------------------------------------------------
+
+    def take(self, now_s: float) -> Ticket | None:
+        """What is to be done next, if anything waits; it is in hand until it is `answered` or the worker `died`.
+
+        Raises:
+            ValueError: there is something in hand already.
+        """
+        if self._in_hand is not None:
+            raise ValueError("the worker has something to do")
+        self.expire(now_s)
+        work = self._next()
+        if work is None:
+            return None
+        self._number += 1
+        self._in_hand = _InHand(work, now_s)
+        return Ticket(self._number, work.job if isinstance(work, _Entry) else work)
+
+    def sent(self, now_s: float) -> None:
+        """The worker has what is in hand: it counts as begun from now on."""
+        hand = self._hand()
+        hand.sent, hand.taken_s = True, now_s
+        if isinstance(hand.work, _Entry):
+            hand.work.attempts += 1
+
+    def answered(self, answer: Answer | Reason | None, now_s: float) -> None:
+        """What is in hand has come to an end: with an answer, or with the reason why there is none. None is the
+        answer to a prefetch, which nobody waits for."""
+        work = self._hand().work
+        self._in_hand = None
+        if isinstance(work, Prefetch):
+            self._causes["prefetch_refused"] += isinstance(answer, Reason)
+            return
+        if answer is None:
+            raise ValueError("a job is answered with something")
+        self._check_was_fatal &= work.job.kind is not Kind.CHECK
+        if work.settled:
+            self._causes["late_answer"] += 1
+        else:
+            self._end(work, Fate.FAILED if isinstance(answer, Reason) else Fate.RESULT, answer, now_s)
+
+    def died(self, why: str, now_s: float) -> None:
+        """The worker is being replaced because it `why` (a verb and what follows). What was in hand and had not reached
+        it goes back in front; of what had, a window does until it has had its attempts, other work is done once or not
+        at all."""
+        hand, self._in_hand = self._in_hand, None
+        if hand is None or isinstance(hand.work, Prefetch):
+            return
+        entry, kind = hand.work, hand.work.job.kind
+        self._check_was_fatal |= hand.sent and kind is Kind.CHECK
+        if entry.settled:
+            return
+        reason = Reason(WORKER_FAILED, f"The worker {why}.")
+        if kind is Kind.SOLVE:
+            again = not hand.sent or entry.attempts < self._attempts
+            if entry.attempts > 1:
+                text = f"The worker failed on this window {entry.attempts} times; the last one {why}."
+                reason = Reason(WORKER_FAILED, text)
+        else:
+            again, entry.returned = not hand.sent and not entry.returned, True
+        if again:
+            self._put_back(entry, reason, now_s)
+        else:
+            self._end(entry, Fate.FAILED, reason, now_s)
+
+    # --- from both --------------------------------------------------------------------------------------------------
+
+    def expire(self, now_s: float) -> None:
+        """Time has passed: jobs whose deadline has come are answered. One that is with the worker stays in hand."""
+        for waiting in self._lanes.values():
+            for entry in [each for each in waiting if each.deadline_s <= now_s]:
+                waiting.remove(entry)
+                self._end_late(entry, now_s)
+        entry_in_hand = self._in_hand.work if self._in_hand else None
+        if isinstance(entry_in_hand, _Entry) and not entry_in_hand.settled and entry_in_hand.deadline_s <= now_s:
+            self._end_late(entry_in_hand, now_s)
+
+    def stop(self, now_s: float) -> None:
+        """Nothing is done any more: whatever waits or is in hand is answered so, and whatever comes in."""
+        self._stopped = True
+        self._prefetches.clear()
+        for waiting in self._lanes.values():
+            while waiting:
+                self._end(waiting.popleft(), Fate.FAILED, STOPPING, now_s)
+        entry = self._in_hand.work if self._in_hand else None
+        if isinstance(entry, _Entry) and not entry.settled:
+            self._end(entry, Fate.FAILED, STOPPING, now_s)
+
+    def drain(self) -> list[tuple[Job, JobOutcome]]:
+        """Takes out what has ended since the last call, in order."""
+        ended, self._outbox = self._outbox, []
+        return ended
+
+    # --- figures ----------------------------------------------------------------------------------------------------
+
+    @property
+    def outcomes(self) -> Mapping[Fate, int]:
+        """Jobs that have ended, by how they did."""
+        return dict(self._outcomes)
+
+    @property
+    def causes(self) -> Mapping[str, int]:
+        """Jobs without a result by the code of their reason; `prefetch_dropped` and `prefetch_refused`: images that
+        were not inferred ahead; `late_answer`: answers that came after the job's deadline."""
+        return {cause: count for cause, count in self._causes.items() if count}
+
+    @property
+    def waiting(self) -> Mapping[str, int]:
+        """Jobs that wait by kind, `backlog` for windows of an earlier run."""
+        names = (
+            "backlog" if lane is Lane.BACKLOG else entry.job.kind.value
+            for lane, entries in self._lanes.items()
+            for entry in entries
+        )
+        return dict(Counter(names))
+
+    def in_progress(self, now_s: float) -> InProgress | None:
+        """What is in hand."""
+        if self._in_hand is None:
+            return None
+        work, age_s = self._in_hand.work, now_s - self._in_hand.taken_s
+        if isinstance(work, Prefetch):
+            return InProgress(PREFETCH, work.pair, PREFETCH, age_s)
+        return InProgress(work.job.kind.value, work.job.pair, work.job.subject, age_s)
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    def _next(self) -> _Entry | Prefetch | None:
+        checks, live = self._lanes[Lane.CHECK], self._lanes[Lane.LIVE]
+        # Checks that kill must not keep every new worker from its windows.
+        if checks and not (self._check_was_fatal and live):
+            return checks.popleft()
+        for waiting in (live, self._lanes[Lane.ERRAND], self._prefetches, self._lanes[Lane.BACKLOG]):
+            if waiting:
+                return waiting.popleft()
+        return None
+
+    def _hand(self) -> _InHand:
+        if self._in_hand is None:
+            raise ValueError("nothing is with the worker")
+        return self._in_hand
+
+    def _is_full(self, lane: Lane, pair: str) -> bool:
+        return sum(entry.job.pair == pair for entry in self._lanes[lane]) >= WAITING[lane]
+
+    def _put_back(self, entry: _Entry, reason: Reason, now_s: float) -> None:
+        """In front, where it came from; unless newer ones of its pair have taken the room."""
+        lane = _lane_of(entry.job)
+        if not self._is_full(lane, entry.job.pair):
+            self._lanes[lane].appendleft(entry)
+        elif lane in SUPERSEDING:
+            self._end(entry, Fate.SUPERSEDED, SUPERSEDED, now_s)
+        else:
+            self._end(entry, Fate.FAILED, reason, now_s)
+
+    def _end_late(self, entry: _Entry, now_s: float) -> None:
+        text = f"The worker had no answer within {entry.job.patience_s:g} s of the question."
+        self._end(entry, Fate.LATE, Reason("deadline_passed", text), now_s)
+
+    def _end(self, entry: _Entry, fate: Fate, end: Answer | Reason, now_s: float) -> None:
+        entry.settled = True
+        reason = end if isinstance(end, Reason) else None
+        answer = None if isinstance(end, Reason) else end
+        self._outcomes[fate] += 1
+        if reason is not None:
+            self._causes[reason.code] += 1
+        self._outbox.append((entry.job, JobOutcome(fate, answer, reason, now_s - entry.asked_s)))
+
+
+def _lane_of(job: Job) -> Lane:
+    match job.kind:
+        case Kind.CHECK:
+            return Lane.CHECK
+        case Kind.SOLVE:
+            return Lane.LIVE if job.live else Lane.BACKLOG
+        case Kind.OVERLAY | Kind.COMMISSION:
+            return Lane.ERRAND

@@ -1,0 +1,320 @@
+"""A pair without threads, driven pair by pair, with a worker that knows the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from coec.adapters.files.conversions import result_of
+from coec.adapters.files.rig import rig_of
+from coec.adapters.system.logs import LossCounter
+from coec.calibration.frames.window import SliceEnded
+from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.calibration.types import (
+    CameraFrame,
+    EgoMotion,
+    EncodedImage,
+    Estimate,
+    FramePair,
+    ImageFormat,
+    LidarFrame,
+    Matrix4,
+    Reason,
+)
+from coec.config import CalibrationConfig, Config, LimitsConfig
+from coec.geometry import se3
+from coec.runtime import pair as runtime_pair
+from coec.runtime.decisions.pair_store import PairStore
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.ingest.inbox import Call
+from coec.runtime.outside import Outside
+from coec.runtime.pair import Pair
+from coec.runtime.recording.recorder import RecordingPlan
+from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutcome, Kind, Solved
+from coec.runtime.worker.messages import unpack_pairs
+from coec.runtime.worker.supervisor import Worker
+from coec.schemas.keys import Keys
+from coec.schemas.replies import HistoryEntry
+from estimates import estimate
+
+S = 1_000_000_000
+BEGIN_S = 1_000_000
+STEP_S = BEGIN_S + 100
+"""When the mount moves."""
+
+END_S = STEP_S + 100
+
+NOMINAL = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+BEFORE = se3.perturb(NOMINAL, np.radians([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+AFTER = se3.perturb(NOMINAL, np.radians([0.1, 1.0, 0.0, 0.0, 0.0, 0.0]))
+WIDTH, HEIGHT = 16, 12
+
+
+def truth(stamp_ns: int) -> Matrix4:
+    return BEFORE if stamp_ns < STEP_S * S else AFTER
+
+
+def configuration(folder: Path, apply: str = "within_limits") -> Config:
+    pair = {
+        "name": "front",
+        "camera": {
+            "key": "in/camera",
+            "intrinsics": {
+                "model": "pinhole",
+                "width": WIDTH,
+                "height": HEIGHT,
+                "fx": 8.0,
+                "fy": 8.0,
+                "cx": 7.5,
+                "cy": 5.5,
+            },
+        },
+        "lidar": {"key": "in/lidar"},
+        "ego": {"key": "in/ego"},
+        "T_camera_lidar": NOMINAL.tolist(),
+        "window": {
+            "pairs": 10,
+            "min_pairs": 5,
+            "slice_s": 40.0,
+            "min_sharpness": 0.0,
+            "min_mean_level": 0.0,
+            "max_clipped": 1.0,
+            "min_points_in_view": 1,
+        },
+        "monitor": {"period_s": 5.0, "pairs": 5, "min_pairs": 4, "urgent_slice_s": 10.0},
+        "policy": {"apply": apply},
+        "calibration": {"depth": {"model": "stereo"}},
+    }
+    return Config.model_validate(
+        {"vehicle": "test", "state": {"directory": str(folder), "min_free_bytes": 0}, "pairs": [pair]}
+    )
+
+
+def pair_at(stamp_ns: int, speed_mps: float = 5.0) -> FramePair:
+    rng = np.random.default_rng(stamp_ns % (2**32))
+    image = EncodedImage(ImageFormat.MONO8, WIDTH, HEIGHT, rng.bytes(WIDTH * HEIGHT))
+    cloud = np.array([[10.0, 0.0, 0.0], [20.0, 1.0, 0.5]], dtype=np.float32)
+    motion = EgoMotion(stamp_ns, "ego", (speed_mps, 0.0, 0.0), (0.0, 0.0, 0.0))
+    return FramePair(CameraFrame(stamp_ns, "camera", image), LidarFrame(stamp_ns, "lidar", cloud), motion)
+
+
+RIG = rig_of(configuration(Path("state")).pairs[0])
+
+
+@dataclass
+class KnowingWorker:
+    """Answers at once, and rightly."""
+
+    cause: str | None = None
+    baseline_not_used: str | None = None
+    fault: Reason | None = None
+    window_fault: Reason | None = None
+    bias: Matrix4 = field(default_factory=lambda: np.eye(4))
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+
+    def ask(self, job: Job) -> None:
+        ways: dict[Kind, Callable[[Job], Answer]] = {
+            Kind.CHECK: self._check,
+            Kind.SOLVE: self._solve,
+            Kind.OVERLAY: self._draw,
+        }
+        answer = ways.get(job.kind)
+        fault = self.fault if job.kind is Kind.CHECK else self.window_fault if job.kind is Kind.SOLVE else None
+        if fault is not None or answer is None:
+            job.done(JobOutcome(Fate.FAILED, None, fault or Reason("no", "not here"), 0.1))
+        else:
+            job.done(JobOutcome(Fate.RESULT, answer(job), None, 0.1))
+
+    def prefetch(self, pair: str, frame: bytes) -> None:
+        """Nothing is inferred."""
+
+    def _check(self, job: Job) -> Checked:
+        pairs = unpack_pairs(job.body["frames"], LimitsConfig())
+        wrong = [se3.difference(np.array(job.body["pose"]), truth(pair.stamp_ns)) for pair in pairs]
+        offset = np.mean(wrong, axis=0)
+        observation = Observation(
+            stamp_ns=pairs[-1].stamp_ns,
+            pair_stamps_ns=tuple(pair.stamp_ns for pair in pairs),
+            metrics=(),
+            offset=offset,
+            sigma=np.full(6, 1e-3),
+            distance2=float(np.abs(offset).max() / 0.005),
+            flagged=bool(np.abs(offset).max() > 0.005),
+            weak=False,
+            flagged_by_paper=None,
+            causes=() if self.cause is None else (CAUSES[self.cause],),
+        )
+        return Checked(observation, self.baseline_not_used)
+
+    def _draw(self, job: Job) -> Drawn:
+        return Drawn(b"jpeg " + job.subject.encode())
+
+    def _solve(self, job: Job) -> Solved:
+        return Solved(result_of(self.estimates[job.subject], RIG, "test"), None)
+
+
+@dataclass
+class SlowWorker(KnowingWorker):
+    """Answers in its own time, and out of order: some of what waits, whenever it is let."""
+
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    waiting: list[Job] = field(default_factory=list)
+
+    def ask(self, job: Job) -> None:
+        self.waiting.append(job)
+
+    def work(self, share: float) -> None:
+        """Answer this share of the questions that wait."""
+        for job in [one for one in self.waiting if self.rng.random() < share]:
+            self.waiting.remove(job)
+            super().ask(job)
+
+
+class InstantRecorder:
+    """Tells the worker what is in a window, the moment it ends: the truth of its pairs, or what lies between two."""
+
+    worker: KnowingWorker
+
+    def __init__(
+        self,
+        plan: RecordingPlan,
+        folder: WindowFolder,
+        losses: LossCounter,
+        on_recorded: Callable[[str, Path, bool], None],
+        on_lost: Callable[[str], None],
+    ) -> None:
+        del losses
+        self.configuration = plan.configuration
+        self.trouble = None
+        self.has_room = True
+        self.recorded = 0
+        self.loses = False
+        self.latest: Path | None = None
+        self._folder = folder
+        self._on_recorded = on_recorded
+        self._on_lost = on_lost
+        self._stamps: list[int] = []
+
+    def use(self, configuration: CalibrationConfig) -> None:
+        self.configuration = configuration
+
+    def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
+        del window_id, T_camera_lidar
+        self._stamps.append(pair.stamp_ns)
+
+    def end(self, ended: SliceEnded) -> None:
+        stamps, self._stamps = self._stamps, []
+        if not ended.complete:
+            return
+        if self.loses:
+            self._on_lost(ended.window_id)
+            return
+        self.recorded += 1
+        self.latest = self._folder.path(ended.window_id)
+        self.latest.touch()
+        moved = np.mean([se3.difference(truth(stamp), NOMINAL) for stamp in stamps], axis=0)
+        pose = se3.perturb(NOMINAL, moved) @ self.worker.bias
+        made = estimate(1)
+        self.worker.estimates[ended.window_id] = replace(
+            made,
+            window_id=ended.window_id,
+            data_stamp_ns=stamps[-1],
+            optimum=replace(made.optimum, T_camera_lidar=pose),
+            correction=se3.difference(pose, NOMINAL),
+            sigma=np.array([5e-4] * 3 + [np.nan] * 3),
+        )
+        self._on_recorded(ended.window_id, self.latest, True)
+
+
+class Bench:
+    """A pair without threads, driven pair by pair; `restart` replaces it by one that reads the same folder."""
+
+    def __init__(self, folder: Path, apply: str = "within_limits", worker: type[KnowingWorker] = KnowingWorker) -> None:
+        self.config = configuration(folder, apply)
+        self.kind = worker
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self.restart()
+
+    def restart(self) -> None:
+        windows = WindowFolder(self.folder / "windows", self.config.state)
+        self.worker = self.kind()
+        store = StateStore(self.folder, "test")
+        self.published: list[str] = []
+        outside = Outside(
+            Keys("coec", "test"),
+            store,
+            windows,
+            cast("Worker", self.worker),
+            lambda key, _: self.published.append(key),
+            lambda: (),
+        )
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(runtime_pair, "Recorder", InstantRecorder)
+            self.pair = Pair(self.config.pairs[0], self.config, outside)
+        self.recorder.worker = self.worker
+        self.answers = self.pair.answers
+
+    @property
+    def recorder(self) -> InstantRecorder:
+        return cast("InstantRecorder", self.pair.recorder)
+
+    @property
+    def store(self) -> PairStore:
+        return self.answers._store
+
+    @property
+    def losses(self) -> dict[tuple[str, str], int]:
+        return self.answers._losses.snapshot()
+
+    def drive(self, begin_s: int, end_s: int, speed_mps: float = 5.0) -> None:
+        for stamp_ns in range(begin_s * S, end_s * S, S // 2):
+            self.pair.stream.take([pair_at(stamp_ns, speed_mps)])
+            self.settle()
+        if isinstance(self.worker, SlowWorker):
+            self.worker.work(share=1.0)
+            self.settle()
+
+    def settle(self) -> None:
+        """What the threads of the pair do until there is nothing more that they may do."""
+        going = True
+        while going:
+            going = False
+            while isinstance(item := self.pair.stream.inbox.take(0.0), Call):
+                item.run()
+                going = True
+            going |= self.pair.stream.choose_next()
+            self.pair.stream.tell()
+            going |= self.pair.decider.work(0.0)
+        if isinstance(self.worker, SlowWorker):
+            self.worker.work(share=0.05)
+
+    def do(self, name: str, **arguments: Any) -> str:
+        with ThreadPoolExecutor(1) as other:
+            told = other.submit(self.pair.command, name, arguments, "the test")
+            while not told.done():
+                self.settle()
+        self.settle()
+        return told.result().code
+
+    @property
+    def pose(self) -> Matrix4:
+        return self.store.state.T_camera_lidar
+
+    @property
+    def health(self) -> str:
+        return self.store.state.health.value
+
+    def entries(self, *kinds: str) -> list[HistoryEntry]:
+        return [kept.entry for kept in self.store.history.entries() if kept.entry.kind in kinds]
+
+    def decisions(self) -> list[tuple[str, str]]:
+        return [(entry.kind, entry.code) for entry in self.entries("state", "extrinsic")]

@@ -1,0 +1,113 @@
+"""Commands do what they answer: each in each state, whole or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from baselines import a_baseline
+from coec.adapters.files.baseline_file import save_baseline
+from coec.calibration.commissioning.baseline import learned_hash
+from coec.geometry import se3
+from coec.runtime.api import commands
+from pair_bench import BEGIN_S, END_S, STEP_S, Bench
+
+
+def test_a_roll_back_on_a_commissioned_rig_serves_what_was_served_to_the_byte(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "state")
+    made = a_baseline()
+    bias = np.radians([0.3, -0.2, 0.1, np.nan, np.nan, np.nan])
+    commissioned = replace(
+        made,
+        config_hash=learned_hash(bench.config.pairs[0].calibration),
+        depth_identity="precomputed",
+        rotation=replace(made.rotation, bias=bias),
+    )
+    save_baseline(bench.folder / "rig.json", commissioned)
+    bench.restart()
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    first = bench.pose.copy()
+    raw = bench.answers.history(0, 2**63 - 1, 10).results[0]
+    off = se3.difference(first, np.array(raw.camera_from_lidar.matrix))
+    assert np.abs(off[:3]).max() > np.radians(0.2), "the estimator's bias was taken out of what is served"
+    bench.drive(STEP_S, END_S)
+    assert not np.array_equal(bench.pose, first)
+    assert bench.do("rollback", to=raw.window_id) == "rolled_back"
+    assert bench.pose.tobytes() == first.tobytes()
+
+
+ORDERS: list[tuple[str, dict[str, Any]]] = [
+    ("calibrate", {}),
+    ("apply", {}),
+    ("rollback", {}),
+    ("reset", {}),
+    ("commission", {}),
+    ("hold", {}),
+    ("hold", {"release": True}),
+]
+ANSWERS = {
+    # What is answered to these, in this order, by what the pair has been through.
+    "nothing": ["too_few_pairs", "nothing_pending", "not_found", "reset", "too_few_windows", "held", "released"],
+    "healthy": ["window_again", "nothing_pending", "not_found", "reset", "commissioning", "held", "released"],
+    "suspect": ["window_again", "nothing_pending", "not_found", "reset", "commissioning", "held", "released"],
+    "corrected": ["window_finished", "nothing_pending", "rolled_back", "reset", "commissioning", "held", "released"],
+    "pending": ["window_finished", "applied", "not_found", "reset", "commissioning", "held", "released"],
+    "held": ["window_finished", "held", "held", "held", "commissioning", "held", "released"],
+    "degraded": ["window_again", "nothing_pending", "not_found", "reset", "commissioning", "held", "released"],
+}
+
+
+def brought_to(situation: str, folder: Path) -> Bench:
+    bench = Bench(folder, apply="never" if situation == "pending" else "within_limits")
+    if situation != "nothing":
+        bench.drive(BEGIN_S, BEGIN_S + 43)
+    if situation == "suspect":
+        bench.drive(STEP_S, STEP_S + 11)
+    if situation in ("corrected", "held", "pending"):
+        bench.drive(BEGIN_S + 43, END_S)
+    if situation == "held":
+        bench.do("hold")
+    if situation == "degraded":
+        bench.worker.cause = "dark"
+        bench.drive(BEGIN_S + 43, BEGIN_S + 56)
+        bench.worker.cause = None
+    return bench
+
+
+@pytest.mark.parametrize("order", range(len(ORDERS)), ids=lambda i: f"{ORDERS[i][0]}-{i}")
+@pytest.mark.parametrize("situation", list(ANSWERS))
+def test_each_command_in_each_state(tmp_path: Path, situation: str, order: int) -> None:
+    bench = brought_to(situation, tmp_path / "state")
+    if situation in ("suspect", "degraded"):
+        assert bench.health == situation
+    name, arguments = ORDERS[order]
+    before, pose = bench.store.state, bench.pose.copy()
+    code = bench.do(name, **arguments)
+    assert code == ANSWERS[situation][order]
+    written = bench.entries("command")
+    assert [(entry.code, entry.sender) for entry in written if entry.sender == "the test"][-1] == (code, "the test")
+    refused = code in ("nothing_pending", "not_found", "too_few_pairs", "too_few_windows")
+    if refused or (code, name) == ("held", "reset"):
+        assert bench.pose.tobytes() == pose.tobytes()
+        assert bench.store.state.health is before.health
+    if code in ("reset", "rolled_back"):
+        assert bench.health == "unknown", "nobody has looked at it since"
+    if name == "hold":
+        assert bench.store.state.frozen is (code == "held")
+
+
+def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(tmp_path / "state")
+    bench.drive(BEGIN_S, BEGIN_S + 30)
+    selected = bench.pair.stream.report.chosen.selected
+    assert selected >= 5
+    monkeypatch.setattr(commands, "TIMEOUT_S", 0.0)
+    told = bench.pair.command("calibrate", {}, "the test")
+    assert (told.accepted, told.code) == (False, "busy")
+    bench.settle()
+    assert (bench.pair.stream.report.chosen.selected, bench.recorder.recorded) == (selected, 0)
+    assert bench.answers.status().commands == {"calibrate_refused": 1}

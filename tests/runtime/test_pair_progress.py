@@ -1,0 +1,123 @@
+"""What a pair says of itself when time, the worker or the recorder misbehave: never green without having looked."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from coec.calibration.types import Reason
+from pair_bench import BEGIN_S, STEP_S, Bench, S, SlowWorker, pair_at
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path / "state")
+
+
+def test_a_drive_played_three_times_is_looked_at_each_time(bench: Bench) -> None:
+    for turn in range(3):
+        bench.drive(BEGIN_S, BEGIN_S + 60)
+        assert bench.health == "healthy"
+        assert bench.answers.status().checks >= 8 * (turn + 1)
+        assert len(bench.pair.stream._held) == 0
+    told = [entry.text for entry in bench.entries("state") if entry.code == "unknown"]
+    assert len(told) == 2
+    assert all("stepped back" in text and "Last known: healthy" in text for text in told)
+    assert bench.losses["monitor", "time_stepped_back"] == 2
+    assert ("monitor", "not_awaited") not in bench.losses
+
+
+def test_after_stamps_an_hour_ahead_the_old_time_goes_on_at_once(bench: Bench) -> None:
+    bench.drive(BEGIN_S, BEGIN_S + 30)
+    bench.drive(BEGIN_S + 3600, BEGIN_S + 3660)
+    before = bench.answers.status().checks
+    bench.drive(BEGIN_S + 30, BEGIN_S + 60)
+    assert bench.answers.status().checks >= before + 4
+    assert len(bench.pair.stream._held) == 0
+
+
+def test_a_worker_that_takes_its_time_while_time_steps_back_is_awaited_and_holds_up_nothing(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "state", worker=SlowWorker)
+    assert isinstance(bench.worker, SlowWorker)
+
+    def catch_up() -> None:
+        for _ in range(100):
+            bench.worker.work(share=1.0)  # type: ignore[attr-defined]
+            bench.settle()
+
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    catch_up()
+    bench.pair.stream.take([pair_at(half_s * S // 2) for half_s in range(2 * BEGIN_S, 2 * BEGIN_S + 60)])
+    catch_up()
+    assert len(bench.pair.stream._held) == 0
+    assert ("monitor", "not_awaited") not in bench.losses
+    assert bench.health == "healthy"
+
+
+def test_while_the_vehicle_stands_it_is_checked_and_nothing_adds_up(bench: Bench) -> None:
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    before = bench.answers.status().checks
+    bench.drive(STEP_S, STEP_S + 60, speed_mps=0.0)
+    assert bench.answers.status().checks >= before + 10
+    assert (bench.health, bench.store.state.monitor.evidence) == ("healthy", 1.0), "of one place there is one check"
+    bench.drive(STEP_S + 60, STEP_S + 90)
+    assert "miscalibrated" in [entry.code for entry in bench.entries("state")]
+
+
+def test_a_window_that_is_lost_is_answered_for_and_three_in_a_row_are_said(bench: Bench) -> None:
+    bench.drive(BEGIN_S, BEGIN_S + 45)
+    bench.recorder.loses = True
+    bench.drive(BEGIN_S + 45, BEGIN_S + 90)
+    assert (bench.losses["window", "not_recorded"], bench.answers.health_reply.state) == (1, "healthy")
+    bench.drive(BEGIN_S - 200, BEGIN_S - 60)
+    told = bench.answers.health_reply
+    assert (told.state, [reason.code for reason in told.reasons]) == ("degraded", ["windows_in_vain"])
+    bench.recorder.loses = False
+    bench.drive(BEGIN_S - 60, BEGIN_S)
+    assert bench.answers.health_reply.state == "healthy"
+
+
+def test_a_window_that_comes_to_nothing_is_no_check(bench: Bench) -> None:
+    bench.worker.window_fault = Reason("worker_failed", "The worker failed on this window 2 times.")
+    bench.worker.fault = Reason("bad_model", "no network")
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    told = bench.answers.health_reply
+    assert (told.state, told.age_s, told.evaluated_ns) == ("unknown", None, None)
+
+
+def test_without_a_completed_check_in_three_periods_nothing_is_green(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    assert bench.answers.health_reply.state == "healthy"
+    bench.pair.decider.look_at_clocks(time.monotonic() + 16.0)
+    told = bench.answers.health_reply
+    assert (told.state, told.level) == ("degraded", 1)
+    assert [reason.code for reason in told.reasons] == ["overdue_data", "last_known"]
+    assert "no camera frames come" in told.reasons[0].text
+    bench.pair.decider.look_at_clocks(time.monotonic() + 601.0)
+    assert bench.health == "stale"
+    bench.drive(BEGIN_S + 60, BEGIN_S + 72)
+    assert bench.answers.health_reply.state == "healthy"
+    # What nobody has renewed is not green either, whatever it says.
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s + 60.0)
+    stuck = bench.answers.health_reply
+    assert (stuck.state, stuck.reasons[-1].code) == ("degraded", "service_stuck")
+
+
+@pytest.mark.parametrize("setback_s", [400 * 86_400, -100 * 86_400, -3600])
+def test_a_state_from_another_time_is_not_green(bench: Bench, monkeypatch: pytest.MonkeyPatch, setback_s: int) -> None:
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    bench.store.save()
+    now_ns = time.time_ns()
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns - setback_s * S)
+    bench.restart()
+    told = bench.answers.health_reply
+    assert told.state == "unknown"
+    assert told.age_s is None or told.age_s >= 0.0
+    assert [reason.code for reason in told.reasons] == ["restarted", "last_known"]
+    bench.drive(BEGIN_S + 60, BEGIN_S + 72)
+    assert bench.answers.health_reply.state == "healthy"

@@ -1,0 +1,87 @@
+"""What the worker answers: under the number that was asked; when the program has a fault, checks go on, and a window is
+tried by another process."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import pytest
+
+from coec.errors import CalibrationError
+from coec.runtime.worker import dispatch
+from coec.runtime.worker.jobs import Drawn
+from coec.runtime.worker.tasks import Solver
+
+
+class FaultySolver:
+    """Fails in whatever it is asked, in the way that it was told."""
+
+    def __init__(self, fault: Exception) -> None:
+        self._fault = fault
+
+    def observe(self, *_: object) -> None:
+        raise self._fault
+
+    def overlay(self, *_: object) -> None:
+        raise self._fault
+
+    def solve(self, _: object) -> None:
+        raise self._fault
+
+
+CHECK = {"id": 3, "kind": "check", "pair": "front", "pose": [], "frames": []}
+OVERLAY = {"id": 4, "kind": "overlay", "path": "w", "pose": [], "title": ""}
+SOLVE = {"id": 5, "kind": "solve", "pair": "front", "path": "w"}
+
+
+def answer(fault: Exception, message: dict[str, Any]) -> dict[str, Any]:
+    return dispatch.answer(cast("Solver", FaultySolver(fault)), message)
+
+
+class Painter:
+    """Draws its title, and infers whatever it is given."""
+
+    def overlay(self, _path: object, _pose: object, title: str) -> Drawn:
+        return Drawn(title.encode())
+
+    def prefetch(self, _pair: str, _frame: bytes) -> None:
+        """Nothing to tell."""
+
+
+def test_an_answer_goes_under_the_number_of_its_question() -> None:
+    painter = cast("Solver", Painter())
+    assert dispatch.answer(painter, {**OVERLAY, "title": "a"}) == {"id": 4, "result": {"jpeg": b"a"}}
+    prefetch = {"id": 6, "kind": "prefetch", "pair": "front", "frame": b""}
+    assert dispatch.answer(painter, prefetch) == {"id": 6, "result": None}
+
+
+def test_a_question_that_nobody_knows_is_refused() -> None:
+    told = dispatch.answer(cast("Solver", Painter()), {"id": 7, "kind": "sing", "pair": "front"})
+    assert told["refused"]["code"] == "internal_error"
+    assert "'sing'" in told["refused"]["text"]
+
+
+@pytest.mark.parametrize("message", [CHECK, OVERLAY])
+def test_a_fault_of_the_program_is_an_answer(message: dict[str, Any]) -> None:
+    told = answer(ZeroDivisionError("division by zero"), message)
+    assert told.keys() == {"id", "refused"}
+    assert told["id"] == message["id"]
+    assert told["refused"]["code"] == "internal_error"
+    assert "ZeroDivisionError: division by zero" in told["refused"]["text"]
+
+
+@pytest.mark.parametrize("message", [CHECK, OVERLAY, SOLVE])
+def test_what_is_wrong_with_the_data_is_told_under_its_own_code(message: dict[str, Any]) -> None:
+    told = answer(CalibrationError("no pairs"), message)
+    refused = {"code": CalibrationError.reply_code, "text": "no pairs"}
+    assert told == {"id": message["id"], "refused": refused}
+
+
+def test_a_window_that_the_program_fails_on_ends_the_process() -> None:
+    with pytest.raises(ZeroDivisionError):
+        answer(ZeroDivisionError(), SOLVE)
+
+
+def test_without_memory_the_process_ends() -> None:
+    with pytest.raises(MemoryError):
+        answer(MemoryError(), CHECK)
