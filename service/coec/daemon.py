@@ -103,10 +103,10 @@ class Daemon:
         self._keys = Keys(config.prefix, config.vehicle)
         self._folder = WindowFolder(config.state.directory / "windows", config.state)
         self._worker = Worker(config.worker, config.model_dump_json())
+        self._bus = Bus(open_session(config.zenoh, config.limits))
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
-        self._bus = Bus(open_session(config.zenoh, config.limits))
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
 
