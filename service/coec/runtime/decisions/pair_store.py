@@ -243,7 +243,7 @@ class Ledger:
             evaluated_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
             clocks = Clocks(evaluated_ns, self._evaluated_stamp_ns, self._since_ns)
             try:
-                self._store.remember(self._rig, self._state, clocks, self.history.head)
+                self._store.remember(self._rig, self._state, clocks, self.history.durable_head)
             except StateError as error:
                 self._losses.add("storage", "state_not_saved", detail=str(error))
 
