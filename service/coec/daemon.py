@@ -33,7 +33,7 @@ from coec.runtime.api.snapshots import Snapshot, reasons_of, worker_status_of
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.runtime.pair import Outside, PairService
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.supervisor import Solved, SolveJob, Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
@@ -94,7 +94,7 @@ class Daemon:
         self._state: Literal["starting", "running", "stopping", "failing"] = "starting"
         self._fault: Reason | None = None
         self._keys = Keys(config.prefix, config.vehicle)
-        self._folder = WindowFolder(config.state.directory / "windows", config.state)
+        self._folder = WindowStore(config.state.directory / "windows", config.state)
         self._worker = Worker(config.worker, config.model_dump_json(), self._on_solved, self._on_failed)
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)

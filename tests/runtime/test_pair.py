@@ -36,7 +36,7 @@ from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.inbox import Call
 from coec.runtime.pair import Outside, PairService
 from coec.runtime.recording.recorder import Recorder
-from coec.runtime.recording.window_store import WindowFolder, start_ns_of
+from coec.runtime.recording.window_store import WindowStore, start_ns_of
 from coec.runtime.worker.messages import pack_observation, unpack_pairs
 from coec.runtime.worker.supervisor import Errand, Solved, SolveJob, Worker
 from coec.schemas.base import to_msgpack
@@ -166,7 +166,7 @@ class SlowWorker(KnowingWorker):
 class InstantRecorder:
     """Tells the worker what is in a window, the moment it ends: the truth of its pairs, or what lies between two."""
 
-    def __init__(self, service: Callable[[], PairService], worker: KnowingWorker, folder: WindowFolder) -> None:
+    def __init__(self, service: Callable[[], PairService], worker: KnowingWorker, folder: WindowStore) -> None:
         self.trouble = None
         self.has_room = True
         self.recorded = 0
@@ -215,7 +215,7 @@ class Bench:
         self.restart()
 
     def restart(self) -> None:
-        windows = WindowFolder(self.folder / "windows", self.config.state)
+        windows = WindowStore(self.folder / "windows", self.config.state)
         self.worker = self.kind(lambda: self.service)
         store = StateStore(self.folder, "test")
         outside = Outside(

@@ -52,7 +52,7 @@ from coec.runtime.ingest.pair_buffer import HeldPairs
 from coec.runtime.ingest.sensor_clock import NS_PER_S, SensorClock
 from coec.runtime.ingest.stream_statistics import StreamReport
 from coec.runtime.recording.recorder import Recorder, RecordingPlan
-from coec.runtime.recording.window_store import WindowFolder, start_ns_of
+from coec.runtime.recording.window_store import WindowStore, start_ns_of
 from coec.runtime.worker.messages import pack_pairs, pack_pose, unpack_observation
 from coec.runtime.worker.supervisor import SUPERSEDED, Errand, Solved, SolveJob, Worker
 from coec.schemas import replies
@@ -94,7 +94,7 @@ class Outside:
 
     keys: Keys
     store: StateStore
-    folder: WindowFolder
+    folder: WindowStore
     worker: Worker
     publish: Callable[[str, Answer], None]
     vehicle_troubles: Callable[[], tuple[Reason, ...]]

@@ -27,7 +27,7 @@ from coec.runtime.decisions.check_log import CheckLog
 from coec.runtime.decisions.history import GENESIS, History, Kept
 from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.state_store import Clocks, StateStore
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
 from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, MetricsPoint
 
@@ -76,7 +76,7 @@ class Ledger:
         vehicle: str,
         config: StateConfig,
         store: StateStore,
-        folder: WindowFolder,
+        folder: WindowStore,
         losses: LossCounter,
     ) -> None:
         self._rig = rig
