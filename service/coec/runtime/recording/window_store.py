@@ -300,21 +300,28 @@ class WindowStore:
     def _compare(self, statuses: Mapping[str, os.stat_result]) -> None:
         """Take over what is there now. A window that nobody has reported counts as the latest; of several of them their
         times are all there is to tell."""
+        gone = self._found.keys() - statuses.keys()
+        changed = [
+            (status.st_mtime_ns, start_ns_of(window_id), window_id)
+            for window_id, status in statuses.items()
+            if (found := self._found.get(window_id)) is None
+            or (found.size_bytes, found.modified_ns) != (status.st_size, status.st_mtime_ns)
+        ]
+        if not gone and not changed:
+            return
         self._views.clear()
-        for gone in self._found.keys() - statuses.keys():
-            del self._found[gone]
-        self._index.prune(statuses)
-        for window_id, status in sorted(statuses.items(), key=lambda item: (item[1].st_mtime_ns, start_ns_of(item[0]))):
-            known = self._found.get(window_id)
-            if known is None:
-                indexed = self._index.get(window_id)
-                order = self._index.next_order() if indexed is None else indexed.order
-            elif (known.size_bytes, known.modified_ns) == (status.st_size, status.st_mtime_ns):
-                continue
-            else:
-                order = known.order
-            pair, start_ns = window_id.rpartition("-")[0], start_ns_of(window_id)
-            self._found[window_id] = _Found(pair, start_ns, order, status.st_size, status.st_mtime_ns)
+        for window_id in gone:
+            del self._found[window_id]
+        for modified_ns, start_ns, window_id in sorted(changed):
+            pair, size_bytes = window_id.rpartition("-")[0], statuses[window_id].st_size
+            self._found[window_id] = _Found(pair, start_ns, self._order(window_id), size_bytes, modified_ns)
+        self._index.prune(self._found)
+
+    def _order(self, window_id: str) -> int:
+        found, indexed = self._found.get(window_id), self._index.get(window_id)
+        if found is not None:
+            return found.order
+        return self._index.next_order() if indexed is None else indexed.order
 
     def _put(self, window_id: str, order: int, version: WindowVersion) -> None:
         self._index.put(IndexedWindow(window_id=window_id, order=order, version=version))
