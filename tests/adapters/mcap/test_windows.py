@@ -551,7 +551,9 @@ def test_salvaging_a_whole_part_gives_the_bytes_that_finish_would_have(tmp_path:
     whole = recorded.path.read_bytes()
     part = tmp_path / ("w.mcap" + PART_SUFFIX)
     recorded.path.rename(part)
-    salvaged = salvage(part, lambda: None)
+    told: list[int] = []
+    salvaged = salvage(part, lambda: told.append(1))
+    assert len(told) == recorded.pairs
     assert salvaged == replace(recorded, modified_ns=recorded.path.stat().st_mtime_ns)
     assert recorded.path.read_bytes() == whole
 

@@ -14,7 +14,7 @@ from coec.errors import StateError
 from coec.runtime.decisions.history import GENESIS, History
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationResult, HistoryEntry
-from disks import Disk
+from disks import EVERYTHING, Disk
 from estimates import RIG, estimate
 
 
@@ -194,6 +194,52 @@ def test_a_disk_that_refuses_for_a_while_loses_nothing_and_is_no_tampering(
             assert_restarts(root, 8)
         first += 1
     assert first > 40
+
+
+def test_what_waits_is_written_without_another_entry_and_the_head_follows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(tmp_path, monkeypatch)
+    history = written(tmp_path / "h", 2)
+    before = history.durable_head
+    disk.refuses = EVERYTHING
+    with pytest.raises(StateError, match="No space"):
+        history.append(entry("third"))
+    with pytest.raises(StateError, match="No space"):
+        history.flush()
+    assert [kept.entry.text for kept in history.entries()] == ["0", "1", "third"]
+    assert history.durable_head == before
+    disk.refuses = ()
+    history.flush()
+    assert history.durable_head != before
+    again = History(tmp_path / "h", 100, history.durable_head)
+    assert again.damage is None
+    assert again.entries() == history.entries()
+
+
+def test_a_broken_chain_is_kept_aside_once_the_disk_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(tmp_path, monkeypatch)
+    path = tmp_path / "h"
+    written(path, 3)
+    broken = path.read_bytes().replace(b'"text":"1"', b'"text":"9"')
+    path.write_bytes(broken)
+    disk.refuses = EVERYTHING
+    history = History(path, 100)
+    assert history.damage is not None
+    assert path.read_bytes() == broken
+    disk.refuses = ()
+    history.append(entry("on"))
+    assert (tmp_path / "h.broken").read_bytes() == broken
+    assert [kept.entry.text for kept in History(path, 100, history.durable_head).entries()] == ["0", "on"]
+
+
+def test_a_history_that_cannot_be_read_is_damage(tmp_path: Path) -> None:
+    (tmp_path / "h").mkdir()
+    history = History(tmp_path / "h", 100)
+    assert history.damage is not None
+    assert "cannot be read" in history.damage
+    with pytest.raises(StateError):
+        history.append(entry())
 
 
 def test_a_power_cut_at_any_byte_loses_nothing_and_is_no_tampering(

@@ -7,6 +7,7 @@ is all put on the disk. Safe to use from several threads.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -242,6 +243,8 @@ class Ledger:
             age_s = self.age_s
             evaluated_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
             clocks = Clocks(evaluated_ns, self._evaluated_stamp_ns, self._since_ns)
+            with contextlib.suppress(StateError):  # counted when it was appended
+                self.history.flush()
             try:
                 self._store.remember(self._rig, self._state, clocks, self.history.durable_head)
             except StateError as error:
