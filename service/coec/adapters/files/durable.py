@@ -122,6 +122,7 @@ class Log:
         self._longest = 2 * limit
         self._waiting: list[bytes] = []
         self._anew = False
+        self._named = False
 
     @property
     def waiting(self) -> bool:
@@ -193,7 +194,6 @@ class Log:
 
     def _write(self, data: bytes) -> None:
         """Write behind what is sound, and cut what cannot be finished; if not even that is possible, the next does."""
-        begins = self._sound_bytes == 0
         descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, _MODE)
         try:
             try:
@@ -207,8 +207,9 @@ class Log:
                 raise
         finally:
             os.close(descriptor)
-        if begins:
+        if not self._named:  # by this process: whether an earlier one came so far is not known
             sync_folder(self._path.parent)
+            self._named = True
 
 
 def _write_new(path: Path, data: bytes) -> None:
