@@ -37,7 +37,7 @@ from coec.runtime.ingest.inbox import Call
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import RecordingPlan
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutcome, Kind, Solved
 from coec.runtime.worker.messages import unpack_pairs
 from coec.runtime.worker.supervisor import Worker
@@ -186,7 +186,7 @@ class InstantRecorder:
     def __init__(
         self,
         plan: RecordingPlan,
-        folder: WindowFolder,
+        folder: WindowStore,
         losses: LossCounter,
         on_recorded: Callable[[str, Path, bool], None],
         on_lost: Callable[[str], None],
@@ -245,7 +245,7 @@ class Bench:
         self.restart()
 
     def restart(self) -> None:
-        windows = WindowFolder(self.folder / "windows", self.config.state)
+        windows = WindowStore(self.folder / "windows", self.config.state)
         self.worker = self.kind()
         store = StateStore(self.folder, "test")
         self.published: list[str] = []

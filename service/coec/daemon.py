@@ -39,7 +39,7 @@ from coec.runtime.ingest.stream import Stream
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import Recorder
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
@@ -101,7 +101,7 @@ class Daemon:
         self._state: Literal["starting", "running", "stopping", "failing"] = "starting"
         self._fault: Reason | None = None
         self._keys = Keys(config.prefix, config.vehicle)
-        self._folder = WindowFolder(config.state.directory / "windows", config.state)
+        self._folder = WindowStore(config.state.directory / "windows", config.state)
         self._worker = Worker(config.worker, config.model_dump_json())
         self._bus = Bus(open_session(config.zenoh, config.limits))
         store = StateStore(config.state.directory, config.vehicle)

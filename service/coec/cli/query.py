@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,9 @@ from coec.schemas.replies import StatusReply, WindowInfo, WindowsReply
 VEHICLE_KEYS = ("status", "config", "metrics")
 PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
 JPEG = "image/jpeg"
+DIGEST_POLL_S = 0.2
+"""Between questions whether the service has read a window: as often as its recorder looks for one."""
+
 PICTURE_KEYS = ("overlay", "evidence")
 """Keys whose answer may be a picture, for `--output`."""
 
@@ -212,17 +216,28 @@ def download_window(
         RemoteError: no such window, or its bytes are not those that were promised.
         OutputError: the file cannot be written.
     """
-    info = _info(session, keys, pair, window_id, timeout_s)
+    info = _digested(session, keys, pair, window_id, timeout_s)
     for attempt in (1, 2):
         data = _pieces(session, keys.window(pair, window_id), info.size_bytes, timeout_s, heard)
         if hashlib.sha256(data).hexdigest() == info.sha256:
             _save(path, data)
             return info
-        renewed = _info(session, keys, pair, window_id, timeout_s)
+        renewed = _digested(session, keys, pair, window_id, timeout_s)
         if attempt == 2 or renewed.sha256 == info.sha256:
             break
         info = renewed
     raise RemoteError("checksum", f"the bytes of window {window_id} do not have the sha256 of the list; try again")
+
+
+def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> WindowInfo:
+    """What the list says of a window; the service may still be reading it."""
+    deadline_s = time.monotonic() + timeout_s
+    while (info := _info(session, keys, pair, window_id, timeout_s)).sha256 is None:
+        if time.monotonic() > deadline_s:
+            text = f"the service has not read window {window_id} since its start: try again in a minute"
+            raise RemoteError("checksum", text)
+        time.sleep(DIGEST_POLL_S)
+    return info
 
 
 def _info(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> WindowInfo:

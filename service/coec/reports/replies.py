@@ -105,8 +105,9 @@ def windows(payload: bytes) -> None:
     table = console.table("window", "pairs", "MB", "verdict", "sha256", right=(1, 2))
     for window in reply.windows:
         size = f"{window.size_bytes / 1e6:.1f}"
-        verdict = console.styled(window.decision or "not evaluated")
-        table.add_row(window.window_id, str(window.pairs), size, verdict, window.sha256[:16])
+        verdict = console.styled(window.decision or ("not evaluated" if window.sha256 else "not read yet"))
+        pairs = "?" if window.pairs is None else str(window.pairs)
+        table.add_row(window.window_id, pairs, size, verdict, (window.sha256 or "not read yet")[:16])
     console.out.print(table)
 
 

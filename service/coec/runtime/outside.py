@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from coec.adapters.zenoh.bus import Answer
 from coec.calibration.types import Reason
 from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.keys import Keys
 
@@ -19,7 +19,7 @@ class Outside:
 
     keys: Keys
     store: StateStore
-    folder: WindowFolder
+    folder: WindowStore
     worker: Worker
     publish: Callable[[str, Answer], None]
     vehicle_troubles: Callable[[], tuple[Reason, ...]]

@@ -45,7 +45,7 @@ class Pair:
         rig, folder = rig_of(pair), outside.folder
         losses = LossCounter(_log, pair.name)
         mailbox, queue = Mailbox(), DecisionQueue()
-        questions = Questions(pair, queue, outside.worker, mailbox)
+        questions = Questions(pair, queue, outside.worker, mailbox, folder)
         store = PairStore(rig, config.vehicle, config.state, outside.store, folder, losses)
         baseline = RigBaseline(pair, rig, config.state.directory)
         plan = RecordingPlan(
@@ -65,6 +65,7 @@ class Pair:
             baseline,
             queue,
             pictures,
+            folder,
             self.stream,
             mailbox,
             losses,

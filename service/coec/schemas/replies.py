@@ -310,10 +310,12 @@ class WindowInfo(Part):
     """One recorded window."""
 
     window_id: str
-    sha256: str = Field(description="of the whole file, hexadecimal")
+    sha256: str | None = Field(
+        description="of the whole file, hexadecimal; null until the service has read this version of it"
+    )
     size_bytes: Count
-    pairs: Count
-    decision: Decision | None = Field(description="null while it is not evaluated")
+    pairs: Count | None = Field(description="null until the file was read, or when it cannot be")
+    decision: Decision | None = Field(description="null while it is not evaluated, or `sha256` is null")
 
 
 class WindowsReply(Message):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from coec.adapters.files.state_file import StateFile
 from coec.errors import StateError
+from disks import Disk
 
 FIRST: dict[str, object] = {"pairs": {"front": {"matrix": [[1.0, 0.1], [1e-17, -0.0]], "name": "Ä"}}}
 SECOND: dict[str, object] = {"pairs": {"front": {"matrix": [[2.0, 0.30000000000000004], [3, None]]}}}
@@ -102,3 +104,54 @@ def test_a_failed_write_is_an_error_and_keeps_the_old_copy(tmp_path: Path, monke
     monkeypatch.undo()
     assert StateFile(path).load().body == FIRST
     assert [entry.name for entry in tmp_path.iterdir()] == ["state.json"]
+
+
+def test_a_power_cut_at_any_byte_of_the_saves_leaves_what_was_saved_last_or_is_being_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "disk").mkdir()
+    bodies: list[dict[str, object]] = [FIRST, SECOND, {"pairs": {}}, FIRST]
+    with monkeypatch.context() as patch:
+        disk = Disk(tmp_path / "disk", patch)
+        file = StateFile(tmp_path / "disk" / "state.json")
+        for number, body in enumerate(bodies):
+            file.save(body)
+            disk.acknowledge(number)
+    count = 0
+    for count, cut in enumerate(disk.power_cuts()):
+        loaded = StateFile(cut.put(tmp_path / str(count)) / "state.json").load()
+        safe = len(cut.acknowledged)
+        assert loaded.body in (None, *bodies)[safe : safe + 2]
+        assert loaded.damage == ()
+    assert count > 400
+
+
+@pytest.mark.parametrize("length", [1, 3])
+def test_whatever_the_disk_refuses_a_good_copy_is_there_and_the_next_save_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int
+) -> None:
+    for first in range(12):
+        root = tmp_path / str(first)
+        root.mkdir()
+        with monkeypatch.context() as patch:
+            disk = Disk(root, patch)
+            file = StateFile(root / "state.json")
+            file.save(FIRST)
+            begins = disk.operations + first
+            disk.refuses = range(begins, begins + length)
+            with suppress(StateError):
+                file.save(SECOND)
+            loaded = StateFile(root / "state.json").load()
+            assert loaded.body in (FIRST, SECOND)
+            assert loaded.damage == ()
+            disk.refuses = ()
+            file.save(SECOND)
+            assert StateFile(root / "state.json").load().body == SECOND
+
+
+def test_a_file_that_somebody_removed_is_written_again(tmp_path: Path) -> None:
+    file = StateFile(tmp_path / "state.json")
+    file.save(FIRST)
+    (tmp_path / "state.json").unlink()
+    file.save(SECOND)
+    assert StateFile(tmp_path / "state.json").load().body == SECOND

@@ -222,6 +222,7 @@ def test_the_record_describes_the_file(tmp_path: Path) -> None:
     recorded = a_window(tmp_path / "w.mcap")
     data = recorded.path.read_bytes()
     assert (recorded.bytes, recorded.sha256) == (len(data), hashlib.sha256(data).hexdigest())
+    assert recorded.modified_ns == recorded.path.stat().st_mtime_ns
     assert [p.name for p in tmp_path.iterdir()] == ["w.mcap"]
 
 
@@ -526,7 +527,7 @@ def test_salvage_saves_every_whole_pair_of_a_part_cut_anywhere(
     rng = np.random.default_rng(2)
     for size in sorted({0, 5, *sizes, len(data), *rng.integers(0, len(data), 60).tolist()}):
         part.write_bytes(data[:size])
-        recorded = salvage(part)
+        recorded = salvage(part, lambda: None)
         assert not part.exists()
         saved_at.append((size, 0 if recorded is None else recorded.pairs))
         if recorded is None:
@@ -550,8 +551,10 @@ def test_salvaging_a_whole_part_gives_the_bytes_that_finish_would_have(tmp_path:
     whole = recorded.path.read_bytes()
     part = tmp_path / ("w.mcap" + PART_SUFFIX)
     recorded.path.rename(part)
-    salvaged = salvage(part)
-    assert salvaged == recorded
+    told: list[int] = []
+    salvaged = salvage(part, lambda: told.append(1))
+    assert len(told) == recorded.pairs
+    assert salvaged == replace(recorded, modified_ns=recorded.path.stat().st_mtime_ns)
     assert recorded.path.read_bytes() == whole
 
 
@@ -561,7 +564,7 @@ def test_salvage_stops_at_a_flipped_bit(tmp_path: Path, part_file: tuple[bytes, 
     damaged[sizes[2] + 30_000] ^= 4
     part = tmp_path / ("w.mcap" + PART_SUFFIX)
     part.write_bytes(damaged)
-    recorded = salvage(part)
+    recorded = salvage(part, lambda: None)
     assert recorded is not None
     assert 1 <= recorded.pairs <= 2
 
@@ -571,7 +574,7 @@ def test_salvage_leaves_a_finished_window_alone(tmp_path: Path) -> None:
     whole = recorded.path.read_bytes()
     part = tmp_path / ("w.mcap" + PART_SUFFIX)
     part.write_bytes(whole[:2000])
-    assert salvage(part) is None
+    assert salvage(part, lambda: None) is None
     assert not part.exists()
     assert recorded.path.read_bytes() == whole
 

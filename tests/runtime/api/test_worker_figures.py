@@ -8,7 +8,7 @@ import numpy as np
 
 from coec.config import WorkerConfig
 from coec.runtime.api import metrics
-from coec.runtime.api.snapshots import worker_status_of
+from coec.runtime.api.status import worker_status_of
 from coec.runtime.worker import jobs
 from coec.runtime.worker.queue import WAITING, Lane
 from coec.runtime.worker.supervisor import Worker

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
+from coec.errors import StateError
 from coec.runtime.decisions.check_log import CheckLog
 from coec.schemas.replies import CheckReply, MetricReply
+from disks import EVERYTHING, Disk
 
 NONE = (None,) * 6
 
@@ -59,3 +63,19 @@ def test_what_cannot_be_read_is_left_out(tmp_path: Path) -> None:
     again = CheckLog(tmp_path / "checks", 10)
     again.append(check(7))
     assert [one.stamp_ns for one in CheckLog(tmp_path / "checks", 10).checks()] == [0, 1, 7]
+
+
+def test_a_full_disk_costs_no_check_but_those_that_a_restart_comes_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(tmp_path, monkeypatch)
+    log = CheckLog(tmp_path / "checks", 10)
+    log.append(check(0))
+    disk.refuses = EVERYTHING
+    with pytest.raises(StateError, match="No space"):
+        log.append(check(1))
+    assert [one.stamp_ns for one in log.checks()] == [0, 1]
+    assert [one.stamp_ns for one in CheckLog(tmp_path / "checks", 10).checks()] == [0]
+    disk.refuses = ()
+    log.append(check(2))
+    assert [one.stamp_ns for one in CheckLog(tmp_path / "checks", 10).checks()] == [0, 1, 2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from coec.adapters.files.conversions import transform_of
 from coec.errors import NotFoundError
 from coec.runtime.decisions.incidents import POINTS_AFTER, POINTS_KEPT, Incidents
 from coec.schemas.replies import EvidenceEvent, MetricsPoint, Reason
+from disks import EVERYTHING, Disk
 
 
 def event(stamp: int, before: str | None = "front-1") -> EvidenceEvent:
@@ -88,3 +90,73 @@ def test_a_disk_that_cannot_be_written_costs_evidence_only(tmp_path: Path) -> No
     evidence.begin(event(1000))
     assert evidence.lost == 1
     assert evidence.event("front-1000").window_before == "front-1"
+    (tmp_path / "evidence").unlink()
+    evidence.note(point(1001))
+    assert Incidents(tmp_path / "evidence", "front", 2).event("front-1000").metrics == (point(1001),)
+
+
+def test_an_event_that_could_not_be_written_is_written_with_the_next_check_however_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(tmp_path, monkeypatch)
+    evidence = Incidents(tmp_path, "front", 2)
+    disk.refuses = EVERYTHING
+    evidence.begin(event(1000))
+    for stamp in range(POINTS_AFTER):
+        evidence.note(point(stamp))
+    assert evidence.lost == 1 + POINTS_AFTER
+    disk.refuses = ()
+    evidence.note(point(9000))
+    assert len(Incidents(tmp_path, "front", 2).event("front-1000").metrics) == POINTS_AFTER
+
+
+def test_half_an_event_of_a_power_cut_is_removed_and_too_many_are_bounded_at_the_start(tmp_path: Path) -> None:
+    evidence = Incidents(tmp_path, "front", 3)
+    for stamp in (1000, 2000, 3000):
+        evidence.begin(event(stamp))
+    for name in ("front-4000", "front-left-5000", "front-notes"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "before.jpg").write_bytes(b"jpeg")
+    assert len(Incidents(tmp_path, "front", 2).listing("test").events) == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "front-2000",
+        "front-3000",
+        "front-left-5000",
+        "front-notes",
+    ]
+
+
+def test_a_power_cut_at_any_byte_takes_no_evidence_that_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two that are kept the older goes when the third begins."""
+    (tmp_path / "disk").mkdir()
+    steps: list[Callable[[Incidents], object]] = [
+        lambda evidence: evidence.begin(event(1)),
+        lambda evidence: evidence.add_overlay("front-1", "before", b"a picture"),
+        lambda evidence: evidence.add_window_after("front-2"),
+        lambda evidence: evidence.resolve(7, "healthy"),
+        lambda evidence: evidence.begin(event(2)),
+        lambda evidence: evidence.begin(event(3)),
+    ]
+    with monkeypatch.context() as patch:
+        disk = Disk(tmp_path / "disk", patch)
+        evidence = Incidents(tmp_path / "disk", "front", 2)
+        for number, step in enumerate(steps):
+            step(evidence)
+            assert evidence.lost == 0
+            disk.acknowledge(number)
+    count = 0
+    for count, cut in enumerate(disk.power_cuts()):
+        again = Incidents(cut.put(tmp_path / str(count)), "front", 2)
+        done = len(cut.acknowledged)
+        found = {each.event_id: each for each in again.listing("test").events}
+        wanted = {"front-1": 0 < done < 5, "front-2": done >= 5, "front-3": done >= 6}
+        assert {event_id for event_id, needed in wanted.items() if needed} <= set(found)
+        if first := found.get("front-1"):
+            assert first.overlays or done < 2
+            assert not first.overlays or again.overlay("front-1", "before") == b"a picture" or done >= 5
+            assert first.window_after == "front-2" or done < 3
+            assert first.resolution == "healthy" or done < 4
+        assert len(found) <= 2
+    assert count > 1000

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import logging
 import os
 import queue
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,10 @@ from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.window import SliceEnded
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, StateConfig
-from coec.errors import NotFoundError, RecordingError, UsageError
+from coec.errors import RecordingError
 from coec.geometry.cameras import build
-from coec.runtime.recording import window_store
 from coec.runtime.recording.recorder import PAIRS_WAITING, UNSOLVED_RESUMED, Recorder, RecordingPlan
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from fakes import wait_until
 
 DEADLINE_S = 20.0
@@ -48,19 +48,19 @@ def pair(stamp_ns: int, points: int = 10) -> FramePair:
     return FramePair(CameraFrame(stamp_ns, "camera", IMAGE), LidarFrame(stamp_ns, "lidar", cloud))
 
 
-def folder_of(path: Path, **limits: Any) -> WindowFolder:
-    return WindowFolder(path / "windows", StateConfig(**{"min_free_bytes": 0, **limits}))
+def store_of(path: Path, **limits: Any) -> WindowStore:
+    return WindowStore(path / "windows", StateConfig(**{"min_free_bytes": 0, **limits}))
 
 
 class Bench:
     """A recorder that is not started yet, and what it reports."""
 
-    def __init__(self, folder: WindowFolder, plan: RecordingPlan = PLAN) -> None:
-        self.folder = folder
+    def __init__(self, store: WindowStore, plan: RecordingPlan = PLAN) -> None:
+        self.store = store
         self.losses = LossCounter(logging.getLogger("test"), "front")
         self.recorded: queue.SimpleQueue[Recorded] = queue.SimpleQueue()
         self.lost: list[str] = []
-        self.recorder = Recorder(plan, folder, self.losses, lambda *event: self.recorded.put(event), self.lost.append)
+        self.recorder = Recorder(plan, store, self.losses, lambda *event: self.recorded.put(event), self.lost.append)
 
     @contextmanager
     def running(self) -> Iterator[Recorder]:
@@ -81,12 +81,12 @@ class Bench:
         self.recorder.end(SliceEnded(name, len(stamps), len(stamps) >= MIN_PAIRS))
 
     def files(self) -> list[str]:
-        return sorted(path.name for path in self.folder.path("x").parent.iterdir())
+        return sorted(path.name for path in self.store.path("x").parent.iterdir())
 
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
-    return Bench(folder_of(tmp_path))
+    return Bench(store_of(tmp_path))
 
 
 def test_a_window_is_written_and_reported(bench: Bench) -> None:
@@ -96,8 +96,9 @@ def test_a_window_is_written_and_reported(bench: Bench) -> None:
         assert (window_id, live) == ("front-10", True)
         window, _ = read_window(path)
         assert [p.stamp_ns for p in window.pairs] == [10, 20, 30]
-        (info,) = bench.folder.listing("front")
+        (info,) = bench.store.listing("front")
         assert (info.window_id, info.pairs, info.decision) == ("front-10", 3, None)
+        assert info.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert bench.files() == ["front-10.mcap"]
     assert bench.recorder.latest == path
 
@@ -160,7 +161,7 @@ def test_a_full_disk_costs_one_window_and_the_next_is_tried(bench: Bench, monkey
 
 
 def test_no_window_starts_below_the_free_space_asked_for(tmp_path: Path) -> None:
-    bench = Bench(folder_of(tmp_path, min_free_bytes=2**62))
+    bench = Bench(store_of(tmp_path, min_free_bytes=2**62))
     with bench.running():
         bench.window("front-10", [10, 20])
     assert bench.files() == []
@@ -168,7 +169,7 @@ def test_no_window_starts_below_the_free_space_asked_for(tmp_path: Path) -> None
 
 
 def test_leftovers_are_salvaged_and_unsolved_windows_resumed_newest_first(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path)
+    folder = store_of(tmp_path)
     for start in range(100, 100 * (UNSOLVED_RESUMED + 2), 100):
         writer = WindowWriter(folder.path(f"front-{start}"), RIG, NOMINAL, f"front-{start}", CalibrationConfig(), {})
         writer.add(pair(start))
@@ -195,73 +196,75 @@ def test_leftovers_are_salvaged_and_unsolved_windows_resumed_newest_first(tmp_pa
     assert bench.losses.snapshot()["window", "too_few_pairs_salvaged"] == 2
 
 
-# --- the folder --------------------------------------------------------------------------------------------------
+def test_trouble_is_told_in_the_words_of_the_disk_until_what_follows_can_be_written(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.fdatasync
+
+    def refusing(_descriptor: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with bench.running() as recorder:
+        monkeypatch.setattr(os, "fdatasync", refusing)
+        bench.window("front-10", [10, 20])
+        wait_until(lambda: bench.lost == ["front-10"], "the loss")
+        assert recorder.trouble is not None
+        assert recorder.trouble.code == "recording_failed"
+        assert "Input/output error" in recorder.trouble.text
+        assert bench.files() == []
+        monkeypatch.setattr(os, "fdatasync", real)
+        bench.window("front-50", [50])  # too short to be kept, but what there was of it went to the disk
+        wait_until(lambda: bench.lost == ["front-10", "front-50"], "the end of the second window")
+        assert recorder.trouble is None
 
 
-def put(folder: WindowFolder, name: str, size: int, age_s: float) -> Path:
-    path = folder.path(name)
-    path.write_bytes(bytes(size))
-    now_s = path.stat().st_mtime
-    os.utime(path, (now_s - age_s, now_s - age_s))
-    return path
+def test_a_window_cannot_be_removed_while_it_is_handed_over(tmp_path: Path) -> None:
+    bench = Bench(store_of(tmp_path, min_free_bytes=2**62))
+    seen: list[bool] = []
+
+    def make_room_meanwhile(window_id: str, path: Path, live: bool) -> None:
+        del live
+        later = bench.store.path("front-999")  # so that it is not the latest
+        later.write_bytes(b"later")
+        with suppress(RecordingError):
+            bench.store.make_room(lambda: None)
+        seen.append(path.exists())
+        bench.recorded.put((window_id, path, True))
+
+    writer = WindowWriter(bench.store.path("front-10"), RIG, NOMINAL, "front-10", CalibrationConfig(), {})
+    writer.add(pair(10))
+    writer.finish()
+    recorder = Recorder(PLAN, bench.store, bench.losses, make_room_meanwhile, bench.lost.append)
+    recorder.thread.start()
+    _, path, _ = bench.recorded.get(timeout=DEADLINE_S)
+    recorder.request_stop()
+    assert recorder.thread.join(DEADLINE_S)
+    assert seen == [True]
+    with pytest.raises(RecordingError):
+        bench.store.make_room(lambda: None)
+    assert not path.exists()
 
 
-def test_room_is_made_by_bytes_and_age_oldest_first(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path, max_bytes=2**20, max_age_days=1.0)
-    expired = put(folder, "front-1", 1000, 2 * 86_400)
-    older = put(folder, "rear-2", 400_000, 3600)
-    newer = put(folder, "front-3", 400_000, 60)
-    folder.make_room()  # another 400 kB would not fit beside two
-    assert not expired.exists()
-    assert not older.exists()
-    assert newer.exists()
-    assert folder.removed == 2
+def test_windows_that_nobody_reported_are_read_beside_the_work(tmp_path: Path) -> None:
+    store = store_of(tmp_path)
+    for start in (100, 200):
+        writer = WindowWriter(store.path(f"front-{start}"), RIG, NOMINAL, f"front-{start}", CalibrationConfig(), {})
+        writer.add(pair(start, points=600_000))  # more than is read in one round
+        writer.finish()
+    bench = Bench(store)
+    assert [info.sha256 for info in store.listing("front")] == [None, None]
+    with bench.running():
+        wait_until(lambda: not store.unread("front"), "the digests")
+        bench.window("front-300", [300, 301])
+        wait_until(lambda: bench.recorder.recorded == 1, "a window")
+    for info in store.listing("front"):
+        assert info.sha256 == hashlib.sha256(store.path(info.window_id).read_bytes()).hexdigest()
 
 
-def test_a_full_disk_takes_old_windows_but_not_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = folder_of(tmp_path, min_free_bytes=1000)
-    old, new = put(folder, "front-1", 10, 60), put(folder, "front-2", 10, 30)
-    monkeypatch.setattr(window_store, "_free_bytes", lambda _: 999)
-    with pytest.raises(RecordingError, match="min_free_bytes"):
-        folder.make_room()
-    assert not old.exists()
-    assert new.exists()
-
-
-def test_pairs_whose_names_begin_alike_do_not_mix(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path)
-    put(folder, "front-1", 1, 0)
-    put(folder, "front-left-2", 1, 0)
-    assert [path.stem for path in folder.windows("front")] == ["front-1"]
-    assert [path.stem for path in folder.windows("front-left")] == ["front-left-2"]
-
-
-@pytest.mark.parametrize("window_id", ["../state", "front-1/..", "rear-1", "front-2", "front-1\0", "front-x", ""])
-def test_only_the_pairs_own_windows_are_read(tmp_path: Path, window_id: str) -> None:
-    folder = folder_of(tmp_path)
-    put(folder, "front-1", 5, 0)
-    put(folder, "rear-1", 5, 0)
-    assert folder.read("front", "front-1", 3, 100) == bytes(2)
-    with pytest.raises(NotFoundError):
-        folder.read("front", window_id, 0, 1)
-    with pytest.raises(UsageError, match="offset"):
-        folder.read("front", "front-1", 6, 1)
-
-
-def test_evidence_is_the_last_to_go_and_never_for_its_age(tmp_path: Path) -> None:
-    path = tmp_path / "windows"
-    path.mkdir()
-    for name, age_days in (("front-1", 200), ("front-2", 200), ("front-3", 0)):
-        (path / f"{name}.mcap").write_bytes(bytes(100_000))
-        when = time.time() - 86_400 * age_days
-        os.utime(path / f"{name}.mcap", (when, when))
-    folder = folder_of(tmp_path, max_age_days=90.0)
-    folder.protect("front", frozenset({"front-1"}))
-    folder.make_room()
-    assert sorted(file.stem for file in path.iterdir()) == ["front-1", "front-3"]
-    (path / "front-4.mcap").write_bytes(bytes(700_000))
-    full = folder_of(tmp_path, max_bytes=2**20)
-    full.protect("front", frozenset({"front-1"}))
-    full.make_room()
-    assert sorted(file.stem for file in path.iterdir()) == ["front-1"]
-    full.protect("front", frozenset())
+def test_a_stop_does_not_wait_for_windows_that_are_being_read(tmp_path: Path) -> None:
+    store = store_of(tmp_path)
+    store.path("front-1").write_bytes(bytes(64 * 2**20))
+    bench = Bench(store)
+    with bench.running():
+        pass
+    assert store.unread("front") == (store.path("front-1"),)

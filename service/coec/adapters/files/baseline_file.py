@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from coec.adapters.files import durable
 from coec.adapters.files.rig import matrix_rows, rigid_matrix
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.commissioning.baseline import Accuracy, Baseline, MonitorLimits
@@ -94,7 +95,10 @@ def save_baseline(path: Path, baseline: Baseline) -> str:
     file = StateFile(path)
     document = baseline_to_json(baseline)
     pairs = {**_pairs_of(file.load().body), baseline.pair: document}
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        durable.make_folder(path.parent)
+    except OSError as error:
+        raise StateError(f"cannot make the folder {path.parent}: {error.strerror}") from error
     file.save({"pairs": pairs})
     return hash_of(document)
 

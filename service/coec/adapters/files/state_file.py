@@ -2,19 +2,18 @@
 
 The file is the canonical JSON (sorted keys, no spaces) of `{"body": …, "checksum": sha256 of the canonical body,
 "schema_version": 1}`. A file that is not byte for byte what this module would write for its own body is damaged: no
-flipped bit can be read as a calibration. A write is a new file, flushed, renamed over the old one.
+flipped bit can be read as a calibration.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from coec.adapters.files import durable
 from coec.errors import StateError
 
 SCHEMA_VERSION = 1
@@ -57,25 +56,11 @@ class StateFile:
         """Replace the file; the copy it replaces, if good, becomes the previous one. On the disk when this returns.
 
         Raises:
-            StateError: the disk is full or the folder not writable; the copies on the disk are as they were.
+            StateError: the disk is full or the folder not writable; there is a good copy on the disk all the same.
         """
-        fresh = self._path.with_name(self._path.name + ".new")
-        link = self._path.with_name(self._path.name + ".link")
         try:
-            with fresh.open("wb") as stream:
-                stream.write(_encode(body))
-                stream.flush()
-                os.fsync(stream.fileno())
-            if self._current_is_good:
-                link.unlink(missing_ok=True)
-                link.hardlink_to(self._path)
-                link.replace(self._previous)
-            fresh.replace(self._path)
-            _sync_folder(self._path.parent)
+            durable.replace(self._path, _encode(body), self._previous if self._current_is_good else None)
         except OSError as error:
-            for leftover in (fresh, link):
-                with contextlib.suppress(OSError):
-                    leftover.unlink(missing_ok=True)
             raise StateError(f"cannot write {self._path}: {error.strerror}; it needs space and permission") from error
         self._current_is_good = True
 
@@ -106,11 +91,3 @@ def _decode(data: bytes) -> dict[str, Any]:
     if expected != data:
         raise StateError("does not match its checksum")
     return body
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -26,6 +26,7 @@ from mcap.writer import CompressionType, Writer
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coec import __version__
+from coec.adapters.files import durable
 from coec.adapters.files.rig import mask_to_png, matrix_rows, rig_from_json, rig_to_json, rigid_matrix
 from coec.adapters.mcap.files import (
     Attachment,
@@ -88,12 +89,14 @@ class _RigAttachment(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class RecordedWindow:
-    """A finished file. `sha256` is hexadecimal and of the whole file, `pairs` their number."""
+    """A finished file. `sha256` is hexadecimal and of the whole file, `pairs` their number. `bytes` and `modified_ns`
+    (what the file system says of the last write) tell this version of the file from a later one."""
 
     path: Path
     window_id: str
     pairs: int
     bytes: int
+    modified_ns: int
     sha256: str
 
 
@@ -123,6 +126,7 @@ class _WindowFile:
         with _failing_as_recording_error(final):
             self._file = _HashingFile(temporary)
         with self._guarded():
+            durable.sync_folder(temporary.parent)
             # The CRC over the data section also covers what lies outside the chunks.
             self._mcap = Writer(self._file, CHUNK_BYTES, CompressionType.NONE, enable_crcs=True, enable_data_crcs=True)
             self._mcap.start(profile="ros2", library=f"coec/{__version__}")
@@ -148,22 +152,21 @@ class _WindowFile:
                 self._channels[topic] = channel
             self._mcap.add_message(channel, stamp_ns, data, stamp_ns, sequence)
 
-    def flush(self) -> None:
-        """Hands what is buffered to the kernel, where it survives the process."""
+    def sync(self) -> None:
+        """Puts what was added on the disk: a little at a time, so that the end of a window does not wait for it all."""
         with self._guarded():
             self._file.flush()
+            os.fdatasync(self._file.fileno())
 
     def finish(self, window_id: str, pairs: int) -> RecordedWindow:
         """Writes the index, and makes file and name durable."""
         with self._guarded():
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
-            size = self._file.tell()
-            os.fsync(self._file.fileno())
-            self._file.close()
-            self._temporary.replace(self._final)
-            _fsync_directory(self._final.parent)
-        return RecordedWindow(self._final, window_id, pairs, size, self._file.sha256.hexdigest())
+            status = os.fstat(self._file.fileno())
+            durable.publish(self._file, self._temporary, self._final)
+        sha256 = self._file.sha256.hexdigest()
+        return RecordedWindow(self._final, window_id, pairs, status.st_size, status.st_mtime_ns, sha256)
 
     def abandon(self) -> None:
         """Removes the temporary file."""
@@ -228,7 +231,7 @@ class WindowWriter:
         if rig.mask is not None:
             self._file.attach(MASK, "image/png", mask_to_png(rig.mask))
         self._file.metadata(_METADATA, {"window_id": window_id, **metadata})
-        self._file.flush()
+        self._file.sync()
 
     def add(self, pair: FramePair) -> None:
         """Appends a pair.
@@ -256,7 +259,7 @@ class WindowWriter:
         image_type, image = cdr.encode_image(pair.camera)
         topic = self._topic(IMAGE if image_type == cdr.IMAGE else COMPRESSED)
         self._cdr(topic, image_type, stamp_ns, image)
-        self._file.flush()
+        self._file.sync()
         self.pairs += 1
 
     def finish(self) -> RecordedWindow:
@@ -299,8 +302,12 @@ def write_result(path: Path, result: CalibrationResult) -> RecordedWindow:
     return file.finish(window_id, pairs)
 
 
-def salvage(part_path: Path) -> RecordedWindow | None:
+def salvage(part_path: Path, progress: Callable[[], None]) -> RecordedWindow | None:
     """Makes a window of what a killed recorder left behind, and removes the `.part` file.
+
+    Args:
+        part_path: the `.part` file.
+        progress: called after every pair.
 
     Returns:
         The window with every pair that is whole, or None when there was none or the rig is lost (or when the window was
@@ -310,9 +317,9 @@ def salvage(part_path: Path) -> RecordedWindow | None:
         RecordingError: it could not be written; the `.part` file is still there.
     """
     final = part_path.with_name(part_path.name.removesuffix(PART_SUFFIX))
-    window = None if final.exists() else _salvaged(part_path, final)
+    window = None if final.exists() else _salvaged(part_path, final, progress)
     with _failing_as_recording_error(final):
-        part_path.unlink(missing_ok=True)
+        durable.remove(part_path)
     return window
 
 
@@ -450,7 +457,7 @@ class _Content:
         return None
 
 
-def _salvaged(part_path: Path, final: Path) -> RecordedWindow | None:
+def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> RecordedWindow | None:
     content = _Content()
     writer: WindowWriter | None = None
     try:
@@ -463,6 +470,7 @@ def _salvaged(part_path: Path, final: Path) -> RecordedWindow | None:
                 if writer is None:
                     writer = _writer_like(content, part_path, final)
                 writer.add(content.pair(part_path, index))
+                progress()
     except BaseException:
         if writer is not None:
             writer.abandon()
@@ -593,11 +601,3 @@ def _failing_as_recording_error(path: Path) -> Iterator[None]:
         raise RecordingError(
             f"cannot write {path}: {error.strerror}; free space or choose another directory"
         ) from error
-
-
-def _fsync_directory(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -23,7 +23,7 @@ from coec.runtime.handover import BusyError
 from coec.runtime.ingest.chooser import Chooser
 from coec.runtime.ingest.stream import Stream
 from coec.runtime.recording.recorder import Recorder
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.schemas.replies import Acknowledgement
 
 _log = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ class Commands:
         stream: Stream,
         chooser: Chooser,
         recorder: Recorder,
-        folder: WindowFolder,
+        folder: WindowStore,
         questions: Questions,
     ) -> None:
         self._pair = pair

@@ -23,7 +23,7 @@ from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.ingest.stream import Stream
 from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
 from coec.schemas.keys import Format
 
@@ -37,7 +37,7 @@ class PairAnswers:
         config: Config,
         rig: Rig,
         store: PairStore,
-        folder: WindowFolder,
+        folder: WindowStore,
         recorder: Recorder,
         stream: Stream,
         losses: LossCounter,

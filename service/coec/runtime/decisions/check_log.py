@@ -1,7 +1,6 @@
 """The checks of the monitor at a pair, a JSON line each: what it saw on a drive, for whoever asks afterwards.
 
-Only the newest are kept. Nothing is decided by them: a line that cannot be read is left out, and a check that a power
-cut takes is gone.
+Only the newest are kept. Nothing is decided by them: a line that cannot be read is left out.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from coec.adapters.files.durable import Log
 from coec.errors import StateError
 from coec.schemas.base import to_json
 from coec.schemas.replies import CheckReply
@@ -26,7 +26,7 @@ class CheckLog:
         self._path = path
         self._lock = threading.Lock()
         self._kept: deque[CheckReply] = deque(maxlen=limit)
-        self._lines = 0
+        self._log = Log(path, limit, lambda: map(to_json, self._kept))
         self._load()
 
     def checks(self) -> tuple[CheckReply, ...]:
@@ -38,37 +38,21 @@ class CheckLog:
         """Keep one more.
 
         Raises:
-            StateError: it is kept in memory, but not on the disk.
+            StateError: it is kept in memory, but not on the disk; it goes there with the next.
         """
         with self._lock:
             self._kept.append(check)
+            self._log.add(to_json(check))
             try:
-                if self._lines >= 2 * (self._kept.maxlen or 1):
-                    self._rewrite()
-                else:
-                    with self._path.open("ab") as stream:
-                        stream.write(to_json(check) + b"\n")
-                    self._lines += 1
+                self._log.flush()
             except OSError as error:
                 raise StateError(f"cannot write {self._path}: {error.strerror}") from error
 
     def _load(self) -> None:
         try:
-            data = self._path.read_bytes()
-        except OSError:
+            lines = self._log.load()
+        except OSError:  # then it begins anew
             return
-        lines = data.splitlines()
         for line in lines:
             with contextlib.suppress(ValidationError):
                 self._kept.append(CheckReply.model_validate_json(line))
-        self._lines = len(lines)
-        if self._lines > len(self._kept) or not data.endswith(b"\n"):
-            # Too many, or one that was torn: the next must not be written behind it.
-            with contextlib.suppress(OSError):
-                self._rewrite()
-
-    def _rewrite(self) -> None:
-        fresh = self._path.with_name(self._path.name + ".new")
-        fresh.write_bytes(b"".join(to_json(check) + b"\n" for check in self._kept))
-        fresh.replace(self._path)
-        self._lines = len(self._kept)

@@ -33,8 +33,9 @@ from coec.runtime.decisions.queue import DecisionQueue, Effect, Question, Take
 from coec.runtime.decisions.rig_baseline import RigBaseline
 from coec.runtime.ingest.chooser import Served
 from coec.runtime.ingest.stream_statistics import StreamReport
-from coec.runtime.recording.window_store import start_ns_of
-from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved
+from coec.runtime.recording.window_index import WindowVersion
+from coec.runtime.recording.window_store import WindowStore, start_ns_of
+from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved, WrittenFile
 from coec.schemas.replies import CalibrationResult, CheckReply
 
 _log = logging.getLogger(__name__)
@@ -107,6 +108,7 @@ class Decider:
         baseline: RigBaseline,
         queue: DecisionQueue,
         pictures: IncidentPictures,
+        windows: WindowStore,
         stream: StreamSide,
         mailbox: Mailbox,
         losses: LossCounter,
@@ -122,6 +124,7 @@ class Decider:
         self._baseline = baseline
         self._queue = queue
         self._pictures = pictures
+        self._windows = windows
         self._stream = stream
         self._mailbox = mailbox
         self._losses = losses
@@ -305,6 +308,8 @@ class Decider:
         result = answer.result
         fields = {"window": result.window_id, "decision": result.verdict.decision}
         _log.info("a window was solved", extra={"fields": fields})
+        if answer.written is not None:
+            self._note_file(result, answer.written)
         if answer.note is not None:
             self._losses.add("window", "result_not_written", detail=answer.note.text)
         if not self._baseline.fits_network(result.depth_identity):
@@ -319,6 +324,16 @@ class Decider:
             return self._judge(result)
         self._store.save()
         return None
+
+    def _note_file(self, result: CalibrationResult, file: WrittenFile) -> None:
+        version = WindowVersion(
+            size_bytes=file.size_bytes,
+            modified_ns=file.modified_ns,
+            sha256=file.sha256,
+            pairs=file.pairs,
+            decision=result.verdict.decision,
+        )
+        self._windows.note(result.window_id, version)
 
     def _judge(self, result: CalibrationResult) -> Effect | None:
         estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)

@@ -2,21 +2,22 @@
 
 A line is `<sha256 of the entry> <entry, JSON><tab><result, JSON or null>`; the entry names the sha256 of its result.
 Hashes are over the bytes of the line, so that a later version with more fields can still verify it. Only the newest
-`limit` entries are kept: the first line's `previous_sha256` is then the hash of what was dropped. The last hash also
-stands in the state file, so that a tail that was cut off is noticed. A chain that does not hold is kept aside as it is,
-and goes on from the part that does.
+`limit` entries are kept: the first line's `previous_sha256` is then the hash of what was dropped. Place and hash of the
+last entry on the disk also stand in the state file, so that a tail that was cut off is noticed. A chain that does not
+hold is kept aside as it is, and goes on from the part that does.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
+from coec.adapters.files import durable
+from coec.adapters.files.durable import Log
 from coec.errors import DecodeError, StateError
 from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import CalibrationResult, ChainedEntry, HistoryEntry
@@ -43,24 +44,30 @@ class Kept:
 class History:
     """All that is kept of one pair, oldest first. Safe to use from several threads.
 
+    An entry that could not be put on the disk is kept, and goes there with the next one, in order: the chain on the
+    disk holds at any time.
+
     Attributes:
         damage: what was wrong with the chain that was found, one sentence; None when it held.
     """
 
     def __init__(self, path: Path, limit: int, head: str | None = None) -> None:
-        """`head` is the last hash that the state file knows of: the chain must hold it, or it was cut off."""
+        """`head` is the `durable_head` that the state file knows of: the chain must reach it, or it was cut off."""
         self._path = path
         self._lock = threading.Lock()
         self._kept: deque[Kept] = deque(maxlen=limit)
-        self._lines = 0
+        self._log = Log(path, limit, lambda: [kept.line for kept in self._kept])
+        self._durable_head: str | None = None
+        self._to_keep_aside = False
         self.damage: str | None = None
         self._load(head)
 
     @property
-    def head(self) -> str:
-        """Hash of the newest entry."""
+    def durable_head(self) -> str | None:
+        """Place and hash of the newest entry that is on the disk, in the words of this module; None before the first.
+        This, and nothing newer, is for the state file to remember."""
         with self._lock:
-            return self._kept[-1].sha256 if self._kept else GENESIS
+            return self._durable_head
 
     def entries(self) -> tuple[Kept, ...]:
         """All that are kept."""
@@ -72,10 +79,10 @@ class History:
         return tuple(kept.result for kept in self.entries() if kept.result is not None)
 
     def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
-        """Keep one more; its place in the chain is filled in. On the disk when this returns.
+        """Keep one more; its place in the chain is filled in. On the disk, with all before it, when this returns.
 
         Raises:
-            StateError: it is kept in memory, but not on the disk.
+            StateError: it is kept in memory, but not on the disk; the next append or `flush` tries again.
         """
         with self._lock:
             last = self._kept[-1] if self._kept else None
@@ -89,65 +96,65 @@ class History:
             document = to_json(placed)
             sha256 = _sha256(document)
             body = document + b"\t" + (to_json(result) if result else b"null")
-            kept = Kept(sha256, placed, result, sha256.encode() + b" " + body + b"\n")
+            kept = Kept(sha256, placed, result, sha256.encode() + b" " + body)
             self._kept.append(kept)
-            try:
-                if self._lines >= 2 * (self._kept.maxlen or 1):
-                    self._rewrite()
-                else:
-                    with self._path.open("ab") as stream:
-                        stream.write(kept.line)
-                        stream.flush()
-                        os.fsync(stream.fileno())
-                    self._lines += 1
-            except OSError as error:
-                raise StateError(f"cannot write {self._path}: {error.strerror}") from error
+            self._log.add(kept.line)
+            self._flush()
             return kept
 
-    def _load(self, head: str | None) -> None:
+    def flush(self) -> None:
+        """Put on the disk what an append could not.
+
+        Raises:
+            StateError: it is still not possible.
+        """
+        with self._lock:
+            self._flush()
+
+    def _flush(self) -> None:
         try:
-            data = self._path.read_bytes()
-        except OSError:
-            data = b""
-        whole, _, torn = data.rpartition(b"\n")
-        lines = whole.split(b"\n") if whole else []
-        hashes: list[str] = []
+            if self._to_keep_aside:
+                self._keep_aside()
+            self._log.flush()
+        except OSError as error:
+            raise StateError(f"cannot write {self._path}: {error.strerror}") from error
+        if self._kept:
+            self._durable_head = _head_of(self._kept[-1])
+
+    def _load(self, head: str | None) -> None:
+        lines = self._read()
         for number, line in enumerate(lines, start=1):
             kept = _parsed(line)
-            if kept is None or (hashes and kept.entry.previous_sha256 != hashes[-1]):
+            last = self._kept[-1] if self._kept else None
+            if kept is None or (last is not None and kept.entry.previous_sha256 != last.sha256):
                 self.damage = f"line {number} of {len(lines)} is not what its hash, or the one before it, says"
                 break
-            hashes.append(kept.sha256)
             self._kept.append(kept)
-        if self.damage is None and head not in (None, GENESIS, *hashes):
+        if self.damage is None and not _reaches(self._kept, head):
             self.damage = "its end was cut off: it lacks an entry that the state file knows of"
-        self._lines = len(lines)
+        if self._kept:
+            self._durable_head = _head_of(self._kept[-1])
         if self.damage is not None:
-            self._keep_aside()
-        elif torn:  # a write that a power cut interrupted
-            self._restore()
+            self._to_keep_aside = True
+            self._log.renew()
+            with contextlib.suppress(StateError):
+                self._flush()
+
+    def _read(self) -> list[bytes]:
+        try:
+            return self._log.load()
+        except OSError as error:
+            self.damage = f"it cannot be read: {error.strerror}"
+            return []
 
     def _keep_aside(self) -> None:
         aside, number = self._path.with_name(f"{self._path.name}.broken"), 0
         while aside.exists():
             number += 1
             aside = self._path.with_name(f"{self._path.name}.broken-{number}")
-        with contextlib.suppress(OSError):
-            self._path.replace(aside)
-        self._restore()
-
-    def _restore(self) -> None:
-        with contextlib.suppress(OSError):
-            self._rewrite()
-
-    def _rewrite(self) -> None:
-        fresh = self._path.with_name(self._path.name + ".new")
-        with fresh.open("wb") as stream:
-            stream.write(b"".join(kept.line for kept in self._kept))
-            stream.flush()
-            os.fsync(stream.fileno())
-        fresh.replace(self._path)
-        self._lines = len(self._kept)
+        with contextlib.suppress(FileNotFoundError):
+            durable.keep_under(self._path, aside)
+        self._to_keep_aside = False
 
 
 def _parsed(line: bytes) -> Kept | None:
@@ -161,7 +168,23 @@ def _parsed(line: bytes) -> Kept | None:
         return None
     if _sha256(document).encode() != sha256 or (_sha256(result) if told else None) != entry.result_sha256:
         return None
-    return Kept(sha256.decode(), entry, told, line + b"\n")
+    return Kept(sha256.decode(), entry, told, line)
+
+
+def _head_of(kept: Kept) -> str:
+    return f"{kept.entry.sequence} {kept.sha256}"
+
+
+def _reaches(chain: deque[Kept], head: str | None) -> bool:
+    """Whether a sound chain holds the entry that `head` names, or only ones after it: the oldest are dropped."""
+    if head is None:
+        return True
+    number, _, sha256 = head.partition(" ")
+    if not number.isdecimal() or not chain:
+        return False
+    return int(number) < chain[0].entry.sequence or any(
+        kept.entry.sequence == int(number) and kept.sha256 == sha256 for kept in chain
+    )
 
 
 def _sha256(document: bytes) -> str:

@@ -8,7 +8,7 @@ from coec.adapters.files.conversions import matrix_of
 from coec.adapters.system.logs import LossCounter
 from coec.runtime.decisions.incidents import Incidents, Side
 from coec.runtime.decisions.questions import Questions
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.jobs import Drawn, JobOutcome
 from coec.schemas.replies import EvidenceEvent
 
@@ -16,7 +16,7 @@ from coec.schemas.replies import EvidenceEvent
 class IncidentPictures:
     """Belongs to the thread that decides about the pair."""
 
-    def __init__(self, incidents: Incidents, folder: WindowFolder, questions: Questions, losses: LossCounter) -> None:
+    def __init__(self, incidents: Incidents, folder: WindowStore, questions: Questions, losses: LossCounter) -> None:
         self._incidents = incidents
         self._folder = folder
         self._questions = questions

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import shutil
 import threading
 from collections import deque
 from pathlib import Path
 from typing import Literal
 
+from coec.adapters.files import durable
 from coec.errors import DecodeError, NotFoundError
 from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import EvidenceEvent, EvidenceReply, MetricsPoint
@@ -26,11 +26,15 @@ POINTS_KEPT = 240
 POINTS_AFTER = 60
 """Checks after the beginning of an event that are added to it: five minutes."""
 
+EVENT = "event.json"
+"""In the folder of each event."""
+
 Side = Literal["before", "after"]
 
 
 class Incidents:
-    """Red events of one pair. Safe to use from several threads; a fault of the disk costs evidence, never the service.
+    """Red events of one pair. Safe to use from several threads. A fault of the disk never costs the service: an event
+    that could not be written is tried again with the next check.
 
     Attributes:
         lost: writes that failed.
@@ -43,13 +47,10 @@ class Incidents:
         self._lock = threading.RLock()
         self._points: deque[MetricsPoint] = deque(maxlen=POINTS_KEPT)
         self._events: dict[str, EvidenceEvent] = {}
+        self._unsaved: set[str] = set()
         self._after = 0
         self.lost = 0
-        for path in sorted(folder.glob(f"{pair}-*/event.json"), key=lambda path: _stamp(path.parent.name)):
-            with contextlib.suppress(OSError, DecodeError):
-                event = from_json(EvidenceEvent, path.read_bytes())
-                if event.pair == pair and event.event_id == path.parent.name:
-                    self._events[event.event_id] = event
+        self._load()
 
     @property
     def window_ids(self) -> frozenset[str]:
@@ -79,6 +80,8 @@ class Incidents:
             if newest is not None and self._after > 0:
                 self._after -= 1
                 self._keep(newest.model_copy(update={"metrics": (*newest.metrics, point)}))
+            elif self._unsaved:
+                self._save()
 
     def begin(self, event: EvidenceEvent) -> EvidenceEvent:
         """A red event begins; the figures so far are added to it."""
@@ -86,10 +89,7 @@ class Incidents:
             begun = event.model_copy(update={"metrics": tuple(self._points)})
             self._after = POINTS_AFTER
             self._keep(begun)
-            while len(self._events) > self._limit:
-                oldest = next(iter(self._events))
-                del self._events[oldest]
-                shutil.rmtree(self._folder / oldest, ignore_errors=True)
+            self._drop_oldest()
             return begun
 
     def add_window_after(self, window_id: str) -> EvidenceEvent | None:
@@ -145,22 +145,58 @@ class Incidents:
         except OSError as error:
             raise NotFoundError(f"the event has no picture of the window {side} it") from error
 
+    def _load(self) -> None:
+        """Events of earlier runs. A folder without its event was about to be filled or removed when the power went."""
+        folders = [path for path in self._folder.glob(f"{self._pair}-*") if _is_event_of(self._pair, path.name)]
+        for folder in sorted(folders, key=lambda path: _stamp(path.name)):
+            with contextlib.suppress(OSError, DecodeError):
+                if not (folder / EVENT).exists():
+                    durable.remove_folder(folder)
+                    continue
+                event = from_json(EvidenceEvent, (folder / EVENT).read_bytes())
+                if event.pair == self._pair and event.event_id == folder.name:
+                    self._events[event.event_id] = event
+        self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        while len(self._events) > self._limit:
+            oldest = next(iter(self._events))
+            del self._events[oldest]
+            self._unsaved.discard(oldest)
+            try:
+                durable.remove_folder(self._folder / oldest)
+            except OSError as error:  # it is found and removed at the next start
+                self._note_failure("removed", error)
+
     def _keep(self, event: EvidenceEvent) -> EvidenceEvent:
         self._events[event.event_id] = event
-        self._write(self._folder / event.event_id / "event.json", to_json(event))
+        self._unsaved.add(event.event_id)
+        self._save()
         return event
 
+    def _save(self) -> None:
+        """Write what is not on the disk: the event that has just changed, and those that could not be written then."""
+        for event_id in sorted(self._unsaved):
+            if self._write(self._folder / event_id / EVENT, to_json(self._events[event_id])):
+                self._unsaved.discard(event_id)
+
     def _write(self, path: Path, data: bytes) -> bool:
-        fresh = path.with_name(path.name + ".new")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            fresh.write_bytes(data)
-            fresh.replace(path)
+            durable.make_folder(path.parent)
+            durable.replace(path, data)
         except OSError as error:
-            self.lost += 1
-            _log.error(f"evidence could not be written: {error.strerror}", extra={"fields": {"pair": self._pair}})
+            self._note_failure("written", error)
             return False
         return True
+
+    def _note_failure(self, what: str, error: OSError) -> None:
+        self.lost += 1
+        _log.error(f"evidence could not be {what}: {error.strerror}", extra={"fields": {"pair": self._pair}})
+
+
+def _is_event_of(pair: str, name: str) -> bool:
+    named, _, stamp = name.rpartition("-")
+    return named == pair and stamp.isdecimal()
 
 
 def _stamp(event_id: str) -> int:

@@ -7,6 +7,7 @@ is all put on the disk. One thread changes it, the one that decides about the pa
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections import Counter
@@ -27,7 +28,7 @@ from coec.runtime.decisions.history import GENESIS, History, Kept
 from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.state_store import Clocks, StateStore
 from coec.runtime.ingest.chooser import Served
-from coec.runtime.recording.window_store import WindowFolder
+from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
 from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, MetricsPoint
 
@@ -71,7 +72,7 @@ class PairStore:
         vehicle: str,
         config: StateConfig,
         store: StateStore,
-        folder: WindowFolder,
+        folder: WindowStore,
         losses: LossCounter,
     ) -> None:
         self._rig = rig
@@ -231,8 +232,10 @@ class PairStore:
         age_s = self.age_s
         completed_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
         clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
+        with contextlib.suppress(StateError):  # counted when it was appended
+            self.history.flush()
         try:
-            self._store.remember(self._rig, self._state, clocks, self.history.head)
+            self._store.remember(self._rig, self._state, clocks, self.history.durable_head)
         except StateError as error:
             self._losses.add("storage", "state_not_saved", detail=str(error))
 

@@ -15,6 +15,7 @@ from coec.config import PairConfig
 from coec.runtime.decisions.mailbox import Mailbox
 from coec.runtime.decisions.queue import DecisionQueue, Question
 from coec.runtime.ingest.chooser import Served
+from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker import jobs
 from coec.runtime.worker.jobs import JobOutcome
 from coec.runtime.worker.supervisor import Worker
@@ -51,8 +52,11 @@ class Decides(Protocol):
 class Questions:
     """Asks for one pair: for its stream (`ingest.chooser.Asks`) and for its recorder. Any thread."""
 
-    def __init__(self, pair: PairConfig, queue: DecisionQueue, worker: Worker, mailbox: Mailbox) -> None:
+    def __init__(
+        self, pair: PairConfig, queue: DecisionQueue, worker: Worker, mailbox: Mailbox, windows: WindowStore
+    ) -> None:
         self._pair = pair
+        self._windows = windows
         self._queue = queue
         self._worker = worker
         self._mailbox = mailbox
@@ -100,8 +104,14 @@ class Questions:
 
     def solve(self, window_id: str, path: Path, live: bool) -> None:
         """A window is on the disk. `live` is False for one of an earlier run."""
-        ended = partial(self._decides.solved, window_id, live=live)
-        self._worker.ask(jobs.solve(self._pair.name, path, window_id, self._post(ended), live))
+        post = self._post(partial(self._decides.solved, window_id, live=live))
+
+        def done(outcome: JobOutcome) -> None:
+            self._windows.release(window_id)
+            post(outcome)
+
+        self._windows.hold(window_id)
+        self._worker.ask(jobs.solve(self._pair.name, path, window_id, done, live))
 
     def lost(self, window_id: str) -> None:
         """A window ended and came to nothing."""

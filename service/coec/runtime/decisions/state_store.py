@@ -49,7 +49,8 @@ class StoredChange(Part):
 
 class StoredPair(Part):
     """`PairState` on the disk; when (wall clock) a check was last completed and since when it is in its state of
-    health; and the last hash of its history. What is not in a file of an earlier version is as at the first start."""
+    health; and the head of its history on the disk. What is not in a file of an earlier version is as at the first
+    start."""
 
     rig_sha256: str
     T_camera_lidar: Rows

@@ -1,25 +1,42 @@
-"""The folder of recorded windows: what is there, what has to go, bytes of a file."""
+"""The folder of recorded windows: what is there, what has to go, bytes of a file.
+
+No clock is trusted alone with a file. Which window is older is told by the order in which they were recorded; one is
+too old only when the wall clock says so and the sensor time of a newer window of its pair as well. And as both may
+jump together, age takes few at a time.
+"""
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import re
 import shutil
 import threading
 import time
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from coec.adapters.mcap.windows import PART_SUFFIX, REWRITE_SUFFIX, read_result
+from coec.adapters.files import durable
+from coec.adapters.mcap.windows import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX, RecordedWindow
 from coec.config import StateConfig
-from coec.errors import CoecError, NotFoundError, RecordingError, UsageError
+from coec.errors import NotFoundError, RecordingError, UsageError
+from coec.runtime.recording.window_index import IndexedWindow, WindowIndex, WindowVersion
 from coec.schemas.replies import WindowInfo
 
 _log = logging.getLogger(__name__)
 
-SECONDS_PER_DAY = 86_400.0
+NS_PER_DAY = 86_400 * 1_000_000_000
+
+EXPIRED_AT_ONCE = 2
+"""Windows that age removes whenever one begins: more than one, so that the folder empties; few, so that a clock that is
+wrong for an hour takes no more than twice what was recorded in it."""
+
+SETTLED_S = 3.0
+"""A folder that has been as it is for so long is not read again before its time of modification changes; that time is
+as coarse as the clock of the file system, 4 ms on ext4 and XFS, 2 s on FAT."""
+
 _WINDOW_ID = re.compile(r"([A-Za-z0-9_.-]{1,64})-(\d{1,19})", re.ASCII)
 
 
@@ -31,32 +48,64 @@ class Usage:
     free: int
 
 
-class WindowFolder:
-    """All windows of all pairs. Safe to use from several threads."""
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A window that is there: its pair, the sensor time of its beginning, its place in the order of recordings, and
+    what the file system says."""
+
+    pair: str
+    start_ns: int
+    order: int
+    size_bytes: int
+    modified_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """The windows of one pair, as long as nothing changes: in order, and the files that were not read yet, the latest
+    first."""
+
+    infos: tuple[WindowInfo, ...]
+    unread: tuple[Path, ...]
+
+
+class WindowStore:
+    """All windows of all pairs. Safe to use from several threads.
+
+    Attributes:
+        removed: windows that had to go.
+    """
 
     def __init__(self, folder: Path, config: StateConfig) -> None:
-        """Makes the folder.
+        """Makes the folder. What was read of its windows is kept beside it.
 
         Raises:
-            RecordingError: it cannot be made.
+            RecordingError: it cannot be made or read.
         """
         self._folder = folder
         self._config = config
         self._lock = threading.Lock()
-        self._known: dict[tuple[str, int, int], WindowInfo] = {}
-        self._pairs_in: dict[str, int] = {}
+        self._found: dict[str, _Found] = {}
+        self._views: dict[str, _View] = {}
         self._protected: dict[str, frozenset[str]] = {}
+        self._held: Counter[str] = Counter()
+        self._changed_ns: int | None = None
+        self._changed_s = self._looked_s = 0.0
         self.removed = 0
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            for leftover in folder.glob(f"*.mcap{REWRITE_SUFFIX}"):  # the original is still there
+            durable.make_folder(folder)
+            for leftover in folder.glob(f"*{SUFFIX}{REWRITE_SUFFIX}"):  # the original is still there
                 leftover.unlink(missing_ok=True)
+            self._index = WindowIndex(folder.with_name(f"{folder.name}.jsonl"))
+            self._look()
         except OSError as error:
-            raise RecordingError(f"cannot make the folder {folder}: {error.strerror}") from error
+            raise RecordingError(f"the folder {folder} cannot be made or read: {error.strerror}") from error
+
+    # --- what is there ----------------------------------------------------------------------------------------------
 
     def path(self, window_id: str) -> Path:
         """Where a window is, or will be."""
-        return self._folder / f"{window_id}.mcap"
+        return self._folder / f"{window_id}{SUFFIX}"
 
     def existing(self, pair: str, window_id: str) -> Path:
         """The file of a window of the pair.
@@ -70,62 +119,31 @@ class WindowFolder:
         return self.path(window_id)
 
     def windows(self, pair: str) -> list[Path]:
-        """Files of the pair's windows, by the sensor time of their beginning."""
-        return [path for _, path in sorted(self._stamped(pair, ".mcap"))]
+        """Files of the pair's windows, in the order in which they were recorded."""
+        with self._lock:
+            return [self.path(info.window_id) for info in self._view(pair).infos]
 
     def leftovers(self, pair: str) -> list[Path]:
-        """Files of the pair that were not finished before the last end of the service."""
-        return [path for _, path in sorted(self._stamped(pair, f".mcap{PART_SUFFIX}"))]
-
-    def note(self, window_id: str, pairs: int) -> None:
-        """Remember how many pairs a fresh window holds, for the list."""
-        self._pairs_in[window_id] = pairs
-
-    def protect(self, pair: str, window_ids: frozenset[str]) -> None:
-        """These windows of the pair (and no others any more) are evidence: age does not remove them, and lack of room
-        only when no other window is left."""
-        with self._lock:
-            self._protected[pair] = window_ids
+        """Files of the pair that were not finished before the last end of the service, by the sensor time of their
+        beginning."""
+        found = []
+        for path in self._folder.glob(f"{pair}-*{SUFFIX}{PART_SUFFIX}"):
+            match = _WINDOW_ID.fullmatch(path.name.removesuffix(f"{SUFFIX}{PART_SUFFIX}"))
+            if match is not None and match[1] == pair:
+                found.append((int(match[2]), path))
+        return [path for _, path in sorted(found)]
 
     def usage(self) -> Usage:
         """How full it is."""
-        return Usage(sum(size for _, size, _ in self._entries()), _free_bytes(self._folder))
-
-    def make_room(self) -> None:
-        """Before a window starts: remove windows that are too old, and the oldest while there are too many bytes or
-        too little is left free. The newest window of a pair stays as long as its bytes are within the limit.
-
-        Raises:
-            RecordingError: too little is free all the same.
-        """
         with self._lock:
-            entries = sorted(self._entries())
-            newest = entries[-1][2] if entries else None
-            evidence = frozenset().union(*self._protected.values())
-            used = sum(size for _, size, _ in entries)
-            reserve = max((size for _, size, _ in entries), default=0)
-            oldest_kept_ns = time.time_ns() - round(self._config.max_age_days * SECONDS_PER_DAY * 1e9)
-            for modified_ns, size, path in sorted(entries, key=lambda entry: entry[2].stem in evidence):
-                too_much = used + reserve > self._config.max_bytes
-                too_full = _free_bytes(self._folder) < self._config.min_free_bytes + reserve
-                too_old = modified_ns < oldest_kept_ns and path.stem not in evidence
-                if not too_much and not (too_full and path != newest) and not too_old:
-                    continue
-                path.unlink(missing_ok=True)
-                self.removed += 1
-                used -= size
-                _log.info("an old window was removed", extra={"fields": {"window": path.stem, "bytes": size}})
-            free = _free_bytes(self._folder)
-            if free < self._config.min_free_bytes:
-                raise RecordingError(
-                    f"only {free >> 20} MiB are free on the disk of {self._folder}; state.min_free_bytes asks for "
-                    f"{self._config.min_free_bytes >> 20} MiB: free space"
-                )
+            self._look()
+            used = sum(found.size_bytes for found in self._found.values())
+        return Usage(used, _free_bytes(self._folder))
 
     def listing(self, pair: str) -> tuple[WindowInfo, ...]:
-        """Every window of the pair, oldest first. Reads files that changed since the last call: may take a while."""
-        infos = (self._info(path) for path in self.windows(pair))
-        return tuple(info for info in infos if info is not None)
+        """Every window of the pair, oldest first. Opens no file: what has not been read yet is null."""
+        with self._lock:
+            return self._view(pair).infos
 
     def read(self, pair: str, window_id: str, offset: int, length: int) -> bytes:
         """`length` bytes of a window's file from `offset`; fewer at its end.
@@ -144,44 +162,197 @@ class WindowFolder:
         except OSError as error:
             raise NotFoundError(f"the window cannot be read: {error.strerror}") from error
 
-    def _stamped(self, pair: str, suffix: str) -> list[tuple[int, Path]]:
-        found = []
-        for path in self._folder.glob(f"{pair}-*{suffix}"):
-            match = _WINDOW_ID.fullmatch(path.name.removesuffix(suffix))
-            if match is not None and match[1] == pair:
-                found.append((int(match[2]), path))
-        return found
+    # --- what is known of it ----------------------------------------------------------------------------------------
 
-    def _entries(self) -> list[tuple[int, int, Path]]:
-        """(modified ns, bytes, path) of every window."""
-        entries = []
-        for path in self._folder.glob("*.mcap"):
+    def add(self, recorded: RecordedWindow) -> None:
+        """A window was recorded: it is the latest."""
+        version = WindowVersion(
+            size_bytes=recorded.bytes,
+            modified_ns=recorded.modified_ns,
+            sha256=recorded.sha256,
+            pairs=recorded.pairs,
+            decision=None,
+        )
+        with self._lock:
+            self._look()
+            found = self._found.get(recorded.window_id)
+            if found is not None:
+                found = self._found[recorded.window_id] = replace(found, order=self._index.next_order())
+                self._put(recorded.window_id, found.order, version)
+
+    def note(self, window_id: str, version: WindowVersion) -> None:
+        """The file of a window was read or written again: this is what it was then. If it is another by now, nothing
+        is lost: what is noted counts for a file of this size and time only."""
+        with self._lock:
+            self._look()
+            found = self._found.get(window_id)
+            if found is not None:
+                self._put(window_id, found.order, version)
+
+    def version(self, window_id: str) -> WindowVersion | None:
+        """What was read of a window as it is now; None: not read yet, or no such window."""
+        with self._lock:
+            self._look()
+            found = self._found.get(window_id)
+            return None if found is None else self._version(window_id, found)
+
+    def unread(self, pair: str) -> tuple[Path, ...]:
+        """The pair's windows of which not everything is known, the latest first."""
+        with self._lock:
+            return self._view(pair).unread
+
+    # --- what has to stay, what has to go ---------------------------------------------------------------------------
+
+    def hold(self, window_id: str) -> None:
+        """Something is under way with this window, which must not be removed until as many `release` have come."""
+        with self._lock:
+            self._held[window_id] += 1
+
+    def release(self, window_id: str) -> None:
+        """What `hold` was for has come to its end."""
+        with self._lock:
+            self._held[window_id] -= 1
+            if self._held[window_id] <= 0:
+                del self._held[window_id]
+
+    def protect(self, pair: str, window_ids: frozenset[str]) -> None:
+        """These windows of the pair (and no others any more) are evidence: age does not remove them, and lack of room
+        only when no other window is left that may go."""
+        with self._lock:
+            self._protected[pair] = window_ids
+
+    def make_room(self, progress: Callable[[], None]) -> None:
+        """Before a window starts: remove windows that are too old, and the oldest while there are too many bytes or
+        too little is left free. What is held stays, and the latest window of a pair; for their sake there may be more
+        bytes than asked for.
+
+        Args:
+            progress: called after every window that is removed.
+
+        Raises:
+            RecordingError: too little is free all the same, or a window cannot be removed.
+        """
+        with self._lock:
             try:
-                status = path.stat()
-            except FileNotFoundError:
-                continue
-            entries.append((status.st_mtime_ns, status.st_size, path))
-        return entries
+                self._make_room(progress)
+            except OSError as error:
+                raise RecordingError(f"no room can be made in {self._folder}: {error.strerror}") from error
 
-    def _info(self, path: Path) -> WindowInfo | None:
+    def _make_room(self, progress: Callable[[], None]) -> None:
+        durable.make_folder(self._folder)
+        self._look()
+        latest = {found.pair: window_id for window_id, found in self._in_order()}
+        evidence = frozenset().union(*self._protected.values())
+        used = sum(found.size_bytes for found in self._found.values())
+        reserve = max((found.size_bytes for found in self._found.values()), default=0)
+        removable = [item for item in self._in_order() if item[0] not in self._held and item[0] != latest[item[1].pair]]
+        expired = 0
+        for window_id, found in sorted(removable, key=lambda item: item[0] in evidence):
+            too_much = used + reserve > self._config.max_bytes
+            too_full = _free_bytes(self._folder) < self._config.min_free_bytes + reserve
+            if not too_much and not too_full:
+                newest = self._found[latest[found.pair]]
+                if window_id in evidence or expired == EXPIRED_AT_ONCE or not self._is_too_old(found, newest):
+                    continue
+                expired += 1
+            durable.remove(self.path(window_id))
+            self.removed += 1
+            used -= found.size_bytes
+            del self._found[window_id]
+            self._views.clear()
+            _log.info("an old window was removed", extra={"fields": {"window": window_id, "bytes": found.size_bytes}})
+            progress()
+        self._index.prune(self._found)
+        free = _free_bytes(self._folder)
+        if free < self._config.min_free_bytes:
+            raise RecordingError(
+                f"only {free >> 20} MiB are free on the disk of {self._folder}; state.min_free_bytes asks for "
+                f"{self._config.min_free_bytes >> 20} MiB: free space"
+            )
+
+    def _is_too_old(self, found: _Found, newest: _Found) -> bool:
+        """A clock that was set back makes an age negative, which is no age."""
+        oldest_ns = round(self._config.max_age_days * NS_PER_DAY)
+        by_wall_clock = time.time_ns() - found.modified_ns > oldest_ns
+        return by_wall_clock and newest.start_ns - found.start_ns > oldest_ns
+
+    # --- inside; the lock is held -----------------------------------------------------------------------------------
+
+    def _in_order(self) -> list[tuple[str, _Found]]:
+        return sorted(self._found.items(), key=lambda item: item[1].order)
+
+    def _look(self) -> None:
+        """Read the folder if it has changed. No file in it is written in place: a window that changes is replaced, and
+        the folder changes with it."""
+        now_s = time.monotonic()
         try:
-            status = path.stat()
-            key = (path.stem, status.st_mtime_ns, status.st_size)
-            if key not in self._known:
-                result = read_result(path)
-                self._known[key] = WindowInfo(
-                    window_id=path.stem,
-                    sha256=_sha256(path),
-                    size_bytes=status.st_size,
-                    pairs=result.pairs if result else self._pairs_in.get(path.stem, 0),
-                    decision=result.verdict.decision if result else None,
-                )
-            return self._known[key]
-        except FileNotFoundError:
+            changed_ns = self._folder.stat().st_mtime_ns
+            if changed_ns != self._changed_ns:
+                self._changed_ns, self._changed_s = changed_ns, now_s
+            elif self._looked_s > self._changed_s + SETTLED_S:
+                return
+            self._looked_s = now_s
+            statuses = _statuses(self._folder)
+        except FileNotFoundError:  # somebody has removed the folder
+            self._changed_ns, statuses = None, {}
+        self._compare(statuses)
+
+    def _compare(self, statuses: Mapping[str, os.stat_result]) -> None:
+        """Take over what is there now. A window that nobody has reported counts as the latest; of several of them their
+        times are all there is to tell."""
+        gone = self._found.keys() - statuses.keys()
+        changed = [
+            (status.st_mtime_ns, start_ns_of(window_id), window_id)
+            for window_id, status in statuses.items()
+            if (found := self._found.get(window_id)) is None
+            or (found.size_bytes, found.modified_ns) != (status.st_size, status.st_mtime_ns)
+        ]
+        if not gone and not changed:
+            return
+        self._views.clear()
+        for window_id in gone:
+            del self._found[window_id]
+        for modified_ns, start_ns, window_id in sorted(changed):
+            pair, size_bytes = window_id.rpartition("-")[0], statuses[window_id].st_size
+            self._found[window_id] = _Found(pair, start_ns, self._order(window_id), size_bytes, modified_ns)
+        self._index.prune(self._found)
+
+    def _order(self, window_id: str) -> int:
+        found, indexed = self._found.get(window_id), self._index.get(window_id)
+        if found is not None:
+            return found.order
+        return self._index.next_order() if indexed is None else indexed.order
+
+    def _put(self, window_id: str, order: int, version: WindowVersion) -> None:
+        self._index.put(IndexedWindow(window_id=window_id, order=order, version=version))
+        self._views.clear()
+
+    def _version(self, window_id: str, found: _Found) -> WindowVersion | None:
+        indexed = self._index.get(window_id)
+        if indexed is None:
             return None
-        except (CoecError, OSError):
-            _log.exception("a window could not be listed", extra={"fields": {"window": path.stem}})
-            return None
+        same = (indexed.version.size_bytes, indexed.version.modified_ns) == (found.size_bytes, found.modified_ns)
+        return indexed.version if same else None
+
+    def _view(self, pair: str) -> _View:
+        self._look()
+        view = self._views.get(pair)
+        if view is None:
+            ours = [(window_id, found) for window_id, found in self._in_order() if found.pair == pair]
+            infos = tuple(self._info(window_id, found) for window_id, found in ours)
+            unread = tuple(self.path(info.window_id) for info in reversed(infos) if info.sha256 is None)
+            view = self._views[pair] = _View(infos, unread)
+        return view
+
+    def _info(self, window_id: str, found: _Found) -> WindowInfo:
+        version, indexed = self._version(window_id, found), self._index.get(window_id)
+        return WindowInfo(
+            window_id=window_id,
+            sha256=version.sha256 if version else None,
+            size_bytes=found.size_bytes,
+            pairs=indexed.version.pairs if indexed else None,
+            decision=version.decision if version else None,
+        )
 
 
 def start_ns_of(window_id: str) -> int:
@@ -189,10 +360,21 @@ def start_ns_of(window_id: str) -> int:
     return int(window_id.rpartition("-")[2])
 
 
+def _statuses(folder: Path) -> dict[str, os.stat_result]:
+    """Of every window, by its id."""
+    found = {}
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            window_id = entry.name.removesuffix(SUFFIX)
+            if window_id != entry.name and _WINDOW_ID.fullmatch(window_id):
+                try:
+                    found[window_id] = entry.stat()
+                except FileNotFoundError:
+                    continue
+    return found
+
+
 def _free_bytes(folder: Path) -> int:
-    return shutil.disk_usage(folder).free
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    """On the disk that holds the folder, or will when it is made."""
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    return shutil.disk_usage(there).free

@@ -57,11 +57,23 @@ COMMISSIONING_TIMEOUT_S = 900.0
 
 
 @dataclass(frozen=True, slots=True)
+class WrittenFile:
+    """A window's file as it was written: its bytes, the time of its last write, its hash, the pairs in it."""
+
+    size_bytes: int
+    modified_ns: int
+    sha256: str
+    pairs: int
+
+
+@dataclass(frozen=True, slots=True)
 class Solved:
-    """A window was calibrated. `note` says why the window's file does not hold the result, if it does not."""
+    """A window was calibrated. `note` says why the window's file does not hold the result, if it does not; `written` is
+    that file if it does."""
 
     result: CalibrationResult
     note: Reason | None
+    written: WrittenFile | None = None
 
 
 @dataclass(frozen=True, slots=True)

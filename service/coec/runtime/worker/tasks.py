@@ -37,7 +37,7 @@ from coec.config import Config, DepthConfig
 from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.cameras import scaled
 from coec.reports.overlay import draw
-from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Solved
+from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Solved, WrittenFile
 from coec.runtime.worker.messages import unpack_pairs
 
 _log = logging.getLogger(__name__)
@@ -109,12 +109,12 @@ class Solver:
         estimate = calibrate(window, self._network(configuration.depth), self._images, configuration, Silence())
         result = result_of(estimate, window.rig, self._config.vehicle)
         try:
-            write_result(path, result)
+            file = write_result(path, result)
         except (RecordingError, WindowError, OSError) as error:
             _log.warning("the result could not be written into its window", extra={"fields": {"window": path.stem}})
             code = error.reply_code if isinstance(error, CoecError) else "recording_failed"
             return Solved(result, Reason(code, f"The window file does not hold the result: {error}"))
-        return Solved(result, None)
+        return Solved(result, None, WrittenFile(file.bytes, file.modified_ns, file.sha256, file.pairs))
 
     def observe(self, pair: str, pose: Sequence[Sequence[float]], frames: Sequence[Sequence[bytes | None]]) -> Checked:
         """A check of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs

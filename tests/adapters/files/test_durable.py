@@ -1,0 +1,231 @@
+"""Durable files: whole or not at all, whatever the disk refuses and whenever the power goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from coec.adapters.files import durable
+from coec.adapters.files.durable import Log
+from disks import EVERYTHING, Disk
+
+
+def log_of(path: Path, lines: list[bytes], limit: int = 100) -> Log:
+    return Log(path, limit, lambda: lines[-limit:])
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    return folder
+
+
+# --- replacement ----------------------------------------------------------------------------------------------------
+
+
+def test_a_file_is_replaced_whole_and_its_previous_copy_kept(root: Path) -> None:
+    path, previous = root / "f", root / "f.previous"
+    durable.replace(path, b"first", previous)
+    durable.replace(path, b"second", previous)
+    durable.replace(path, b"third", previous)
+    assert (path.read_bytes(), previous.read_bytes()) == (b"third", b"second")
+    assert names(root) == ["f", "f.previous"]
+
+
+def test_at_every_refusal_the_file_is_old_or_new_and_nothing_else_is_left(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(root, monkeypatch)
+    path, previous = root / "f", root / "f.previous"
+    durable.replace(path, b"old old")
+    before = disk.operations
+    durable.replace(path, b"old old", previous)
+    for refused in range(disk.operations - before):
+        first = disk.operations
+        disk.refuses = [first + refused]
+        with suppress(OSError):
+            durable.replace(path, b"new", previous)
+        disk.refuses = ()
+        assert path.read_bytes() in (b"old old", b"new")
+        assert previous.read_bytes() == b"old old"
+        durable.replace(path, b"old old")
+        assert names(root) == ["f", "f.previous"]
+
+
+def test_a_power_cut_in_a_replacement_leaves_the_one_or_the_other(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(root, monkeypatch)
+    contents = (b"first", b"second, longer", b"3")
+    for number, data in enumerate(contents):
+        durable.replace(root / "f", data, root / "f.previous")
+        disk.acknowledge(number)
+    cuts = list(disk.power_cuts())
+    assert len(cuts) > sum(map(len, contents))
+    for cut in cuts:
+        files = dict(cut.files)
+        safe = len(cut.acknowledged)
+        assert files.get("f") in (None, *contents)[safe : safe + 2]
+        assert files.get("f.previous") in (None, *contents)
+
+
+def test_folders_are_made_and_removed(root: Path) -> None:
+    durable.make_folder(root / "a" / "b")
+    durable.make_folder(root / "a" / "b")
+    durable.replace(root / "a" / "b" / "f", b"1")
+    durable.remove_folder(root / "a" / "b")
+    durable.remove_folder(root / "a" / "b")
+    durable.remove(root / "a" / "nothing")
+    assert names(root / "a") == []
+    (root / "file").write_bytes(b"")
+    with pytest.raises(NotADirectoryError):
+        durable.make_folder(root / "file")
+
+
+# --- lines ----------------------------------------------------------------------------------------------------------
+
+
+def write(log: Log, lines: list[bytes], line: bytes) -> None:
+    lines.append(line)
+    log.add(line)
+    log.flush()
+
+
+def test_a_torn_tail_is_left_out_and_cut_at_the_next_append(root: Path) -> None:
+    path = root / "log"
+    path.write_bytes(b"one\ntwo\nthr")
+    lines = [b"one", b"two"]
+    log = log_of(path, lines)
+    assert log.load() == [b"one", b"two"]
+    write(log, lines, b"3")
+    assert path.read_bytes() == b"one\ntwo\n3\n"
+
+
+def test_a_full_disk_leaves_no_half_line_and_what_waits_follows_in_order(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(root, monkeypatch)
+    lines: list[bytes] = []
+    log = log_of(root / "log", lines)
+    write(log, lines, b"zero")
+    disk.refuses = EVERYTHING
+    for line in (b"one", b"two"):
+        with pytest.raises(OSError, match="No space"):
+            write(log, lines, line)
+        assert log.waiting
+    assert log_of(root / "log", []).load() == [b"zero"]
+    disk.refuses = ()
+    log.flush()
+    assert not log.waiting
+    assert (root / "log").read_bytes() == b"zero\none\ntwo\n"
+
+
+def test_a_file_that_has_become_too_long_is_written_anew(root: Path) -> None:
+    lines: list[bytes] = []
+    log = log_of(root / "log", lines, limit=3)
+    for number in range(20):
+        write(log, lines, b"%d" % number)
+        found = log_of(root / "log", []).load()
+        assert len(found) <= 6
+        assert found[-3:] == lines[-3:]
+
+
+@pytest.mark.parametrize("harm", [Path.unlink, lambda path: path.write_bytes(b"on")], ids=["removed", "cut"])
+def test_what_somebody_else_took_is_written_again(root: Path, harm: Callable[[Path], object]) -> None:
+    lines: list[bytes] = []
+    log = log_of(root / "log", lines)
+    write(log, lines, b"one")
+    harm(root / "log")
+    write(log, lines, b"two")
+    assert (root / "log").read_bytes() == b"one\ntwo\n"
+
+
+def test_what_somebody_else_took_is_written_again_though_the_disk_refuses_at_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for refused in range(8):
+        root = tmp_path / str(refused)
+        root.mkdir()
+        with monkeypatch.context() as patch:
+            disk = Disk(root, patch)
+            lines: list[bytes] = []
+            log = log_of(root / "log", lines)
+            write(log, lines, b"one")
+            write(log, lines, b"two")
+            (root / "log").unlink()
+            first = disk.operations + refused
+            disk.refuses = [first]
+            for line in (b"three", b"four"):
+                with suppress(OSError):
+                    write(log, lines, line)
+            disk.refuses = ()
+            log.flush()
+            assert (root / "log").read_bytes() == b"one\ntwo\nthree\nfour\n"
+
+
+def test_a_power_cut_takes_no_line_that_was_written(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(root, monkeypatch)
+    lines: list[bytes] = []
+    log = log_of(root / "log", lines, limit=3)
+    for number in range(9):
+        write(log, lines, b"%d" % number)
+        disk.acknowledge(number)
+    for cut in disk.power_cuts():
+        whole = dict(cut.files).get("log", b"").rpartition(b"\n")[0].split()
+        assert [int(line) for line in whole][-1:] >= list(cut.acknowledged)[-1:]
+
+
+def test_a_disk_that_stays_full_gets_the_newest_in_the_end(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(root, monkeypatch)
+    disk.refuses = EVERYTHING
+    lines: list[bytes] = []
+    log = log_of(root / "log", lines, limit=3)
+    for number in range(100):
+        with pytest.raises(OSError, match="No space"):
+            write(log, lines, b"%d" % number)
+    disk.refuses = ()
+    log.flush()
+    assert (root / "log").read_bytes() == b"97\n98\n99\n"
+
+
+def test_a_file_that_cannot_be_read_is_written_anew(root: Path) -> None:
+    (root / "log").mkdir()
+    lines: list[bytes] = []
+    log = log_of(root / "log", lines)
+    with pytest.raises(OSError, match="directory"):
+        log.load()
+    (root / "log").rmdir()
+    (root / "log").write_bytes(b"unknown")
+    write(log, lines, b"one")
+    assert (root / "log").read_bytes() == b"one\n"
+
+
+@pytest.mark.parametrize("length", [1, 2, 5, 40])
+def test_whatever_is_refused_no_line_is_lost_torn_or_out_of_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int
+) -> None:
+    for first in range(60):
+        root = tmp_path / f"{length}-{first}"
+        root.mkdir()
+        with monkeypatch.context() as patch:
+            disk = Disk(root, patch)
+            disk.refuses = range(first, first + length)
+            lines: list[bytes] = []
+            log = log_of(root / "log", lines, limit=3)
+            safe = -1
+            for number in range(10):
+                with suppress(OSError):
+                    write(log, lines, b"%d" % number)
+                    safe = number
+                found = [int(line) for line in log_of(root / "log", []).load()]
+                assert found == list(range(found[0], found[-1] + 1)) if found else safe == -1
+                assert not found or (found[-1] >= safe and found[0] <= max(0, found[-1] - 2))
+            disk.refuses = ()
+            log.flush()
+            assert log_of(root / "log", []).load()[-1] == b"9"
