@@ -31,6 +31,7 @@ from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import halved
+from coec.geometry.thinning import thinned
 
 Seen = TypeVar("Seen")
 
@@ -194,18 +195,22 @@ ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused":
 
 
 def depth_features(sight: Sight, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:
-    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4); of one in so many
-    points of every sweep, so that about `at_most` are left.
+    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4); of every sweep the
+    same share of its points, so that about `at_most` are left in all.
 
     Raises:
         CalibrationError: a frame has no usable depth.
     """
-    points = sum(len(pair.lidar.xyz_m) for pair in sight.window.pairs)
-    step = slice(None, None, 1 if at_most is None else max(1, round(points / at_most)))
+    counts = [len(pair.lidar.xyz_m) for pair in sight.window.pairs]
+    share = 1.0 if at_most is None else min(1.0, at_most / max(sum(counts), 1))
     return [
-        distance_and_depth(sight.points(index, step), depth, T_camera_lidar)
+        distance_and_depth(sight.points(index, _share_of(counts[index], share)), depth, T_camera_lidar)
         for index, depth in enumerate(sight.depths())
     ]
+
+
+def _share_of(count: int, share: float) -> Choice:
+    return EVERY if share >= 1.0 else thinned(count, round(share * count))
 
 
 def _by_mutual_information(frames: list[Features], sight: Sight, config: CalibrationConfig) -> Found:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
 from coec.calibration.monitor.sensor_faults import SceneFacts, scene_facts
 from coec.calibration.objective.curvature import axis_derivatives
-from coec.calibration.objective.edges import THINNED_POINTS, EdgeWitness, build_edges, evenly
+from coec.calibration.objective.edges import THINNED_POINTS, EdgeWitness, build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
     Evaluation,
@@ -34,6 +34,7 @@ from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import se3
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
 from coec.geometry.edges.charts import EdgeCharts
+from coec.geometry.thinning import thinned
 
 REACH_RAD = radians(4.0)
 """How far about the pose a check searches. A pose further off leaves the local optimum at the rim, or nowhere: both are
@@ -207,8 +208,7 @@ class _EdgesAlone:
 
 def _witness_of(edges: EdgeWitness, indices: Sequence[int]) -> EdgeWitness:
     coarse, fine = (_charts_of(charts, indices) for charts in edges.charts)
-    count = len(coarse.weight)
-    kept = evenly(count, THINNED_POINTS)
+    kept = thinned(len(coarse.weight), THINNED_POINTS)
     return replace(
         edges,
         sharp=_frames_of(edges.sharp, indices),
