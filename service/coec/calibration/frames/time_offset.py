@@ -81,7 +81,7 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
     Args:
         window: pairs with ego-motion.
         images: decodes them.
-        pose: (4, 4) T_camera_lidar that was found for the window; its translation is taken as it is.
+        pose: (4, 4) T_camera_lidar that was found for the window; the camera's centre is taken as it is.
         config: `time_offset` and whether sweeps are motion-compensated.
 
     Raises:

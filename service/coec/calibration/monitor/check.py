@@ -75,7 +75,7 @@ class Check:
     rx ry rz tx ty tz; equation (2) looks at the rotations.
 
     Attributes:
-        T_rotation: (4, 4) local optimum of both witnesses over rotations, the translation being that of the pose.
+        T_rotation: (4, 4) local optimum of both witnesses over rotations, the camera's centre being that of the pose.
         T_pose: (4, 4) local optimum over all six degrees of freedom.
         offset_rotation, offset_pose: (6,) ξ from the pose to these (rad, m).
         mi: equation (1), nats.

@@ -6,9 +6,10 @@ with a fresh quadratic model of its size. Deterministic: same objective, same ev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import degrees, radians
+from typing import Protocol
 
 import nlopt
 import numpy as np
@@ -57,7 +58,7 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     """The pose of the highest score in the box about `start` (4, 4).
 
     Coordinates are the perturbation ξ = [rx ry rz tx ty tz] on the left of the start, about the camera axes; with three
-    degrees of freedom the translation is not searched.
+    degrees of freedom the camera turns about its centre, which stays that of the start.
     """
     evaluations = 0
 
@@ -84,34 +85,47 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     return SearchResult(_pose(start, found), evaluations, stop_reason)
 
 
+class Constraint(Protocol):
+    """What a search leaves as it is."""
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Places in ξ that are not searched."""
+        ...
+
+    def __call__(self, T_camera_lidar: Matrix4) -> Matrix4:
+        """The nearest pose (4, 4) that keeps them."""
+        ...
+
+
 def polish(
     objective: Objective,
     basin: Matrix4,
     config: SearchConfig,
     progress: Progress,
     evaluations: int = 0,
-    kept: Collection[int] = (),
+    kept: Constraint | None = None,
 ) -> SearchResult:
     """The maximum next to `basin` (4, 4), which lies within a few of the objective's difference steps of it;
-    `evaluations` were made before. The axes in `kept` stay as they are."""
+    `evaluations` were made before. Every pose that is tried obeys `kept`."""
+    moved = [axis for axis in range(config.dof) if kept is None or axis not in kept.axes]
+
+    def pose(coordinates: NDArray[np.float64]) -> Matrix4:
+        perturbation = np.zeros(6)
+        perturbation[moved] = coordinates
+        perturbed = se3.perturb(basin, perturbation)
+        return perturbed if kept is None else kept(perturbed)
 
     def score(coordinates: NDArray[np.float64]) -> float:
         nonlocal evaluations
         evaluations += 1
         progress.step("search", evaluations, config.max_evaluations)
-        return objective.evaluate(_pose(basin, placed(coordinates))).score
-
-    moved = [axis for axis in range(config.dof) if axis not in kept]
-
-    def placed(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-        perturbation = np.zeros(6)
-        perturbation[moved] = coordinates
-        return perturbation
+        return objective.evaluate(pose(coordinates)).score
 
     step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)[moved]
     found, exhausted = _bobyqa(score, np.zeros(len(moved)), 4.0 * step, 4.0 * step, step, config)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
-    return SearchResult(_pose(basin, placed(found)), evaluations, stop_reason)
+    return SearchResult(pose(found), evaluations, stop_reason)
 
 
 def near(config: SearchConfig, objective: Objective) -> SearchConfig:
