@@ -36,7 +36,7 @@ _MEANING = {
 
 def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictConfig) -> tuple[Metric, ...]:
     """What any objective has to show at an optimum: no slope, a peak, an uncertainty worth the name, enough in view."""
-    peakedness = float(np.min(curvature.second_derivative[:3])) * radians(1.0) ** 2 / max(evaluation.score, 1e-12)
+    peakedness = float(np.min(curvature.peakedness(evaluation.score))) * radians(1.0) ** 2
     metrics = [
         Metric(
             "newton_step_deg", degrees(_newton_step(curvature, ROTATION)), limits.max_newton_step_deg, at_least=False

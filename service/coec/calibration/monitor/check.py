@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
 from coec.calibration.monitor.sensor_faults import SceneFacts, scene_facts
 from coec.calibration.objective.curvature import axis_derivatives
-from coec.calibration.objective.edges import THINNED_POINTS, EdgeWitness, build_edges
+from coec.calibration.objective.edges import THINNED_POINTS, EdgesAlone, EdgeWitness, build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
-    Evaluation,
     Features,
     Objective,
     SearchBox,
@@ -32,7 +31,7 @@ from coec.calibration.search.local_search import near, polish_in_turn
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import se3
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.alignment import EdgeFrames, significances
 from coec.geometry.edges.charts import EdgeCharts
 from coec.geometry.thinning import thinned
 
@@ -160,7 +159,7 @@ def check_at(
     ways = (fusion.settling, (fusion.ranking[-1], *fusion.settling[1:]))
     ends = [polished(way, T_rotation, in_all) for way in ways]
     T_pose = max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score)
-    of_edges = _EdgesAlone(evidence.edges)
+    of_edges = EdgesAlone(evidence.edges.whole, evidence.edges.blur_rad)
     T_edges, T_depth = polished([of_edges], T_rotation), polished([depth], T_rotation)
     at_pose = fusion.settling[0].evaluate(pose)
     first_derivative, second_derivative = axis_derivatives(depth, pose)
@@ -186,24 +185,6 @@ def check_at(
 def _kept(band: EdgeFrames, T_expected: Matrix4, T_best: Matrix4) -> float:
     expected, best = significances(band, np.stack([T_expected, T_best])).tolist()
     return float(expected / max(best, 1e-9))
-
-
-class _EdgesAlone:
-    """The edge witness as an objective."""
-
-    def __init__(self, edges: EdgeWitness) -> None:
-        self._edges = edges
-
-    @property
-    def step_rad(self) -> float:
-        """The blur of the edges."""
-        return self._edges.blur_rad
-
-    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
-        """Significance; depth and overlap are not looked at."""
-        strength, square = frame_alignment(self._edges.whole, T_camera_lidar)
-        of_frames = len(strength) * strength / np.sqrt(max(float(square.sum()), 1e-9))
-        return Evaluation(float(of_frames.mean()), of_frames, mi=float("nan"), overlap=float("nan"), points_in_view=0)
 
 
 def _witness_of(edges: EdgeWitness, indices: Sequence[int]) -> EdgeWitness:

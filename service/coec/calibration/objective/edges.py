@@ -10,10 +10,11 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import FramePair, Rig
+from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, pixel_rad, scaled
-from coec.geometry.edges.alignment import EdgeFrames
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
@@ -63,7 +64,27 @@ class EdgeWitness:
     thinned: tuple[EdgeCharts, EdgeCharts]
 
 
+class EdgesAlone:
+    """The edge witness as an objective by itself, at one blur."""
+
+    def __init__(self, frames: EdgeFrames, blur_rad: float) -> None:
+        """`blur_rad` is the blur of the edge maps, an angle about the optical axis."""
+        self._frames = frames
+        self._blur_rad = blur_rad
+
+    @property
+    def step_rad(self) -> float:
+        """The blur of the edges."""
+        return self._blur_rad
+
+    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
+        """Significance at `T_camera_lidar` (4, 4), 0 where nothing is in view; depth and overlap are not looked at."""
+        at = frame_alignment(self._frames, T_camera_lidar)
+        return Evaluation(at.significance, at.of_frames, mi=math.nan, overlap=math.nan, points_in_view=0)
+
+
 Points = Callable[[int, NDArray[np.int64]], NDArray[np.float32]]
+"""The chosen points of the sweep of a pair: (N, 3), motion-compensated."""
 
 
 def build_edges(

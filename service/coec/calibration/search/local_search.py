@@ -1,4 +1,4 @@
-"""Maximising an objective over a box of perturbations with BOBYQA (Powell 2009, NLopt): bounded, derivative-free.
+"""Maximising an objective over a box of perturbations: bounded, derivative-free.
 
 Two stages on one objective: the first finds the basin with a trust region of degrees, the second starts again in it
 with a fresh quadratic model of its size. Deterministic: same objective, same evaluations, same optimum.
@@ -6,17 +6,17 @@ with a fresh quadratic model of its size. Deterministic: same objective, same ev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees, radians
 from typing import Protocol
 
-import nlopt
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective.mutual_information import Objective, SearchBox
 from coec.calibration.ports import Progress
+from coec.calibration.search.bounded import Box, maximum_in
 from coec.calibration.types import Matrix4, StopReason
 from coec.config import SearchConfig
 from coec.geometry import se3
@@ -31,6 +31,9 @@ REFINE_BOX_M, REFINE_STEP_M = 0.10, 0.04
 
 POLISH_METRES_PER_RADIAN = 10.0
 """Step of a translation per step of a rotation when a basin is polished."""
+
+POLISH_STEPS = 4.0
+"""Half-width of the box of a polish, in steps: what leads to a basin ends within a few of them."""
 
 NEAR = 0.1
 """Share of an objective's difference step within which a maximum is found that only ranks a basin, or leads to a finer
@@ -68,15 +71,13 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
         progress.step("search", evaluations, config.max_evaluations)
         return objective.evaluate(_pose(start, coordinates)).score
 
+    centre, most = np.zeros(config.dof), config.max_evaluations
     half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
-    found, exhausted = _bobyqa(
-        score, np.zeros(config.dof), half_width, half_width,
-        _per_axis(config.dof, radians(config.step_deg), config.step_m), config,
-    )  # fmt: skip
-    near = _per_axis(config.dof, REFINE_BOX_RAD, REFINE_BOX_M)
-    found, exhausted_again = _bobyqa(
-        score, found, near, half_width, _per_axis(config.dof, REFINE_STEP_RAD, REFINE_STEP_M), config
-    )
+    step = _per_axis(config.dof, radians(config.step_deg), config.step_m)
+    found, exhausted = maximum_in(_box(centre, half_width, half_width, step, config), score, centre, most)
+    reach = _per_axis(config.dof, REFINE_BOX_RAD, REFINE_BOX_M)
+    step = _per_axis(config.dof, REFINE_STEP_RAD, REFINE_STEP_M)
+    found, exhausted_again = maximum_in(_box(found, reach, half_width, step, config), score, found, most)
     stop_reason = StopReason.TOLERANCE
     if exhausted or exhausted_again:
         stop_reason = StopReason.EVALUATIONS
@@ -123,7 +124,8 @@ def polish(
         return objective.evaluate(pose(coordinates)).score
 
     step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)[moved]
-    found, exhausted = _bobyqa(score, np.zeros(len(moved)), 4.0 * step, 4.0 * step, step, config)
+    centre, reach = np.zeros(len(moved)), POLISH_STEPS * step
+    found, exhausted = maximum_in(_box(centre, reach, reach, step, config), score, centre, config.max_evaluations)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
     return SearchResult(pose(found), evaluations, stop_reason)
 
@@ -147,28 +149,17 @@ def polish_in_turn(
     return polish(last, basin, config, progress, evaluations)
 
 
-def _bobyqa(
-    score: Callable[[NDArray[np.float64]], float],
+def _box(
     centre: NDArray[np.float64],
     reach: NDArray[np.float64],
     half_width: NDArray[np.float64],
     step: NDArray[np.float64],
     config: SearchConfig,
-) -> tuple[NDArray[np.float64], bool]:
-    """The best coordinates within `reach` of `centre` and inside the box, and whether the evaluations ran out."""
-    optimiser = nlopt.opt(nlopt.LN_BOBYQA, len(centre))
-    lower, upper = np.maximum(centre - reach, -half_width), np.minimum(centre + reach, half_width)
-    # The first quadratic model needs two steps of room between the bounds.
-    step = np.minimum(step, (upper - lower) / 2.0)
-    optimiser.set_lower_bounds(lower)
-    optimiser.set_upper_bounds(upper)
-    optimiser.set_initial_step(step)
-    # NLopt scales the axes by their steps; this is the radius of the last trust region on each of them.
-    optimiser.set_xtol_abs(step * radians(config.tolerance_deg) / step[0])
-    optimiser.set_maxeval(config.max_evaluations)
-    optimiser.set_max_objective(lambda x, _gradient: score(x))
-    found = np.asarray(optimiser.optimize(centre))
-    return found, optimiser.last_optimize_result() == nlopt.MAXEVAL_REACHED
+) -> Box:
+    """What lies within `reach` of `centre` and inside the box of `half_width`, all (n,); the tolerance of the
+    rotations is the configuration's, that of the translations has the proportion of the steps."""
+    tolerance = step * radians(config.tolerance_deg) / step[0]
+    return Box(np.maximum(centre - reach, -half_width), np.minimum(centre + reach, half_width), step, tolerance)
 
 
 def _per_axis(dof: int, rotation: float, translation: float) -> NDArray[np.float64]:

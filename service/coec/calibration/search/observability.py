@@ -3,8 +3,8 @@
 Rotations move every point of an image alike, translations only near ones. Where nothing near has an edge, the optimum
 slides along a translation, and takes a rotation with it: better to leave the camera where it was, and say so.
 
-What is left is the camera's *centre*, c = -Rᵀ·t in LiDAR coordinates for T_camera_lidar = [R | t], and not a component
-of t. The column t is where the LiDAR lies as seen from the camera. It swings with every rotation that is found: by 35 cm
+What is left is the camera's *centre*, c = -Rᵀ·t in LiDAR coordinates for T_camera_lidar = [R | t], and not an entry of
+t. The column t is where the LiDAR lies as seen from the camera. It swings with every rotation that is found: by 35 cm
 for a start that was turned by 20° and a camera 1 m from the LiDAR, though nobody moved the camera.
 
 In the terms of METHOD, section 4: the perturbation T(ξ) = exp(ξ)·T on the left turns the camera about its own centre,
