@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from coec.adapters.images.codec import GreyImages
-from coec.calibration.estimators import Sight, depth_features
+from coec.calibration.estimators import Sight, depth_features, runner_up
 from coec.calibration.ports import Silence
-from coec.calibration.types import CameraFrame, DepthMap, Window
+from coec.calibration.types import CameraFrame, DepthMap, Metric, Window
 from coec.config import LimitsConfig
 from coec.geometry.vectors import lengths
 
@@ -55,3 +56,17 @@ def test_all_beams_carry_the_depth_witness_in_equal_shares(street: Window) -> No
         beam = np.rint((np.degrees(np.arcsin(sines)) + 15.0) / 2.0).astype(np.int64)
         left = np.bincount(beam, minlength=BEAMS)
         assert np.abs(left - FIRINGS / 2).max() < 4.0 * np.sqrt(FIRINGS / 4)
+
+
+@pytest.mark.parametrize(
+    ("contrast", "rivals", "share"),
+    [(8.0, [2.0, 4.0], 0.5), (8.0, [], 0.0), (8.0, [-3.0], 0.0), (2.0, [3.0], 1.5)],
+)
+def test_the_runner_up_is_a_share_of_the_best(contrast: float, rivals: list[float], share: float) -> None:
+    assert runner_up(contrast, rivals) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("contrast", [0.0, -1.0])
+@pytest.mark.parametrize("rivals", [[], [-2.0], [3.0]])
+def test_a_pose_that_does_not_stand_out_has_no_runner_up_that_passes(contrast: float, rivals: list[float]) -> None:
+    assert not Metric("runner_up", runner_up(contrast, rivals), 0.85, at_least=False).passed

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import radians
+from math import nan, radians
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -179,7 +179,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     metrics = (
         Metric("range_edges", len(edges.sharp.weight), limits.min_range_edges, at_least=True),
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
-        Metric("runner_up", max(rivals, default=0.0) / max(contrast, 1e-9), limits.max_runner_up, at_least=False),
+        Metric("runner_up", runner_up(contrast, rivals), limits.max_runner_up, at_least=False),
     )
     alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
     settled = [polish_in_turn(fusion.settling, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
@@ -189,6 +189,14 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     if at_rim(found.T_camera_lidar, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
     return Found(finest, found, metrics)
+
+
+def runner_up(contrast: float, rivals: Sequence[float]) -> float:
+    """The largest edge contrast of the rivals over that of the pose; 0 without a rival that stands out at all.
+
+    NaN where the pose itself does not stand out: nothing is behind it, and what is not a number passes no limit.
+    """
+    return max((0.0, *rivals)) / contrast if contrast > 0.0 else nan
 
 
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})

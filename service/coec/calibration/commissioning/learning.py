@@ -21,11 +21,11 @@ from coec.calibration.commissioning.baseline import (
     Accuracy,
     Baseline,
     MonitorLimits,
-    chi2_quantile,
     learned_hash,
-    normal_quantile,
     pixel_floor,
 )
+from coec.calibration.commissioning.equation_2 import PaperLimits, beyond
+from coec.calibration.commissioning.quantiles import chi2_quantile, normal_quantile
 from coec.calibration.commissioning.verdict_limits import verdict_limits
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import POSE_DOF, ROTATION_DOF, Check, CheckInput, check_at, gather
@@ -36,6 +36,7 @@ from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
+from coec.geometry.vectors import random_direction
 
 MAX_PAIRS = 48
 """Pairs that are looked at, evenly chosen from all windows: two windows of the default size."""
@@ -73,6 +74,7 @@ MOVES = (
 """By name: rotations about random axes (rad) and translations in random directions (m)."""
 
 SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
 
 MOST_KEPT = 0.88
 """Limit of the edges that a check keeps, at most. Right checks kept 0.91 and more on other pairs than those that the
@@ -279,16 +281,11 @@ class _Checks:
             # Neighbours, as the monitor sees them.
             first = int(rng.integers(0, pairs))
             indices = sorted((first + step) % pairs for step in range(size))
-            xi = np.concatenate([turn_rad * _direction(rng), shift_m * _direction(rng)])
+            xi = np.concatenate([turn_rad * random_direction(rng), shift_m * random_direction(rng)])
             moved = se3.perturb(self._right, xi)
             seen.append(check_at(self._evidence.of(indices), moved, self._config, self._bias))
             self._heard.step(name, number, count)
         return seen
-
-
-def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
-    drawn = rng.normal(size=3)
-    return np.asarray(drawn / np.sqrt((drawn**2).sum()))
 
 
 def _monitor_limits(
@@ -304,8 +301,8 @@ def _monitor_limits(
     edges = float(np.min([edges_per_pair(seen) for seen in clean]))
     lost = float(np.median([edges_per_pair(seen) for seen in far]))
     kept = float(np.min([seen.edges_kept for seen in clean]))
-    z = normal_quantile(1.0 - rate / 3.0)
-    agreement = _beyond([seen.agreement_rad for seen in clean], z)
+    of_paper = PaperLimits.learned(clean, rate)
+    agreement = beyond([seen.agreement_rad for seen in clean], normal_quantile(1.0 - rate / 3.0))
     return MonitorLimits(
         max_distance2_rotation=_between(chi2_quantile(1.0 - rate / 2.0, ROTATION_DOF), min(turned)),
         max_farthest2_pose=_between(chi2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1), min(shifted)),
@@ -313,9 +310,9 @@ def _monitor_limits(
         min_edges_kept=min(1.0 - 2.0 * (1.0 - kept), MOST_KEPT),
         max_agreement_rad=max(agreement, AGREEMENT_RAD),
         min_overlap=0.8 * float(np.min([seen.overlap for seen in clean])),
-        min_mi=_beyond([seen.mi for seen in clean], -z),
-        max_f1=_beyond([seen.f1 for seen in clean], z),
-        min_f2=_beyond([seen.f2 for seen in clean], -z),
+        min_mi=of_paper.min_mi,
+        max_f1=of_paper.max_f1,
+        min_f2=of_paper.min_f2,
     )
 
 
@@ -323,8 +320,3 @@ def _between(right: float, wrong: float) -> float:
     """Half-way, in ratio, from what right checks do not exceed to the least of the moved ones, and no nearer to these
     than at a quarter of it; where the two come close the false-alarm rate decides."""
     return max(right, min(sqrt(right * wrong), 0.25 * wrong))
-
-
-def _beyond(values: Sequence[float], z: float) -> float:
-    """So many standard deviations from the mean."""
-    return float(np.mean(values) + z * np.std(values, ddof=1))

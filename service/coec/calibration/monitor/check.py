@@ -184,7 +184,7 @@ def check_at(
 
 def _kept(band: EdgeFrames, T_expected: Matrix4, T_best: Matrix4) -> float:
     expected, best = significances(band, np.stack([T_expected, T_best])).tolist()
-    return float(expected / max(best, 1e-9))
+    return float(expected / best) if best > 0.0 else 1.0  # an optimum without edges has none to lose
 
 
 def _witness_of(edges: EdgeWitness, indices: Sequence[int]) -> EdgeWitness:
