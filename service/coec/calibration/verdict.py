@@ -19,6 +19,7 @@ from coec.calibration.types import Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
+"""Places of both in ξ = [rx ry rz tx ty tz]."""
 
 _MEANING = {
     "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.commissioning.equation_2 import PaperLimits
 from coec.calibration.monitor.sensor_faults import SceneBaseline
+from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4, Rig
 from coec.config import CalibrationConfig, VerdictConfig, config_hash
 from coec.geometry import se3
@@ -31,10 +32,6 @@ lie between the vendor's calibration and the edges."""
 PIXEL_SHARE = 0.3
 """Share of a pixel that the local optimum may be off for the pixels alone, whatever the scenes of a commissioning say:
 edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
-
-PIXEL_RANGE_M = 8.0
-"""Range at which a pixel of rotation looks like one of translation, m: of the near edges, which tell translation."""
-
 
 FIGURES = "points-drawn"
 """Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a check at
@@ -65,7 +62,8 @@ class Accuracy:
         return fsum(self._squares(offset, pairs))
 
     def farthest2(self, offset: NDArray[np.float64], pairs: int) -> float:
-        """The same along the one axis on which it is farthest: one axis that is off is not hidden by five that are
+        """Squared distance of an offset (6,) from the bias along the one axis on which it is farthest, in standard
+        deviations: one axis that is off is not hidden by five that are
         not."""
         return max(self._squares(offset, pairs))
 
@@ -80,7 +78,8 @@ class MonitorLimits:
 
     Attributes:
         max_distance2_rotation: of the local optimum over rotations, in standard deviations, squared.
-        max_farthest2_pose: the same over six degrees of freedom, of the axis that is farthest off.
+        max_farthest2_pose: of the local optimum over six degrees of freedom, along the axis that is farthest off, likewise
+            squared.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
         min_edges_kept: see `Check`; where fewer are kept, a quarter of the distance over rotations is too far.
         max_agreement_rad: between the local optima of the two witnesses.
@@ -107,7 +106,7 @@ class MonitorLimits:
 def pixel_floor(camera: Camera) -> NDArray[np.float64]:
     """(6,) standard deviation that the pixels of a camera leave to any check, however many pairs it has (rad, m)."""
     off_rad = PIXEL_SHARE * pixel_rad(camera)
-    return np.array([off_rad] * 3 + [off_rad * PIXEL_RANGE_M] * 3)
+    return of_both(off_rad)
 
 
 def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:

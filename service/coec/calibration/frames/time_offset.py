@@ -24,6 +24,7 @@ from coec.calibration.objective.differences import FrameScores, across, along
 from coec.calibration.objective.edges import EdgeWitness, build_edges
 from coec.calibration.ports import ImageReader
 from coec.calibration.search.bounded import Box, maximum_in
+from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig, TimeOffsetConfig
 from coec.geometry import se3
@@ -36,9 +37,12 @@ OFFSET = 6
 """Place of the offset behind the six axes of the perturbation."""
 
 FITTED = (0, 1, 2, OFFSET)
-SHIFTS = (3, 4, 5)
+"""Places of what is fitted: the rotation and the offset."""
 
-STEPS = np.array([radians(0.3)] * 3 + [0.02] * 3 + [0.01])
+SHIFTS = (3, 4, 5)
+"""Places of the camera's position, which is taken as it is."""
+
+STEPS = np.array([*of_both(radians(0.3)), 0.01])
 """Difference steps, radians, metres and seconds: each moves edges by about the blur of the sharpest edges."""
 
 PROFILE_STEP_S = 0.02

@@ -40,16 +40,18 @@ REACH_RAD = radians(4.0)
 far beyond any limit."""
 
 BASINS = 2
-"""Maxima that both witnesses judge: what a few pairs have two of, all blurs together have one of."""
+"""Maxima that both witnesses rank: what a few pairs have two of, all blurs together have one of."""
 
 ROTATION_DOF, POSE_DOF = 3, 6
+"""Axes of ξ that the two optima of a check are searched over: rotations, and all."""
 
 NO_BIAS = np.zeros(6)
+"""Of a rig that was not commissioned: its optimum is expected at the pose itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckInput:
-    """Some pairs with everything decoded and inferred that looks at any pose need. Entries are per pair, in order."""
+    """Some pairs with all that a check at any pose needs, decoded and inferred. Entries are per pair, in order."""
 
     rig: Rig
     pairs: tuple[FramePair, ...]
@@ -58,7 +60,7 @@ class CheckInput:
     scenes: tuple[SceneFacts, ...]
 
     def of(self, indices: Sequence[int]) -> CheckInput:
-        """The same of some of the pairs."""
+        """That of some of the pairs alone, by their indices."""
         return CheckInput(
             self.rig,
             tuple(self.pairs[i] for i in indices),
@@ -71,7 +73,7 @@ class CheckInput:
 @dataclass(frozen=True, slots=True, eq=False)
 class Check:
     """What a check at a pose tells. Derivatives are those of mutual information (Borer et al. 2023), at the pose, over
-    rx ry rz tx ty tz; equation (2) looks at the rotations.
+    rx ry rz tx ty tz; equation (2) takes those of the rotations.
 
     Attributes:
         T_rotation: (4, 4) local optimum of both witnesses over rotations, the camera's centre being that of the pose.
@@ -117,7 +119,7 @@ class Check:
 
 
 def gather(sight: Sight) -> CheckInput:
-    """Decodes and infers everything that looks at the pairs of `sight` need.
+    """Decodes and infers everything that checks of the pairs of `sight` need.
 
     Raises:
         CalibrationError: an image cannot be decoded, a frame has no depth, no sweep has a range edge.

@@ -38,7 +38,7 @@ MIN_PAIRS = 4
 
 LOST_EDGES_SHARE = 0.25
 """Of the limit of the squared distance over rotations, where the edges are lost at the pose. Standard deviations are
-those of a rig's looks at large; how sharply this scene tells the pose, its edges know."""
+those of a rig's checks at large; how sharply this scene tells the pose, its edges know."""
 
 UNCOMMISSIONED = MonitorLimits(
     max_distance2_rotation=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0, ROTATION_DOF),

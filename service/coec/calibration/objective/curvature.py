@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 
 from coec.calibration.objective.differences import FrameScores, across, along
 from coec.calibration.objective.mutual_information import Objective
+from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.geometry.linear import inverted
-
-METRES_PER_RADIAN = 6.0
-"""Difference step of a translation per step of a rotation: moves a point 6 m away as far."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +79,7 @@ def _frame_scores_about(
         perturbation[moved] = offset
         return objective.evaluate(se3.perturb(pose, perturbation)).frame_scores
 
-    return at, objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)[moved]
+    return at, of_both(objective.step_rad)[moved]
 
 
 def _sandwich(gradients: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:

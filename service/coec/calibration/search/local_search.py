@@ -17,20 +17,15 @@ from numpy.typing import NDArray
 from coec.calibration.objective.mutual_information import Objective, SearchBox
 from coec.calibration.ports import Progress
 from coec.calibration.search.bounded import Box, maximum_in
+from coec.calibration.steps import POLISH_METRES_PER_RADIAN, of_both
 from coec.calibration.types import Matrix4, StopReason
 from coec.config import SearchConfig
 from coec.geometry import se3
 
 REFINE_BOX_RAD, REFINE_STEP_RAD = radians(1.5), radians(0.6)
-"""Second stage, rotation. The box holds the widest ripple of pixels and scan lines around the end of the first stage;
+"""Second stage. The box holds the widest ripple of pixels and scan lines around the end of the first stage;
 the step spans several of those ripples (cells of a depth map, rings of a sweep: 0.1 to 0.4 degrees), so that the first
 quadratic model sees the hill and not the ripple."""
-
-REFINE_BOX_M, REFINE_STEP_M = 0.10, 0.04
-"""Second stage, translation: the shifts that move a point 4 m away as far as the rotations above."""
-
-POLISH_METRES_PER_RADIAN = 10.0
-"""Step of a translation per step of a rotation when a basin is polished."""
 
 POLISH_STEPS = 4.0
 """Half-width of the box of a polish, in steps: what leads to a basin ends within a few of them."""
@@ -75,8 +70,7 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
     step = _per_axis(config.dof, radians(config.step_deg), config.step_m)
     found, exhausted = maximum_in(_box(centre, half_width, half_width, step, config), score, centre, most)
-    reach = _per_axis(config.dof, REFINE_BOX_RAD, REFINE_BOX_M)
-    step = _per_axis(config.dof, REFINE_STEP_RAD, REFINE_STEP_M)
+    reach, step = (of_both(turn_rad)[: config.dof] for turn_rad in (REFINE_BOX_RAD, REFINE_STEP_RAD))
     found, exhausted_again = maximum_in(_box(found, reach, half_width, step, config), score, found, most)
     stop_reason = StopReason.TOLERANCE
     if exhausted or exhausted_again:
@@ -123,7 +117,7 @@ def polish(
         progress.step("search", evaluations, config.max_evaluations)
         return objective.evaluate(pose(coordinates)).score
 
-    step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)[moved]
+    step = of_both(objective.step_rad, POLISH_METRES_PER_RADIAN)[moved]
     centre, reach = np.zeros(len(moved)), POLISH_STEPS * step
     found, exhausted = maximum_in(_box(centre, reach, reach, step, config), score, centre, config.max_evaluations)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
