@@ -13,7 +13,7 @@ and 0.5 m away) 6, 7, 8 and 10 m have medians within 0.01° and 3 mm of each oth
 
 POLISH_METRES_PER_RADIAN = 10.0
 """Metres per radian of the first trust region of a polish: wider along the translations, whose hill is the wider one.
-It ends at the same places after 2 to 12 % fewer evaluations than with 7 m (KITTI-360 and KITTI raw, the same starts)."""
+It ends at the same places after 2 to 12 % fewer evaluations than with 7 m (KITTI-360 and KITTI raw, same starts)."""
 
 
 def of_both(rotation_rad: float, metres_per_radian: float = METRES_PER_RADIAN) -> NDArray[np.float64]:

@@ -78,8 +78,8 @@ class MonitorLimits:
 
     Attributes:
         max_distance2_rotation: of the local optimum over rotations, in standard deviations, squared.
-        max_farthest2_pose: of the local optimum over six degrees of freedom, along the axis that is farthest off, likewise
-            squared.
+        max_farthest2_pose: of the local optimum over six degrees of freedom, along the axis that is farthest off,
+            likewise squared.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
         min_edges_kept: see `Check`; where fewer are kept, a quarter of the distance over rotations is too far.
         max_agreement_rad: between the local optima of the two witnesses.
