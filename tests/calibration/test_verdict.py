@@ -82,3 +82,19 @@ def test_a_saddle_is_not_a_maximum() -> None:
 @pytest.mark.parametrize("at_least", [True, False])
 def test_what_is_not_a_number_never_passes(at_least: bool) -> None:
     assert not Metric("any", float("nan"), 0.0, at_least).passed
+
+
+@pytest.mark.parametrize("score", [0.0, -0.0, -1e-13, -2.5])
+def test_a_peak_of_a_score_that_is_not_above_zero_is_none(score: float) -> None:
+    """The fused objective counts from the mean of other poses: below it, a ripple is no summit."""
+    verdict = verdict_on(replace(GOOD, score=score))
+    assert verdict.decision is Decision.FAILED
+    assert [reason.code for reason in verdict.reasons] == ["peakedness_per_deg2"]
+
+
+def test_peakedness_is_the_curvature_over_the_score() -> None:
+    np.testing.assert_allclose(PEAK.peakedness(2.0), PEAK.second_derivative[:3] / 2.0)
+    half = {m.name: m.value for m in shape_metrics(replace(GOOD, score=2.8), PEAK, LIMITS)}["peakedness_per_deg2"]
+    whole = {m.name: m.value for m in shape_metrics(GOOD, PEAK, LIMITS)}["peakedness_per_deg2"]
+    assert half == pytest.approx(whole / 2.0)
+    assert whole == pytest.approx(250.0 * np.radians(1.0) ** 2 / 1.4)

@@ -9,10 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.types import Matrix4
-from coec.evaluation.profiles import NARROW, WIDE, EdgeLandscape, Span, scan, views
+from coec.evaluation.profiles import NARROW, WIDE, Span, scan, views
 from coec.geometry import se3
-from coec.geometry.cameras import build
-from coec.geometry.edges.alignment import EdgeFrames, significances
 
 REFERENCE = se3.exp(np.array([1.2, -1.2, 1.2, 0.1, -0.3, 0.8]))
 
@@ -57,16 +55,3 @@ def test_views_are_those_of_every_landscape() -> None:
     assert list(seen) == ["one", "other"]
     assert heard == [(1, "one"), (2, "other")]
     assert seen["one"].narrow[0].best_offset > 0 > seen["other"].narrow[0].best_offset
-
-
-def test_edge_landscape_is_the_significance() -> None:
-    camera = build("pinhole", width=40, height=30, fx=30.0, fy=30.0, cx=19.5, cy=14.5)
-    rng = np.random.default_rng(7)
-    # Pixels at integers, where both ways to look up a pixel agree.
-    u, v = rng.integers(2, 37, 50), rng.integers(2, 27, 50)
-    xyz = np.stack([(u - 19.5) / 30.0, (v - 14.5) / 30.0, np.ones(50)]).astype(np.float32)
-    maps = np.repeat(rng.integers(-40, 40, (1, 30, 1)), 40, axis=2).astype(np.int8)
-    frames = EdgeFrames(camera, xyz, np.ones(50, np.float32), np.array([0, 50]), maps)
-    expected = float(significances(frames, np.eye(4)[None])[0])
-    assert EdgeLandscape(frames).score(np.eye(4)) == pytest.approx(expected, abs=1e-3)
-    assert EdgeLandscape(frames).score(se3.exp(np.array([0, 3.0, 0, 0, 0, 0]))) == 0.0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import radians
+from math import nan, radians
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -31,6 +31,7 @@ from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import halved
+from coec.geometry.thinning import thinned
 
 Seen = TypeVar("Seen")
 
@@ -178,7 +179,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     metrics = (
         Metric("range_edges", len(edges.sharp.weight), limits.min_range_edges, at_least=True),
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
-        Metric("runner_up", max(rivals, default=0.0) / max(contrast, 1e-9), limits.max_runner_up, at_least=False),
+        Metric("runner_up", runner_up(contrast, rivals), limits.max_runner_up, at_least=False),
     )
     alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
     settled = [polish_in_turn(fusion.settling, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
@@ -190,22 +191,34 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     return Found(finest, found, metrics)
 
 
+def runner_up(contrast: float, rivals: Sequence[float]) -> float:
+    """The largest edge contrast of the rivals over that of the pose; 0 without a rival that stands out at all.
+
+    NaN where the pose itself does not stand out: nothing is behind it, and what is not a number passes no limit.
+    """
+    return max((0.0, *rivals)) / contrast if contrast > 0.0 else nan
+
+
 ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused": by_fusion, "intensity": by_intensity})
 
 
 def depth_features(sight: Sight, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:
-    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4); of one in so many
-    points of every sweep, so that about `at_most` are left.
+    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4); of every sweep the
+    same share of its points, so that about `at_most` are left in all.
 
     Raises:
         CalibrationError: a frame has no usable depth.
     """
-    points = sum(len(pair.lidar.xyz_m) for pair in sight.window.pairs)
-    step = slice(None, None, 1 if at_most is None else max(1, round(points / at_most)))
+    counts = [len(pair.lidar.xyz_m) for pair in sight.window.pairs]
+    share = 1.0 if at_most is None else min(1.0, at_most / max(sum(counts), 1))
     return [
-        distance_and_depth(sight.points(index, step), depth, T_camera_lidar)
+        distance_and_depth(sight.points(index, _share_of(counts[index], share)), depth, T_camera_lidar)
         for index, depth in enumerate(sight.depths())
     ]
+
+
+def _share_of(count: int, share: float) -> Choice:
+    return EVERY if share >= 1.0 else thinned(count, round(share * count))
 
 
 def _by_mutual_information(frames: list[Features], sight: Sight, config: CalibrationConfig) -> Found:

@@ -32,6 +32,7 @@ from coec.geometry.linear import congruent, solved
 Matrix6 = NDArray[np.float64]
 
 NS_PER_H = 3_600_000_000_000
+"""Nanoseconds in an hour."""
 
 
 class StepState(StrEnum):

@@ -285,7 +285,8 @@ class Estimate:
         correction: (6,) rotation vector (rad) and translation (m) from the nominal calibration, about the camera axes.
         sigma: (6,) standard deviation per axis (rad, m); NaN where it was not estimated.
         solved: (6,) bool, the axes that were searched and found.
-        unobservable: (6,) bool, the axes that were searched but that the window does not tell: kept as before.
+        unobservable: (6,) bool, the translations that were searched but that the window does not tell: along these
+            axes of the camera its centre, -Rᵀ·t in LiDAR coordinates, is that of the start.
         compensation: how many pairs ended with which `Compensation`, by name.
         depth_identity: sha256 of the network, or `precomputed`.
         config_hash: of everything that decides the result.

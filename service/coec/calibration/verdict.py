@@ -19,6 +19,7 @@ from coec.calibration.types import Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
+"""Places of both in ξ = [rx ry rz tx ty tz]."""
 
 _MEANING = {
     "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",
@@ -46,7 +47,7 @@ def cannot_tell(verdict: Verdict) -> bool:
 
 def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictConfig) -> tuple[Metric, ...]:
     """What any objective has to show at an optimum: no slope, a peak, an uncertainty worth the name, enough in view."""
-    peakedness = float(np.min(curvature.second_derivative[:3])) * radians(1.0) ** 2 / max(evaluation.score, 1e-12)
+    peakedness = float(np.min(curvature.peakedness(evaluation.score))) * radians(1.0) ** 2
     metrics = [
         Metric(
             "newton_step_deg", degrees(_newton_step(curvature, ROTATION)), limits.max_newton_step_deg, at_least=False

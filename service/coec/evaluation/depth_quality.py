@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from coec.calibration.estimators import Sight
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.objective.mutual_information import (
-    MutualInformation,
     SearchBox,
     build_mutual_information,
     distance_and_depth,
@@ -160,7 +159,7 @@ def assess(sight: Sight, config: CalibrationConfig, heard: Callable[[int, str], 
         mi_of_unrelated=unrelated,
         bias=se3.difference(optimum, reference)[:3],
         half_width=np.array([half_width(along, unrelated) for along in through]),
-        peakedness=_peakedness(objective, optimum, curvature.second_derivative),
+        peakedness=curvature.peakedness(objective.evaluate(optimum).score),
         scans=scans,
         joint=joint_histogram(pairings, config.objective.range_bins),
     )
@@ -247,9 +246,3 @@ def joint_histogram(pairings: Sequence[Pairing], bins: int) -> NDArray[np.int64]
         column = (ranks(1.0 / pairing.range_m) * scale).astype(np.int64)
         np.add.at(counts, (np.minimum(row, bins - 1), np.minimum(column, bins - 1)), 1)
     return counts
-
-
-def _peakedness(
-    objective: MutualInformation, optimum: Matrix4, second_derivative: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    return second_derivative[:3] / max(objective.evaluate(optimum).score, 1e-12)

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from coec.calibration.commissioning.learning import is_flagged, learn_accuracy, learn_limits
 from coec.calibration.monitor.check import Check, CheckInput, check_at
-from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, by_equation_2
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS
 from coec.calibration.types import Matrix4
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
+from coec.geometry.vectors import random_direction
 
 MOVES = (
     ("right", 0.0, 0.0),
@@ -36,6 +37,7 @@ MIN_RECORDED = 2 * MIN_PAIRS + 1
 """Pairs of a recording that can be split: a check needs `MIN_PAIRS`, commissioning one more."""
 
 SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +107,7 @@ def try_detection(
                 indices = sorted(rng.permutation(kept)[:size].tolist())
                 xi = _move(rng, turn_rad, shift_m, known)
                 seen = check_at(evidence.of(indices), se3.perturb(right, xi), config, accuracies[0].expected)
-                tried.append(Tried(name, is_flagged(seen, *accuracies, limits), by_equation_2(seen, limits), seen))
+                tried.append(Tried(name, is_flagged(seen, *accuracies, limits), limits.of_paper.flags(seen), seen))
         heard(split + 1, splits)
     return tried
 
@@ -123,9 +125,8 @@ def table(tried: Sequence[Tried]) -> tuple[Detection, ...]:
 
 
 def _move(rng: np.random.Generator, turn_rad: float, shift_m: float, axes: Sequence[int]) -> NDArray[np.float64]:
-    drawn = rng.normal(size=3)
     xi = np.zeros(6)
-    xi[:3] = turn_rad * drawn / np.sqrt((drawn**2).sum())
+    xi[:3] = turn_rad * random_direction(rng)
     if shift_m > 0.0:
         xi[axes[int(rng.integers(len(axes)))]] = shift_m * float(rng.choice([-1.0, 1.0]))
     return xi

@@ -11,22 +11,23 @@ from dataclasses import dataclass
 from math import radians
 
 import numpy as np
-from numpy.typing import NDArray
 
-from coec.calibration.commissioning.baseline import normal_quantile
+from coec.calibration.commissioning.equation_2 import PaperLimits
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.objective.mutual_information import Features, SearchBox, build_mutual_information
 from coec.calibration.types import Matrix4, Rig
 from coec.config import CalibrationConfig
 from coec.geometry import se3
+from coec.geometry.vectors import random_direction
 
 MOVES_DEG = (0.0, 1.0, 3.0)
-"""Errors of the extrinsic at which the figures are taken."""
+"""Errors of the extrinsic at which the figures are taken, degrees: those of the paper."""
 
 FALSE_ALARM_RATE = 0.01
 """Share of right poses that each of the three limits may refuse, a third each."""
 
 SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,19 +39,6 @@ class Figures:
     mi: float
     f1: float
     f2: float
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Of equation (2)."""
-
-    min_mi: float
-    max_f1: float
-    min_f2: float
-
-    def flags(self, figures: Figures) -> bool:
-        """Failed if MI < MI_lim or f' > f'_lim or f'' < f''_lim."""
-        return figures.mi < self.min_mi or figures.f1 > self.max_f1 or figures.f2 < self.min_f2
 
 
 def failure_figures(
@@ -74,7 +62,7 @@ def failure_figures(
         chosen = sorted(rng.permutation(len(frames))[: max(len(frames) // 2, 1)].tolist())
         mutual = build_mutual_information([frames[i] for i in chosen], rig, right, box, config.objective)
         for moved_deg in MOVES_DEG:
-            pose = se3.perturb(right, np.concatenate([radians(moved_deg) * _direction(rng), np.zeros(3)]))
+            pose = se3.perturb(right, np.concatenate([radians(moved_deg) * random_direction(rng), np.zeros(3)]))
             shape = measure_curvature(mutual, pose, 3)
             found.append(
                 Figures(
@@ -88,23 +76,11 @@ def failure_figures(
     return found
 
 
-def learned(figures: Sequence[Figures]) -> Limits:
-    """Limits from the figures at the right pose, at the false-alarm rate if they were normal."""
-    right = np.array([(f.mi, f.f1, f.f2) for f in figures if f.moved_deg == 0.0])
-    z = normal_quantile(1.0 - FALSE_ALARM_RATE / 3.0)
-    mean, deviation = right.mean(axis=0), right.std(axis=0, ddof=1)
-    return Limits(
-        min_mi=float(mean[0] - z * deviation[0]),
-        max_f1=float(mean[1] + z * deviation[1]),
-        min_f2=float(mean[2] - z * deviation[2]),
-    )
+def learned(figures: Sequence[Figures]) -> PaperLimits:
+    """Limits from the figures at the right pose."""
+    return PaperLimits.learned([f for f in figures if f.moved_deg == 0.0], FALSE_ALARM_RATE)
 
 
 def slices(count: int, length: int) -> list[list[int]]:
     """Indices of neighbouring pairs: every run of `length` of `count`, in order."""
     return [list(range(first, first + length)) for first in range(max(count - length + 1, 1))]
-
-
-def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
-    drawn = rng.normal(size=3)
-    return np.asarray(drawn / np.sqrt((drawn**2).sum()))

@@ -20,6 +20,7 @@ from coec.geometry import se3
 from coec.sources import windows
 
 FRAME_COUNTS = (5, 25, 50)
+"""Those of the paper."""
 
 REPEATS, SOLVES = 20, 3
 """Runs of which the fastest counts: what else the machine does only ever adds."""

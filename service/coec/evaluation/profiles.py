@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.estimators import ESTIMATORS, Sight
-from coec.calibration.objective.edges import build_edges
+from coec.calibration.objective.edges import EdgesAlone, build_edges
 from coec.calibration.objective.mutual_information import Objective
 from coec.calibration.types import Matrix4
 from coec.config import CalibrationConfig
 from coec.geometry import se3
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
 
 CROWDING = 1.5
 """Power by which the points of a scan crowd about the middle: a peak of 0.2 degrees is not stepped over."""
@@ -81,18 +80,6 @@ class ObjectiveLandscape:
         return self.objective.evaluate(T_camera_lidar).score
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeLandscape:
-    """The significance of the edge witness alone, at one blur: Σ w·e / √Σ w²."""
-
-    frames: EdgeFrames
-
-    def score(self, T_camera_lidar: Matrix4) -> float:
-        """See `Landscape.score`; 0 where nothing is in view."""
-        strength, square = frame_alignment(self.frames, T_camera_lidar)
-        return float(strength.sum() / np.sqrt(max(float(square.sum()), 1e-9)))
-
-
 def landscapes(sight: Sight, config: CalibrationConfig) -> dict[str, Landscape]:
     """What the methods see in a window, by name: the fused objective, its two witnesses alone (`mi` is the paper's
     objective, too), and the objective of the configuration if it is another.
@@ -105,7 +92,7 @@ def landscapes(sight: Sight, config: CalibrationConfig) -> dict[str, Landscape]:
         kind: ObjectiveLandscape(ESTIMATORS[kind](sight, config).objective) for kind in kinds
     }
     edges = build_edges(sight.window.pairs, sight.points, sight.greys(), sight.window.rig)
-    return {**found, "edges": EdgeLandscape(edges.whole)}
+    return {**found, "edges": ObjectiveLandscape(EdgesAlone(edges.whole, edges.blur_rad))}
 
 
 def scan(landscape: Landscape, centre: Matrix4, axes: int, span: Span) -> tuple[Scan, ...]:

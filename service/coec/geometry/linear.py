@@ -6,14 +6,39 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import fsum, sqrt
 
+Rows = Sequence[Sequence[float]]
 
-def solved(matrix: Sequence[Sequence[float]], right: Sequence[float]) -> list[float]:
+
+def solved(matrix: Rows, right: Sequence[float]) -> list[float]:
     """The solution (n,) of a symmetric positive definite system (n, n), by its Cholesky factor.
 
     Raises:
         ValueError: the matrix is not positive definite.
     """
-    n = len(right)
+    return _solved(_cholesky(matrix), right)
+
+
+def inverted(matrix: Rows) -> list[list[float]]:
+    """The inverse (n, n) of a symmetric positive definite matrix (n, n).
+
+    Raises:
+        ValueError: the matrix is not positive definite.
+    """
+    factor, n = _cholesky(matrix), len(matrix)
+    # The inverse is symmetric: its columns are its rows.
+    return [_solved(factor, [float(row == column) for row in range(n)]) for column in range(n)]
+
+
+def congruent(a: Rows, m: Rows) -> list[list[float]]:
+    """A·M·Aᵀ (r, r) of A (r, n) and M (n, n)."""
+    inner = range(len(m))
+    left = [[fsum(row[k] * m[k][j] for k in inner) for j in inner] for row in a]
+    return [[fsum(of_left[k] * row[k] for k in inner) for row in a] for of_left in left]
+
+
+def _cholesky(matrix: Rows) -> list[list[float]]:
+    """L (n, n) of the matrix L·Lᵀ, zeros above the diagonal."""
+    n = len(matrix)
     factor = [[0.0] * n for _ in range(n)]
     for i in range(n):
         for j in range(i + 1):
@@ -21,6 +46,12 @@ def solved(matrix: Sequence[Sequence[float]], right: Sequence[float]) -> list[fl
             if i == j and not rest > 0.0:
                 raise ValueError(f"the matrix is not positive definite: its pivot {i} is {rest:.3g}")
             factor[i][j] = sqrt(rest) if i == j else rest / factor[j][j]
+    return factor
+
+
+def _solved(factor: Rows, right: Sequence[float]) -> list[float]:
+    """Of L·Lᵀ·x = right, forwards and backwards."""
+    n = len(right)
     forward: list[float] = []
     for i in range(n):
         forward.append((right[i] - fsum(factor[i][k] * forward[k] for k in range(i))) / factor[i][i])
@@ -28,10 +59,3 @@ def solved(matrix: Sequence[Sequence[float]], right: Sequence[float]) -> list[fl
     for i in reversed(range(n)):
         solution[i] = (forward[i] - fsum(factor[k][i] * solution[k] for k in range(i + 1, n))) / factor[i][i]
     return solution
-
-
-def congruent(a: Sequence[Sequence[float]], m: Sequence[Sequence[float]]) -> list[list[float]]:
-    """A·M·Aᵀ (r, r) of A (r, n) and M (n, n)."""
-    inner = range(len(m))
-    left = [[fsum(row[k] * m[k][j] for k in inner) for j in inner] for row in a]
-    return [[fsum(of_left[k] * row[k] for k in inner) for row in a] for of_left in left]

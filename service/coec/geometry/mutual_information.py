@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from coec.geometry.cameras import Camera
 from coec.geometry.compiler import njit, prange
 from coec.geometry.culling import BUNDLE, Bundles
-from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Limits, certain_pixels, exact_pixel, filter_of
+from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Certainty, certain_pixels, exact_pixel, filter_of
 from coec.geometry.prefetch import prefetch
 
 TASK = 32 * BUNDLE
@@ -107,7 +107,7 @@ def _every_bundle(first_point: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 @njit(cache=True, parallel=True)
 def _count(
-    camera: Camera, single: Camera, limits: Limits, T: NDArray[np.float64], xyz: NDArray[np.float32],
+    camera: Camera, single: Camera, limits: Certainty, T: NDArray[np.float64], xyz: NDArray[np.float32],
     range_bin: NDArray[np.unsignedinteger], first_point: NDArray[np.int64], depth_bin: NDArray[np.unsignedinteger],
     in_view: NDArray[np.bool_], depth_bins: int, range_bins: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:  # fmt: skip
@@ -152,7 +152,7 @@ def _tasks(
 
 @njit(cache=True, error_model="numpy")
 def _count_points(
-    camera: Camera, single: Camera, limits: Limits, T: NDArray[np.float64], T_single: NDArray[np.float32],
+    camera: Camera, single: Camera, limits: Certainty, T: NDArray[np.float64], T_single: NDArray[np.float32],
     x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], range_bin: NDArray[np.unsignedinteger],
     in_view: NDArray[np.bool_], depth_bin: NDArray[np.unsignedinteger], counts: NDArray[np.int32],
 ) -> None:  # fmt: skip

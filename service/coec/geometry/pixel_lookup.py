@@ -51,7 +51,7 @@ _LOOSE = {"contract", "reassoc", "nsz", "arcp", "afn"}
 _HALF = np.float32(0.5)
 
 
-class Limits(NamedTuple):
+class Certainty(NamedTuple):
     """What single precision can tell.
 
     Attributes:
@@ -71,11 +71,11 @@ class PixelFilter(NamedTuple):
     two go into it one by one."""
 
     camera: Camera
-    limits: Limits
+    certainty: Certainty
 
-    def at(self, T_camera_lidar: NDArray[np.float64]) -> Limits:
+    def at(self, T_camera_lidar: NDArray[np.float64]) -> Certainty:
         """The limits at a pose (4, 4)."""
-        return self.limits._replace(near_m=np.float32(max(NEAR_M, float(np.linalg.norm(T_camera_lidar[:3, 3])))))
+        return self.certainty._replace(near_m=np.float32(max(NEAR_M, float(np.linalg.norm(T_camera_lidar[:3, 3])))))
 
 
 @lru_cache(maxsize=32)
@@ -94,7 +94,7 @@ def filter_of(camera: Camera) -> PixelFilter:
     error_px = _largest_error_px(camera, single, edge_cosine, T, T.astype(np.float32), xyz)
     countable = camera.width * camera.height < _MAX_PIXELS
     reach_px = max(0.5 - SAFETY * error_px, 0.0) if countable else 0.0
-    return PixelFilter(single, Limits(np.float32(reach_px), edge_cosine, np.float32(NEAR_M)))
+    return PixelFilter(single, Certainty(np.float32(reach_px), edge_cosine, np.float32(NEAR_M)))
 
 
 def _sample(edge_rad: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -148,7 +148,7 @@ def _largest_error_px(
 
 @njit(cache=True, error_model="numpy", fastmath=_LOOSE)
 def certain_pixels(
-    camera: Camera, limits: Limits, T: NDArray[np.float32], x_m: NDArray[np.float32], y_m: NDArray[np.float32],
+    camera: Camera, limits: Certainty, T: NDArray[np.float32], x_m: NDArray[np.float32], y_m: NDArray[np.float32],
     z_m: NDArray[np.float32], pixel: NDArray[np.int32],
 ) -> np.int32:  # fmt: skip
     """The pixel of each point (row · width + column), OUTSIDE or UNSURE, into `pixel`; returns the largest entry.

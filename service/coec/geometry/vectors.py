@@ -24,3 +24,9 @@ def lengths(vectors: NDArray[Precision]) -> NDArray[Precision]:
     adds up row by row."""
     x, y, z = vectors.T
     return np.asarray(np.sqrt(x * x + y * y + z * z), vectors.dtype)
+
+
+def random_direction(rng: np.random.Generator) -> NDArray[np.float64]:
+    """A unit vector (3,), every direction as likely: three normal numbers have no preferred one."""
+    drawn = rng.normal(size=3)
+    return np.asarray(drawn / np.sqrt((drawn**2).sum()))

@@ -8,7 +8,8 @@ from math import degrees
 import numpy as np
 from matplotlib.figure import Figure
 
-from coec.evaluation.paper import MOVES_DEG, Figures, Limits
+from coec.calibration.commissioning.equation_2 import PaperLimits
+from coec.evaluation.paper import MOVES_DEG, Figures
 from coec.evaluation.statistics import HIT_RAD, Outcome
 from coec.reports.plots import png
 
@@ -26,7 +27,7 @@ ROTATIONS = ((2, "roll"), (0, "pitch"), (1, "yaw"))
 """Axis and name, in the order of the paper."""
 
 
-def failure_metrics(figures: Sequence[Figures], limits: Limits, title: str) -> bytes:
+def failure_metrics(figures: Sequence[Figures], limits: PaperLimits, title: str) -> bytes:
     """The three figures at the right pose and at wrong ones, with the limits between them."""
     figure = Figure(figsize=(14.0, 4.6), layout="constrained")
     figure.suptitle(title)

@@ -11,33 +11,14 @@ from baselines import a_baseline
 from coec.calibration.commissioning.baseline import (
     PIXEL_SHARE,
     Accuracy,
-    chi2_quantile,
     drift,
     mismatch,
-    normal_quantile,
     uncommissioned,
 )
 from coec.calibration.types import Window
 from coec.config import VerdictConfig
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
-
-
-class TestQuantiles:
-    @pytest.mark.parametrize(("probability", "value"), [(0.5, 0.0), (0.975, 1.95996), (0.01, -2.32635)])
-    def test_normal(self, probability: float, value: float) -> None:
-        assert normal_quantile(probability) == pytest.approx(value, abs=5e-4)
-
-    @pytest.mark.parametrize(
-        ("probability", "dof", "value"),
-        [(0.99, 3, 11.3449), (0.995, 3, 12.8382), (0.95, 1, 3.8415)],
-    )
-    def test_chi_squared(self, probability: float, dof: int, value: float) -> None:
-        assert chi2_quantile(probability, dof) == pytest.approx(value, rel=0.03)
-
-    def test_outside_of_probabilities(self) -> None:
-        with pytest.raises(ValueError, match="between 0 and 1"):
-            normal_quantile(1.0)
 
 
 class TestAccuracy:

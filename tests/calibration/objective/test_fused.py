@@ -99,8 +99,8 @@ def is_accounted_for(estimate: Estimate) -> bool:
 
 # ------------------------------------------------------------------------------------------------- the objective
 def z_of(edges: EdgeFrames, pose: Matrix4) -> float:
-    strength, square = frame_alignment(edges, pose)
-    return float(strength.sum() / np.sqrt(square.sum()))
+    at = frame_alignment(edges, pose)
+    return float(at.strength.sum() / np.sqrt(at.square.sum()))
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 0.4, 3.0, 20.0])

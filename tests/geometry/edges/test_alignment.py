@@ -52,9 +52,13 @@ def test_every_camera_model_agrees_with_the_plain_form_between_pixels(model: str
     frames = frames_of(CAMERAS[model], (2000, 0, 1, 1501))
     expected = by_oracle(frames, POSE, between_pixels=True)
     assert expected[0, 1] > 50.0
-    strength, square = frame_alignment(frames, POSE)
-    np.testing.assert_allclose(strength, expected[:, 0], atol=1e-3)
-    np.testing.assert_allclose(square, expected[:, 1], rtol=1e-6)
+    at = frame_alignment(frames, POSE)
+    np.testing.assert_allclose(at.strength, expected[:, 0], atol=1e-3)
+    np.testing.assert_allclose(at.square, expected[:, 1], rtol=1e-6)
+    strength, square = expected.sum(axis=0)
+    assert at.significance == pytest.approx(strength / np.sqrt(square), abs=1e-4)
+    assert at.of_frames.mean() == pytest.approx(at.significance)
+    assert at.of_frames[1] == 0.0
 
 
 @pytest.mark.parametrize("model", CAMERAS)
@@ -71,10 +75,12 @@ def test_points_behind_the_camera_and_masked_pixels_count_for_nothing() -> None:
     behind = EdgeFrames(
         frames.camera, -np.abs(frames.xyz_m), frames.weight, frames.first_point, np.ones_like(frames.maps)
     )
-    assert [float(s[0]) for s in frame_alignment(behind, np.eye(4))] == [0.0, 0.0]
+    nothing = frame_alignment(behind, np.eye(4))
+    assert (nothing.strength.tolist(), nothing.square.tolist(), nothing.significance) == ([0.0], [0.0], 0.0)
     assert significances(behind, np.eye(4)[None]).tolist() == [0.0]
     masked = EdgeFrames(frames.camera, frames.xyz_m, frames.weight, frames.first_point, np.full_like(frames.maps, VOID))
-    assert [float(s[0]) for s in frame_alignment(masked, np.eye(4))] == [0.0, 0.0]
+    nothing = frame_alignment(masked, np.eye(4))
+    assert (nothing.strength.tolist(), nothing.square.tolist(), nothing.significance) == ([0.0], [0.0], 0.0)
     assert significances(masked, np.eye(4)[None]).tolist() == [0.0]
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import fsum, inf, radians, sqrt
+from math import fsum, inf, radians
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.commissioning.equation_2 import PaperLimits
 from coec.calibration.monitor.sensor_faults import SceneBaseline
+from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4, Rig
 from coec.config import CalibrationConfig, VerdictConfig, config_hash
 from coec.geometry import se3
@@ -31,11 +33,7 @@ PIXEL_SHARE = 0.3
 """Share of a pixel that the local optimum may be off for the pixels alone, whatever the scenes of a commissioning say:
 edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
 
-PIXEL_RANGE_M = 8.0
-"""Range at which a pixel of rotation looks like one of translation, m: of the near edges, which tell translation."""
-
-
-FIGURES = "edges-kept"
+FIGURES = "points-drawn"
 """Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a check at
 the same pairs gives other figures: limits of the old ones would not fit."""
 
@@ -64,7 +62,8 @@ class Accuracy:
         return fsum(self._squares(offset, pairs))
 
     def farthest2(self, offset: NDArray[np.float64], pairs: int) -> float:
-        """The same along the one axis on which it is farthest: one axis that is off is not hidden by five that are
+        """Squared distance of an offset (6,) from the bias along the one axis on which it is farthest, in standard
+        deviations: one axis that is off is not hidden by five that are
         not."""
         return max(self._squares(offset, pairs))
 
@@ -79,7 +78,8 @@ class MonitorLimits:
 
     Attributes:
         max_distance2_rotation: of the local optimum over rotations, in standard deviations, squared.
-        max_farthest2_pose: the same over six degrees of freedom, of the axis that is farthest off.
+        max_farthest2_pose: of the local optimum over six degrees of freedom, along the axis that is farthest off,
+            likewise squared.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
         min_edges_kept: see `Check`; where fewer are kept, a quarter of the distance over rotations is too far.
         max_agreement_rad: between the local optima of the two witnesses.
@@ -97,11 +97,16 @@ class MonitorLimits:
     max_f1: float = inf
     min_f2: float = -inf
 
+    @property
+    def of_paper(self) -> PaperLimits:
+        """Those of equation (2)."""
+        return PaperLimits(self.min_mi, self.max_f1, self.min_f2)
+
 
 def pixel_floor(camera: Camera) -> NDArray[np.float64]:
     """(6,) standard deviation that the pixels of a camera leave to any check, however many pairs it has (rad, m)."""
     off_rad = PIXEL_SHARE * pixel_rad(camera)
-    return np.array([off_rad] * 3 + [off_rad * PIXEL_RANGE_M] * 3)
+    return of_both(off_rad)
 
 
 def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:
@@ -203,20 +208,3 @@ def mismatch(baseline: Baseline, rig: Rig, depth_identity: str, config_hash: str
 def learned_hash(config: CalibrationConfig) -> str:
     """Of the configuration that a baseline holds for: all that moves an optimum; the limits are what it replaces."""
     return config_hash(config.objective, config.search, str(config.motion_compensation), FIGURES)
-
-
-def chi2_quantile(probability: float, dof: int) -> float:
-    """Of the χ² distribution, by the cube-root approximation of Wilson and Hilferty (1931): within 3 % from one degree
-    of freedom and 0.9 on."""
-    h = 2.0 / (9.0 * dof)
-    return dof * (1.0 - h + normal_quantile(probability) * sqrt(h)) ** 3
-
-
-def normal_quantile(probability: float) -> float:
-    """Of the standard normal distribution, within 5e-4 (Abramowitz and Stegun 1964, 26.2.23)."""
-    tail = min(probability, 1.0 - probability)
-    if not tail > 0.0:
-        raise ValueError(f"a quantile needs a probability between 0 and 1, got {probability}")
-    t = sqrt(-2.0 * float(np.log(tail)))
-    upper = t - (2.515517 + 0.802853 * t + 0.010328 * t * t) / (1.0 + 1.432788 * t + 0.189269 * t * t + 0.001308 * t**3)
-    return upper if probability > 0.5 else -upper

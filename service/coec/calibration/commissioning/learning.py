@@ -1,6 +1,6 @@
 """From good windows to the baseline of a rig: the estimator's bias and spread on it, and every limit.
 
-Nothing is set by hand: the same windows are looked at where they are right and after they were moved by known amounts,
+Nothing is set by hand: the same windows are checked where they are right and after they were moved by known amounts,
 and each limit is put where it flags no more of the right ones than the stated rate, and as many of the moved ones as
 that leaves. Moves are seeded: the same windows give the same baseline.
 """
@@ -21,11 +21,11 @@ from coec.calibration.commissioning.baseline import (
     Accuracy,
     Baseline,
     MonitorLimits,
-    chi2_quantile,
     learned_hash,
-    normal_quantile,
     pixel_floor,
 )
+from coec.calibration.commissioning.equation_2 import PaperLimits, beyond
+from coec.calibration.commissioning.quantiles import chi2_quantile, normal_quantile
 from coec.calibration.commissioning.verdict_limits import verdict_limits
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import POSE_DOF, ROTATION_DOF, Check, CheckInput, check_at, gather
@@ -36,9 +36,10 @@ from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
+from coec.geometry.vectors import random_direction
 
 MAX_PAIRS = 48
-"""Pairs that are looked at, evenly chosen from all windows: two windows of the default size."""
+"""Pairs that are checked, evenly chosen from all windows: two windows of the default size."""
 
 BLOCKS = 10
 """Blocks of neighbouring pairs, of which half are left out at a time: neighbours are not independent."""
@@ -73,10 +74,29 @@ MOVES = (
 """By name: rotations about random axes (rad) and translations in random directions (m)."""
 
 SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
 
 MOST_KEPT = 0.88
 """Limit of the edges that a check keeps, at most. Right checks kept 0.91 and more on other pairs than those that the
 bias was learned from; after half a degree they kept 0.2 to 0.8."""
+
+MAX_BIAS_RAD = radians(1.0)
+"""More than this about an axis is no bias of the estimator, but a wrong reference: on the recordings tried it was up to
+0.28°."""
+
+LAYOUT_SHARE = 0.25
+"""Of the edges of right checks, what a lost pose counts as keeping at least: the layout of a street fits anywhere, and
+five checks far off may all have missed it."""
+
+POOREST_SHARE = 0.8
+"""Of the least that right checks showed, what a limit may ask for at most: a dozen checks are not the poorest stretch
+of a drive."""
+
+LOSS_ALLOWED = 2.0
+"""Times the most that right checks lost of their edges, which a check may lose."""
+
+NEAREST_SHARE = 0.25
+"""Of the squared distance of the least of the moved checks, what a limit may be at most: half its distance."""
 
 AGREEMENT_RAD = radians(0.5)
 """Least limit of the witnesses' disagreement: a quarter of the hill of the depth witness."""
@@ -248,10 +268,6 @@ def _check(rotation: Accuracy) -> None:
         )
 
 
-MAX_BIAS_RAD = radians(1.0)
-"""More than this is no bias of the estimator, but a wrong reference."""
-
-
 class _Checks:
     """Checks at seeded subsets of the pairs, near the right pose moved by a known amount in seeded directions."""
 
@@ -270,7 +286,7 @@ class _Checks:
         self._heard = heard
 
     def moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[Check]:
-        """`count` looks after a turn and a shift."""
+        """`count` checks after a turn and a shift."""
         rng = np.random.default_rng([SEED, round(turn_rad * 1e6), round(shift_m * 1e6)])
         pairs = len(self._evidence.pairs)
         size = min(CHECK_PAIRS, pairs - 1)
@@ -279,16 +295,11 @@ class _Checks:
             # Neighbours, as the monitor sees them.
             first = int(rng.integers(0, pairs))
             indices = sorted((first + step) % pairs for step in range(size))
-            xi = np.concatenate([turn_rad * _direction(rng), shift_m * _direction(rng)])
+            xi = np.concatenate([turn_rad * random_direction(rng), shift_m * random_direction(rng)])
             moved = se3.perturb(self._right, xi)
             seen.append(check_at(self._evidence.of(indices), moved, self._config, self._bias))
             self._heard.step(name, number, count)
         return seen
-
-
-def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
-    drawn = rng.normal(size=3)
-    return np.asarray(drawn / np.sqrt((drawn**2).sum()))
 
 
 def _monitor_limits(
@@ -304,27 +315,22 @@ def _monitor_limits(
     edges = float(np.min([edges_per_pair(seen) for seen in clean]))
     lost = float(np.median([edges_per_pair(seen) for seen in far]))
     kept = float(np.min([seen.edges_kept for seen in clean]))
-    z = normal_quantile(1.0 - rate / 3.0)
-    agreement = _beyond([seen.agreement_rad for seen in clean], z)
+    of_paper = PaperLimits.learned(clean, rate)
+    agreement = beyond([seen.agreement_rad for seen in clean], normal_quantile(1.0 - rate / 3.0))
     return MonitorLimits(
         max_distance2_rotation=_between(chi2_quantile(1.0 - rate / 2.0, ROTATION_DOF), min(turned)),
         max_farthest2_pose=_between(chi2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1), min(shifted)),
-        min_edges_per_pair=min(sqrt(edges * max(lost, 0.25 * edges)), 0.8 * edges),
-        min_edges_kept=min(1.0 - 2.0 * (1.0 - kept), MOST_KEPT),
+        min_edges_per_pair=min(sqrt(edges * max(lost, LAYOUT_SHARE * edges)), POOREST_SHARE * edges),
+        min_edges_kept=min(1.0 - LOSS_ALLOWED * (1.0 - kept), MOST_KEPT),
         max_agreement_rad=max(agreement, AGREEMENT_RAD),
-        min_overlap=0.8 * float(np.min([seen.overlap for seen in clean])),
-        min_mi=_beyond([seen.mi for seen in clean], -z),
-        max_f1=_beyond([seen.f1 for seen in clean], z),
-        min_f2=_beyond([seen.f2 for seen in clean], -z),
+        min_overlap=POOREST_SHARE * float(np.min([seen.overlap for seen in clean])),
+        min_mi=of_paper.min_mi,
+        max_f1=of_paper.max_f1,
+        min_f2=of_paper.min_f2,
     )
 
 
 def _between(right: float, wrong: float) -> float:
     """Half-way, in ratio, from what right checks do not exceed to the least of the moved ones, and no nearer to these
     than at a quarter of it; where the two come close the false-alarm rate decides."""
-    return max(right, min(sqrt(right * wrong), 0.25 * wrong))
-
-
-def _beyond(values: Sequence[float], z: float) -> float:
-    """So many standard deviations from the mean."""
-    return float(np.mean(values) + z * np.std(values, ddof=1))
+    return max(right, min(sqrt(right * wrong), NEAREST_SHARE * wrong))

@@ -16,15 +16,18 @@ from coec.calibration.types import Estimate, Matrix4, Window
 from coec.config import CalibrationConfig, VerdictConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
+from coec.geometry.vectors import random_direction
 
 SOLVES = 6
-"""Calibrations of each kind, each on a random half of the pairs."""
+"""Calibrations of each kind, each on a random half of the pairs; limits lie between the worst right and the best wrong
+one."""
 
-MIN_PAIRS = 5
-"""Pairs of such a half at least."""
+MIN_HALF = 5
+"""Pairs of such a half at least: fewer than axes and one more have no uncertainty (three degrees of freedom)."""
 
 NEAR_RAD, LOST_RAD, LOST_REACH_RAD = radians(5.0), radians(20.0), radians(8.0)
-"""Where they start; a lost one may not search as far as the right pose."""
+"""Where they start from the right pose, well inside of any search and twice as far as a lost one may search: that one
+cannot come to it."""
 
 RIGHT_RAD = radians(0.5)
 """A calibration that ends nearer than this to where the estimator puts this rig is right."""
@@ -34,6 +37,7 @@ OF_NOISE = ("sigma", "newton_step")
 result is for, and stay as configured."""
 
 SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
 
 
 def verdict_limits(
@@ -58,10 +62,9 @@ def verdict_limits(
     count = len(window.pairs)
     for number in range(1, 2 * SOLVES + 1):
         astray = number % 2 == 0
-        chosen = sorted(rng.permutation(count)[: max(count // 2, min(MIN_PAIRS, count))].tolist())
-        drawn = rng.normal(size=3)
+        chosen = sorted(rng.permutation(count)[: max(count // 2, min(MIN_HALF, count))].tolist())
         xi = np.zeros(6)
-        xi[:3] = (LOST_RAD if astray else NEAR_RAD) * drawn / np.sqrt((drawn**2).sum())
+        xi[:3] = (LOST_RAD if astray else NEAR_RAD) * random_direction(rng)
         tried = replace(
             window, T_camera_lidar_start=se3.perturb(right, xi), pairs=tuple(window.pairs[i] for i in chosen)
         )

@@ -53,8 +53,8 @@ MIN_PRESENCE, MIN_AXIS_AGREEMENT = 0.8, 0.9
 Measured on ten frames of a drive: the world has 0.2 % of such cells, scattered."""
 
 MIN_BOUND_AGREEMENT = 0.8
-"""The same around still cells: whole groups are judged there, which the 2 to 8 % of such cells in the world never
-bound."""
+"""Least length of the mean of the axes around still cells: whole groups are judged there, which the 2 to 8 % of such
+cells in the world never bound."""
 
 STILL_SHARE = 0.2
 """A cell whose standard deviation is below this share of the median of those that moved is still."""

@@ -13,6 +13,7 @@ Choice = NDArray[np.int64] | slice
 """Of the points of a sweep."""
 
 EVERY = slice(None)
+"""All points, without a copy."""
 
 
 def compensate(pair: FramePair, rig: Rig, *, enabled: bool, chosen: Choice = EVERY) -> NDArray[np.float32]:

@@ -16,13 +16,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import fsum, hypot, isnan, nan, radians, sqrt
 
-import nlopt
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate, sensor_twist
+from coec.calibration.objective.differences import FrameScores, across, along
 from coec.calibration.objective.edges import EdgeWitness, build_edges
 from coec.calibration.ports import ImageReader
+from coec.calibration.search.bounded import Box, maximum_in
+from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4, Window
 from coec.config import CalibrationConfig, TimeOffsetConfig
 from coec.geometry import se3
@@ -35,9 +37,12 @@ OFFSET = 6
 """Place of the offset behind the six axes of the perturbation."""
 
 FITTED = (0, 1, 2, OFFSET)
-SHIFTS = (3, 4, 5)
+"""Places of what is fitted: the rotation and the offset."""
 
-STEPS = np.array([radians(0.3)] * 3 + [0.02] * 3 + [0.01])
+SHIFTS = (3, 4, 5)
+"""Places of the camera's position, which is taken as it is."""
+
+STEPS = np.array([*of_both(radians(0.3)), 0.01])
 """Difference steps, radians, metres and seconds: each moves edges by about the blur of the sharpest edges."""
 
 PROFILE_STEP_S = 0.02
@@ -81,7 +86,7 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
     Args:
         window: pairs with ego-motion.
         images: decodes them.
-        pose: (4, 4) T_camera_lidar that was found for the window; its translation is taken as it is.
+        pose: (4, 4) T_camera_lidar that was found for the window; the camera's centre is taken as it is.
         config: `time_offset` and whether sweeps are motion-compensated.
 
     Raises:
@@ -166,17 +171,13 @@ def _coarse(edges: EdgeWitness, twists: list[Twist], pose: Matrix4, limits: Time
     return ends[best][0][0], float(offsets_s[best])
 
 
-Scores = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-
-
-def _scores(frames: EdgeFrames, twists: list[Twist], pose: Matrix4) -> Scores:
+def _scores(frames: EdgeFrames, twists: list[Twist], pose: Matrix4) -> FrameScores:
     """Significance of each frame (F,), as a function of the perturbation of `pose` and the offset (7,)."""
     frame = np.repeat(np.arange(len(twists)), np.diff(frames.first_point))
 
     def of(x: NDArray[np.float64]) -> NDArray[np.float64]:
         moved = replace(frames, xyz_m=_moved(frames.xyz_m, frame, twists, float(x[OFFSET])))
-        strength, square = frame_alignment(moved, se3.perturb(pose, x[:OFFSET]))
-        return np.asarray(strength / sqrt(max(float(square.sum()), 1e-9)))
+        return frame_alignment(moved, se3.perturb(pose, x[:OFFSET])).of_frames
 
     return of
 
@@ -184,7 +185,7 @@ def _scores(frames: EdgeFrames, twists: list[Twist], pose: Matrix4) -> Scores:
 def _maximum(
     score: Callable[[NDArray[np.float64]], float], offset_s: float, limits: TimeOffsetConfig
 ) -> NDArray[np.float64]:
-    """The best rotation and offset (7,), translation zero: BOBYQA (Powell 2009)."""
+    """The best rotation and offset (7,), translation zero."""
     fitted = list(FITTED)
 
     def full(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -192,18 +193,14 @@ def _maximum(
         x[fitted] = coordinates
         return x
 
-    bounds = np.array([TURN_RAD] * 3 + [limits.reach_s])
-    optimiser = nlopt.opt(nlopt.LN_BOBYQA, len(fitted))
-    optimiser.set_lower_bounds(-bounds)
-    optimiser.set_upper_bounds(bounds)
-    optimiser.set_initial_step(STEPS[fitted])
-    optimiser.set_xtol_abs(TOLERANCE * STEPS[fitted])
-    optimiser.set_maxeval(MAX_EVALUATIONS)
-    optimiser.set_max_objective(lambda x, _gradient: score(full(x)))
-    return full(np.asarray(optimiser.optimize(np.array([0.0, 0.0, 0.0, offset_s]))))
+    reach, steps = np.array([TURN_RAD] * 3 + [limits.reach_s]), STEPS[fitted]
+    start = np.array([0.0, 0.0, 0.0, offset_s])
+    box = Box(-reach, reach, steps, TOLERANCE * steps)
+    found, _ = maximum_in(box, lambda coordinates: score(full(coordinates)), start, MAX_EVALUATIONS)
+    return full(found)
 
 
-def _sigma(scores: Scores, found: NDArray[np.float64], limits: TimeOffsetConfig) -> float:
+def _sigma(scores: FrameScores, found: NDArray[np.float64], limits: TimeOffsetConfig) -> float:
     """Standard deviation of the offset, seconds; infinite where the score has no maximum or rests on a single frame.
 
     From leaving out one frame at a time (Efron 1982), each by its Newton step: a frame in a sharp turn has so much
@@ -226,26 +223,19 @@ def _sigma(scores: Scores, found: NDArray[np.float64], limits: TimeOffsetConfig)
 
 
 def _derivatives(
-    scores: Scores, found: NDArray[np.float64]
+    scores: FrameScores, found: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Central differences of each frame's score: negative Hessians over the fitted axes (F, 4, 4), those of the fitted
     axes with the translation (F, 4, 3), gradients (F, 4)."""
-    axes = np.diag(STEPS)
 
-    def mixed(i: int, j: int) -> NDArray[np.float64]:
-        both, against = axes[i] + axes[j], axes[i] - axes[j]
-        change = scores(found + both) + scores(found - both) - scores(found + against) - scores(found - against)
-        return np.asarray(-change / (4.0 * STEPS[i] * STEPS[j]))
+    def at(shift: NDArray[np.float64]) -> NDArray[np.float64]:
+        return scores(found + shift)
 
-    centre = scores(found)
-    plus = np.array([scores(found + axes[i]) for i in FITTED])
-    minus = np.array([scores(found - axes[i]) for i in FITTED])
-    steps = STEPS[list(FITTED)]
-    hessians = np.zeros((len(centre), len(FITTED), len(FITTED)))
+    gradients, second = along(at, STEPS, FITTED)
+    hessians = np.zeros((gradients.shape[1], len(FITTED), len(FITTED)))
     for a, i in enumerate(FITTED):
-        hessians[:, a, a] = -(plus[a] + minus[a] - 2.0 * centre) / steps[a] ** 2
+        hessians[:, a, a] = -second[a]
         for b, j in enumerate(FITTED[:a]):
-            hessians[:, a, b] = hessians[:, b, a] = mixed(i, j)
-    shifts = np.array([[mixed(i, j) for j in SHIFTS] for i in FITTED])
-    gradients = (plus - minus) / (2.0 * steps[:, None])
+            hessians[:, a, b] = hessians[:, b, a] = -across(at, STEPS, i, j)
+    shifts = np.array([[-across(at, STEPS, i, j) for j in SHIFTS] for i in FITTED])
     return hessians, np.moveaxis(shifts, 2, 0), gradients.T

@@ -13,7 +13,6 @@ from dataclasses import replace
 from math import radians
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.monitor.sensor_faults import EGO_MOTION_WRONG, TIME_OFFSET, Cause
@@ -60,18 +59,18 @@ def explained_by_motion(
     if 2 * len(moving) < len(pairs):
         return None
     edges = [_edges_only(pair) for pair in pairs]
-    null, at_found = _significance(_per_frame(level, expected)), _per_frame(level, found)
-    to_beat = _significance(at_found)
+    null, at_found = frame_alignment(level, expected).significance, frame_alignment(level, found)
+    to_beat = at_found.significance
     least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
     best, explanation = 0.0, None
     for changed, cause in _hypotheses(edges):
         xyz_m = np.concatenate([compensate(pair, rig, enabled=True) for pair in changed])
         again = replace(level, xyz_m=np.ascontiguousarray(xyz_m.T))
-        unmoved, moved = _significance(_per_frame(again, expected)), _per_frame(again, found)
-        agree = float((moved[:, 0] > at_found[:, 0]).mean()) >= FRAMES_AGREE
-        gains = agree and _significance(moved) >= least_gain * to_beat
+        unmoved, moved = frame_alignment(again, expected).significance, frame_alignment(again, found)
+        agree = float((moved.strength > at_found.strength).mean()) >= FRAMES_AGREE
+        gains = agree and moved.significance >= least_gain * to_beat
         enough = unmoved >= max(AS_GOOD * to_beat, BETTER * null)
-        reached = max(unmoved if enough else 0.0, _significance(moved) if gains else 0.0)
+        reached = max(unmoved if enough else 0.0, moved.significance if gains else 0.0)
         if reached > max(best, min_significance):
             best, explanation = reached, cause
     return explanation
@@ -82,15 +81,6 @@ def _hypotheses(edges: Sequence[FramePair]) -> Iterator[tuple[list[FramePair], C
         yield [_shifted(pair, seconds) for pair in edges], TIME_OFFSET
     for factor in SCALES:
         yield [_scaled(pair, factor) for pair in edges], EGO_MOTION_WRONG
-
-
-def _per_frame(level: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
-    """(F, 2) Σ w·e and Σ w²."""
-    return np.column_stack(frame_alignment(level, pose))
-
-
-def _significance(sums: NDArray[np.float64]) -> float:
-    return float(sums[:, 0].sum()) / float(np.sqrt(max(float(sums[:, 1].sum()), 1e-9)))
 
 
 def _edges_only(pair: FramePair) -> FramePair:

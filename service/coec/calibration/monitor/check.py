@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
 from coec.calibration.monitor.sensor_faults import SceneFacts, scene_facts
 from coec.calibration.objective.curvature import axis_derivatives
-from coec.calibration.objective.edges import THINNED_POINTS, EdgeWitness, build_edges, evenly
+from coec.calibration.objective.edges import THINNED_POINTS, EdgesAlone, EdgeWitness, build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
-    Evaluation,
     Features,
     Objective,
     SearchBox,
@@ -32,24 +31,27 @@ from coec.calibration.search.local_search import near, polish_in_turn
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import se3
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.alignment import EdgeFrames, significances
 from coec.geometry.edges.charts import EdgeCharts
+from coec.geometry.thinning import thinned
 
 REACH_RAD = radians(4.0)
 """How far about the pose a check searches. A pose further off leaves the local optimum at the rim, or nowhere: both are
 far beyond any limit."""
 
 BASINS = 2
-"""Maxima that both witnesses judge: what a few pairs have two of, all blurs together have one of."""
+"""Maxima that both witnesses rank: what a few pairs have two of, all blurs together have one of."""
 
 ROTATION_DOF, POSE_DOF = 3, 6
+"""Axes of ξ that the two optima of a check are searched over: rotations, and all."""
 
 NO_BIAS = np.zeros(6)
+"""Of a rig that was not commissioned: its optimum is expected at the pose itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckInput:
-    """Some pairs with everything decoded and inferred that looks at any pose need. Entries are per pair, in order."""
+    """Some pairs with all that a check at any pose needs, decoded and inferred. Entries are per pair, in order."""
 
     rig: Rig
     pairs: tuple[FramePair, ...]
@@ -58,7 +60,7 @@ class CheckInput:
     scenes: tuple[SceneFacts, ...]
 
     def of(self, indices: Sequence[int]) -> CheckInput:
-        """The same of some of the pairs."""
+        """That of some of the pairs alone, by their indices."""
         return CheckInput(
             self.rig,
             tuple(self.pairs[i] for i in indices),
@@ -71,10 +73,10 @@ class CheckInput:
 @dataclass(frozen=True, slots=True, eq=False)
 class Check:
     """What a check at a pose tells. Derivatives are those of mutual information (Borer et al. 2023), at the pose, over
-    rx ry rz tx ty tz; equation (2) looks at the rotations.
+    rx ry rz tx ty tz; equation (2) takes those of the rotations.
 
     Attributes:
-        T_rotation: (4, 4) local optimum of both witnesses over rotations, the translation being that of the pose.
+        T_rotation: (4, 4) local optimum of both witnesses over rotations, the camera's centre being that of the pose.
         T_pose: (4, 4) local optimum over all six degrees of freedom.
         offset_rotation, offset_pose: (6,) ξ from the pose to these (rad, m).
         mi: equation (1), nats.
@@ -117,7 +119,7 @@ class Check:
 
 
 def gather(sight: Sight) -> CheckInput:
-    """Decodes and infers everything that looks at the pairs of `sight` need.
+    """Decodes and infers everything that checks of the pairs of `sight` need.
 
     Raises:
         CalibrationError: an image cannot be decoded, a frame has no depth, no sweep has a range edge.
@@ -159,7 +161,7 @@ def check_at(
     ways = (fusion.settling, (fusion.ranking[-1], *fusion.settling[1:]))
     ends = [polished(way, T_rotation, in_all) for way in ways]
     T_pose = max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score)
-    of_edges = _EdgesAlone(evidence.edges)
+    of_edges = EdgesAlone(evidence.edges.whole, evidence.edges.blur_rad)
     T_edges, T_depth = polished([of_edges], T_rotation), polished([depth], T_rotation)
     at_pose = fusion.settling[0].evaluate(pose)
     first_derivative, second_derivative = axis_derivatives(depth, pose)
@@ -184,31 +186,12 @@ def check_at(
 
 def _kept(band: EdgeFrames, T_expected: Matrix4, T_best: Matrix4) -> float:
     expected, best = significances(band, np.stack([T_expected, T_best])).tolist()
-    return float(expected / max(best, 1e-9))
-
-
-class _EdgesAlone:
-    """The edge witness as an objective."""
-
-    def __init__(self, edges: EdgeWitness) -> None:
-        self._edges = edges
-
-    @property
-    def step_rad(self) -> float:
-        """The blur of the edges."""
-        return self._edges.blur_rad
-
-    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
-        """Significance; depth and overlap are not looked at."""
-        strength, square = frame_alignment(self._edges.whole, T_camera_lidar)
-        of_frames = len(strength) * strength / np.sqrt(max(float(square.sum()), 1e-9))
-        return Evaluation(float(of_frames.mean()), of_frames, mi=float("nan"), overlap=float("nan"), points_in_view=0)
+    return float(expected / best) if best > 0.0 else 1.0  # an optimum without edges has none to lose
 
 
 def _witness_of(edges: EdgeWitness, indices: Sequence[int]) -> EdgeWitness:
     coarse, fine = (_charts_of(charts, indices) for charts in edges.charts)
-    count = len(coarse.weight)
-    kept = evenly(count, THINNED_POINTS)
+    kept = thinned(len(coarse.weight), THINNED_POINTS)
     return replace(
         edges,
         sharp=_frames_of(edges.sharp, indices),

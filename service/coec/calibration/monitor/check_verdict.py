@@ -15,9 +15,9 @@ from coec.calibration.commissioning.baseline import (
     Baseline,
     Drift,
     MonitorLimits,
-    chi2_quantile,
     uncommissioned,
 )
+from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.timing import explained_by_motion
 from coec.calibration.monitor.change_detector import Observation
@@ -38,7 +38,7 @@ MIN_PAIRS = 4
 
 LOST_EDGES_SHARE = 0.25
 """Of the limit of the squared distance over rotations, where the edges are lost at the pose. Standard deviations are
-those of a rig's looks at large; how sharply this scene tells the pose, its edges know."""
+those of a rig's checks at large; how sharply this scene tells the pose, its edges know."""
 
 UNCOMMISSIONED = MonitorLimits(
     max_distance2_rotation=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0, ROTATION_DOF),
@@ -94,7 +94,7 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
         distance2=max(of_rotation, of_pose),
         flagged=flagged,
         weak=weak,
-        flagged_by_paper=None if baseline is None else by_equation_2(seen, limits),
+        flagged_by_paper=None if baseline is None else limits.of_paper.flags(seen),
         causes=causes,
         first_derivative=seen.first_derivative,
         second_derivative=seen.second_derivative,
@@ -112,11 +112,6 @@ def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: Monitor
         rotation.distance2(seen.offset_rotation, seen.pairs) / within,
         pose.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose,
     )
-
-
-def by_equation_2(seen: Check, limits: MonitorLimits) -> bool:
-    """Equation (2) of Borer et al. 2023: failed if MI < MI_lim or f' > f'_lim or f'' < f''_lim."""
-    return seen.mi < limits.min_mi or seen.f1 > limits.max_f1 or seen.f2 < limits.min_f2
 
 
 def edges_per_pair(seen: Check) -> float:

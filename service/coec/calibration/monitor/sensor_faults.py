@@ -42,7 +42,7 @@ running. Another street does the same to 6 % of them for 5 s, and to less than 0
 is."""
 
 DIRTY_CHECKS = 3.5
-"""Independent looks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
+"""Independent checks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
 
 THUMBNAIL_CELL_PX = 8
 """Pixels a side that are one of the thumbnail by which pictures are compared."""
@@ -178,8 +178,8 @@ def scene_baseline(scenes: Sequence[SceneFacts]) -> SceneBaseline:
 
 
 def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) -> tuple[Cause, ...]:
-    """Every reason in the frames themselves not to believe a look at them, those that hide others first. Lost beams are
-    seen against a commissioned rig only, dirt only over several checks."""
+    """Every reason in the frames themselves not to believe a check of them, those that hide others first. Lost beams
+    are seen against a commissioned rig only, dirt only over several checks."""
     gradient = np.array([scene.gradient for scene in scenes])
     causes = []
     dark = float(np.median([scene.bright for scene in scenes])) < DARK_LEVEL

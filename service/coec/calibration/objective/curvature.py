@@ -7,7 +7,7 @@ sum (the sandwich estimator of maximum-likelihood theory, Huber 1967: J⁻¹·V�
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import fsum, sqrt
@@ -15,12 +15,12 @@ from math import fsum, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.objective.differences import FrameScores, across, along
 from coec.calibration.objective.mutual_information import Objective
+from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-
-METRES_PER_RADIAN = 6.0
-"""Difference step of a translation per step of a rotation: moves a point 6 m away as far."""
+from coec.geometry.linear import inverted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,17 +37,23 @@ class Curvature:
     second_derivative: NDArray[np.float64]
     sigma: NDArray[np.float64]
 
+    def peakedness(self, score: float) -> NDArray[np.float64]:
+        """(3,) -f''/f of the rotations, per radian², where the objective is `score`.
+
+        NaN where the score is not above zero: a share of nothing, or of what is worse than nothing, tells no peak. A
+        figure that is not a number passes no limit.
+        """
+        return np.asarray(self.second_derivative[:3] / (score if score > 0.0 else np.nan))
+
 
 def measure_curvature(objective: Objective, pose: Matrix4, dof: int, kept: Collection[int] = ()) -> Curvature:
     """Central differences per frame about `pose` (4, 4) on the first `dof` axes, less those in `kept`."""
     moved = [axis for axis in range(dof) if axis not in kept]
     at, steps = _frame_scores_about(objective, pose, moved)
-    gradients, second = _along_axes(at, steps)
-    axes, hessian = np.diag(steps), np.diag(second)
+    gradients, second = along(at, steps, range(len(moved)))
+    hessian = np.diag(second.mean(axis=1))
     for i, j in combinations(range(len(moved)), 2):
-        both, against = axes[i] + axes[j], axes[i] - axes[j]
-        mixed = (at(both) + at(-both) - at(against) - at(-against)).mean()
-        hessian[i, j] = hessian[j, i] = mixed / (4.0 * steps[i] * steps[j])
+        hessian[i, j] = hessian[j, i] = across(at, steps, i, j).mean()
     return Curvature(
         first_derivative=_padded(gradients.mean(axis=1), moved),
         second_derivative=_padded(-np.diag(hessian), moved),
@@ -58,16 +64,13 @@ def measure_curvature(objective: Objective, pose: Matrix4, dof: int, kept: Colle
 def axis_derivatives(objective: Objective, pose: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(6,) ∂S/∂ξ and (6,) -∂²S/∂ξ² at `pose` (4, 4), per radian or metre: what `measure_curvature` says of each axis by
     itself, for a fifth of the evaluations."""
-    gradients, second = _along_axes(*_frame_scores_about(objective, pose, range(6)))
-    return gradients.mean(axis=1), -second
-
-
-_FrameScores = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    gradients, second = along(*_frame_scores_about(objective, pose, range(6)), range(6))
+    return gradients.mean(axis=1), -second.mean(axis=1)
 
 
 def _frame_scores_about(
     objective: Objective, pose: Matrix4, moved: Sequence[int]
-) -> tuple[_FrameScores, NDArray[np.float64]]:
+) -> tuple[FrameScores, NDArray[np.float64]]:
     """The scores of the frames (F,) as a function of the perturbation of `pose` along the axes `moved`, and the
     difference step of each."""
 
@@ -76,15 +79,7 @@ def _frame_scores_about(
         perturbation[moved] = offset
         return objective.evaluate(se3.perturb(pose, perturbation)).frame_scores
 
-    return at, objective.step_rad * np.array([1.0] * 3 + [METRES_PER_RADIAN] * 3)[moved]
-
-
-def _along_axes(at: _FrameScores, steps: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Central differences along each of n axes: gradients of the frames (n, F), second derivatives of their mean."""
-    axes, centre = np.diag(steps), at(np.zeros(len(steps)))
-    plus = np.array([at(axis) for axis in axes])
-    minus = np.array([at(-axis) for axis in axes])
-    return (plus - minus) / (2.0 * steps[:, None]), (plus + minus - 2.0 * centre).mean(axis=1) / steps**2
+    return at, of_both(objective.step_rad)[moved]
 
 
 def _sandwich(gradients: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -94,34 +89,17 @@ def _sandwich(gradients: NDArray[np.float64], information: NDArray[np.float64]) 
     the byte.
     """
     dof, frames = gradients.shape
-    inverse = _inverse(information.tolist())
-    # Fewer frames than axes cannot span the noise; without a maximum there is no spread to speak of.
-    if frames <= dof or inverse is None:
+    if frames <= dof:  # they cannot span the noise
+        return np.full(dof, np.nan)
+    try:
+        inverse = inverted(information.tolist())
+    except ValueError:  # no maximum, and no spread to speak of
         return np.full(dof, np.nan)
     centred = [[g - fsum(row) / frames for g in row] for row in gradients.tolist()]
     # J⁻¹·g of every frame: its own Newton step. Their spread over the root of F is that of the mean. The optimum has
     # used up as many degrees of freedom as there are axes (MacKinnon, White 1985, "HC1").
     steps = [[fsum(inverse[i][j] * centred[j][f] for j in range(dof)) for f in range(frames)] for i in range(dof)]
     return np.array([sqrt(fsum(s * s for s in row) / (frames - dof) / frames) for row in steps])
-
-
-def _inverse(matrix: list[list[float]]) -> list[list[float]] | None:
-    """Inverse of a symmetric matrix by its Cholesky factor; None when it is not positive definite."""
-    n = len(matrix)
-    factor = [[0.0] * n for _ in range(n)]
-    for i in range(n):
-        for j in range(i + 1):
-            rest = matrix[i][j] - fsum(factor[i][k] * factor[j][k] for k in range(j))
-            if i == j and not rest > 0.0:
-                return None
-            factor[i][j] = sqrt(rest) if i == j else rest / factor[j][j]
-    # L⁻¹ by forward substitution, column by column; the inverse is L⁻ᵀ·L⁻¹.
-    lower = [[0.0] * n for _ in range(n)]
-    for column in range(n):
-        for i in range(column, n):
-            unit = 1.0 if i == column else 0.0
-            lower[i][column] = (unit - fsum(factor[i][k] * lower[k][column] for k in range(column, i))) / factor[i][i]
-    return [[fsum(lower[k][i] * lower[k][j] for k in range(n)) for j in range(n)] for i in range(n)]
 
 
 def _padded(values: NDArray[np.float64], axes: list[int]) -> NDArray[np.float64]:

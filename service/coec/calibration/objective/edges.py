@@ -10,13 +10,15 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import FramePair, Rig
+from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, pixel_rad, scaled
-from coec.geometry.edges.alignment import EdgeFrames
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.thinning import thinned
 
 BANDS = 3
 """Bands of about 0.8, 0.4 and 0.2 degrees: the coarsest feels a pose 0.9 degrees away, the finest is sharp enough to
@@ -46,11 +48,11 @@ class EdgeWitness:
         whole: the same on blurred edges, layout and all: leads there. It is drawn to where edges are dense, but its
             hills are wide; those of a band as fine are not. Half as many pixels a side: the blur is a pixel wide.
         blur_rad: the blur of `whole`, an angle about the optical axis.
-        bands: from fine to coarse, `RANKED_POINTS` evenly chosen range edges on one band each, through the model of the
+        bands: from fine to coarse, `RANKED_POINTS` of the range edges on one band each, through the model of the
             lens: ranks basins.
         band_blur_rad: the blur of each, an angle likewise.
         charts: the coarsest and the next finer band with the same range edges: fast.
-        thinned: the same with `THINNED_POINTS` evenly chosen range edges: faster.
+        thinned: the charts with `THINNED_POINTS` of those range edges: faster.
     """
 
     sharp: EdgeFrames
@@ -62,7 +64,27 @@ class EdgeWitness:
     thinned: tuple[EdgeCharts, EdgeCharts]
 
 
+class EdgesAlone:
+    """The edge witness as an objective by itself, at one blur."""
+
+    def __init__(self, frames: EdgeFrames, blur_rad: float) -> None:
+        """`blur_rad` is the blur of the edge maps, an angle about the optical axis."""
+        self._frames = frames
+        self._blur_rad = blur_rad
+
+    @property
+    def step_rad(self) -> float:
+        """The blur of the edges."""
+        return self._blur_rad
+
+    def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
+        """Significance at `T_camera_lidar` (4, 4), 0 where nothing is in view; depth and overlap are not looked at."""
+        at = frame_alignment(self._frames, T_camera_lidar)
+        return Evaluation(at.significance, at.of_frames, mi=math.nan, overlap=math.nan, points_in_view=0)
+
+
 Points = Callable[[int, NDArray[np.int64]], NDArray[np.float32]]
+"""The chosen points of the sweep of a pair: (N, 3), motion-compensated."""
 
 
 def build_edges(
@@ -97,7 +119,7 @@ def build_edges(
         first_chosen = np.searchsorted(chosen, first_point)
         return EdgeFrames(camera, np.ascontiguousarray(points_m[:, chosen]), weight[chosen], first_chosen, maps)
 
-    every, ranked = np.arange(len(weight)), evenly(len(weight), RANKED_POINTS)
+    every, ranked = np.arange(len(weight)), thinned(len(weight), RANKED_POINTS)
     levels = range(coarsest + 1 - BANDS, coarsest + 1)
     bands = tuple(frames(level, maps, ranked) for level, maps in zip(levels, of_bands, strict=True))
     blur_rad = tuple(_blur_rad(rig.camera, level) for level in levels)
@@ -106,7 +128,7 @@ def build_edges(
         edge_charts(bands[k].camera, bands[k].maps, blur_rad[k], points_m[:, ranked], weight[ranked], of_points)
         for k in (-1, -2)
     )
-    kept = evenly(len(ranked), THINNED_POINTS)
+    kept = thinned(len(ranked), THINNED_POINTS)
     return EdgeWitness(
         sharp=frames(finest, sharp, every),
         whole=frames(finest + 1, whole, every),
@@ -135,11 +157,6 @@ def _maps(scales: EdgeScales, greys: Iterable[NDArray[np.uint8]], frames: int) -
         for stack, level in zip(stacks, maps, strict=True):
             stack[frame] = level
     return stacks
-
-
-def evenly(count: int, at_most: int) -> NDArray[np.int64]:
-    """Indices of so many of `count` things, evenly chosen; of all where there are no more."""
-    return np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(np.int64))
 
 
 def _finest_level(camera: Camera) -> int:

@@ -59,9 +59,7 @@ class FusedObjective:
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
         """The objective at `T_camera_lidar` (4, 4), in standard deviations."""
         depth = self._depth.evaluate(T_camera_lidar)
-        strength, square = frame_alignment(self._edges, T_camera_lidar)
-        # Σ w·e of a frame over the root of all frames' Σ w²: the sum over the frames is the significance of the window.
-        of_frames = len(strength) * strength / np.sqrt(max(float(square.sum()), 1e-9))
+        of_frames = frame_alignment(self._edges, T_camera_lidar).of_frames
         frame_scores = (of_frames - self._of_edges.mean) / self._of_edges.deviation
         frame_scores = frame_scores + (depth.frame_scores - self._of_depth.mean) / self._of_depth.deviation
         return Evaluation(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.objective.edges import EdgeWitness
 from coec.calibration.objective.mutual_information import SearchBox
+from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.geometry.edges.charts import EdgeCharts, charted_significances, climb, keep_apart
@@ -46,6 +47,7 @@ class _Round:
 
 
 COARSE, FINE = 0, 1
+"""Places of the charts in `EdgeWitness.charts` and `.thinned`."""
 
 ROUNDS = (
     _Round(1500, radians(0.9), COARSE, thinned=True, step_rad=radians(0.45), halvings=1),
@@ -60,9 +62,6 @@ SHIFTED_POSES, SHIFT_M = 4, 0.25
 """Where translation is searched, six more poses climb once more for so many of the best, shifted by so much along each
 axis: poses of one rotation do not lie apart, so that the translation was chosen on the coarse chart, which hardly tells
 it (one start of 24, half a metre away, had ended 36 cm aside)."""
-
-METRES_PER_RADIAN = 7.0
-"""Translation step per rotation step: what moves a point 7 m away as far."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,8 +153,9 @@ def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 def _climbed(
     charts: EdgeCharts, poses: NDArray[np.float64], number: _Round, start: Matrix4, reach: SearchBox
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    shift_m = number.step_rad * METRES_PER_RADIAN if reach.translation_m > 0.0 else 0.0
-    steps = np.array([number.step_rad] * 3 + [shift_m] * 3)
+    steps = of_both(number.step_rad)
+    if reach.translation_m == 0.0:
+        steps[3:] = 0.0
     return climb(charts, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m]))
 
 

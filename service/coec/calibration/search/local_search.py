@@ -1,4 +1,4 @@
-"""Maximising an objective over a box of perturbations with BOBYQA (Powell 2009, NLopt): bounded, derivative-free.
+"""Maximising an objective over a box of perturbations: bounded, derivative-free.
 
 Two stages on one objective: the first finds the basin with a trust region of degrees, the second starts again in it
 with a fresh quadratic model of its size. Deterministic: same objective, same evaluations, same optimum.
@@ -6,30 +6,29 @@ with a fresh quadratic model of its size. Deterministic: same objective, same ev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees, radians
+from typing import Protocol
 
-import nlopt
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective.mutual_information import Objective, SearchBox
 from coec.calibration.ports import Progress
+from coec.calibration.search.bounded import Box, maximum_in
+from coec.calibration.steps import POLISH_METRES_PER_RADIAN, of_both
 from coec.calibration.types import Matrix4, StopReason
 from coec.config import SearchConfig
 from coec.geometry import se3
 
 REFINE_BOX_RAD, REFINE_STEP_RAD = radians(1.5), radians(0.6)
-"""Second stage, rotation. The box holds the widest ripple of pixels and scan lines around the end of the first stage;
+"""Second stage. The box holds the widest ripple of pixels and scan lines around the end of the first stage;
 the step spans several of those ripples (cells of a depth map, rings of a sweep: 0.1 to 0.4 degrees), so that the first
 quadratic model sees the hill and not the ripple."""
 
-REFINE_BOX_M, REFINE_STEP_M = 0.10, 0.04
-"""Second stage, translation: the shifts that move a point 4 m away as far as the rotations above."""
-
-POLISH_METRES_PER_RADIAN = 10.0
-"""Step of a translation per step of a rotation when a basin is polished."""
+POLISH_STEPS = 4.0
+"""Half-width of the box of a polish, in steps: what leads to a basin ends within a few of them."""
 
 NEAR = 0.1
 """Share of an objective's difference step within which a maximum is found that only ranks a basin, or leads to a finer
@@ -57,7 +56,7 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     """The pose of the highest score in the box about `start` (4, 4).
 
     Coordinates are the perturbation ξ = [rx ry rz tx ty tz] on the left of the start, about the camera axes; with three
-    degrees of freedom the translation is not searched.
+    degrees of freedom the camera turns about its centre, which stays that of the start.
     """
     evaluations = 0
 
@@ -67,15 +66,12 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
         progress.step("search", evaluations, config.max_evaluations)
         return objective.evaluate(_pose(start, coordinates)).score
 
+    centre, most = np.zeros(config.dof), config.max_evaluations
     half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
-    found, exhausted = _bobyqa(
-        score, np.zeros(config.dof), half_width, half_width,
-        _per_axis(config.dof, radians(config.step_deg), config.step_m), config,
-    )  # fmt: skip
-    near = _per_axis(config.dof, REFINE_BOX_RAD, REFINE_BOX_M)
-    found, exhausted_again = _bobyqa(
-        score, found, near, half_width, _per_axis(config.dof, REFINE_STEP_RAD, REFINE_STEP_M), config
-    )
+    step = _per_axis(config.dof, radians(config.step_deg), config.step_m)
+    found, exhausted = maximum_in(_box(centre, half_width, half_width, step, config), score, centre, most)
+    reach, step = (of_both(turn_rad)[: config.dof] for turn_rad in (REFINE_BOX_RAD, REFINE_STEP_RAD))
+    found, exhausted_again = maximum_in(_box(found, reach, half_width, step, config), score, found, most)
     stop_reason = StopReason.TOLERANCE
     if exhausted or exhausted_again:
         stop_reason = StopReason.EVALUATIONS
@@ -84,34 +80,48 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     return SearchResult(_pose(start, found), evaluations, stop_reason)
 
 
+class Constraint(Protocol):
+    """What a search leaves as it is."""
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Places in ξ that are not searched."""
+        ...
+
+    def __call__(self, T_camera_lidar: Matrix4) -> Matrix4:
+        """The nearest pose (4, 4) that keeps them."""
+        ...
+
+
 def polish(
     objective: Objective,
     basin: Matrix4,
     config: SearchConfig,
     progress: Progress,
     evaluations: int = 0,
-    kept: Collection[int] = (),
+    kept: Constraint | None = None,
 ) -> SearchResult:
     """The maximum next to `basin` (4, 4), which lies within a few of the objective's difference steps of it;
-    `evaluations` were made before. The axes in `kept` stay as they are."""
+    `evaluations` were made before. Every pose that is tried obeys `kept`."""
+    moved = [axis for axis in range(config.dof) if kept is None or axis not in kept.axes]
+
+    def pose(coordinates: NDArray[np.float64]) -> Matrix4:
+        perturbation = np.zeros(6)
+        perturbation[moved] = coordinates
+        perturbed = se3.perturb(basin, perturbation)
+        return perturbed if kept is None else kept(perturbed)
 
     def score(coordinates: NDArray[np.float64]) -> float:
         nonlocal evaluations
         evaluations += 1
         progress.step("search", evaluations, config.max_evaluations)
-        return objective.evaluate(_pose(basin, placed(coordinates))).score
+        return objective.evaluate(pose(coordinates)).score
 
-    moved = [axis for axis in range(config.dof) if axis not in kept]
-
-    def placed(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-        perturbation = np.zeros(6)
-        perturbation[moved] = coordinates
-        return perturbation
-
-    step = _per_axis(config.dof, objective.step_rad, objective.step_rad * POLISH_METRES_PER_RADIAN)[moved]
-    found, exhausted = _bobyqa(score, np.zeros(len(moved)), 4.0 * step, 4.0 * step, step, config)
+    step = of_both(objective.step_rad, POLISH_METRES_PER_RADIAN)[moved]
+    centre, reach = np.zeros(len(moved)), POLISH_STEPS * step
+    found, exhausted = maximum_in(_box(centre, reach, reach, step, config), score, centre, config.max_evaluations)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
-    return SearchResult(_pose(basin, placed(found)), evaluations, stop_reason)
+    return SearchResult(pose(found), evaluations, stop_reason)
 
 
 def near(config: SearchConfig, objective: Objective) -> SearchConfig:
@@ -133,28 +143,17 @@ def polish_in_turn(
     return polish(last, basin, config, progress, evaluations)
 
 
-def _bobyqa(
-    score: Callable[[NDArray[np.float64]], float],
+def _box(
     centre: NDArray[np.float64],
     reach: NDArray[np.float64],
     half_width: NDArray[np.float64],
     step: NDArray[np.float64],
     config: SearchConfig,
-) -> tuple[NDArray[np.float64], bool]:
-    """The best coordinates within `reach` of `centre` and inside the box, and whether the evaluations ran out."""
-    optimiser = nlopt.opt(nlopt.LN_BOBYQA, len(centre))
-    lower, upper = np.maximum(centre - reach, -half_width), np.minimum(centre + reach, half_width)
-    # The first quadratic model needs two steps of room between the bounds.
-    step = np.minimum(step, (upper - lower) / 2.0)
-    optimiser.set_lower_bounds(lower)
-    optimiser.set_upper_bounds(upper)
-    optimiser.set_initial_step(step)
-    # NLopt scales the axes by their steps; this is the radius of the last trust region on each of them.
-    optimiser.set_xtol_abs(step * radians(config.tolerance_deg) / step[0])
-    optimiser.set_maxeval(config.max_evaluations)
-    optimiser.set_max_objective(lambda x, _gradient: score(x))
-    found = np.asarray(optimiser.optimize(centre))
-    return found, optimiser.last_optimize_result() == nlopt.MAXEVAL_REACHED
+) -> Box:
+    """What lies within `reach` of `centre` and inside the box of `half_width`, all (n,); the tolerance of the
+    rotations is the configuration's, that of the translations has the proportion of the steps."""
+    tolerance = step * radians(config.tolerance_deg) / step[0]
+    return Box(np.maximum(centre - reach, -half_width), np.minimum(centre + reach, half_width), step, tolerance)
 
 
 def _per_axis(dof: int, rotation: float, translation: float) -> NDArray[np.float64]:

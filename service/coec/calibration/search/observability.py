@@ -1,12 +1,21 @@
-"""Translations that a window does not tell: they keep the place that they had before the search.
+"""Translations that a window does not tell: there the camera's centre keeps the place that it had before the search.
 
 Rotations move every point of an image alike, translations only near ones. Where nothing near has an edge, the optimum
-slides along a translation, and takes a rotation with it: better to leave it where the workshop put it, and say so.
+slides along a translation, and takes a rotation with it: better to leave the camera where it was, and say so.
+
+What is left is the camera's *centre*, c = -Rᵀ·t in LiDAR coordinates for T_camera_lidar = [R | t], and not an entry of
+t. The column t is where the LiDAR lies as seen from the camera. It swings with every rotation that is found: by 35 cm
+for a start that was turned by 20° and a camera 1 m from the LiDAR, though nobody moved the camera.
+
+In the terms of METHOD, section 4: the perturbation T(ξ) = exp(ξ)·T on the left turns the camera about its own centre,
+and its translation shifts that centre along the axes of the turned camera, by -R·(c - c₀). An axis is kept where this
+component, counted from the start, is zero. With three degrees of freedom all three are: a search of rotations alone
+leaves the centre of the start where it is.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,8 +25,31 @@ from coec.calibration.ports import Progress
 from coec.calibration.search.local_search import SearchResult, polish
 from coec.calibration.types import Matrix4
 from coec.config import SearchConfig, VerdictConfig
+from coec.geometry import se3
 
 TRANSLATIONS = range(3, 6)
+"""Places of the translations in ξ = [rx ry rz tx ty tz]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CentreKept:
+    """Along some axes of the camera, its centre stays where it was.
+
+    Attributes:
+        axes: of `TRANSLATIONS`.
+        prior: (4, 4) T_camera_lidar whose centre that is.
+    """
+
+    axes: tuple[int, ...]
+    prior: Matrix4
+
+    def __call__(self, T_camera_lidar: Matrix4) -> Matrix4:
+        """The pose (4, 4) with its centre put back along the kept axes of that camera; its rotation stays."""
+        shifted = se3.difference(T_camera_lidar, self.prior)
+        pose = T_camera_lidar.copy()
+        for axis in self.axes:
+            pose[axis - TRANSLATIONS.start, 3] -= shifted[axis]
+        return pose
 
 
 def unobservable(curvature: Curvature, dof: int, limits: VerdictConfig) -> tuple[int, ...]:
@@ -40,9 +72,7 @@ def without(
     config: SearchConfig,
     progress: Progress,
 ) -> SearchResult:
-    """The search ended anew with the translations `blind` put back to those of `prior` (4, 4)."""
-    pose = search.T_camera_lidar.copy()
-    for axis in blind:
-        pose[axis - TRANSLATIONS.start, 3] = prior[axis - TRANSLATIONS.start, 3]
-    again = polish(objective, pose, config, progress, search.evaluations, blind)
+    """The search ended anew with the camera's centre put back to that of `prior` (4, 4) along the axes `blind`."""
+    kept = CentreKept(blind, prior)
+    again = polish(objective, kept(search.T_camera_lidar), config, progress, search.evaluations, kept)
     return replace(again, stop_reason=search.stop_reason)

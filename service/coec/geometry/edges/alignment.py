@@ -43,19 +43,44 @@ class EdgeFrames:
     maps: NDArray[np.int8]
 
 
-def frame_alignment(
-    frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Per frame Σ w·e and Σ w² (F,) at one pose (4, 4), with e interpolated between pixels: smooth in the pose."""
+LEAST_SQUARE = 1e-9
+"""Least Σ w² that a significance divides by: where nothing is in view it is 0, and not 0 / 0. A single range edge has
+more than 0.5."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """Sums over the range edges in view at one pose, per frame: `strength` (F,) Σ w·e, `square` (F,) Σ w²."""
+
+    strength: NDArray[np.float64]
+    square: NDArray[np.float64]
+
+    @property
+    def significance(self) -> float:
+        """z of all frames together; 0 where nothing is in view."""
+        return float(self.strength.sum() / self._scale)
+
+    @property
+    def of_frames(self) -> NDArray[np.float64]:
+        """(F,) what each frame adds to z, F times: their mean is `significance`."""
+        return np.asarray(len(self.strength) * self.strength / self._scale)
+
+    @property
+    def _scale(self) -> float:
+        return math.sqrt(max(float(self.square.sum()), LEAST_SQUARE))
+
+
+def frame_alignment(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> Alignment:
+    """The alignment at one pose (4, 4), with e interpolated between pixels: smooth in the pose."""
     pose = np.ascontiguousarray(T_camera_lidar, np.float64)
     sums = _smooth_sums(frames.camera, pose, frames.xyz_m, frames.weight, frames.first_point, frames.maps)
-    return sums[:, 0], sums[:, 1]
+    return Alignment(sums[:, 0], sums[:, 1])
 
 
 def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4), with e at the nearest pixel: (K,)."""
     return np.asarray(
-        _significances(frames.camera, poses, frames.xyz_m, frames.weight, frames.first_point, frames.maps)
+        _nearest_pixel_z(frames.camera, poses, frames.xyz_m, frames.weight, frames.first_point, frames.maps)
     )
 
 
@@ -93,7 +118,7 @@ def _smooth_sums(
 
 
 @njit(cache=True, parallel=True)
-def _significances(
+def _nearest_pixel_z(
     camera: Camera,
     poses: NDArray[np.float64],
     xyz: NDArray[np.float32],
@@ -103,12 +128,12 @@ def _significances(
 ) -> NDArray[np.float64]:
     z = np.empty(poses.shape[0])
     for k in prange(poses.shape[0]):
-        z[k] = _significance(camera, poses[k], xyz, weight, first_point, maps)
+        z[k] = _nearest_pixel_z_at(camera, poses[k], xyz, weight, first_point, maps)
     return z
 
 
 @njit(cache=True)
-def _significance(
+def _nearest_pixel_z_at(
     camera: Camera,
     T: NDArray[np.float64],
     xyz: NDArray[np.float32],
@@ -129,7 +154,7 @@ def _significance(
                         w = float(weight[begin + i])
                         strength += w * e
                         square += w * w
-    return strength / (STRENGTH_STEPS * math.sqrt(max(square, 1e-9)))
+    return strength / (STRENGTH_STEPS * math.sqrt(max(square, LEAST_SQUARE)))
 
 
 @njit(cache=True, error_model="numpy")

@@ -146,7 +146,7 @@ def _extent(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def charted_significances(charts: EdgeCharts, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4): (K,)."""
-    return _significances(*_arguments(charts), poses)
+    return _charted_z(*_arguments(charts), poses)
 
 
 def climb(
@@ -191,7 +191,7 @@ def _arguments(charts: EdgeCharts) -> _Arguments:
 
 
 @njit(cache=True, error_model="numpy")
-def _significance(
+def _charted_z_at(
     cells: NDArray[np.int8],
     height: int,
     width: int,
@@ -233,7 +233,7 @@ def _significance(
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _significances(
+def _charted_z(
     cells: NDArray[np.int8],
     height: int,
     width: int,
@@ -248,7 +248,7 @@ def _significances(
     for k in prange(poses.shape[0]):
         narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
         narrow[:] = poses[k, :3]
-        z[k] = _significance(cells, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
+        z[k] = _charted_z_at(cells, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
     return z
 
 
@@ -274,7 +274,7 @@ def _climb(
         pose = starts[k].copy()
         narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
         narrow[:] = pose[:3]
-        best = _significance(cells, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
+        best = _charted_z_at(cells, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
         step = steps.copy()
         halved = 0
         for _ in range(MAX_SWEEPS):
@@ -287,7 +287,7 @@ def _climb(
                     if not _within(trial, centre, reach):
                         continue
                     narrow[:] = trial[:3]
-                    score = _significance(cells, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
+                    score = _charted_z_at(cells, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
                     if score > best:
                         best, pose, improved = score, trial, True
                         break

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.compiler import njit, prange
+from coec.geometry.thinning import thinned
 
 CLIP_SHARE = 0.95
 """Gradients are clipped at this quantile: reflections and lamps would outweigh the rest."""
 
 SAMPLES = 100_000
-"""Pixels of an image, evenly chosen, from which that quantile (flat ones apart) and the mean gradient are taken."""
+"""Pixels of an image from which that quantile (flat ones apart) and the mean gradient are taken."""
 
 MEAN_RADIUS_PX = 20
 """The local mean is over a square of 41 px (METHOD: 40 px)."""
@@ -158,7 +159,7 @@ def _normalised_gradient(
 ) -> NDArray[np.float32]:
     """The gradient over its local mean; zero but at `inner` pixels. `gradient` (h, w) is scratch; returns `out`."""
     _gradient(grey, inner, gradient)
-    sample = gradient.ravel()[:: max(1, gradient.size // SAMPLES)]
+    sample = gradient.ravel()[thinned(gradient.size, SAMPLES)]
     steep = sample[sample > 0.0]
     clip = np.float32(np.quantile(steep, CLIP_SHARE) if steep.size else 0.0)
     floor = FLOOR_SHARE * float(np.minimum(sample, clip).mean(dtype=np.float64))

@@ -1,0 +1,24 @@
+"""Quantiles against tables."""
+
+import pytest
+
+from coec.calibration.commissioning.quantiles import chi2_quantile, normal_quantile
+
+
+@pytest.mark.parametrize(("probability", "value"), [(0.5, 0.0), (0.975, 1.959964), (0.01, -2.326348)])
+def test_normal(probability: float, value: float) -> None:
+    assert normal_quantile(probability) == pytest.approx(value, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("probability", "dof", "value"),
+    [(0.99, 3, 11.3449), (0.995, 3, 12.8382), (0.95, 1, 3.8415)],
+)
+def test_chi_squared(probability: float, dof: int, value: float) -> None:
+    assert chi2_quantile(probability, dof) == pytest.approx(value, rel=0.03)
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0, -0.1, float("nan")])
+def test_outside_of_probabilities(probability: float) -> None:
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        normal_quantile(probability)
