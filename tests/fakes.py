@@ -53,7 +53,7 @@ def _answer(folder: Path, question: dict[str, Any]) -> Any:
         case "solve":
             estimate = msgpack.unpackb((folder / RESULT).read_bytes())
             estimate["window_id"] = Path(question["path"]).stem
-            result = {"result": msgpack.packb(estimate), "note": None}
+            result = {"result": msgpack.packb(estimate), "note": None, "written": None}
         case "check":
             result = {"observation": _OBSERVATION, "baseline_not_used": f"{len(question['frames'])} pairs"}
         case "overlay":

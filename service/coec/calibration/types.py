@@ -268,6 +268,11 @@ class Metric:
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
 
+ELSEWHERE = frozenset({"newton_step_deg", "newton_step_m", *(stop.value for stop in StopReason)})
+"""Codes of reasons that refuse a result although a pose stands out in its window: where exactly it lies is open, not
+whether there is one. Every other reason says that the window cannot tell."""
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """Equation (2): every metric beside its limit, and the reasons when it failed (empty when accepted)."""
@@ -275,6 +280,12 @@ class Verdict:
     decision: Decision
     metrics: tuple[Metric, ...]
     reasons: tuple[Reason, ...]
+
+    @property
+    def cannot_tell(self) -> bool:
+        """Of a refused window: it says nothing of where the camera is; too little to see, or more than one answer."""
+        codes = {reason.code for reason in self.reasons}
+        return not codes or not codes <= ELSEWHERE
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,16 +34,6 @@ _MEANING = {
     "overlap": "too few LiDAR points are in view",
 }
 
-ELSEWHERE = frozenset({"newton_step_deg", "newton_step_m", *(stop.value for stop in StopReason)})
-"""Codes of reasons that refuse a result although a pose stands out in its window: where exactly it lies is open, not
-whether there is one. Every other reason says that the window cannot tell."""
-
-
-def cannot_tell(verdict: Verdict) -> bool:
-    """Whether a refused window says nothing of where the camera is: too little to see, or more than one answer."""
-    codes = {reason.code for reason in verdict.reasons}
-    return not codes or not codes <= ELSEWHERE
-
 
 def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictConfig) -> tuple[Metric, ...]:
     """What any objective has to show at an optimum: no slope, a peak, an uncertainty worth the name, enough in view."""

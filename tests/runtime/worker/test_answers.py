@@ -168,10 +168,10 @@ def test_what_is_no_check_is_malformed(result: object) -> None:
 @pytest.mark.parametrize(
     ("kind", "result"),
     [
-        (Kind.SOLVE, {"result": b"\xc1", "note": None}),
-        (Kind.SOLVE, {"result": msgpack.packb({"pair": "front"}), "note": None}),
-        (Kind.SOLVE, {"result": msgpack.packb(7), "note": None}),
-        (Kind.SOLVE, {"result": to_msgpack(result_of(estimate(1), RIG, "test")), "note": "text"}),
+        (Kind.SOLVE, {"result": b"\xc1", "note": None, "written": None}),
+        (Kind.SOLVE, {"result": msgpack.packb({"pair": "front"}), "note": None, "written": None}),
+        (Kind.SOLVE, {"result": msgpack.packb(7), "note": None, "written": None}),
+        (Kind.SOLVE, {"result": to_msgpack(result_of(estimate(1), RIG, "test")), "note": "text", "written": None}),
         (Kind.OVERLAY, {"jpeg": 7}),
         (Kind.OVERLAY, {"code": "a", "text": "a reason, and no refusal"}),
         (

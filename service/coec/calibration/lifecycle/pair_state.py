@@ -20,7 +20,6 @@ from coec.calibration.monitor.change_detector import after_observation as check_
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
 from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
-from coec.calibration.verdict import cannot_tell
 from coec.config import PolicyConfig, TrackerConfig
 from coec.errors import CoecError
 from coec.geometry import se3
@@ -180,7 +179,7 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     if estimate.verdict.decision is Decision.FAILED:
         state = replace(state, status=Status.FAILED)
         elsewhere = not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
-        if cannot_tell(estimate.verdict) or not elsewhere:
+        if estimate.verdict.cannot_tell or not elsewhere:
             return state
         return _unless_red(state, Event.REFUSED_ELSEWHERE, *estimate.verdict.reasons)
     state = replace(state, status=Status.ACCEPTED)

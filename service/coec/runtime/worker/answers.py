@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from coec.calibration.types import Reason
 from coec.errors import DecodeError
-from coec.runtime.worker.jobs import ANSWERS, Answer, Checked, Commissioned, Drawn, Kind, Solved
+from coec.runtime.worker.jobs import ANSWERS, Answer, Checked, Commissioned, Drawn, Kind, Solved, WrittenFile
 from coec.schemas.base import from_msgpack, to_msgpack
 
 ARRAY = 1
@@ -35,6 +35,7 @@ class _SolvedOnTheWire:
 
     result: bytes
     note: Reason | None
+    written: WrittenFile | None
 
 
 def pack_answer(number: int, answer: Answer | None) -> dict[str, Any]:
@@ -86,7 +87,7 @@ def _solved(wire: _SolvedOnTheWire) -> Solved:
     from coec.schemas.replies import CalibrationResult
 
     try:
-        return Solved(from_msgpack(CalibrationResult, wire.result), wire.note)
+        return Solved(from_msgpack(CalibrationResult, wire.result), wire.note, wire.written)
     except DecodeError as error:
         raise MalformedAnswerError(str(error)) from error
 
