@@ -7,7 +7,7 @@ import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +21,7 @@ from campaign.drives import Drive, Truth
 from coec.adapters.frames.msgpack_frames import decode_ego
 from coec.adapters.zenoh.client import ask_one, connected
 from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, WindowConfig, load_config
+from coec.errors import CoecError
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
 from e2e.processes import COMMAND, Service, environment, write_configuration
@@ -52,6 +53,10 @@ def configured(folder: Path, drive: Drive) -> Path:
     worker = config.worker.model_copy(update={"niceness": 0})
     path.write_text(commented_yaml(config.model_copy(update={"pairs": (pair,), "worker": worker})))
     return path
+
+
+class ServiceEndedError(Exception):
+    """The service is gone, although nobody told it to go."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +128,20 @@ class Watch:
         return json.loads(ask_one(self.session, f"{key}?format=json", ANSWER_S).payload)
 
     def look(self) -> Sample:
-        """One more sample."""
-        assert self.running.process.poll() is None, f"the service has ended: {self.running.log.read_text()[-4000:]}"
-        health, extrinsic = self.ask(self.keys.health(self.pair)), self.ask(self.keys.extrinsic(self.pair))
-        status = self.ask(self.keys.status)
+        """One more sample.
+
+        Raises:
+            ServiceEndedError: nobody answers any more, because the service is gone.
+        """
+        try:
+            health, extrinsic = self.ask(self.keys.health(self.pair)), self.ask(self.keys.extrinsic(self.pair))
+            status = self.ask(self.keys.status)
+        except CoecError as error:
+            # A process that closes its session answers nothing for a while before it is gone.
+            with suppress(subprocess.TimeoutExpired):
+                code = self.running.process.wait(ENDED_S)
+                raise ServiceEndedError(f"the service has ended with {code}: {self.errors_logged()[-3:]}") from error
+            raise
         pair, worker = status["pairs"][0], status["worker"]
         served = np.array(extrinsic["camera_from_lidar"]["matrix"])
         known = self.truth is not None and self._stamp_ns > 0
@@ -213,6 +228,7 @@ def watching(
         assert ego is not None
         subscriber = session.declare_subscriber(ego.key, watch.heard)
         try:
+            _answered(watch)
             assert watch.until(lambda sample: sample.worker == "idle", START_S), "the worker does not become ready"
             yield watch
         finally:
@@ -220,6 +236,19 @@ def watching(
             subscriber.undeclare()
             if running.process.poll() is None:
                 running.terminate()
+
+
+def _answered(watch: Watch) -> None:
+    """Until the service answers at all: its router is there before its answers are."""
+    end_s = time.monotonic() + START_S
+    while time.monotonic() < end_s:
+        assert watch.running.process.poll() is None, watch.running.log.read_text()
+        with suppress(CoecError):
+            for key in (watch.keys.health(watch.pair), watch.keys.extrinsic(watch.pair), watch.keys.status):
+                watch.ask(key)
+            return
+        time.sleep(POLL_S)
+    raise AssertionError(f"the service answers nothing: {watch.running.log.read_text()}")
 
 
 @contextmanager
