@@ -10,7 +10,7 @@ import pytest
 from campaign.drives import Drive, Truth
 from campaign.figures import Figure, at_most, exactly, is_long, publish
 from campaign.test_never_blind import rate
-from campaign.watching import Transition, configured, transitions, watching
+from campaign.watching import WRONG_DEG, Transition, configured, transitions, watching
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 pytestmark = pytest.mark.slow
@@ -37,8 +37,8 @@ def drives() -> list[Drive]:
 
 def test_a_right_mount_is_not_accused(tmp_path: Path) -> None:
     found: dict[str, list[Transition]] = {}
-    longest_min, entries = 0.0, {}
-    most_per_minute = 0
+    entries: dict[str, Any] = {}
+    most_per_minute, worst_deg = 0, 0.0
     never_well = []
     for drive in drives():
         recording = drive.recorded(tmp_path)
@@ -55,7 +55,8 @@ def test_a_right_mount_is_not_accused(tmp_path: Path) -> None:
             found[name] = told[first + 1 :]
             history = watch.ask(watch.keys.history(watch.pair))["entries"]
             entries[name] = [one["entry"] for one in history if one["entry"]["kind"] == "state"]
-            longest_min = max(longest_min, drive.seconds / 60)
+            errors = [one.error_deg for one in watch.samples if one.error_deg is not None]
+            worst_deg = max(worst_deg, *errors)
             most_per_minute = max(most_per_minute, _most_per_minute(found[name]))
     for name, told in found.items():
         print(f"\n{name}")
@@ -67,6 +68,7 @@ def test_a_right_mount_is_not_accused(tmp_path: Path) -> None:
         exactly("drives that never were healthy", [], never_well),
         exactly("changes to anything but stale, degraded (and back)", 0, len(accused)),
         exactly("changes without a reason", 0, len(mute)),
+        at_most("served pose off the truth", WRONG_DEG, worst_deg, "deg"),
         at_most("changes of health in any minute of sensor time", 1, most_per_minute, ""),
     ]
     details: dict[str, Any] = {

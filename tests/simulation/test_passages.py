@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
-from coec.calibration.types import LidarFrame
+from coec.calibration.types import EgoMotion, FramePair, LidarFrame
 from coec.simulation.drive import SimulatedDrive
 from coec.simulation.faults import parse_fault
 from coec.simulation.parallel import messages_by
@@ -14,7 +14,7 @@ from coec.simulation.passages import CLEAR_M, Passages, Span, passages
 from coec.simulation.scene import Town
 from coec.simulation.tunnel import HIGH_M, VERGE_M
 from coec.simulation.vehicle import P_EGO_LIDAR_M, Pace
-from simulation.test_drive import fingerprint, pictures, pixels, small, sweeps
+from simulation.test_drive import fingerprint, pictures, pixels, share_consistent, small, sweeps
 
 
 def at(second: float, *faults: str) -> tuple[NDArray[np.int64], LidarFrame]:
@@ -46,6 +46,15 @@ def test_a_tunnel_is_near_dim_and_bare() -> None:
     above = sweep.xyz_m[:, 2][np.linalg.norm(sweep.xyz_m, axis=1) < 20.0]
     assert HIGH_M - P_EGO_LIDAR_M[2] - 0.4 < above.max() < HIGH_M - P_EGO_LIDAR_M[2] + 0.4
     assert picture.mean() < 0.7 * street.mean()
+
+
+@pytest.mark.parametrize("fault", ["tunnel:0-20", "open_road:0-20", "night:0-20"])
+def test_camera_and_lidar_see_the_same_place(fault: str) -> None:
+    drive = small(fault, depth=True, camera="pinhole600x300", seconds=6.0, lidar=32, camera_hz=1.0, lidar_hz=1.0)
+    messages = list(drive.messages([4]))
+    exposed, turn = pictures(messages)[0], sweeps(messages)[0]
+    motion = min((m for m in messages if isinstance(m, EgoMotion)), key=lambda m: abs(m.stamp_ns - exposed.stamp_ns))
+    assert share_consistent(drive, FramePair(exposed, turn, motion), compensated=True) > 0.9
 
 
 def test_an_open_road_has_nothing_but_ground() -> None:
