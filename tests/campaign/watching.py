@@ -67,6 +67,7 @@ class Sample:
         wall_s: steady clock of the one who watches.
         stamp_ns: sensor time of the newest ego-motion on the air.
         error_deg: of the served pose against the truth then; None without a truth.
+        age_s: what health says of its last evaluation.
     """
 
     wall_s: float
@@ -74,6 +75,7 @@ class Sample:
     state: str
     reasons: tuple[str, ...]
     error_deg: float | None
+    age_s: float | None
     checks: int
     solved: int
     held: int
@@ -151,6 +153,7 @@ class Watch:
             state=health["state"],
             reasons=tuple(reason["code"] for reason in health["reasons"]),
             error_deg=self.truth.error_deg(served, self._stamp_ns) if known and self.truth else None,
+            age_s=health["age_s"],
             checks=pair["checks"],
             solved=pair["solved"],
             held=pair["held"],
