@@ -24,6 +24,9 @@ from coec.simulation.faults import parse_fault, shifted
         ("no-ego:1-2", faults.NoEgo(1, 2)),
         ("offset:1-2:seconds=-0.1", faults.Offset(1, 2, seconds=-0.1)),
         ("loss:0:share=1", faults.Loss(0, math.inf, share=1)),
+        ("tunnel:20-35", faults.Tunnel(20, 35)),
+        ("open_road:20", faults.OpenRoad(20, math.inf)),
+        ("night:1-2", faults.Night(1, 2)),
     ],
 )
 def test_the_words_of_a_fault(text: str, expected: faults.Fault) -> None:
@@ -43,6 +46,7 @@ def test_the_words_of_a_fault(text: str, expected: faults.Fault) -> None:
         ("step:1:rx=nan", "rx must be a number"),
         ("drift:1:rx=1", "a drift needs an end"),
         ("frozen:1:share=1", "it takes no settings"),
+        ("tunnel:1:light=1", "it takes no settings"),
         ("loss:1:share=2", "share must lie between 0 and 1"),
     ],
 )

@@ -501,7 +501,7 @@ Faults = Annotated[
     typer.Option(
         "--fault",
         help="KIND:BEGIN[-END][:KEY=VALUE,...], repeatable: step:30:rx=3, drift:30-90:ry=2, dirt, dark, frozen, beams, "
-        "no-ego, offset, loss.",
+        "no-ego, offset, loss; poor stretches: tunnel:20-35, open_road:20-50, night:20-60.",
         metavar="FAULT",
     ),
 ]

@@ -23,13 +23,15 @@ from coec.errors import UsageError
 from coec.geometry.cameras import Camera, build
 from coec.geometry.se3 import inverse, perturb
 from coec.simulation import faults as wrong
-from coec.simulation.exposure import Lens, dirt_cover, expose
+from coec.simulation.exposure import Lens, at_night, dirt_cover, expose
 from coec.simulation.faults import Fault, shifted
+from coec.simulation.lamps import around, headlights, night_sky
 from coec.simulation.lidar import LIDARS, LidarModel, sweep
 from coec.simulation.mesh import Floats
+from coec.simulation.passages import passages
 from coec.simulation.render import pixel_rays, render_radiance
 from coec.simulation.scene import Scene, Solid, Town
-from coec.simulation.vehicle import T_ego_lidar, Trip, body, build_trip, workshop_T_camera_lidar
+from coec.simulation.vehicle import T_ego_lidar, Trip, body, build_pace, build_trip, workshop_T_camera_lidar
 from coec.sources.recording import MOTION_REACH_NS, Message, chosen_indices
 
 Doubles = NDArray[np.float64]
@@ -42,6 +44,8 @@ XI, ALPHA = -0.2, 0.6
 """Of the double sphere fisheye: near those of common lenses."""
 BODY = np.float32(0.05)
 """Share of the light of the horizon that the black body of the vehicle sends back."""
+DAYLIGHT = np.empty((0, 4, 3))
+"""No headlights."""
 NEAREST_M = 1.0
 """Range whose inverse has the largest depth code, 65535."""
 SPEED_SCALE_SIGMA, SPEED_SIGMA_MPS = 0.004, 0.02
@@ -105,9 +109,11 @@ class SimulatedDrive:
         self.config = config
         self.camera = _camera(config.camera, config.half_view_deg)
         self.lidar = _lidar(config.lidar)
-        town = Town(config.seed, config.start_m + FARTHEST_MPS * config.seconds)
+        pace = build_pace(config.seed, config.start_m)
+        poor = passages(config.faults, pace, config.seconds)
+        town = Town(config.seed, config.start_m + FARTHEST_MPS * config.seconds, poor)
         self._town = town
-        self._trip: Trip = build_trip(config.seed, town.road, town.lane_left_m(), config.start_m)
+        self._trip: Trip = build_trip(config.seed, town.road, town.lane_left_m(), pace)
         self._true = workshop_T_camera_lidar()
         self._body = Solid(body())
         self._rays = pixel_rays(self.camera, math.radians(config.half_view_deg))
@@ -221,8 +227,12 @@ class SimulatedDrive:
         return np.random.default_rng([self.config.seed, *key])
 
     def _scene(self, time_s: float) -> Scene:
-        at_m = float(self._trip.progress(np.array([time_s]))[0])
-        return self._town.scene(at_m, time_s, self._trip.progress)
+        at_m = float(self._trip.pace.progress(np.array([time_s]))[0])
+        scene = self._town.scene(at_m, time_s, self._trip.pace.progress)
+        night = any(self._now(wrong.Night, time_s))
+        scene.sky = night_sky(self._town.sky) if night else self._town.sky
+        scene.headlights = headlights(self._trip.poses(np.array([time_s]))[0]) if night else DAYLIGHT
+        return scene
 
     def _expose(self, index: int, stamp_ns: int) -> CameraFrame:
         time_s = self._time_s(_CAMERA, index)
@@ -244,11 +254,13 @@ class SimulatedDrive:
         scene = self._scene(time_s)
         radiance = render_radiance(scene, self.camera, pose, time_s=time_s, half_view_rad=view)
         hidden = self._own_body(T_camera_lidar)
-        radiance.linear[hidden] = BODY * np.array(scene.sky.horizon, np.float32)
+        share, lamps = around(scene, pose[:3, 3])
+        radiance.linear[hidden] = BODY * (np.float32(share) * np.array(scene.sky.horizon, np.float32) + lamps)
         light = math.prod(fault.light for fault in self._now(wrong.Dark, time_s))
-        share = max((fault.share for fault in self._now(wrong.Dirt, time_s)), default=0.0)
+        covered = max((fault.share for fault in self._now(wrong.Dirt, time_s)), default=0.0)
+        lens = at_night(self.config.lens) if any(self._now(wrong.Night, time_s)) else self.config.lens
         pixels = expose(
-            radiance.linear, self._seen, self.config.lens, self._rng(131, index), light=light, dirt=self._cover(share)
+            radiance.linear, self._seen, lens, self._rng(131, index), light=light, dirt=self._cover(covered)
         )
         size = (self.camera.width, self.camera.height)
         image = EncodedImage(ImageFormat.JPEG, *size, encode_jpeg(pixels, self.config.lens.jpeg_quality))

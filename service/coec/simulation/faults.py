@@ -98,6 +98,21 @@ class Loss(Fault):
     share: float = 0.3
 
 
+@dataclass(frozen=True, slots=True)
+class Tunnel(Fault):
+    """The vehicle is in a tunnel: bare walls and a ceiling near, dim lamps."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenRoad(Fault):
+    """Nothing stands or drives within reach of the LiDAR: a road, a meadow, the horizon."""
+
+
+@dataclass(frozen=True, slots=True)
+class Night(Fault):
+    """No light but the vehicle's headlights; the camera exposes for longer and amplifies: blur and noise."""
+
+
 KINDS: dict[str, type[Fault]] = {
     "step": Step,
     "drift": Drift,
@@ -108,10 +123,14 @@ KINDS: dict[str, type[Fault]] = {
     "no-ego": NoEgo,
     "offset": Offset,
     "loss": Loss,
+    "tunnel": Tunnel,
+    "open_road": OpenRoad,
+    "night": Night,
 }
 FORMS = (
     "step:30:rx=3,tz=0.1 | drift:30-90:ry=2 | dirt:30-60:share=0.3 | dark:30-60:light=0.02 | frozen:30-60 | "
-    "beams:30-60:share=0.5 | no-ego:30-60 | offset:30-60:seconds=0.05 | loss:30-60:share=0.3"
+    "beams:30-60:share=0.5 | no-ego:30-60 | offset:30-60:seconds=0.05 | loss:30-60:share=0.3 | "
+    "tunnel:20-35 | open_road:20-50 | night:20-60"
 )
 """One of each, for help and errors."""
 

@@ -22,10 +22,10 @@ SPREAD: tuple[tuple[float, float], ...] = ((1.0, 0.0), (-0.5, 0.866), (-0.5, -0.
 JUMP = 0.03
 """A beam is looked at as a cone where its neighbours' ranges differ by more than this share."""
 
-REFLECTANCE = np.full(16, np.nan)
+REFLECTANCE = np.full(len(Material), np.nan)
 """Of each material at the laser's 905 nm; NaN: as bright as it looks."""
 REFLECTANCE[[Material.ASPHALT, Material.GRASS, Material.FOLIAGE, Material.RUBBER]] = [0.17, 0.45, 0.5, 0.06]
-REFLECTANCE[[Material.MARKING, Material.SIGN, Material.GLASS]] = [0.75, 1.0, 0.03]
+REFLECTANCE[[Material.MARKING, Material.SIGN, Material.GLASS, Material.LAMP]] = [0.75, 1.0, 0.03, 0.3]
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,7 @@ class Material(IntEnum):
     RUBBER = 13
     CONCRETE = 14
     CLOTH = 15
+    LAMP = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from coec.geometry.compiler import njit
 from coec.simulation import props
 from coec.simulation.mesh import Floats, Mesh, join
+from coec.simulation.passages import Passages
 from coec.simulation.road import Road, build_road
 from coec.simulation.sky import Sky, draw_sky
-from coec.simulation.street import STRETCH_M, Stretch, Style, backdrop, build_stretch, draw_style
+from coec.simulation.street import NO_PASSAGES, STRETCH_M, Stretch, Style, backdrop, build_stretch, draw_style
+from coec.simulation.tunnel import Bore, bore
 
 Doubles = NDArray[np.float64]
 Progress = Callable[[Doubles], Doubles]
@@ -103,13 +105,20 @@ class Scene:
         street: what stands still, without the models of the cars.
         colour, material: (T, 3) float32 and (T,) int8 of all triangles: street, then each model of car.
         sky: light and weather.
+        movers: cars on their way; of the instant for which the scene was asked.
+        headlights: (L, 4, 3) of the vehicle, see `lamps.headlights`; none by day.
+        bores: the tunnels of the road.
     """
 
-    def __init__(self, road: Road, sky: Sky, origin_m: Doubles, street: Mesh, models: list[Solid]) -> None:
+    def __init__(
+        self, road: Road, sky: Sky, origin_m: Doubles, street: Mesh, models: list[Solid], bores: tuple[Bore, ...] = ()
+    ) -> None:
         self.road = road
         self.sky = sky
         self.origin_m = origin_m
         self.movers: tuple[Mover, ...] = ()
+        self.headlights: Doubles = np.empty((0, 4, 3))
+        self.bores = bores
         self.street = street
         self._solid = Solid(street)
         self._models = models
@@ -174,12 +183,14 @@ class Scene:
 class Town:
     """The streets of one seed. Builds what is around a place, and keeps only that."""
 
-    def __init__(self, seed: int, length_m: float = 1000.0) -> None:
+    def __init__(self, seed: int, length_m: float = 1000.0, passages: Passages = NO_PASSAGES) -> None:
         self.seed = seed
         self.style: Style = draw_style(seed)
         self.sky: Sky = draw_sky(seed)
         margin = STRETCH_M * (BEHIND + AHEAD + 2) + 300.0
         self.road = build_road(seed, -margin, length_m + margin)
+        self._passages = passages
+        self._bores = tuple(bore(self.road, span, self.style.lane_m) for span in passages.tunnels)
         rng = np.random.default_rng([seed, 103])
         self._models = [Solid(props.car(rng)) for _ in range(MODELS)]
         self._stretches: dict[int, Stretch] = {}
@@ -211,7 +222,7 @@ class Town:
         wanted = range(place - BEHIND, place + AHEAD + 1)
         # In the order of the road, wherever the vehicle comes from: the order of triangles shows in the bytes.
         kept = {
-            index: self._stretches.get(index) or build_stretch(self.seed, index, self.road, self.style)
+            index: self._stretches.get(index) or build_stretch(self.seed, index, self.road, self.style, self._passages)
             for index in wanted
         }
         self._stretches = kept
@@ -221,9 +232,8 @@ class Town:
             shift = (stretch.origin_m - origin).astype(np.float32)
             parts.append(Mesh(stretch.mesh.corners_m + shift, stretch.mesh.colour, stretch.mesh.material))
         lowest = min(float(mesh.corners_m[:, :, 2].min()) for mesh in parts)
-        return Scene(
-            self.road, self.sky, origin, join([*parts, backdrop().placed(0, 0, min(lowest, 0.0), 0)]), self._models
-        )
+        street = join([*parts, backdrop().placed(0, 0, min(lowest, 0.0), 0)])
+        return Scene(self.road, self.sky, origin, street, self._models, self._bores)
 
     def _traffic(self, at_m: float, time_s: float, own: Progress) -> list[Mover]:
         lane = self.style.lane_m / 2
@@ -238,7 +248,11 @@ class Town:
             if rng.random() < 0.6:
                 start = number * ONCOMING_GAP_M + rng.uniform(0, ONCOMING_GAP_M - 12)
                 movers.append(Mover(int(rng.integers(MODELS)), _against(float(start)), lane, oncoming=True))
-        return movers
+        return [mover for mover in movers if not self._on_cleared(mover, time_s)]
+
+    def _on_cleared(self, mover: Mover, time_s: float) -> bool:
+        place_m = float(mover.progress(np.array([time_s]))[0])
+        return any(span.holds(place_m) for span in self._passages.cleared())
 
 
 def _steady(at_m: float, since_s: float) -> Progress:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.compiler import njit, prange
+from coec.simulation.lamps import incident
 from coec.simulation.mesh import Floats
 from coec.simulation.scene import Hits, Scene
 from coec.simulation.sky import Sky
@@ -21,6 +22,12 @@ Doubles = NDArray[np.float64]
 # The numbers of `Material`, as constants of the compiled code.
 ASPHALT, PAVING, GRASS, BRICK, PLASTER, GLASS, LACQUER, FOLIAGE, BARK, TILES, MARKING = range(1, 12)
 RUBBER, CONCRETE = 13, 14
+LAMP = 16
+
+DAY_HORIZON = 0.5
+"""The horizon is brighter than this by day (`sky.draw_sky`): where it is darker, so is the skyline before it."""
+LAMP_RADIANCE = 2.0
+"""Of a lamp that is looked at: white, twice a wall in full sun."""
 
 
 def shade(
@@ -35,9 +42,11 @@ def shade(
     """
     sky = scene.sky
     out = np.empty((len(directions), 3), np.float32)
+    light = incident(scene, origin_m, directions, hits)
     _shade(
         np.asarray(origin_m, np.float64), directions, hits.range_m, hits.triangle, hits.normal, shadowed,
-        scene.colour, scene.material, _light(sky), float(sky.clouds), float(sky.haze_m), pixel_rad, out,
+        light.sky_share, light.lamps, scene.colour, scene.material, _light(sky), float(sky.clouds), float(sky.haze_m),
+        pixel_rad, out,
     )  # fmt: skip
     return out
 
@@ -151,9 +160,10 @@ def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: boo
     line = 0.012 + 0.05 * _noise(9.0 * math.atan2(y, x), 0.5, 34) + 0.012 * _noise(70.0 * math.atan2(y, x), 0.5, 35)
     if z < line:
         dark = min(max((line - z) / 0.004, 0.0), 1.0) * 0.55
-        colour[0] = colour[0] * (1 - dark) + dark * 0.30
-        colour[1] = colour[1] * (1 - dark) + dark * 0.33
-        colour[2] = colour[2] * (1 - dark) + dark * 0.27
+        lit = min(light[3, 1] / DAY_HORIZON, 1.0)
+        colour[0] = colour[0] * (1 - dark) + dark * lit * 0.30
+        colour[1] = colour[1] * (1 - dark) + dark * lit * 0.33
+        colour[2] = colour[2] * (1 - dark) + dark * lit * 0.27
 
 
 @njit(cache=True, parallel=True)
@@ -164,6 +174,8 @@ def _shade(
     triangle: NDArray[np.int32],
     normal: Floats,
     shadowed: Floats,
+    sky_share: Floats,
+    lamps: Floats,
     paint: Floats,
     material: NDArray[np.int8],
     light: Doubles,
@@ -208,7 +220,7 @@ def _shade(
             open_sky *= 0.72
         for c in range(3):
             ambient = 0.55 * (light[2, c] + light[3, c]) * 0.5 * open_sky + 0.06 * light[1, c] * (1 - 0.5 * nz)
-            colour[c] = paint[t, c] * factor * (light[1, c] * sunny + ambient)
+            colour[c] = paint[t, c] * factor * (light[1, c] * sunny + ambient * sky_share[i] + lamps[i])
         if shiny > 0.0:
             along = 2.0 * (nx * dx + ny * dy + nz * dz)
             rx, ry, rz = dx - along * nx, dy - along * ny, dz - along * nz
@@ -219,10 +231,15 @@ def _shade(
                 shade_of = 0.10 + 0.25 * _noise(0.35 * u + 3 * rx, 0.35 * v + 3 * rz, 40)
                 for c in range(3):
                     mirrored[c] = shade_of * (light[3, c] + 0.3 * light[1, c])
+            for c in range(3):
+                mirrored[c] *= sky_share[i]
             glint = rx * light[0, 0] + ry * light[0, 1] + rz * light[0, 2]
             spot = 6.0 * max(glint, 0.0) ** 400 * (1.0 - shadowed[i]) if glint > 0.9 else 0.0
             for c in range(3):
                 colour[c] = colour[c] * (1 - shiny) + shiny * mirrored[c] + spot * light[1, c]
+        if kind == LAMP:
+            for c in range(3):
+                colour[c] = LAMP_RADIANCE
         air = math.exp(-r / haze_m)
-        for c in range(3):
-            out[i, c] = colour[c] * air + (1 - air) * light[3, c] * 0.95
+        for c in range(3):  # the air shines with the light that falls into it
+            out[i, c] = colour[c] * air + (1 - air) * light[3, c] * 0.95 * sky_share[i]

@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from coec.simulation import props
 from coec.simulation.buildings import Plan, house
-from coec.simulation.mesh import Floats, Material, Mesh, join, quads
+from coec.simulation.mesh import Material, Mesh, join, quads
+from coec.simulation.passages import Passages
 from coec.simulation.road import Road
+from coec.simulation.site import Site
+from coec.simulation.tunnel import dig
 
 Doubles = NDArray[np.float64]
 
@@ -25,6 +28,9 @@ GROUND_HALF_M = 60.0
 KERB_M, KERB_WIDTH_M = 0.12, 0.15
 MOUTH_M = 9.0
 """Width of a side street where it opens."""
+MEADOW = (0.09, 0.23, 0.16)
+"""Colour of what lies beside an open road."""
+NO_PASSAGES = Passages()
 BACKDROP_M, BACKDROP_DOWN_M = 500.0, 3.0
 """A last plane under everything, so that no ray falls through beside the ground."""
 
@@ -83,38 +89,21 @@ class Stretch:
     mesh: Mesh
 
 
-class _Site:
-    """Gathers the meshes of a stretch at places along the road."""
-
-    def __init__(self, road: Road, begin_m: float) -> None:
-        self.road = road
-        self.begin_m = begin_m
-        self.origin_m = road.points(begin_m, 0.0, 0.0)
-        self.meshes: list[Mesh] = []
-
-    def put(self, mesh: Mesh, s_m: float, left_m: float, turn_rad: float = 0.0, up_m: float = 0.0) -> None:
-        """Stands a mesh at arc length `begin_m + s_m`, its x along the road before it is turned."""
-        x, y, z = self.road.points(self.begin_m + s_m, left_m, up_m) - self.origin_m
-        heading = float(self.road.at(self.begin_m + s_m)[3])
-        self.meshes.append(mesh.placed(float(x), float(y), float(z), heading + turn_rad))
-
-    def strip(self, s_m: Doubles, left_m: tuple[float, float], up_m: tuple[float, float]) -> Floats:
-        """(Q, 4, 3) quads that follow the road between the given arc lengths."""
-        a = self.road.points(self.begin_m + s_m, left_m[0], up_m[0]) - self.origin_m
-        b = self.road.points(self.begin_m + s_m, left_m[1], up_m[1]) - self.origin_m
-        return np.stack([a[:-1], a[1:], b[1:], b[:-1]], axis=1).astype(np.float32)
-
-
-def build_stretch(seed: int, index: int, road: Road, style: Style) -> Stretch:
-    """Stretch `index`, from `index * STRETCH_M` on."""
+def build_stretch(seed: int, index: int, road: Road, style: Style, passages: Passages = NO_PASSAGES) -> Stretch:
+    """Stretch `index`, from `index * STRETCH_M` on. What is drawn does not depend on the passages, what stands does."""
     rng = np.random.default_rng([seed, 102, index + 2**20])
-    site = _Site(road, index * STRETCH_M)
+    begin_m, end_m = index * STRETCH_M, (index + 1) * STRETCH_M
+    site = Site(road, begin_m, passages.empty())
+    bare = any(span.part(begin_m, end_m) for span in passages.cleared())
     _road(rng, site, style)
     for side in (1.0, -1.0):
         mouth = bool(rng.random() < style.mouths)
-        _ground(rng, site, style, side, mouth)
+        _ground(rng, site, style, side, mouth, bare)
         _row(rng, site, style, side, MOUTH_M if mouth else 0.0)
         _furniture(rng, site, style, side, MOUTH_M + 2.0 if mouth else 0.0)
+    for span in passages.tunnels:
+        if part := span.part(begin_m, end_m):
+            dig(site, span, part, style.lane_m)
     return Stretch(site.origin_m, join(site.meshes))
 
 
@@ -124,7 +113,7 @@ def backdrop() -> Mesh:
     return quads([[-r, -r, z], [r, -r, z], [r, r, z], [-r, r, z]], (0.10, 0.20, 0.17), Material.GRASS)
 
 
-def _road(rng: np.random.Generator, site: _Site, style: Style) -> None:
+def _road(rng: np.random.Generator, site: Site, style: Style) -> None:
     s = np.arange(0.0, STRETCH_M + 1e-6, GROUND_STEP_M)
     grey = np.array([0.19, 0.19, 0.19]) * rng.uniform(0.75, 1.25)
     half = style.half_road_m
@@ -149,7 +138,8 @@ def _road(rng: np.random.Generator, site: _Site, style: Style) -> None:
             site.meshes.append(quads(bar, white, Material.MARKING))
 
 
-def _ground(rng: np.random.Generator, site: _Site, style: Style, side: float, mouth: bool) -> None:
+def _ground(rng: np.random.Generator, site: Site, style: Style, side: float, mouth: bool, bare: bool) -> None:
+    """What lies beside the road: kerb, sidewalk and yards; a meadow up to the asphalt where it is bare."""
     half, front = style.half_road_m, style.front_m
     kerb, up = np.array([0.42, 0.43, 0.43]) * rng.uniform(0.8, 1.2), KERB_M
     paving = np.array([0.34, 0.36, 0.37]) * rng.uniform(0.7, 1.3)
@@ -157,6 +147,11 @@ def _ground(rng: np.random.Generator, site: _Site, style: Style, side: float, mo
     yard = np.array([0.09, 0.24, 0.16]) * rng.uniform(0.7, 1.3) if green else paving * 0.9
     asphalt = np.array([0.17, 0.17, 0.17])
     s = np.arange(0.0, STRETCH_M + 1e-6, GROUND_STEP_M)
+    if bare:
+        site.meshes.append(
+            quads(site.strip(s, (side * half, side * GROUND_HALF_M), (0.0, 0.0)), MEADOW, Material.GRASS)
+        )
+        return
     parts = [(s[s >= MOUTH_M], kerb, paving, yard, Material.GRASS if green else Material.PAVING)] if mouth else []
     if mouth:
         opening = s[s <= MOUTH_M]
@@ -177,7 +172,7 @@ def _ground(rng: np.random.Generator, site: _Site, style: Style, side: float, mo
         ]
 
 
-def _row(rng: np.random.Generator, site: _Site, style: Style, side: float, begin_m: float) -> None:
+def _row(rng: np.random.Generator, site: Site, style: Style, side: float, begin_m: float) -> None:
     """The buildings of one side, none across the end of the stretch, and what stands before and behind them."""
     kind = int(rng.choice(4, p=np.asarray(style.kinds) / np.sum(style.kinds)))
     at = begin_m + rng.uniform(0.0, 1.0)
@@ -224,14 +219,14 @@ def _plan(rng: np.random.Generator, style: Style, kind: int, shop: bool) -> Plan
     )
 
 
-def _stand(rng: np.random.Generator, site: _Site, plan: Plan, side: float, at_m: float, front_m: float) -> None:
+def _stand(rng: np.random.Generator, site: Site, plan: Plan, side: float, at_m: float, front_m: float) -> None:
     mesh = house(rng, plan)
     half = plan.width_m / 2
     centred = Mesh(mesh.corners_m - np.array([half, 0, 0], dtype=np.float32), mesh.colour, mesh.material)
     site.put(centred, at_m + half, side * front_m, 0.0 if side > 0 else np.pi, KERB_M)
 
 
-def _border(rng: np.random.Generator, site: _Site, style: Style, side: float, begin_m: float) -> None:
+def _border(rng: np.random.Generator, site: Site, style: Style, side: float, begin_m: float) -> None:
     """Hedges and fences between gardens and sidewalk, with gaps for gates."""
     at = begin_m + 0.5
     while at < STRETCH_M - 4.0:
@@ -244,7 +239,7 @@ def _border(rng: np.random.Generator, site: _Site, style: Style, side: float, be
         at += length + rng.uniform(1.0, 3.0)
 
 
-def _furniture(rng: np.random.Generator, site: _Site, style: Style, side: float, begin_m: float) -> None:
+def _furniture(rng: np.random.Generator, site: Site, style: Style, side: float, begin_m: float) -> None:
     """Parked cars, lamps, street trees, signs and people of one side."""
     half = style.half_road_m
     if style.parking_m:

@@ -34,36 +34,47 @@ CAMERA_MOUNT_RAD = np.deg2rad([4.0, -2.0, 1.0])
 """Rotation of the camera about its x, y, z axes from looking straight ahead."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Trip:
-    """The true way of the vehicle along a road in its own lane.
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How fast the vehicle is.
 
     Attributes:
         start_m: arc length at time 0.
-        left_m: middle of the lane.
-        phases: (7,) of the swings, radians.
+        phase: of the swing of its speed, radians.
     """
 
-    road: Road
     start_m: float
-    left_m: float
-    phases: Doubles
+    phase: float
 
     def progress(self, time_s: Doubles) -> Doubles:
         """Arc length, metres."""
         omega = 2 * np.pi / SPEED_PERIOD_S
         swing = SPEED_MPS * SPEED_SWING / omega
         result: Doubles = (
-            self.start_m
-            + SPEED_MPS * time_s
-            + swing * (np.cos(self.phases[0]) - np.cos(omega * time_s + self.phases[0]))
+            self.start_m + SPEED_MPS * time_s + swing * (np.cos(self.phase) - np.cos(omega * time_s + self.phase))
         )
         return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trip:
+    """The true way of the vehicle along a road in its own lane.
+
+    Attributes:
+        pace: along the road.
+        left_m: middle of the lane.
+        phases: (7,) of the swings, radians.
+    """
+
+    road: Road
+    pace: Pace
+    left_m: float
+    phases: Doubles
 
     def poses(self, time_s: Doubles) -> Doubles:
         """(N, 4, 4) maps ego coordinates (x forward, y left, z up) to the world."""
         time = np.asarray(time_s, np.float64)
-        s = self.progress(time)
+        s = self.pace.progress(time)
         wave = 2 * np.pi * s / WANDER_PERIOD_M + self.phases[1]
         left = self.left_m + WANDER_M * np.sin(wave)
         turn = np.arctan(WANDER_M * 2 * np.pi / WANDER_PERIOD_M * np.cos(wave))
@@ -85,10 +96,18 @@ class Trip:
         return linear, rotation_log(turned) / (2 * TWIST_STEP_S)
 
 
-def build_trip(seed: int, road: Road, left_m: float, start_m: float) -> Trip:
+def build_pace(seed: int, start_m: float) -> Pace:
+    """The pace of a seed."""
+    return Pace(start_m, float(_phases(seed)[0]))
+
+
+def build_trip(seed: int, road: Road, left_m: float, pace: Pace) -> Trip:
     """The trip of a seed."""
-    phases = np.random.default_rng([seed, 110]).uniform(0, 2 * np.pi, 7)
-    return Trip(road, start_m, left_m, phases)
+    return Trip(road, pace, left_m, _phases(seed))
+
+
+def _phases(seed: int) -> Doubles:
+    return np.random.default_rng([seed, 110]).uniform(0, 2 * np.pi, 7)
 
 
 def T_ego_lidar() -> Matrix4:

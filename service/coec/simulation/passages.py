@@ -1,0 +1,75 @@
+"""Poor stretches of a road as places: where its tunnels are, and where nothing stands beside it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from coec.simulation.faults import Fault, OpenRoad, Tunnel
+from coec.simulation.vehicle import Pace
+
+F = TypeVar("F", bound=Fault)
+
+CLEAR_M = 120.0
+"""Nothing stands within this of a vehicle on an open road: the reach of the longest LiDAR of `lidar.LIDARS`."""
+BESIDE_M = 3.0
+"""What stands by the road is up to so much longer along it than its middle tells: half a parked car, and a little."""
+LONGEST_BEYOND_S = 30.0
+"""Passages reach at most this far beyond the end of the drive: the road goes on for longer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A part of the road by arc length, metres; the end is not part of it."""
+
+    begin_m: float
+    end_m: float
+
+    def holds(self, s_m: float) -> bool:
+        """Whether a place lies in it."""
+        return self.begin_m <= s_m < self.end_m
+
+    def part(self, begin_m: float, end_m: float) -> Span | None:
+        """What lies between two places; None if nothing does."""
+        low, high = max(self.begin_m, begin_m), min(self.end_m, end_m)
+        return Span(low, high) if low < high else None
+
+    def widened(self, by_m: float) -> Span:
+        """By so much at both ends."""
+        return Span(self.begin_m - by_m, self.end_m + by_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Passages:
+    """The poor stretches of a road.
+
+    Attributes:
+        tunnels: between their mouths.
+        open: where the vehicle is while it has nothing but ground around it.
+    """
+
+    tunnels: tuple[Span, ...] = ()
+    open: tuple[Span, ...] = ()
+
+    def cleared(self) -> tuple[Span, ...]:
+        """Where nothing stands or drives for the sake of an open road."""
+        return tuple(span.widened(CLEAR_M) for span in self.open)
+
+    def empty(self) -> tuple[Span, ...]:
+        """Where nothing stands."""
+        return (*self.cleared(), *(span.widened(BESIDE_M) for span in self.tunnels))
+
+
+def passages(faults: tuple[Fault, ...], pace: Pace, seconds: float) -> Passages:
+    """Where the vehicle is while faults order a tunnel or an open road; `seconds` is the length of the drive."""
+
+    def of(kind: type[F]) -> tuple[Span, ...]:
+        chosen = [fault for fault in faults if isinstance(fault, kind)]
+        times = [(fault.begin_s, min(fault.end_s, seconds + LONGEST_BEYOND_S)) for fault in chosen]
+        spans = [pace.progress(np.array(both)) for both in times if both[0] < both[1]]
+        return tuple(Span(float(low), float(high)) for low, high in spans if math.isfinite(high))
+
+    return Passages(tunnels=of(Tunnel), open=of(OpenRoad))

@@ -1,0 +1,89 @@
+"""A mount that is right, on drives through tunnels, open roads and nights: what does the service say of it?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from campaign.drives import Drive, Truth
+from campaign.figures import Figure, at_most, exactly, is_long, publish
+from campaign.test_never_blind import rate
+from campaign.watching import WRONG_DEG, Transition, configured, transitions, watching
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytestmark = pytest.mark.slow
+
+SETTLED_S = 40
+"""A first window has been taken when the first poor stretch begins."""
+ALLOWED = ("healthy", "degraded", "stale")
+PATIENCE_S = 300.0
+
+
+def drives() -> list[Drive]:
+    """Ten, each with all three in another order and of another length; two in the short form."""
+    kinds = ("tunnel", "open_road", "night")
+    chosen = []
+    for seed in range(10 if is_long() else 2):
+        faults, begin_s = [], SETTLED_S
+        for place in range(3 if is_long() else 2):
+            end_s = begin_s + 12 + 3 * ((seed + place) % 4)
+            faults.append(f"{kinds[(seed + place) % 3]}:{begin_s}-{end_s}")
+            begin_s = end_s + 12
+        chosen.append(Drive(seed + 20, begin_s + 10, tuple(faults)))
+    return chosen
+
+
+def test_a_right_mount_is_not_accused(tmp_path: Path) -> None:
+    found: dict[str, list[Transition]] = {}
+    entries: dict[str, Any] = {}
+    most_per_minute, worst_deg = 0, 0.0
+    never_well = []
+    for drive in drives():
+        recording = drive.recorded(tmp_path)
+        truth = Truth(recording)
+        folder = tmp_path / f"drive{drive.seed}"
+        with watching(configured(folder, drive), truth) as watch:
+            watch.play_through(recording, rate(), PATIENCE_S + drive.seconds / rate())
+            watch.passing(3.0)
+            name = f"seed {drive.seed}: {', '.join(drive.faults)}"
+            told = transitions(watch.samples, truth.second)
+            if not any(one.after == "healthy" for one in told):
+                never_well.append(drive.seed)
+            first = next((place for place, one in enumerate(told) if one.after == "healthy"), len(told) - 1)
+            found[name] = told[first + 1 :]
+            history = watch.ask(watch.keys.history(watch.pair))["entries"]
+            entries[name] = [one["entry"] for one in history if one["entry"]["kind"] == "state"]
+            errors = [one.error_deg for one in watch.samples if one.error_deg is not None]
+            worst_deg = max(worst_deg, *errors)
+            most_per_minute = max(most_per_minute, _most_per_minute(found[name]))
+    for name, told in found.items():
+        print(f"\n{name}")
+        for one in told:
+            print(f"  {one.second:6.1f} s  {one.before} -> {one.after}  {', '.join(one.reasons)}")
+    accused = [one for told in found.values() for one in told if one.after not in ALLOWED]
+    mute = [one for told in found.values() for one in told if one.after != "healthy" and not one.reasons]
+    figures: list[Figure] = [
+        exactly("drives that never were healthy", [], never_well),
+        exactly("changes to anything but stale, degraded (and back)", 0, len(accused)),
+        exactly("changes without a reason", 0, len(mute)),
+        at_most("served pose off the truth", WRONG_DEG, worst_deg, "deg"),
+        at_most("changes of health in any minute of sensor time", 1, most_per_minute, ""),
+    ]
+    details: dict[str, Any] = {
+        "rate": rate(),
+        "transitions": {name: [_row(one) for one in told] for name, told in found.items()},
+        "history": entries,
+    }
+    publish("poor_stretches", tmp_path, figures, details)
+
+
+def _most_per_minute(told: list[Transition]) -> int:
+    """In any minute of the drive. Back to healthy is the end of a change, not another one."""
+    begins = [one.second for one in told if one.after != "healthy"]
+    return max((sum(begin <= other < begin + 60.0 for other in begins) for begin in begins), default=0)
+
+
+def _row(one: Transition) -> dict[str, Any]:
+    return {"second": one.second, "before": one.before, "after": one.after, "reasons": list(one.reasons)}

@@ -1,0 +1,331 @@
+"""A service that is driven for a long time and watched from outside: what it serves, what it says of it, what it is."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import zenoh
+
+from campaign.drives import Drive, Truth
+from coec.adapters.frames.msgpack_frames import decode_ego
+from coec.adapters.zenoh.client import ask_one, connected
+from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, WindowConfig, load_config
+from coec.errors import CoecError
+from coec.reports.commented_yaml import commented_yaml
+from coec.schemas.keys import Keys
+from e2e.processes import COMMAND, Service, environment, write_configuration
+
+PERIOD_S = 5.0
+"""One check per so much sensor time."""
+WRONG_DEG = 0.5
+"""A served pose further from the truth than this is wrong."""
+POLL_S = 0.2
+ANSWER_S = 10.0
+MIB = 2**20
+ENDED_S = 15.0
+START_S = 300.0
+"""A worker that compiles every kernel, on cores that others use."""
+
+
+def configured(folder: Path, drive: Drive) -> Path:
+    """A configuration for a drive: windows and checks as short as the demonstration's, everything else default."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = write_configuration(folder, drive.source, np.zeros(6), CalibrationConfig())
+    config = load_config(path)
+    pair = config.pairs[0].model_copy(
+        update={
+            "window": WindowConfig(pairs=16, min_pairs=8, slice_s=32.0),
+            "monitor": MonitorConfig(period_s=PERIOD_S, pairs=5, min_pairs=4, urgent_slice_s=16.0),
+        }
+    )
+    # On a vehicle the player does not compete with the worker for the processor.
+    worker = config.worker.model_copy(update={"niceness": 0})
+    path.write_text(commented_yaml(config.model_copy(update={"pairs": (pair,), "worker": worker})))
+    return path
+
+
+class ServiceEndedError(Exception):
+    """The service is gone, although nobody told it to go."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What was seen at one instant.
+
+    Attributes:
+        wall_s: steady clock of the one who watches.
+        stamp_ns: sensor time of the newest ego-motion on the air.
+        error_deg: of the served pose against the truth then; None without a truth.
+        age_s: what health says of its last evaluation.
+    """
+
+    wall_s: float
+    stamp_ns: int
+    state: str
+    reasons: tuple[str, ...]
+    error_deg: float | None
+    age_s: float | None
+    checks: int
+    solved: int
+    held: int
+    worker: str
+    worker_pid: int | None
+    restarts: int
+    rss_bytes: int
+
+    @property
+    def blind(self) -> bool:
+        """Says that all is well, while it is not."""
+        return self.state == "healthy" and self.error_deg is not None and self.error_deg > WRONG_DEG
+
+
+@dataclass
+class Watch:
+    """One who watches a service.
+
+    Attributes:
+        samples: everything seen so far.
+    """
+
+    running: Service
+    session: zenoh.Session
+    config: Config
+    path: Path
+    truth: Truth | None = None
+    samples: list[Sample] = field(default_factory=list)
+    _stamp_ns: int = 0
+    _player: subprocess.Popen[bytes] | None = None
+    _next_s: float = 0.0
+
+    @property
+    def keys(self) -> Keys:
+        return Keys(self.config.prefix, self.config.vehicle)
+
+    @property
+    def pair(self) -> str:
+        return self.config.pairs[0].name
+
+    @property
+    def last(self) -> Sample:
+        """The latest sample."""
+        return self.samples[-1]
+
+    def heard(self, sample: zenoh.Sample) -> None:
+        """Of the ego-motion on the air: the client's own clock of the sensors."""
+        self._stamp_ns = decode_ego(sample.payload.to_bytes(), LimitsConfig()).stamp_ns
+
+    def ask(self, key: str) -> Any:
+        """The document behind a key."""
+        return json.loads(ask_one(self.session, f"{key}?format=json", ANSWER_S).payload)
+
+    def look(self) -> Sample:
+        """One more sample.
+
+        Raises:
+            ServiceEndedError: nobody answers any more, because the service is gone.
+        """
+        try:
+            health, extrinsic = self.ask(self.keys.health(self.pair)), self.ask(self.keys.extrinsic(self.pair))
+            status = self.ask(self.keys.status)
+        except CoecError as error:
+            # A process that closes its session answers nothing for a while before it is gone.
+            with suppress(subprocess.TimeoutExpired):
+                code = self.running.process.wait(ENDED_S)
+                raise ServiceEndedError(f"the service has ended with {code}: {self.errors_logged()[-3:]}") from error
+            raise
+        pair, worker = status["pairs"][0], status["worker"]
+        served = np.array(extrinsic["camera_from_lidar"]["matrix"])
+        known = self.truth is not None and self._stamp_ns > 0
+        sample = Sample(
+            wall_s=time.monotonic(),
+            stamp_ns=self._stamp_ns,
+            state=health["state"],
+            reasons=tuple(reason["code"] for reason in health["reasons"]),
+            error_deg=self.truth.error_deg(served, self._stamp_ns) if known and self.truth else None,
+            age_s=health["age_s"],
+            checks=pair["checks"],
+            solved=pair["solved"],
+            held=pair["held"],
+            worker=worker["state"],
+            worker_pid=worker["pid"],
+            restarts=worker["restarts"],
+            rss_bytes=psutil.Process(self.running.process.pid).memory_info().rss,
+        )
+        self.samples.append(sample)
+        return sample
+
+    def until(self, condition: Callable[[Sample], bool], patience_s: float) -> bool:
+        """Watches until a sample fulfils the condition, at most so long; whether one did."""
+        end_s = time.monotonic() + patience_s
+        while time.monotonic() < end_s:
+            time.sleep(max(self._next_s - time.monotonic(), 0.0))
+            self._next_s = time.monotonic() + POLL_S
+            if condition(self.look()):
+                return True
+        return False
+
+    def passing(self, seconds: float) -> None:
+        """Watches for so long."""
+        self.until(lambda _: False, seconds)
+
+    def play(self, recording: Path, rate: float, *, loop: bool = False) -> None:
+        """Starts `coec play`."""
+        assert self._player is None or self._player.poll() is not None, "something is played already"
+        command = [*COMMAND, "play", str(recording), "--config", str(self.path), "--rate", str(rate)]
+        command += ["--connect", self.running.endpoint, *(["--loop"] if loop else [])]
+        log = self.running.log.with_name("play.log").open("ab")
+        with log:
+            self._player = subprocess.Popen(command, stdout=log, stderr=log, env=environment())
+
+    @property
+    def playing(self) -> bool:
+        """Whether frames are still being sent."""
+        return self._player is not None and self._player.poll() is None
+
+    def play_through(self, recording: Path, rate: float, patience_s: float) -> int:
+        """Plays a recording to its end, and watches; the number of the first sample."""
+        first = len(self.samples)
+        self.play(recording, rate)
+        assert self.until(lambda _: not self.playing, patience_s), "the player does not come to its end"
+        return first
+
+    def stop_playing(self) -> None:
+        """Ends the player."""
+        if self._player is not None and self._player.poll() is None:
+            self._player.terminate()
+            self._player.wait(ENDED_S)
+
+    def errors_logged(self) -> list[str]:
+        """Messages of the service's log at level error or above."""
+        found = []
+        for line in self.running.log.read_text().splitlines():
+            if line.startswith("{") and (entry := json.loads(line)).get("level") in ("error", "critical"):
+                found.append(str(entry.get("message", entry)))
+        return found
+
+
+@contextmanager
+def watching(
+    path: Path, truth: Truth | None = None, extra_environment: dict[str, str] | None = None
+) -> Iterator[Watch]:
+    """A service with this configuration whose worker is ready, and one who watches it."""
+    config = load_config(path)
+    with (
+        _environment(extra_environment or {}),
+        _served(path, config) as running,
+        connected(config.zenoh.listen, START_S) as session,
+    ):
+        watch = Watch(running, session, config, path, truth)
+        ego = config.pairs[0].ego
+        assert ego is not None
+        subscriber = session.declare_subscriber(ego.key, watch.heard)
+        try:
+            _answered(watch)
+            assert watch.until(lambda sample: sample.worker == "idle", START_S), "the worker does not become ready"
+            yield watch
+        finally:
+            watch.stop_playing()
+            subscriber.undeclare()
+            if running.process.poll() is None:
+                running.terminate()
+
+
+def _answered(watch: Watch) -> None:
+    """Until the service answers at all: its router is there before its answers are."""
+    end_s = time.monotonic() + START_S
+    while time.monotonic() < end_s:
+        assert watch.running.process.poll() is None, watch.running.log.read_text()
+        with suppress(CoecError):
+            for key in (watch.keys.health(watch.pair), watch.keys.extrinsic(watch.pair), watch.keys.status):
+                watch.ask(key)
+            return
+        time.sleep(POLL_S)
+    raise AssertionError(f"the service answers nothing: {watch.running.log.read_text()}")
+
+
+@contextmanager
+def _served(path: Path, config: Config) -> Iterator[Service]:
+    """As `e2e.processes.service`, but nobody waits for it by starting processes, which take the cores from it."""
+    log = path.with_name("coec.log")
+    with log.open("ab") as stream:
+        command = [*COMMAND, "run", "--config", str(path), "--embedded-router"]
+        process = subprocess.Popen(command, stdout=stream, stderr=stream, env=environment())
+    running = Service(process, config.zenoh.listen[0], log)
+    try:
+        yield running
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+@contextmanager
+def _environment(extra: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in extra}
+    os.environ.update(extra)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name)
+            else:
+                os.environ[name] = value
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """A change of health."""
+
+    second: float
+    before: str
+    after: str
+    reasons: tuple[str, ...]
+
+
+def transitions(samples: Sequence[Sample], second_of: Callable[[int], float]) -> list[Transition]:
+    """Every change of state between two samples, with the second of the drive and the reasons of the new state."""
+    return [
+        Transition(second_of(after.stamp_ns), before.state, after.state, after.reasons)
+        for before, after in pairwise(samples)
+        if before.state != after.state
+    ]
+
+
+def longest(samples: Sequence[Sample], condition: Callable[[Sample], bool], rate: float) -> float:
+    """Seconds of sensor time over which the condition held without a break, at most. Sensor time by the steady clock
+    of the one who watches and the rate of the player: the stamps themselves may jump."""
+    best, begin_s = 0.0, None
+    for sample in samples:
+        if not condition(sample):
+            begin_s = None
+        else:
+            begin_s = sample.wall_s if begin_s is None else begin_s
+            best = max(best, (sample.wall_s - begin_s) * rate)
+    return best
+
+
+def longest_unchecked(samples: Sequence[Sample], rate: float) -> float:
+    """Seconds of sensor time in which it was `healthy` and no check was completed, at most."""
+    best, begin = 0.0, None
+    for sample in samples:
+        if sample.state != "healthy" or begin is None or sample.checks != begin.checks:
+            begin = sample
+        best = max(best, (sample.wall_s - begin.wall_s) * rate if sample.state == "healthy" else 0.0)
+    return best
+
+
+def as_rows(samples: Sequence[Sample]) -> list[dict[str, Any]]:
+    """For the report."""
+    return [asdict(sample) for sample in samples]
