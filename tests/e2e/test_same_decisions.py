@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from e2e.rides import SECONDS, Ride, between, configured, drive, error_deg, riding, without_depth
 
 from coec.adapters.mcap.bag_writer import write_bag
 from coec.config import CalibrationConfig, DepthConfig
 from e2e.processes import coec
-from e2e.rides import SECONDS, Ride, between, configured, drive, error_deg, riding, without_depth
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 

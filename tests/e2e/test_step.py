@@ -6,10 +6,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from e2e.rides import SECONDS, STEP_S, between, configured, drive, error_deg, riding
 
 from coec.adapters.zenoh.client import ask_one
 from coec.config import CalibrationConfig, DepthConfig, PolicyConfig
-from e2e.rides import SECONDS, STEP_S, between, configured, drive, error_deg, riding
 from fakes import wait_until
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
