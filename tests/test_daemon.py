@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
@@ -186,11 +185,16 @@ def has_ended(pid: int) -> bool:
 def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     tmp_path: Path, drive: Drive, router: Router
 ) -> None:
-    said: list[Any] = []
+    said: list[bytes] = []
+
+    def hear(sample: zenoh.Sample) -> None:
+        said.append(sample.payload.to_bytes())
+
     config = configured(tmp_path, drive, router)
     with service(config, router, warm=False, program=BROKEN) as running:
-        hear = zenoh.handlers.Callback(lambda sample: said.append(sample.payload.to_bytes()), indirect=False)
-        subscriber = router.session.declare_subscriber(running.keys.health(FRONT), hear)
+        subscriber = router.session.declare_subscriber(
+            running.keys.health(FRONT), zenoh.handlers.Callback(hear, indirect=False)
+        )
         running.send(drive.frames)
         assert running.process.wait(PATIENCE_S) == EXIT_THREAD_DIED
         subscriber.undeclare()

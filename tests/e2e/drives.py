@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from coec.adapters.zenoh.player import Frame
 from coec.calibration.types import CameraFrame
+from coec.config import CalibrationConfig, DepthConfig, MonitorConfig, PolicyConfig, WindowConfig
 from coec.geometry.se3 import inverse, rotation_angle_rad
 from coec.simulation.source import open_sim
+from e2e.processes import Router, write_configuration
 
 if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
@@ -72,3 +75,16 @@ def later(frames: Sequence[Frame], seconds: float) -> list[Frame]:
 def without_depth(frames: Sequence[Frame]) -> list[Frame]:
     """The frames as a real camera sends them."""
     return [replace(frame, depth=None) if isinstance(frame, CameraFrame) else frame for frame in frames]
+
+
+def stepped_configuration(folder: Path, router: Router, depth: DepthConfig, **policy: Any) -> Path:
+    """A configuration for the drive with the step, with short windows."""
+    return write_configuration(
+        folder,
+        rendered(STEPPED).recording,
+        router.endpoint,
+        window=WindowConfig(pairs=16, min_pairs=8, slice_s=32.0),
+        monitor=MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=16.0),
+        calibration=CalibrationConfig(depth=depth),
+        policy=PolicyConfig(**policy),
+    )

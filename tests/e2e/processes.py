@@ -11,9 +11,10 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import zenoh
 from coec.adapters.files.rig import mask_to_png
 from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.client import ask_one, connected
-from coec.adapters.zenoh.player import Frame, Played, Player, Streams, stream_of
+from coec.adapters.zenoh.player import CAMERA, Frame, Played, Player, Streams, stream_of
 from coec.cli.convert import configuration_for
 from coec.config import Config, LimitsConfig, StateConfig, ZenohConfig, load_config
 from coec.geometry.se3 import Array, perturb
@@ -33,7 +34,7 @@ from coec.sources import Recording
 from conftest import REPOSITORY
 
 COMMAND: Sequence[str] = [sys.executable, "-m", "coec"]
-PATIENCE_S = 40.0
+PATIENCE_S = 180.0
 """Within this a step must have come about; on two idle cores the longest, the first start, takes some 10 s. Nothing
 waits so long that comes about: how fast it does is no test's verdict."""
 
@@ -46,6 +47,9 @@ RENEWED_S = 0.05
 QUIET_STATUSES = 2
 """Renewals of the status, one after the other, in which nothing waits and nothing is under way: what the recorder
 writes is in neither the queue before it nor the one behind it."""
+
+PORTION = 12
+"""Pictures that are sent at once: the service lets 16 wait."""
 
 LOG_SHOWN = 8000
 """Characters of the service's log, its last, that a failed test shows."""
@@ -196,12 +200,14 @@ class Service:
         """Until its worker is."""
         self.until(self.status, lambda status: status["state"] == "running", "a warm worker")
 
-    def send(self, frames: Iterable[Frame], rate: float = 0.0) -> None:
-        """Publishes frames `rate` times as fast as they were taken; 0: without waiting."""
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Publishes frames, in portions that its inbox holds: however slow the machine is, none is lost."""
         player = Player(self.session, Streams.of_pair(self.config.pairs[0]), "msgpack")
         try:
             assert not player.wait_for_listener(PATIENCE_S)
-            player.play(frames, rate, threading.Event(), self._count)
+            for portion in _portions(frames):
+                player.play(portion, 0.0, threading.Event(), self._count)
+                self.until_received()
         finally:
             player.close()
 
@@ -249,6 +255,12 @@ class Service:
         """SIGKILL."""
         self.process.kill()
         self.process.wait()
+
+
+def _portions(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+    pictures = [index for index, frame in enumerate(frames) if stream_of(frame) == CAMERA]
+    ends = [0, *(index + 1 for index in pictures[PORTION - 1 :: PORTION]), len(frames)]
+    return (frames[begin:end] for begin, end in pairwise(ends) if begin < end)
 
 
 @contextmanager
