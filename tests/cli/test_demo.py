@@ -200,18 +200,18 @@ def check_files(document: Any) -> Path:
 def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_not_come_true(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Everything but the knock, in small pictures: the service, the vehicle, the view, the pictures, the page."""
+    """Everything but the knock, in pictures as small as `fused` can do with: the service, the vehicle, the view, the pictures, the page."""
     pytest.importorskip("embreex", reason="needs ray casting")
     from coec.simulation.drive import DriveConfig
 
     # So long that it cannot be over before the window has been judged: see `pace.LEAD_NS`.
     quiet = DriveConfig(
-        seed=story.SEED, seconds=30.0, camera="fisheye350", lidar=32, camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
+        seed=story.SEED, seconds=32.0, camera="fisheye600", lidar=64, camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
         workshop=story.WORKSHOP,
     )  # fmt: skip
     monkeypatch.setattr(story, "drive_config", lambda: quiet)
-    monkeypatch.setattr(story, "WINDOW", WindowConfig(pairs=10, min_pairs=8, slice_s=10.0))
-    monkeypatch.setattr(story, "CLOSE_UP_PX", tuple(value // 2 for value in story.CLOSE_UP_PX))
+    monkeypatch.setattr(story, "WINDOW", WindowConfig(pairs=12, min_pairs=8, slice_s=12.0))
+    monkeypatch.setattr(story, "CLOSE_UP_PX", tuple(value * 6 // 7 for value in story.CLOSE_UP_PX))
     outcome = coec("demo", "--json", "--output", tmp_path / "demo")
     assert outcome.status == 1
     document = outcome.document
