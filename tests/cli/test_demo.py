@@ -200,7 +200,8 @@ def check_files(document: Any) -> Path:
 def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_not_come_true(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Everything but the knock, in pictures as small as `fused` can do with: the service, the vehicle, the view, the pictures, the page."""
+    """Everything but the knock, in pictures as small as `fused` can do with: the service, the vehicle, the view, the
+    pictures, the page."""
     pytest.importorskip("embreex", reason="needs ray casting")
     from coec.simulation.drive import DriveConfig
 

@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +27,7 @@ from coec.adapters.zenoh.client import ask_one, connected
 from coec.adapters.zenoh.player import CAMERA, Frame, Played, Player, Streams, stream_of
 from coec.cli.convert import configuration_for
 from coec.config import Config, LimitsConfig, StateConfig, ZenohConfig, load_config
+from coec.errors import NotFoundError
 from coec.geometry.se3 import Array, perturb
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
@@ -189,16 +190,14 @@ class Service:
         deadline_s = time.monotonic() + PATIENCE_S
         while True:
             self.changed.clear()
-            answer = ask()
-            if condition(answer):
+            answer = None
+            with suppress(NotFoundError):  # who is announced may not be reached yet, as routes are still being laid
+                answer = ask()
+            if answer is not None and condition(answer):
                 return answer
             assert self.process.poll() is None, f"the service ended ({self.process.returncode}), before: {what}"
             assert time.monotonic() < deadline_s, f"not within {PATIENCE_S:g} s: {what}; last answer {answer}"
             self.changed.wait(RENEWED_S)
-
-    def until_warm(self) -> None:
-        """Until its worker is."""
-        self.until(self.status, lambda status: status["state"] == "running", "a warm worker")
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Publishes frames, in portions that its inbox holds: however slow the machine is, none is lost."""
@@ -285,8 +284,8 @@ def service(
             running = Service(process, session, loaded, log)
             with _told_of_changes(running):
                 _await_alive(running)
-                if warm:
-                    running.until_warm()
+                wanted = ("running",) if warm else ("starting", "running", "failing")
+                running.until(running.status, lambda status: status["state"] in wanted, f"a service that is {wanted}")
                 yield running
     except BaseException:
         sys.stderr.write(log.read_text()[-LOG_SHOWN:])
