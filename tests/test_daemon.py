@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from coec.adapters.frames.msgpack_frames import encode_lidar
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.adapters.zenoh.bus import MSGPACK
 from coec.adapters.zenoh.client import RemoteError
+from coec.calibration.types import LidarFrame
 from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig, SearchConfig, WindowConfig, load_config
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.base import from_msgpack
@@ -195,7 +197,8 @@ def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
         subscriber = router.session.declare_subscriber(
             running.keys.health(FRONT), zenoh.handlers.Callback(hear, indirect=False)
         )
-        running.send(drive.frames)
+        sweep = next(frame for frame in drive.frames if isinstance(frame, LidarFrame))
+        router.session.put("sensors/sim/lidar", encode_lidar(sweep), encoding=MSGPACK)
         assert running.process.wait(PATIENCE_S) == EXIT_THREAD_DIED
         subscriber.undeclare()
     health = from_msgpack(HealthReply, said[-1])
