@@ -1,10 +1,17 @@
 """Fixtures and rules for all tests."""
 
+from __future__ import annotations
+
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+
+if TYPE_CHECKING:
+    from e2e.processes import Router
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 BENCHMARKS = REPOSITORY / "tests" / "bench"
@@ -16,9 +23,9 @@ hypothesis.settings.load_profile("coec")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave benchmarks to the long run, except their short forms, which are marked `ratio`."""
+    """Leave benchmarks to the long run: how fast the machine is at the moment is no verdict on a change."""
     for item in items:
-        if item.path.is_relative_to(BENCHMARKS) and item.get_closest_marker("ratio") is None:
+        if item.path.is_relative_to(BENCHMARKS):
             item.add_marker("slow")
 
 
@@ -33,3 +40,12 @@ def sample_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"needs the sample recordings: {folder} is absent; COEC_SAMPLE_DATA may name another folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def router() -> Iterator[Router]:
+    """The router of all services that a run starts, which come one after the other."""
+    from e2e.processes import routing  # Zenoh and more, which most tests do without
+
+    with routing() as found:
+        yield found

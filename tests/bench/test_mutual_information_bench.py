@@ -99,7 +99,6 @@ def bare_loop(
                 counts[depth_bin[np.uint64(pixel[i])], bins[i]] += np.int32(1)
 
 
-@pytest.mark.ratio
 def test_ratios_to_the_plain_forms() -> None:
     """On one thread each, over a frame that stays in the cache: the ratio is that of the code, not of the cores and the
     memory bandwidth that other processes leave.

@@ -19,12 +19,13 @@ import zenoh
 
 from campaign.drives import Drive, Truth
 from coec.adapters.frames.msgpack_frames import decode_ego
-from coec.adapters.zenoh.client import ask_one, connected
+from coec.adapters.zenoh.client import ask_one
 from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, WindowConfig, load_config
 from coec.errors import CoecError
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
-from e2e.processes import COMMAND, Service, environment, write_configuration
+from coec.sources import open_source
+from e2e.processes import COMMAND, Service, environment, free_endpoint, service, write_configuration
 
 PERIOD_S = 5.0
 """One check per so much sensor time."""
@@ -34,24 +35,22 @@ POLL_S = 0.2
 ANSWER_S = 10.0
 MIB = 2**20
 ENDED_S = 15.0
-START_S = 300.0
-"""A worker that compiles every kernel, on cores that others use."""
 
 
 def configured(folder: Path, drive: Drive) -> Path:
     """A configuration for a drive: windows and checks as short as the demonstration's, everything else default."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = write_configuration(folder, drive.source, np.zeros(6), CalibrationConfig())
-    config = load_config(path)
-    pair = config.pairs[0].model_copy(
-        update={
-            "window": WindowConfig(pairs=16, min_pairs=8, slice_s=32.0),
-            "monitor": MonitorConfig(period_s=PERIOD_S, pairs=5, min_pairs=4, urgent_slice_s=16.0),
-        }
+    path = write_configuration(
+        folder,
+        open_source(drive.source),
+        free_endpoint(),
+        calibration=CalibrationConfig(),
+        window=WindowConfig(pairs=16, min_pairs=8, slice_s=32.0),
+        monitor=MonitorConfig(period_s=PERIOD_S, pairs=5, min_pairs=4, urgent_slice_s=16.0),
     )
+    config = load_config(path)
     # On a vehicle the player does not compete with the worker for the processor.
     worker = config.worker.model_copy(update={"niceness": 0})
-    path.write_text(commented_yaml(config.model_copy(update={"pairs": (pair,), "worker": worker})))
+    path.write_text(commented_yaml(config.model_copy(update={"worker": worker})))
     return path
 
 
@@ -183,7 +182,7 @@ class Watch:
         """Starts `coec play`."""
         assert self._player is None or self._player.poll() is not None, "something is played already"
         command = [*COMMAND, "play", str(recording), "--config", str(self.path), "--rate", str(rate)]
-        command += ["--connect", self.running.endpoint, *(["--loop"] if loop else [])]
+        command += ["--connect", self.config.zenoh.listen[0], *(["--loop"] if loop else [])]
         log = self.running.log.with_name("play.log").open("ab")
         with log:
             self._player = subprocess.Popen(command, stdout=log, stderr=log, env=environment())
@@ -220,54 +219,18 @@ def watching(
     path: Path, truth: Truth | None = None, extra_environment: dict[str, str] | None = None
 ) -> Iterator[Watch]:
     """A service with this configuration whose worker is ready, and one who watches it."""
-    config = load_config(path)
-    with (
-        _environment(extra_environment or {}),
-        _served(path, config) as running,
-        connected(config.zenoh.listen, START_S) as session,
-    ):
-        watch = Watch(running, session, config, path, truth)
-        ego = config.pairs[0].ego
+    with _environment(extra_environment or {}), service(path, None) as running:
+        watch = Watch(running, running.session, running.config, path, truth)
+        ego = running.config.pairs[0].ego
         assert ego is not None
-        subscriber = session.declare_subscriber(ego.key, watch.heard)
+        subscriber = running.session.declare_subscriber(ego.key, watch.heard)
         try:
-            _answered(watch)
-            assert watch.until(lambda sample: sample.worker == "idle", START_S), "the worker does not become ready"
             yield watch
         finally:
             watch.stop_playing()
             subscriber.undeclare()
             if running.process.poll() is None:
                 running.terminate()
-
-
-def _answered(watch: Watch) -> None:
-    """Until the service answers at all: its router is there before its answers are."""
-    end_s = time.monotonic() + START_S
-    while time.monotonic() < end_s:
-        assert watch.running.process.poll() is None, watch.running.log.read_text()
-        with suppress(CoecError):
-            for key in (watch.keys.health(watch.pair), watch.keys.extrinsic(watch.pair), watch.keys.status):
-                watch.ask(key)
-            return
-        time.sleep(POLL_S)
-    raise AssertionError(f"the service answers nothing: {watch.running.log.read_text()}")
-
-
-@contextmanager
-def _served(path: Path, config: Config) -> Iterator[Service]:
-    """As `e2e.processes.service`, but nobody waits for it by starting processes, which take the cores from it."""
-    log = path.with_name("coec.log")
-    with log.open("ab") as stream:
-        command = [*COMMAND, "run", "--config", str(path), "--embedded-router"]
-        process = subprocess.Popen(command, stdout=stream, stderr=stream, env=environment())
-    running = Service(process, config.zenoh.listen[0], log)
-    try:
-        yield running
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()
 
 
 @contextmanager

@@ -7,11 +7,12 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 from rich.console import Console
 
+from cli.conftest import Coec
 from coec.calibration.types import EgoMotion
 from coec.cli.demo import report, story
 from coec.cli.demo.outcome import Ending, outcome_of
@@ -19,6 +20,7 @@ from coec.cli.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
 from coec.cli.demo.screen import BARS, curve
 from coec.cli.demo.vehicle import NS_PER_S, paced
 from coec.cli.demo.watch import Moment
+from coec.config import WindowConfig
 from coec.reports.timeline_plot import timeline
 from coec.schemas import replies
 
@@ -184,3 +186,56 @@ def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
     left, top, width, height = story.CLOSE_UP_PX
     assert left + width <= drive.rig.camera.width
     assert top + height <= drive.rig.camera.height
+
+
+def check_files(document: Any) -> Path:
+    """What the demonstration left; the window that it fetched."""
+    written = [Path(path) for path in document["files"]]
+    assert all(path.stat().st_size > 0 for path in written)
+    assert {"timeline.png", "overlay_before.png", "overlay_after.png", "report.html"} <= {path.name for path in written}
+    (window,) = (path for path in written if path.suffix == ".mcap")
+    return window
+
+
+def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_not_come_true(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Everything but the knock, in pictures as small as `fused` can do with: the service, the vehicle, the view, the
+    pictures, the page."""
+    pytest.importorskip("embreex", reason="needs ray casting")
+    from coec.simulation.drive import DriveConfig
+
+    # So long that it cannot be over before the window has been judged: see `pace.LEAD_NS`.
+    quiet = DriveConfig(
+        seed=story.SEED, seconds=32.0, camera="fisheye600", lidar=64, camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
+        workshop=story.WORKSHOP,
+    )  # fmt: skip
+    monkeypatch.setattr(story, "drive_config", lambda: quiet)
+    monkeypatch.setattr(story, "WINDOW", WindowConfig(pairs=12, min_pairs=8, slice_s=12.0))
+    monkeypatch.setattr(story, "CLOSE_UP_PX", tuple(value * 6 // 7 for value in story.CLOSE_UP_PX))
+    outcome = coec("demo", "--json", "--output", tmp_path / "demo")
+    assert outcome.status == 1
+    document = outcome.document
+    assert not document["passed"]
+    assert document["objections"] == ["The service never noticed the knock."]
+    first, last = document["timeline"][0], document["timeline"][-1]
+    assert (first["health"], first["provenance"]) == ("unknown", "nominal")
+    assert (last["health"], last["provenance"], last["status"]) == ("healthy", "estimated", "accepted")
+    assert last["error_deg"] < MAX_ERROR_DEG < first["error_deg"]
+    assert last["window_id"] == check_files(document).stem
+
+
+@pytest.mark.slow
+def test_the_knock_is_noticed_and_repaired(coec: Coec, tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="needs ray casting")
+    outcome = coec("demo", "--json", "--output", tmp_path / "demo")
+    document = outcome.document
+    assert outcome.status == 0, document["objections"]
+    assert document["passed"]
+    assert document["error_after_deg"] < MAX_ERROR_DEG < 2.5 < document["error_before_deg"]
+    assert document["knock_s"] < document["alarm_s"] <= document["repaired_s"]
+    states = [moment["health"] for moment in document["timeline"]]
+    assert states[0] == "unknown"
+    assert states[-1] == "healthy"
+    assert "miscalibrated" in states
+    assert coec("replay", check_files(document)).status == 0

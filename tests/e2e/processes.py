@@ -1,4 +1,4 @@
-"""Real processes on loopback: the service and the commands that talk to it."""
+"""Real processes on loopback: the service, the commands that talk to it, and a client that asks and drives it."""
 
 from __future__ import annotations
 
@@ -8,27 +8,52 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import zenoh
+
 from coec.adapters.files.rig import mask_to_png
+from coec.adapters.zenoh.bus import open_session
+from coec.adapters.zenoh.client import ask_one, connected
+from coec.adapters.zenoh.player import CAMERA, Frame, Played, Player, Streams, stream_of
 from coec.cli.convert import configuration_for
-from coec.config import CalibrationConfig, Config, StateConfig, ZenohConfig, load_config
+from coec.config import Config, LimitsConfig, StateConfig, ZenohConfig, load_config
+from coec.errors import NotFoundError
 from coec.geometry.se3 import Array, perturb
 from coec.reports.commented_yaml import commented_yaml
-from coec.sources import open_source
+from coec.schemas.keys import Keys
+from coec.sources import Recording
 from conftest import REPOSITORY
 
-COMMAND = [sys.executable, "-m", "coec"]
-ANSWER_S = 60.0
-"""Within this a step must have come about; on two cores the longest, the first start, takes some 10 s."""
+COMMAND: Sequence[str] = [sys.executable, "-m", "coec"]
+PATIENCE_S = 180.0
+"""Within this a step must have come about; on two idle cores the longest, the first start, takes some 10 s. Nothing
+waits so long that comes about: how fast it does is no test's verdict."""
 
 END_S = 15.0
-"""SIGTERM to exit."""
+"""SIGTERM to exit, as promised."""
+
+RENEWED_S = 0.05
+"""Between two questions for what the service does not publish when it changes: its counters, renewed once a second."""
+
+QUIET_STATUSES = 2
+"""Renewals of the status, one after the other, in which nothing waits and nothing is under way: what the recorder
+writes is in neither the queue before it nor the one behind it."""
+
+PORTION = 12
+"""Pictures that are sent at once: the service lets 16 wait."""
+
+LOG_SHOWN = 8000
+"""Characters of the service's log, its last, that a failed test shows."""
 
 
 def environment() -> dict[str, str]:
@@ -37,35 +62,55 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-def coec(*arguments: object, timeout_s: float = ANSWER_S) -> subprocess.CompletedProcess[str]:
+def coec(*arguments: object, timeout_s: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
     """Runs `coec ARGS` to its end."""
     command = [*COMMAND, *(str(argument) for argument in arguments)]
     return subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=timeout_s)
 
 
-def free_port() -> int:
-    """A TCP port of loopback that nobody listened on a moment ago."""
+def free_endpoint() -> str:
+    """A TCP endpoint of loopback that nobody listened on a moment ago."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Router:
+    """The router of a vehicle, in this process; it stays where services come and go."""
+
+    session: zenoh.Session
+    endpoint: str
+
+
+@contextmanager
+def routing() -> Iterator[Router]:
+    """A router on a free port."""
+    endpoint = free_endpoint()
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig()) as session:
+        yield Router(session, endpoint)
 
 
 def write_configuration(
-    folder: Path, source: str, perturbation: Array, calibration: CalibrationConfig, min_free_bytes: int = 2**20
+    folder: Path, recording: Recording, endpoint: str, perturbation: Array | None = None, **of_pair: Any
 ) -> Path:
-    """A configuration for a recording, on a free port, with a nominal calibration that is off by `perturbation`
-    (6,)."""
-    recording = open_source(source)
-    if recording.rig.mask is not None:
-        (folder / "mask.png").write_bytes(mask_to_png(recording.rig.mask))
-    mask = None if recording.rig.mask is None else Path("mask.png")
-    nominal = perturb(recording.rig.T_camera_lidar_nominal, perturbation)
-    pair = configuration_for(recording, nominal, mask).model_copy(update={"calibration": calibration})
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    """A configuration for a recording.
+
+    Args:
+        folder: where it goes, with the state directory beside it; made if need be.
+        perturbation: (6,) rad and m by which the nominal calibration is to be off the recording's; None: not.
+        of_pair: stages of the pair's configuration that differ from those for the recording.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    rig = recording.rig
+    mask = None if rig.mask is None else Path("mask.png")
+    if mask is not None and rig.mask is not None:
+        (folder / mask).write_bytes(mask_to_png(rig.mask))
+    nominal = perturb(rig.T_camera_lidar_nominal, np.zeros(6) if perturbation is None else perturbation)
+    pair = configuration_for(recording, nominal, mask).model_copy(update=of_pair)
     config = Config(
         zenoh=ZenohConfig(connect=(endpoint,), listen=(endpoint,)),
-        state=StateConfig(directory=Path("state"), min_free_bytes=min_free_bytes),
+        state=StateConfig(directory=Path("state"), min_free_bytes=0),
         pairs=(pair,),
     )
     path = folder / "coec.yaml"
@@ -75,61 +120,217 @@ def write_configuration(
 
 @dataclass
 class Service:
-    """A running `coec run`."""
+    """A running `coec run`, and what a client has of it. Questions are about its first pair where none is named.
+
+    Attributes:
+        sent: frames that were sent to it, by stream.
+    """
 
     process: subprocess.Popen[bytes]
-    endpoint: str
+    session: zenoh.Session
+    config: Config
     log: Path
+    sent: Counter[str] = field(default_factory=Counter)
+    changed: threading.Event = field(default_factory=threading.Event)
 
-    def query(self, *arguments: object) -> subprocess.CompletedProcess[str]:
-        """`coec query ARGS --json`, as a process."""
-        return coec("query", *arguments, "--connect", self.endpoint, "--json")
+    @property
+    def keys(self) -> Keys:
+        return Keys(self.config.prefix, self.config.vehicle)
 
-    def ask(self, *arguments: object) -> Any:
-        """The document of a query that must succeed."""
-        done = self.query(*arguments)
-        assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}"
-        return json.loads(done.stdout)
+    @property
+    def pair(self) -> str:
+        return self.config.pairs[0].name
 
-    def until(self, key: str, condition: Callable[[Any], bool], what: str, deadline_s: float = ANSWER_S) -> Any:
-        """The first answer that fulfils the condition; fails with the service's log after the deadline.
+    def ask(self, key: str, parameters: str = "", payload: bytes | None = None) -> Any:
+        """The document of a query for one key; `parameters` as `;name=value`.
 
-        Each question is a process of its own, which takes half a second: no need to wait between two.
+        Raises:
+            RemoteError: the service refused.
         """
-        end_s = time.monotonic() + deadline_s
-        last = ""
-        while time.monotonic() < end_s:
-            assert self.process.poll() is None, f"the service ended ({self.process.returncode}): {self.log.read_text()}"
-            done = self.query(key)
-            last = done.stdout
-            if done.returncode == 0 and condition(json.loads(done.stdout)):
-                return json.loads(done.stdout)
-        raise AssertionError(f"not within {deadline_s:g} s: {what}; last answer {last}; log {self.log.read_text()}")
+        return json.loads(ask_one(self.session, f"{key}?format=json{parameters}", PATIENCE_S, payload).payload)
 
-    def play(self, source: str, config: Path, rate: float) -> None:
-        """`coec play`, to its end."""
-        done = coec("play", source, "--config", config, "--rate", rate, "--connect", self.endpoint, "--json")
-        assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout)["nobody_listened_to"] == []
+    def extrinsic(self) -> Any:
+        return self.ask(self.keys.extrinsic(self.pair))
+
+    def health(self) -> Any:
+        return self.ask(self.keys.health(self.pair))
+
+    def history(self) -> Any:
+        return self.ask(self.keys.history(self.pair))
+
+    def windows(self) -> list[Any]:
+        found: list[Any] = self.ask(self.keys.windows(self.pair))["windows"]
+        return found
+
+    def status(self) -> Any:
+        """Of the service."""
+        return self.ask(self.keys.status)
+
+    def counters(self) -> Any:
+        """Of the pair."""
+        return self.status()["pairs"][0]
+
+    def worker(self) -> Any:
+        return self.status()["worker"]
+
+    def entries(self, *kinds: str) -> list[Any]:
+        """Of the history, of these kinds."""
+        return [one["entry"] for one in self.history()["entries"] if one["entry"]["kind"] in kinds]
+
+    def command(self, name: str, payload: bytes | None = None) -> Any:
+        """The acknowledgement."""
+        return self.ask(self.keys.command(self.pair, name), payload=payload)
+
+    def until(self, ask: Callable[[], Any], condition: Callable[[Any], bool], what: str) -> Any:
+        """The first answer that fulfils the condition: asked again when the service has published a change, and soon in
+        any case.
+
+        Fails with `what` and the last answer when the service ends before, or it takes too long.
+        """
+        deadline_s = time.monotonic() + PATIENCE_S
+        while True:
+            self.changed.clear()
+            answer = None
+            with suppress(NotFoundError):  # who is announced may not be reached yet, as routes are still being laid
+                answer = ask()
+            if answer is not None and condition(answer):
+                return answer
+            assert self.process.poll() is None, f"the service ended ({self.process.returncode}), before: {what}"
+            assert time.monotonic() < deadline_s, f"not within {PATIENCE_S:g} s: {what}; last answer {answer}"
+            self.changed.wait(RENEWED_S)
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Publishes frames, in portions that its inbox holds: however slow the machine is, none is lost."""
+        player = Player(self.session, Streams.of_pair(self.config.pairs[0]), "msgpack")
+        try:
+            assert not player.wait_for_listener(PATIENCE_S)
+            for portion in _portions(frames):
+                player.play(portion, 0.0, threading.Event(), self._count)
+                self.until_received()
+        finally:
+            player.close()
+
+    def _count(self, frame: Frame, _: Played) -> None:
+        self.sent[stream_of(frame)] += 1
+
+    def until_received(self) -> Any:
+        """Until every frame that was sent has come; the pair's counters then."""
+        return self.until(self.counters, self._has_received, "every frame that was sent")
+
+    def rest(self) -> None:
+        """Until it has every frame that was sent, nothing waits and nothing is under way."""
+        quiet: dict[float, Any] = {}
+
+        def rests(status: Any) -> bool:
+            worker, pair = status["worker"], status["pairs"][0]
+            at_work = worker["state"] != "idle" or worker["queued"] > 0 or pair["held"] > 0
+            done = {name: pair[name] for name in ("pairs", "windows", "solved", "checks", "losses")}
+            if at_work or not self._has_received(pair) or any(before != done for before in quiet.values()):
+                quiet.clear()
+            else:
+                quiet[status["uptime_s"]] = done
+            return len(quiet) >= QUIET_STATUSES
+
+        self.until(self.status, rests, "rest")
+
+    def end(self) -> None:
+        """Until the streams have been silent for long enough to end the open window, and it was judged."""
+        self.until(self.counters, lambda pair: pair["selected"] == 0, "the end of the open window")
+        self.rest()
+
+    def _has_received(self, pair: Any) -> bool:
+        streams = {name: pair[name] or {"received": 0, "losses": {}} for name in ("camera", "lidar", "ego")}
+        return all(
+            stream["received"] + stream["losses"].get("overrun", 0) >= self.sent[name]
+            for name, stream in streams.items()
+        )
 
     def terminate(self) -> int:
         """SIGTERM; the exit status, within the limit."""
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(END_S)
 
+    def kill(self) -> None:
+        """SIGKILL."""
+        self.process.kill()
+        self.process.wait()
+
+
+def _portions(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+    pictures = [index for index, frame in enumerate(frames) if stream_of(frame) == CAMERA]
+    ends = [0, *(index + 1 for index in pictures[PORTION - 1 :: PORTION]), len(frames)]
+    return (frames[begin:end] for begin, end in pairwise(ends) if begin < end)
+
 
 @contextmanager
-def service(config: Path) -> Iterator[Service]:
-    """`coec run --embedded-router`, until its worker is warm."""
+def service(
+    config: Path, router: Router | None, *, warm: bool = True, program: Sequence[str] = COMMAND
+) -> Iterator[Service]:
+    """`coec run` with a configuration, until it serves and, if need be, its worker is warm; killed at the end if it
+    still runs then. Its log is shown when the test fails.
+
+    Args:
+        router: what it connects to; None: it is its own router.
+        program: what stands for `coec`.
+    """
     log = config.with_name("coec.log")
+    loaded = load_config(config)
+    own = () if router else ("--embedded-router",)
     with log.open("ab") as stream:
-        command = [*COMMAND, "run", "--config", str(config), "--embedded-router"]
+        command = [*program, "run", "--config", str(config), *own]
         process = subprocess.Popen(command, stdout=stream, stderr=stream, env=environment())
-    running = Service(process, load_config(config).zenoh.listen[0], log)
     try:
-        running.until("status", lambda status: status["state"] == "running", "the service is up")
-        yield running
+        with nullcontext(router.session) if router else connected(loaded.zenoh.listen, PATIENCE_S) as session:
+            running = Service(process, session, loaded, log)
+            with _told_of_changes(running):
+                _await_alive(running)
+                wanted = ("running",) if warm else ("starting", "running", "failing")
+                running.until(running.status, lambda status: status["state"] in wanted, f"a service that is {wanted}")
+                yield running
+    except BaseException:
+        sys.stderr.write(log.read_text()[-LOG_SHOWN:])
+        raise
     finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def _told_of_changes(running: Service) -> Iterator[None]:
+    """Sets `changed` for everything that the service publishes of its pairs."""
+
+    def heard(_: zenoh.Sample) -> None:
+        running.changed.set()
+
+    subscribers = [
+        running.session.declare_subscriber(key, zenoh.handlers.Callback(heard, indirect=False))
+        for key in (running.keys.extrinsic("*"), running.keys.health("*"))
+    ]
+    try:
+        yield
+    finally:
+        for subscriber in subscribers:
+            subscriber.undeclare()
+
+
+def _await_alive(running: Service) -> None:
+    """Until every pair is announced, or the process has ended."""
+    missing = {running.keys.alive(pair.name) for pair in running.config.pairs}
+
+    def heard(token: zenoh.Sample) -> None:
+        if token.kind == zenoh.SampleKind.PUT:
+            missing.discard(str(token.key_expr))
+            running.changed.set()
+
+    handler = zenoh.handlers.Callback(heard, indirect=False)
+    tokens = running.session.liveliness().declare_subscriber(running.keys.alive("*"), handler, history=True)
+    deadline_s = time.monotonic() + PATIENCE_S
+    try:
+        while missing:
+            assert running.process.poll() is None, f"the service ended ({running.process.returncode})"
+            assert time.monotonic() < deadline_s, f"not alive within {PATIENCE_S:g} s: {missing}"
+            running.changed.clear()
+            if missing:
+                running.changed.wait(RENEWED_S)
+    finally:
+        tokens.undeclare()

@@ -1,47 +1,104 @@
-"""One drive, three times: live, restarted in the middle, and replayed from MCAP at another speed. The decisions are the
-same, whatever the machine does meanwhile; replayed, they are so to the last digit."""
+"""One drive, three times: live, killed or restarted in the middle, and replayed. The decisions are the same, whatever
+the machine does meanwhile."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import psutil
 import pytest
 
 from coec.adapters.mcap.bag_writer import write_bag
-from coec.config import CalibrationConfig, DepthConfig
-from e2e.processes import coec
-from e2e.rides import SECONDS, Ride, between, configured, drive, error_deg, riding, without_depth
+from coec.config import CalibrationConfig, DepthConfig, WindowConfig
+from e2e.drives import SECONDS, STEPPED, Drive, rendered, stepped_configuration, without_depth
+from e2e.processes import Router, Service, coec, service, write_configuration
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
+SLICE_S, SLICES = 12, 2
+"""Two windows before the mount moves, and the beginning of a third. The kill comes in the last solve: what is solved
+after a start is served at once, in a stream only when its time has come, so that a later window would start from
+another pose."""
+
+ENDED_S = SLICES * SLICE_S
+CERTAIN_S = 2
+"""Of driving, until the pair that ends a window is certain."""
+
+WORKSHOP = np.array([*np.radians([0.3, -0.2, 0.2]), 0.0, 0.0, 0.0])
+"""By how much nominal is off, so that every window moves what is served."""
+
 RESTART_S = 52
-"""After the step, before it is certain."""
+"""Of the long form: after the step, before it is certain."""
 
 REPLAY_SPEED = 12.0
-PLAYED_S = 180.0
+"""Seconds of driving per second, of the recording that is played."""
+
 MAX_ERROR_DEG = 0.35
 
-DECISIONS = ("estimate", "extrinsic", "state")
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return rendered(STEPPED)
 
 
-@pytest.fixture
-def calibration(sample_data: Path) -> CalibrationConfig:
-    """With a network: a bag of sensors holds no depth maps."""
-    return CalibrationConfig(depth=DepthConfig(model=str(sample_data / "depth" / "tcsmallnet_dyn.onnx")))
-
-
-def decisions(ride: Ride) -> dict[str, Any]:
-    """Everything that was decided, without the wall clock and what hangs on it."""
-    entries = [{**entry, "wall_ns": 0, "previous_sha256": ""} for entry in ride.entries(*DECISIONS)]
-    windows = ride.ask(ride.keys.windows(ride.pair))["windows"]
+def told_of(running: Service, *kinds: str) -> dict[str, Any]:
+    """What was decided and is served, and the entries of these kinds, without the wall clock and what hangs on it."""
+    entries = [{**entry, "wall_ns": 0, "previous_sha256": "", "sequence": 0} for entry in running.entries(*kinds)]
     return {
         "entries": entries,
-        "results": ride.ask(ride.keys.history(ride.pair))["results"],
-        "windows": [(window["window_id"], window["pairs"], window["decision"]) for window in windows],
-        "extrinsic": ride.extrinsic()["camera_from_lidar"],
-        "checks": ride.ask(ride.keys.history(ride.pair))["checks"],
-        "losses": ride.status()["losses"],
+        "results": running.history()["results"],
+        "windows": [(window["window_id"], window["pairs"], window["decision"]) for window in running.windows()],
+        "extrinsic": running.extrinsic()["camera_from_lidar"],
+    }
+
+
+def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(
+    tmp_path: Path, drive: Drive, router: Router
+) -> None:
+    def configured(name: str) -> Path:
+        window = WindowConfig(pairs=SLICE_S, min_pairs=8, slice_s=SLICE_S)
+        calibration = CalibrationConfig(depth=DepthConfig(model="stereo"))
+        return write_configuration(
+            tmp_path / name, drive.recording, router.endpoint, WORKSHOP, window=window, calibration=calibration
+        )
+
+    with service(configured("live"), router) as running:
+        running.send(drive.between(0, ENDED_S + CERTAIN_S))
+        running.rest()
+        live = told_of(running, "estimate", "extrinsic")
+        assert running.terminate() == 0
+    assert [decision for *_, decision in live["windows"]] == ["accepted"] * SLICES
+    assert len({str(entry["camera_from_lidar"]) for entry in live["entries"] if entry["kind"] == "extrinsic"}) > 1
+
+    config = configured("killed")
+    with service(config, router) as running:
+        running.send(drive.between(0, ENDED_S))
+        running.rest()
+        psutil.Process(running.worker()["pid"]).suspend()
+        running.send(drive.between(ENDED_S, ENDED_S + CERTAIN_S))
+        running.until(running.counters, lambda pair: pair["windows"] == SLICES, "the last window is recorded")
+        running.kill()
+    with service(config, router) as running:
+        running.until(running.history, lambda told: told["total"] == SLICES, "the window that was being solved")
+        running.rest()
+        killed = told_of(running, "estimate", "extrinsic")
+        assert running.terminate() == 0
+    assert killed == live
+
+    windows = sorted((tmp_path / "live" / "state" / "windows").glob("*.mcap"))
+    replayed = [coec("replay", window) for window in windows if window.stem in {name for name, *_ in live["windows"]}]
+    assert [done.returncode for done in replayed] == [0] * SLICES, [done.stdout + done.stderr for done in replayed]
+    assert all("identical" in done.stdout for done in replayed)
+
+
+def decisions(running: Service) -> dict[str, Any]:
+    """All of it, of a run that was not interrupted."""
+    return {
+        **told_of(running, "estimate", "extrinsic", "state"),
+        "checks": running.history()["checks"],
+        "losses": running.counters()["losses"],
     }
 
 
@@ -50,37 +107,45 @@ def states(decided: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 @pytest.mark.slow
-def test_live_restarted_and_replayed_the_decisions_are_the_same(tmp_path: Path, calibration: CalibrationConfig) -> None:
-    whole = [without_depth(frame) for frame in between(0, SECONDS + 1)]
-    with riding(configured(tmp_path / "live", calibration)) as ride:
-        ride.send(whole)
-        ride.rest()
-        ride.end()
-        live = decisions(ride)
+def test_live_restarted_and_replayed_the_decisions_are_the_same(
+    tmp_path: Path, drive: Drive, router: Router, sample_data: Path
+) -> None:
+    # A bag of sensors holds no depth maps.
+    network = DepthConfig(model=str(sample_data / "depth" / "tcsmallnet_dyn.onnx"))
+    with service(stepped_configuration(tmp_path / "live", router, network), router) as running:
+        running.send(without_depth(drive.between(0, SECONDS + 1)))
+        running.rest()
+        running.end()
+        live = decisions(running)
+        assert running.terminate() == 0
     assert {code for code, _ in states(live)} >= {"healthy", "suspect", "miscalibrated"}
     assert states(live)[-1][0] == "healthy"
 
     bag = tmp_path / "drive.mcap"
-    recording = drive()[0]
+    recording = drive.recording
+    whole = without_depth(drive.between(0, SECONDS + 1))
     write_bag(bag, recording.rig, recording.T_camera_lidar_start, whole, lambda _: None)
-    config = configured(tmp_path / "replayed", calibration)
-    with riding(config) as ride:
-        told = ("--config", config, "--rate", REPLAY_SPEED, "--connect", ride.running.endpoint)
-        played = coec("play", bag, *told, "--json", timeout_s=PLAYED_S)
+    config = stepped_configuration(tmp_path / "replayed", router, network)
+    with service(config, router) as running:
+        told = ("--config", config, "--rate", REPLAY_SPEED, "--connect", router.endpoint)
+        played = coec("play", bag, *told, "--json")
         assert played.returncode == 0, played.stderr
-        ride.rest()
-        ride.end()
-        replayed = decisions(ride)
+        running.rest()
+        running.end()
+        replayed = decisions(running)
+        assert running.terminate() == 0
     assert replayed == live
 
-    config = configured(tmp_path / "restarted", calibration)
-    with riding(config) as ride:
-        ride.send([without_depth(frame) for frame in between(0, RESTART_S)])
-        ride.rest()
-    with riding(config) as ride:
-        ride.send([without_depth(frame) for frame in between(RESTART_S, SECONDS + 1)])
-        ride.rest()
-        ride.end()
-        restarted = decisions(ride)
-        assert error_deg(ride.extrinsic(), SECONDS) < MAX_ERROR_DEG
+    config = stepped_configuration(tmp_path / "restarted", router, network)
+    with service(config, router) as running:
+        running.send(without_depth(drive.between(0, RESTART_S)))
+        running.rest()
+        assert running.terminate() == 0
+    with service(config, router) as running:
+        running.send(without_depth(drive.between(RESTART_S, SECONDS + 1)))
+        running.rest()
+        running.end()
+        restarted = decisions(running)
+        assert drive.error_deg(running.extrinsic(), SECONDS) < MAX_ERROR_DEG
+        assert running.terminate() == 0
     assert [code for code, _ in states(restarted)] == [code for code, _ in states(live)]

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,71 +16,83 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from coec.adapters.mcap.windows import read_result, read_window
-from coec.adapters.zenoh.bus import open_session
-from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig, ZenohConfig
-from e2e.processes import ANSWER_S, Service, coec, free_port, service, write_configuration
+from coec.adapters.zenoh.player import Frame
+from coec.cli import play
+from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig, WindowConfig
+from coec.sources import open_source
+from e2e.drives import NS_PER_S, SHORT, SHORT_PAIRS, Drive, later, rendered
+from e2e.processes import Router, Service, coec, free_endpoint, service, write_configuration
 from fakes import wait_until
 
-SYNTHETIC = "synthetic:?frames=12&width=240"
+SHORT_S = 12
 PERTURBATION = np.array([*np.radians([2.0, -1.5, 1.0]), 0.0, 0.0, 0.0])
 MAX_ERROR_DEG = 0.35
+WINDOW = WindowConfig(pairs=SHORT_PAIRS, min_pairs=4, slice_s=SHORT_S)
 
 MAPS = DepthConfig(model="stereo")
-STEREO = CalibrationConfig(depth=MAPS)
 """Depth from the maps that come with the frames."""
 
 BY_DEPTH = CalibrationConfig(depth=MAPS, objective=ObjectiveConfig(kind="mi"))
-"""The synthetic street has too few pixels for edges."""
+"""Six small pictures have too few edges for `fused`."""
 
 SLOW = CalibrationConfig(depth=MAPS, objective=ObjectiveConfig(depth_bins=256, range_bins=256))
 """Sixty-five thousand cells per histogram: a solve takes seconds, so that there is a middle of it."""
+
+OVER_S = 3.0
+"""Into the next slice: its first pair is then certain, and the slice before has ended."""
+
+KITTI_SPEED = 20.0
+"""Times as fast as recorded: the ten pairs lie 6 to 23 s apart, and are some MB each: more at once than a link
+holds."""
 
 COMPUTED_S = 0.2
 """Processor time after which the worker is in that middle."""
 
 
-def _received(count: int, stream: str = "lidar") -> Any:
-    return lambda status: status["pairs"][0][stream]["received"] >= count
-
-
-def _solved(status: Any) -> bool:
-    return bool(status["pairs"][0]["solved"])
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    return rendered(SHORT)
 
 
 def _text(document: Any) -> str:
     return json.dumps(document["camera_from_lidar"], sort_keys=True)
 
 
-def _play_and_solve(running: Service, source: str, config: Path, rate: float, frames: int) -> Any:
-    """Has a window recorded and solved; the extrinsic that is served then."""
-    running.play(source, config, rate)
-    running.until("status", _received(frames), "every frame has arrived")
-    acknowledged = running.ask("command/calibrate")
+def _asked(endpoint: str, *arguments: object) -> Any:
+    """The document of `coec query ARGS --json`."""
+    done = coec("query", *arguments, "--connect", endpoint, "--json")
+    assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}"
+    return json.loads(done.stdout)
+
+
+def _played(endpoint: str, source: str, config: Path, rate: float) -> None:
+    done = coec("play", source, "--config", config, "--rate", rate, "--connect", endpoint, "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["nobody_listened_to"] == []
+
+
+def _solved(running: Service, endpoint: str, count: int) -> Any:
+    """Has the window of so many pictures finished, unless silence did, and solved; the extrinsic that is served
+    then."""
+    running.until(running.counters, lambda pair: pair["camera"]["received"] == count, "every picture")
+    acknowledged = _asked(endpoint, "command/calibrate")
     assert acknowledged["accepted"], acknowledged
-    running.until("status", _solved, "the window is solved")
-    return running.ask("extrinsic")
+    running.until(running.extrinsic, lambda told: told["status"] != "not_accepted", "the result")
+    return _asked(endpoint, "extrinsic")
 
 
-def _bring_into_a_solve(running: Service, source: str, config: Path) -> int:
-    """Plays until the slice has ended of itself and the worker computes; the worker's process.
-
-    The worker is held while the job comes to it, so that there is time to see it, and let go until it has computed for
-    a while: a solve with `SLOW` takes much longer.
-    """
-    worker = psutil.Process(running.ask("status")["worker"]["pid"])
-    worker.suspend()
-    running.play(source, config, 40.0)
-    running.until("status", lambda status: status["worker"]["state"] == "busy", "the worker has the window")
-    before_s = worker.cpu_times().user
-    worker.resume()
-    wait_until(lambda: worker.cpu_times().user > before_s + COMPUTED_S, "the worker computes")
-    return int(worker.pid)
+def _check_corrected(extrinsic: Any, perturbation: Any) -> None:
+    """The nominal calibration was off by -perturbation: that is what must have been corrected."""
+    correction = np.array([extrinsic["axes"][axis]["correction"] for axis in ("rx", "ry", "rz")])
+    assert np.abs(correction + np.degrees(perturbation[:3])).max() < MAX_ERROR_DEG
 
 
-def _check_same_by_calibrate(running: Service, extrinsic: Any, folder: Path) -> Path:
+def _check_same_by_calibrate(endpoint: str, extrinsic: Any, folder: Path) -> Path:
     """Downloads the window, calibrates it, replays it: the same to the byte."""
     window = folder / "downloaded.mcap"
-    running.ask(f"windows/{extrinsic['window_id']}", "--output", window)
+    _asked(endpoint, f"windows/{extrinsic['window_id']}", "--output", window)
     calibrated = coec("calibrate", window, "--json")
     assert calibrated.returncode == 0, calibrated.stderr
     assert _text(json.loads(calibrated.stdout)) == _text(extrinsic)
@@ -97,114 +108,113 @@ def _check_opens_in_ros_tools(window: Path, topic: str, pairs: int) -> None:
     assert all(cloud.width * cloud.height > 0 for cloud in clouds)
 
 
-def test_synthetic_drive_from_frames_to_extrinsic(tmp_path: Path) -> None:
-    config = write_configuration(tmp_path, SYNTHETIC, PERTURBATION, BY_DEPTH)
-    with service(config) as running:
-        before = running.ask("extrinsic")
+def test_from_frames_to_extrinsic_and_after_a_restart(tmp_path: Path, drive: Drive, router: Router) -> None:
+    source = drive.recording
+    config = write_configuration(tmp_path, source, router.endpoint, PERTURBATION, calibration=BY_DEPTH, window=WINDOW)
+    with service(config, router) as running:
+        before = _asked(router.endpoint, "extrinsic")
         assert (before["provenance"], before["status"]) == ("nominal", "not_accepted")
-        extrinsic = _play_and_solve(running, SYNTHETIC, config, 40.0, 12)
+        _played(router.endpoint, drive.source, config, 0.0)
+        extrinsic = _solved(running, router.endpoint, SHORT_PAIRS)
         assert (extrinsic["provenance"], extrinsic["status"]) == ("estimated", "accepted")
-        # The nominal calibration was off by -PERTURBATION: that is what must have been corrected.
-        correction = np.array([extrinsic["axes"][axis]["correction"] for axis in ("rx", "ry", "rz")])
-        assert np.abs(correction + np.degrees(PERTURBATION[:3])).max() < MAX_ERROR_DEG
-        assert running.ask("health")["state"] == "healthy"
-        window = _check_same_by_calibrate(running, extrinsic, tmp_path)
-        listed = running.ask("windows")["windows"]
-        assert [item["decision"] for item in listed] == ["accepted"]
-        _check_opens_in_ros_tools(window, "/coec/synthetic/lidar/points", listed[0]["pairs"])
+        _check_corrected(extrinsic, PERTURBATION)
+        assert _asked(router.endpoint, "health")["state"] == "healthy"
+        window = _check_same_by_calibrate(router.endpoint, extrinsic, tmp_path)
+        (listed,) = _asked(router.endpoint, "windows")["windows"]
+        assert listed["decision"] == "accepted"
+        _check_opens_in_ros_tools(window, "/coec/sim/lidar/points", listed["pairs"])
         assert running.terminate() == 0
 
-    with service(config) as running:
-        again = running.ask("extrinsic")
+    with service(config, router, warm=False) as running:
+        again = running.extrinsic()
         assert again["provenance"] == "restored"
         assert _text(again) == _text(extrinsic)
         assert running.terminate() == 0
 
 
-def test_worker_killed_in_a_solve_is_replaced_and_the_estimate_comes(tmp_path: Path) -> None:
-    source = "synthetic:?frames=10&width=160"
-    config = write_configuration(tmp_path, source, PERTURBATION, SLOW)
-    with service(config) as running:
-        victim = _bring_into_a_solve(running, source, config)
-        os.kill(victim, signal.SIGKILL)
-
-        assert running.ask("extrinsic")["status"] == "not_accepted"
-        assert running.ask("health")["state"] in ("unknown", "degraded")
-
-        def _replaced(status: Any) -> bool:
-            worker = status["worker"]
-            return worker["restarts"] == 1 and worker["pid"] not in (None, victim)
-
-        running.until("status", _replaced, "another worker is there")
-        running.until("status", _solved, "the window is solved after all", 2 * ANSWER_S)
-        (result,) = running.ask("history")["results"]
-        recorded = read_result(tmp_path / "state" / "windows" / f"{result['window_id']}.mcap")
-        assert recorded is not None
-        assert recorded.model_dump(mode="json") == result
-
-        # Another drive, left open: its window is finished when the service is told to stop.
-        running.play(f"{source}&seed=1", config, 40.0)
-        running.until("status", _received(20), "every frame has arrived again")
-        assert running.terminate() == 0
-    files = sorted((tmp_path / "state" / "windows").iterdir())
-    assert all(path.suffix == ".mcap" for path in files), files
-    assert sum(len(read_window(path)[0].pairs) for path in files) > result["pairs"]
-
-
-def test_sigterm_in_a_solve_ends_in_time_and_the_next_start_solves_it(tmp_path: Path) -> None:
-    source = "synthetic:?frames=10&width=160"
-    config = write_configuration(tmp_path, source, PERTURBATION, SLOW)
-    with service(config) as running:
-        _bring_into_a_solve(running, source, config)
-        assert running.terminate() == 0
-    (path,) = (tmp_path / "state" / "windows").iterdir()
-    assert read_result(path) is None
-    with service(config) as running:
-        running.until("history", lambda history: bool(history["results"]), "the window of the last run is solved")
-        assert running.terminate() == 0
-
-
 def test_kitti360_from_frames_to_extrinsic(tmp_path: Path, sample_data: Path) -> None:
+    """Real sensors, and a service that is its own router."""
     source = f"kitti360:{sample_data / 'kitti360'}?camera=image_00"
     perturbation = np.array([*np.radians([3.0, -3.0, 3.0]), 0.0, 0.0, 0.0])
-    config = write_configuration(tmp_path, source, perturbation, STEREO)
-    with service(config) as running:
-        extrinsic = _play_and_solve(running, source, config, 20.0, 10)
+    endpoint = free_endpoint()
+    calibration = CalibrationConfig(depth=MAPS)
+    config = write_configuration(tmp_path, open_source(source), endpoint, perturbation, calibration=calibration)
+    with service(config, None) as running:
+        _played(endpoint, source, config, KITTI_SPEED)
+        extrinsic = _solved(running, endpoint, 10)
         assert extrinsic["status"] == "accepted"
-        correction = np.array([extrinsic["axes"][axis]["correction"] for axis in ("rx", "ry", "rz")])
-        assert np.abs(correction + np.degrees(perturbation[:3])).max() < MAX_ERROR_DEG
-        _check_same_by_calibrate(running, extrinsic, tmp_path)
+        _check_corrected(extrinsic, perturbation)
+        _check_same_by_calibrate(endpoint, extrinsic, tmp_path)
         assert running.terminate() == 0
 
 
-def test_demonstration(tmp_path: Path) -> None:
-    pytest.importorskip("embreex", reason="needs ray casting")
-    done = coec("demo", "--json", "--output", tmp_path / "demo", timeout_s=10 * ANSWER_S)
-    assert done.returncode == 0, done.stdout + done.stderr
-    document = json.loads(done.stdout)
-    assert document["passed"]
-    assert document["error_after_deg"] < MAX_ERROR_DEG < 2.5 < document["error_before_deg"]
-    assert document["knock_s"] < document["alarm_s"] <= document["repaired_s"]
-    states = [moment["health"] for moment in document["timeline"]]
-    assert states[0] == "unknown"
-    assert states[-1] == "healthy"
-    assert "miscalibrated" in states
-    written = [Path(path) for path in document["files"]]
-    assert all(path.stat().st_size > 0 for path in written)
-    assert {"timeline.png", "overlay_before.png", "overlay_after.png", "report.html"} <= {path.name for path in written}
-    (window,) = (path for path in written if path.suffix == ".mcap")
-    assert coec("replay", window, timeout_s=2 * ANSWER_S).returncode == 0
+def _bring_into_a_solve(running: Service, frames: list[Frame]) -> int:
+    """Sends a window, with the frame that ends it, and returns the worker's process once it computes.
+
+    The worker is held while the job comes to it, so that there is time to see it, and let go until it has computed for
+    a while: a solve with `SLOW` takes much longer.
+    """
+    worker = psutil.Process(running.worker()["pid"])
+    worker.suspend()
+    running.send(frames)
+    running.until(running.worker, lambda told: told["state"] == "busy", "the worker has the window")
+    before_s = worker.cpu_times().user
+    worker.resume()
+    wait_until(lambda: worker.cpu_times().user > before_s + COMPUTED_S, "the worker computes")
+    return int(worker.pid)
 
 
-def test_playing_to_nobody_says_so() -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with closing(open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())):
-        done = coec("play", "synthetic:?frames=1&width=64", "--connect", endpoint, "--rate", "0", "--json")
-    assert done.returncode == 0
-    assert json.loads(done.stdout)["nobody_listened_to"] == [
-        f"sensors/synthetic/{stream}" for stream in ("camera", "lidar", "ego")
+def test_worker_killed_and_service_stopped_in_a_solve_lose_no_window(
+    tmp_path: Path, drive: Drive, router: Router
+) -> None:
+    config = write_configuration(
+        tmp_path, drive.recording, router.endpoint, PERTURBATION, calibration=SLOW, window=WINDOW
+    )
+    windows = tmp_path / "state" / "windows"
+    frames = [*drive.frames, *later(drive.frames, SHORT_S), *later(drive.frames, 2 * SHORT_S)]
+    begun_ns = drive.start_ns + round((SHORT_S + OVER_S) * NS_PER_S)
+    with service(config, router) as running:
+        victim = _bring_into_a_solve(running, [frame for frame in frames if frame.stamp_ns < begun_ns])
+        os.kill(victim, signal.SIGKILL)
+        assert running.extrinsic()["status"] == "not_accepted"
+        assert running.health()["state"] in ("unknown", "degraded")
+
+        def replaced(worker: Any) -> bool:
+            return worker["restarts"] == 1 and worker["pid"] not in (None, victim)
+
+        running.until(running.worker, replaced, "another worker is there")
+        told = running.until(running.history, lambda told: bool(told["results"]), "the window is solved after all")
+        (result,) = told["results"]
+        recorded = read_result(windows / f"{result['window_id']}.mcap")
+        assert recorded is not None
+        assert recorded.model_dump(mode="json") == result
+        assert result["pairs"] == SHORT_PAIRS
+
+        # The rest ends a second window, and leaves a third one open.
+        _bring_into_a_solve(running, [frame for frame in frames if frame.stamp_ns >= begun_ns])
+        assert running.terminate() == 0
+    files = sorted(windows.iterdir())
+    assert [(path.suffix, read_result(path) is None) for path in files] == [(".mcap", n > 0) for n in range(3)]
+    assert [len(read_window(path)[0].pairs) for path in files] == [SHORT_PAIRS] * 3
+
+    with service(config, router, warm=False) as running:
+        told = running.until(running.history, lambda told: told["total"] == 3, "what the last run left is solved")
+        assert told["results"][0] == result
+        assert {one["window_id"] for one in told["results"]} == {path.stem for path in files}
+        assert running.terminate() == 0
+
+
+def test_playing_to_nobody_says_so(
+    drive: Drive, router: Router, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(play, "LISTENER_S", 0.1)
+    source = drive.source.replace(f"seconds={SHORT_S}", "seconds=1")
+    assert play.run(play.Options(source, connect=router.endpoint, rate=0.0, as_json=True)) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["nobody_listened_to"] == [
+        f"sensors/sim/{stream}" for stream in ("camera", "lidar", "ego")
     ]
-    assert "nobody listens" in done.stderr
+    assert "nobody listens" in said.err
 
 
 def test_questions_to_nobody_fail() -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.zenoh.client import ask_one
-from coec.config import CalibrationConfig, DepthConfig, PolicyConfig
-from e2e.rides import SECONDS, STEP_S, between, configured, drive, error_deg, riding
-from fakes import wait_until
+from coec.adapters.zenoh.client import Reply, ask_one
+from coec.config import DepthConfig
+from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
+from e2e.processes import PATIENCE_S, Router, Service, service
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -19,81 +19,89 @@ NOTICED_S = 60.0
 
 MAX_ERROR_DEG = 0.35
 
-STEREO = CalibrationConfig(depth=DepthConfig(model="stereo"))
+MAPS = DepthConfig(model="stereo")
+"""Depth from the maps that come with the frames."""
 
 
-def test_a_step_is_noticed_corrected_and_remembered(tmp_path: Path) -> None:
-    config = configured(tmp_path, STEREO)
-    with riding(config) as ride:
-        ride.send(between(0, STEP_S))
-        ride.rest()
-        before = ride.extrinsic()
-        assert ride.health()["state"] == "healthy"
-        assert error_deg(before, 0) < MAX_ERROR_DEG
-        ride.send(between(STEP_S, SECONDS + 1))
-        ride.rest()
-        step_ns = drive()[0].camera_stamps_ns[0] + STEP_S * 1_000_000_000
-        states = {entry["code"]: (entry["stamp_ns"] - step_ns) / 1e9 for entry in ride.entries("state")}
-        assert [entry["code"] for entry in ride.entries("state")][:1] == ["healthy"], "no false alarm"
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return rendered(STEPPED)
+
+
+def asked(running: Service, selector: str) -> Reply:
+    return ask_one(running.session, selector, PATIENCE_S)
+
+
+def test_a_step_is_noticed_corrected_and_remembered(tmp_path: Path, drive: Drive, router: Router) -> None:
+    config = stepped_configuration(tmp_path, router, MAPS)
+    with service(config, router) as running:
+        keys, pair = running.keys, running.pair
+        running.send(drive.between(0, STEP_S))
+        running.rest()
+        before = running.extrinsic()
+        assert running.health()["state"] == "healthy"
+        assert drive.error_deg(before, 0) < MAX_ERROR_DEG
+        running.send(drive.between(STEP_S, SECONDS + 1))
+        running.rest()
+        step_ns = drive.start_ns + STEP_S * NS_PER_S
+        states = {entry["code"]: (entry["stamp_ns"] - step_ns) / NS_PER_S for entry in running.entries("state")}
+        assert [entry["code"] for entry in running.entries("state")][:1] == ["healthy"], "no false alarm"
         assert 0 < states["suspect"] <= states["miscalibrated"] < NOTICED_S
         assert states["miscalibrated"] < states["healthy"]
-        assert ride.health()["state"] == "healthy"
-        after = ride.extrinsic()
-        assert error_deg(after, SECONDS) < MAX_ERROR_DEG
+        assert running.health()["state"] == "healthy"
+        assert drive.error_deg(running.extrinsic(), SECONDS) < MAX_ERROR_DEG
 
-        (event,) = ride.ask(ride.keys.evidence(ride.pair))["events"]
+        (event,) = running.ask(keys.evidence(pair))["events"]
         assert event["resolution"].startswith("healthy")
-        assert {event["window_before"], event["window_after"]} <= {
-            item["window_id"] for item in ride.ask(ride.keys.windows(ride.pair))["windows"]
-        }
+        assert {event["window_before"], event["window_after"]} <= {item["window_id"] for item in running.windows()}
         assert event["overlays"] == ["before", "after"]
-        whole = ride.ask(ride.keys.evidence_of(ride.pair, event["event_id"]))
-        assert len(whole["metrics"]) > 5
-        picture = ask_one(
-            ride.session, f"{ride.keys.evidence_of(ride.pair, event['event_id'])}?overlay=after", 10.0
-        ).payload
-        assert picture[:3] == b"\xff\xd8\xff"
+        kept = keys.evidence_of(pair, event["event_id"])
+        assert len(running.ask(kept)["metrics"]) > 5
+        assert asked(running, f"{kept}?overlay=after").payload[:3] == b"\xff\xd8\xff"
         for parameters in ("", "?at=nominal", f"?window={event['window_before']}"):
-            drawn = ask_one(ride.session, f"{ride.keys.overlay(ride.pair)}{parameters}", 20.0)
+            drawn = asked(running, f"{keys.overlay(pair)}{parameters}")
             assert drawn.encoding == "image/jpeg"
             assert drawn.payload[:3] == b"\xff\xd8\xff"
 
-        back = ride.command("rollback")
+        back = running.command("rollback")
         assert back["code"] == "rolled_back"
-        assert ride.extrinsic()["camera_from_lidar"] == before["camera_from_lidar"]
-        assert ride.health()["state"] == "unknown"
-        assert ride.command("hold")["code"] == "held"
-        assert ride.command("reset")["code"] == "held"
-        entries = ride.ask(ride.keys.history(ride.pair))["entries"]
+        assert running.extrinsic()["camera_from_lidar"] == before["camera_from_lidar"]
+        assert running.health()["state"] == "unknown"
+        assert running.command("hold")["code"] == "held"
+        assert running.command("reset")["code"] == "held"
+        entries = running.history()["entries"]
+        assert running.terminate() == 0
 
-    with riding(config) as ride:
-        again = ride.extrinsic()
+    with service(config, router) as running:
+        again = running.extrinsic()
         assert again["camera_from_lidar"] == before["camera_from_lidar"]
         assert (again["provenance"], again["held"]) == ("restored", True)
         # What was open when the service stopped is solved now, and moves nothing.
-        assert ride.ask(ride.keys.history(ride.pair))["entries"][: len(entries)] == entries
-        assert ride.command("hold", b'{"release":true}')["code"] == "released"
-        assert ride.command("reset")["code"] == "reset"
-        assert ride.extrinsic()["provenance"] == "nominal"
+        assert running.history()["entries"][: len(entries)] == entries
+        assert running.command("hold", b'{"release":true}')["code"] == "released"
+        assert running.command("reset")["code"] == "reset"
+        assert running.extrinsic()["provenance"] == "nominal"
+        assert running.terminate() == 0
 
 
-def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path) -> None:
-    with riding(configured(tmp_path, STEREO, PolicyConfig(apply="never"))) as ride:
-        ride.send(between(0, STEP_S))
-        ride.rest()
-        before = ride.extrinsic()
+def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path, drive: Drive, router: Router) -> None:
+    with service(stepped_configuration(tmp_path, router, MAPS, apply="never"), router) as running:
+        running.send(drive.between(0, STEP_S))
+        running.rest()
+        before = running.extrinsic()
         assert before["provenance"] == "nominal"
-        assert ride.health()["state"] == "healthy", "a window agrees with nominal"
-        ride.send(between(STEP_S, SECONDS + 1))
-        ride.rest()
-        after = ride.extrinsic()
+        assert running.health()["state"] == "healthy", "a window agrees with nominal"
+        running.send(drive.between(STEP_S, SECONDS + 1))
+        running.rest()
+        after = running.extrinsic()
         assert after["camera_from_lidar"] == before["camera_from_lidar"]
         assert after["provenance"] == "nominal"
-        assert ride.health()["state"] == "miscalibrated"
+        assert running.health()["state"] == "miscalibrated"
         assert after["pending"] is not None
-        assert error_deg(after["pending"], SECONDS) < MAX_ERROR_DEG
-        assert ride.command("apply")["code"] == "applied"
-        applied = ride.extrinsic()
+        assert drive.error_deg(after["pending"], SECONDS) < MAX_ERROR_DEG
+        assert running.command("apply")["code"] == "applied"
+        applied = running.extrinsic()
         assert applied["camera_from_lidar"] == after["pending"]["camera_from_lidar"]
         assert (applied["provenance"], applied["pending"]) == ("estimated", None)
-        wait_until(lambda: ride.health()["state"] == "healthy", "health after the command")
+        running.until(running.health, lambda told: told["state"] == "healthy", "health after the command")
+        assert running.terminate() == 0
