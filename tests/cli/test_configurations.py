@@ -71,8 +71,8 @@ def test_converted_configuration_fits_the_recording(coec: Coec, tmp_path: Path) 
     written = coec("convert", SMALL, path, "--json").document["written"]
     (pair,) = load_config(path).pairs
     assert written == [str(tmp_path / "coec-mask.png"), str(path)]
-    assert pair.name == "synthetic"
-    assert pair.camera.key == "sensors/synthetic/camera"
+    assert pair.name == "sim"
+    assert pair.camera.key == "sensors/sim/camera"
     assert pair.camera.mask == tmp_path / "coec-mask.png"
     assert pair.camera.intrinsics.model == "double_sphere"
     assert pair.ego is not None
