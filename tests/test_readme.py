@@ -19,7 +19,8 @@ import psutil
 import pytest
 
 from conftest import REPOSITORY
-from e2e.processes import environment, free_port
+from e2e.processes import environment
+from ports import free_port
 
 README = REPOSITORY / "README.md"
 SAMPLES = "../shared/data"

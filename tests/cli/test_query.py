@@ -15,7 +15,7 @@ from coec.errors import NotFoundError
 from coec.schemas.base import Message, to_json
 from coec.schemas.keys import Keys, parse_range_selector
 from coec.schemas.replies import PairStatus, StatusReply, StorageStatus, WindowInfo, WindowsReply, WorkerStatus
-from e2e.processes import free_port
+from ports import free_port
 
 DEADLINE_S = 20.0
 KEYS = Keys("coec", "vehicle")
