@@ -1,4 +1,4 @@
-"""What goes wrong on a road, done to a recorded or synthetic window: one mutation each, seeded, pure.
+"""What goes wrong on a road, done to a recorded or simulated window: one mutation each, seeded, pure.
 
 A mutation takes a window and a generator and returns another window. Images come back raw, so that nothing but the
 mutation changes them.

@@ -1,4 +1,6 @@
-"""A window of the synthetic street, with exact depth, for everything that needs a scene with a known truth."""
+"""Windows of a simulated street, with exact depth, for everything that needs a scene with a known truth."""
+
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -9,23 +11,29 @@ from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.objective.edges import EdgeWitness, build_edges
 from coec.calibration.ports import DepthModel
-from coec.calibration.types import FramePair, Window
+from coec.calibration.types import Window
 from coec.config import DepthConfig, LimitsConfig, PairingConfig
-from coec.sources import open_source
+from coec.sources import Recording
+from coec.sources.windows import RECORDED_GAP_S
+from drives import drawn_source
+
+STREET = "sim:seed=1&seconds=40&camera_hz=0.2&lidar_hz=0.2&camera=fisheye320&lidar=32&depth=yes"
+SHARP_STREET = "sim:seed=1&seconds=70&camera_hz=0.142857&lidar_hz=0.142857&camera=fisheye700&lidar=32&depth=yes"
 
 
-def pairs_of(source: str) -> tuple[tuple[FramePair, ...], Window]:
-    recording = open_source(source)
-    pairer = Pairer(PairingConfig(), expects_motion=True)
-    pairs = [pair for message in recording.messages() for pair in pairer.push(message)]
+def window_of(recording: Recording, cameras: Sequence[int] | None = None) -> Window:
+    """The window of all frames of a recording, or of the chosen camera frames; it starts at the recording's own
+    calibration."""
+    pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
+    pairs = [pair for message in recording.messages(cameras) for pair in pairer.push(message)]
     pairs += pairer.flush()
-    return tuple(pairs), Window("street-0", recording.rig, recording.rig.T_camera_lidar_nominal.copy(), tuple(pairs))
+    return Window("street-0", recording.rig, recording.rig.T_camera_lidar_nominal.copy(), tuple(pairs))
 
 
 @pytest.fixture(scope="session")
 def street() -> Window:
-    """Eight pairs; it starts at the truth."""
-    return pairs_of("synthetic:?seed=3&frames=8&width=320")[1]
+    """Eight pairs, 40 m apart; it starts at the truth."""
+    return window_of(drawn_source(STREET))
 
 
 @pytest.fixture(scope="session")
@@ -36,9 +44,9 @@ def stereo() -> DepthModel:
 
 @pytest.fixture(scope="session")
 def sharp_street() -> Window:
-    """The same street at three times the resolution: 0.23° per pixel. With coarser ones its edges hardly tell pitch
-    from height."""
-    return pairs_of("synthetic:?seed=3&frames=10&width=960")[1]
+    """Ten pairs of the same street, 60 m apart, at twice the resolution: 0.27° per pixel. With coarser ones its edges
+    hardly tell pitch from height."""
+    return window_of(drawn_source(SHARP_STREET))
 
 
 @pytest.fixture(scope="session")

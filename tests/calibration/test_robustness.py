@@ -1,6 +1,6 @@
 """What goes wrong on a road lowers the confidence and does not move the answer: refused, or right within its claim.
 
-The short form is the synthetic street, the long one real drives with a small network.
+The short form is a simulated street, the long one real drives with a small network.
 """
 
 import zlib
@@ -86,7 +86,7 @@ def confidence(estimate: Estimate | None) -> float:
 
 # ------------------------------------------------------------------------------------------------------- short form
 @pytest.mark.parametrize("scenario", SHORT)
-def test_on_the_synthetic_street(sharp_street: Window, stereo: DepthModel, scenario: str) -> None:
+def test_on_the_simulated_street(sharp_street: Window, stereo: DepthModel, scenario: str) -> None:
     check(solve(mutated(sharp_street, scenario), stereo, GREY, STARTS_DEG[1]))
 
 

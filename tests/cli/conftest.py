@@ -11,9 +11,16 @@ from typing import Any
 import pytest
 
 from coec.cli import main
+from drives import drawn
 
-SMALL = "synthetic:?frames=6&width=160&period_s=2"
-"""A recording that is cast in a fraction of a second."""
+SMALL = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"
+"""Six frames, two seconds apart, with exact depth."""
+
+
+@pytest.fixture(autouse=True)
+def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A simulated drive is drawn by the first command that opens it, and handed to the others as it is."""
+    monkeypatch.setattr("coec.simulation.source.open_sim", drawn)
 
 
 @dataclass(frozen=True)

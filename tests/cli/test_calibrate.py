@@ -1,4 +1,4 @@
-"""`coec calibrate` on a small synthetic recording."""
+"""`coec calibrate` on a small simulated drive."""
 
 from __future__ import annotations
 

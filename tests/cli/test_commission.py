@@ -9,8 +9,8 @@ from typing import Any
 
 Coec = Callable[..., Any]
 
-RIG = "synthetic:?frames=8&width=320&period_s=2"
-"""A street that is cast in a second and has edges enough for a check."""
+RIG = "sim:seed=1&seconds=16&camera_hz=0.5&lidar_hz=0.5&camera=fisheye320&lidar=32&depth=yes"
+"""Eight frames, two seconds apart, with edges enough for a check."""
 
 
 def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec) -> None:

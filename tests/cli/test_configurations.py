@@ -9,8 +9,10 @@ from ruamel.yaml import YAML
 
 from cli.conftest import SMALL, Coec
 from coec.cli.check_config import example, template
+from coec.cli.convert import configuration_for
 from coec.config import Config, config_hash, load_config
 from coec.reports.commented_yaml import commented_yaml
+from coec.simulation.source import open_sim
 from conftest import REPOSITORY
 
 
@@ -71,13 +73,30 @@ def test_converted_configuration_fits_the_recording(coec: Coec, tmp_path: Path) 
     written = coec("convert", SMALL, path, "--json").document["written"]
     (pair,) = load_config(path).pairs
     assert written == [str(tmp_path / "coec-mask.png"), str(path)]
-    assert pair.name == "synthetic"
-    assert pair.camera.key == "sensors/synthetic/camera"
+    assert pair.name == "sim"
+    assert pair.camera.key == "sensors/sim/camera"
     assert pair.camera.mask == tmp_path / "coec-mask.png"
     assert pair.camera.intrinsics.model == "double_sphere"
     assert pair.ego is not None
     # Six frames cannot make the ten that a window needs by default.
     assert pair.window.min_pairs == 3
+
+
+@pytest.mark.parametrize(
+    ("seconds", "hertz", "slice_s", "min_pairs"),
+    [("60", "1", 29.5, 10), ("600", "1", 180.0, 10), ("600", "0.1", 180.0, 10), ("30", "0.2", 180.0, 3)],
+    ids=["a minute", "ten minutes", "sparse", "few frames"],
+)
+def test_the_window_is_one_that_the_recording_fills(seconds: str, hertz: str, slice_s: float, min_pairs: int) -> None:
+    query = {"seconds": seconds, "camera_hz": hertz, "lidar_hz": hertz, "camera": "fisheye64", "lidar": "16"}
+    recording = open_sim(query)
+    window = configuration_for(recording, recording.T_camera_lidar_start, None).window
+    assert window.slice_s == pytest.approx(slice_s)
+    assert window.min_pairs == min_pairs
+    # As many pairs as it takes, were they all good.
+    bin_s = window.slice_s / window.pairs
+    bins = {int((stamp_ns - recording.camera_stamps_ns[0]) / 1e9 / bin_s) for stamp_ns in recording.camera_stamps_ns}
+    assert len(bins) >= window.min_pairs
 
 
 @pytest.mark.parametrize(

@@ -38,10 +38,10 @@ def test_bag_opens_in_ros_tools(coec: Coec, tmp_path: Path) -> None:
     with AnyReader([path]) as reader:
         assert {connection.topic for connection in reader.connections} == {
             "/tf_static",
-            "/synthetic/camera/camera_info",
-            "/synthetic/camera/image/compressed",
-            "/synthetic/lidar/points",
-            "/synthetic/odometry",
+            "/sim/camera/camera_info",
+            "/sim/camera/image/compressed",
+            "/sim/lidar/points",
+            "/sim/odometry",
         }
 
 

@@ -1,9 +1,12 @@
-"""`coec evaluate` on a small synthetic recording."""
+"""`coec evaluate` on a small simulated drive."""
 
 from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +14,29 @@ import pytest
 
 from cli.conftest import SMALL, Coec
 from coec.calibration.commissioning import learning
+from coec.calibration.types import LidarFrame
 from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, Options, configuration_of
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
 from coec.evaluation import experiments
 from coec.evaluation.starts import perturbations
 from coec.schemas.evaluation import ComparisonReport, EvaluationReport
+from coec.sources.recording import FramewiseRecording
+from drives import drawn
 
 CONTRACT = {
     "starts", "hits", "hit_rate", "rotation_deg", "translation_m", "bias", "std", "solve_s", "classified_correctly",
 }  # fmt: skip
+
+
+def without_intensity(recording: FramewiseRecording) -> FramewiseRecording:
+    """The recording of a LiDAR that tells no reflectance."""
+
+    def bare(load: Callable[[], LidarFrame]) -> LidarFrame:
+        return replace(load(), intensity=None)
+
+    frames = tuple(replace(frame, load_lidar=partial(bare, frame.load_lidar)) for frame in recording.frames)
+    return replace(recording, frames=frames)
 
 
 def test_report_has_the_figures_of_the_contract(coec: Coec) -> None:
@@ -79,7 +95,7 @@ def test_output_folder_holds_table_report_and_pictures(coec: Coec, tmp_path: Pat
     )  # fmt: skip
     written = tmp_path / "out"
     assert json.loads((written / "report.json").read_text()) == outcome.document
-    for name in ("bullseye", "landscape", "frames", "overlay_before", "overlay_after"):
+    for name in ("bullseye", "profiles", "frames", "overlay_before", "overlay_after"):
         assert (written / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert [point["frames"] for point in outcome.document["frames"]] == [1, 2]
 
@@ -102,18 +118,19 @@ def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
     report = outcome.document
     assert outcome.status == 0
     assert ComparisonReport.model_validate(report).model_dump(mode="json") == report
-    assert set(report["methods"]) | set(report["not_evaluated"]) == {"fused", "mi", "intensity"}
-    assert {"fused", "mi"} <= set(report["methods"])
+    assert set(report["methods"]) == {"fused", "mi", "intensity"}
+    assert report["not_evaluated"] == {}
     for name, method in report["methods"].items():
         assert method["objective"] == name
         assert set(method) >= CONTRACT
         assert json.loads((tmp_path / "out" / name / "report.json").read_text()) == method
-        assert (tmp_path / "out" / name / "landscape.png").is_file()
+        assert (tmp_path / "out" / name / "profiles.png").is_file()
     assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
     assert (tmp_path / "out" / "bullseye.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_methods_side_by_side_in_words(coec: Coec) -> None:
+def test_methods_side_by_side_in_words(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("coec.simulation.source.open_sim", lambda query: without_intensity(drawn(query)))
     outcome = coec(
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--frames", "2",
         "--objective", "all", "--halves", "1",
@@ -217,7 +234,7 @@ def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.Monk
     for name in ("CHECKS", "FAR_CHECKS", "HALVES"):
         monkeypatch.setattr(learning, name, 3)
     monkeypatch.setattr(experiments, "CHECKS", 2)
-    arguments = (SMALL.replace("frames=6", "frames=9"), "--depth", "stereo", "--detection", "1")
+    arguments = (SMALL.replace("seconds=12", "seconds=18"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
     diagnosed = coec("diagnose", *arguments, "--checks", "2", "--json").document
     detection = report.document["detection"]

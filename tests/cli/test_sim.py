@@ -18,6 +18,11 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 SHORT = ("--seed", 4, "--seconds", 0.6, "--camera", "fisheye96", "--lidar", 16, "--camera-hz", 5, "--lidar-hz", 5)
 
 
+@pytest.fixture(autouse=True)
+def drawn_once() -> None:
+    """Here the drawing itself is under test."""
+
+
 def test_a_drive_reads_back_with_its_truth_beside_it(coec: Coec, tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     outcome = coec(

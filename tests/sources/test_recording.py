@@ -68,8 +68,9 @@ def test_a_frame_that_is_not_there_is_refused() -> None:
     [
         ("kitti360:/data?camera=image_00&drive=d", "kitti360", "/data", {"camera": "image_00", "drive": "d"}),
         ("kitti-raw:rel/dir", "kitti-raw", "rel/dir", {}),
-        ("synthetic:?seed=3", "synthetic", ".", {"seed": "3"}),
-        ("synthetic:", "synthetic", ".", {}),
+        ("sim:?seed=3", "sim", ".", {"seed": "3"}),
+        ("sim:seed=3", "sim", ".", {"seed": "3"}),
+        ("sim:", "sim", ".", {}),
         ("a/b.mcap?camera=/front/image", None, "a/b.mcap", {"camera": "/front/image"}),
         ("./with:colon.yaml", None, "./with:colon.yaml", {}),
     ],

@@ -23,7 +23,7 @@ EXIT_BROKEN_PIPE = 141
 
 SOURCE_HELP = (
     "a recorded window or ROS 2 bag (.mcap), kitti360:ROOT?camera=image_00, kitti-raw:ROOT?..., a folder or "
-    "dataset.yaml, synthetic:?seed=0, sim:seed=1&seconds=60"
+    "dataset.yaml, sim:seed=1&seconds=60"
 )
 
 app = typer.Typer(

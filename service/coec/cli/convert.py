@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +33,8 @@ from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
 from coec.sources import Recording, open_source
 
+NS_PER_S = 1_000_000_000
+
 
 def run(source: str, out: Path, *, as_json: bool) -> int:
     """Writes OUT.
@@ -56,8 +59,7 @@ def run(source: str, out: Path, *, as_json: bool) -> int:
 def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path | None) -> PairConfig:
     """A pair that takes the frames of a recording as they are, on `sensors/<pair>/camera|lidar|ego`.
 
-    A recording with less than twice as many camera frames as a window needs would make none as soon as a few are
-    refused (the vehicle stood): half of its frames are then enough.
+    The window is one that the recording can fill, see `_window`.
     """
     rig = recording.rig
     streams = Streams.default(rig.pair)
@@ -65,10 +67,6 @@ def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path 
     motion = next((frame for frame in first if isinstance(frame, EgoMotion)), None)
     camera = next(frame for frame in first if isinstance(frame, CameraFrame))
     lidar = next(frame for frame in first if isinstance(frame, LidarFrame))
-    window = WindowConfig()
-    frames = len(recording.camera_stamps_ns)
-    if frames < 2 * window.min_pairs:
-        window = window.model_copy(update={"min_pairs": max(1, frames // 2)})
     return PairConfig(
         name=rig.pair,
         camera=CameraConfig(
@@ -80,9 +78,26 @@ def configuration_for(recording: Recording, T_camera_lidar: Matrix4, mask: Path 
         lidar=LidarConfig(key=streams.lidar, frame_id=lidar.frame_id, sweep=_sweep(rig)),
         ego=None if motion is None else EgoConfig(key=str(streams.ego), T_lidar_ego=matrix_rows(rig.T_lidar_ego)),
         T_camera_lidar=matrix_rows(T_camera_lidar),
-        window=window,
+        window=_window(recording.camera_stamps_ns),
         calibration=recording.configuration or _calibration(camera),
     )
+
+
+def _window(camera_stamps_ns: Sequence[int]) -> WindowConfig:
+    """The default window, fitted to a recording that could not fill it.
+
+    Of less than twice as many camera frames as a window needs there would be too few as soon as some are refused (the
+    vehicle stood): half of them are then enough. A drive so short that it touches fewer bins of a slice than a window
+    needs pairs gets slices of half its length: one window is judged while the other half still passes.
+    """
+    window = WindowConfig()
+    frames = len(camera_stamps_ns)
+    if frames < 2 * window.min_pairs:
+        return window.model_copy(update={"min_pairs": max(1, frames // 2)})
+    length_s = (camera_stamps_ns[-1] - camera_stamps_ns[0]) / NS_PER_S
+    if length_s < (window.min_pairs - 1) * window.slice_s / window.pairs:
+        return window.model_copy(update={"slice_s": length_s / 2})
+    return window
 
 
 def _calibration(camera: CameraFrame) -> CalibrationConfig:

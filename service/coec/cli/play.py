@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from coec.adapters.zenoh.client import connected
+from coec.adapters.zenoh.client import connected, single_key
 from coec.adapters.zenoh.player import Frame, Played, Player, Streams, repeated
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.cli import DEFAULT_CONNECT
@@ -56,6 +56,7 @@ def run(options: Options) -> int:
     recording = open_source(options.source)
     pair, endpoints = _target(options)
     streams = Streams.default(options.pair or recording.rig.pair) if pair is None else Streams.of_pair(pair)
+    single_key(streams.camera)
     _warn(recording, pair, options.encoding)
     shift_ns = time.time_ns() - _first_stamp_ns(recording) if options.start_now else 0
     with _until_signal() as stop, connected(endpoints, CONNECT_S) as session:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +15,7 @@ from typing import Any
 import zenoh
 
 from coec.adapters.files.output import OutputError
-from coec.adapters.zenoh.client import RemoteError, Reply, ask, ask_one, connected, nobody
+from coec.adapters.zenoh.client import RemoteError, Reply, ask, ask_one, connected, key_expression, nobody, single_key
 from coec.errors import UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
@@ -22,9 +24,13 @@ from coec.schemas.replies import StatusReply, WindowInfo, WindowsReply
 
 VEHICLE_KEYS = ("status", "config", "metrics")
 PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
+PLAIN_KEYS = (*PAIR_KEYS, "overlay", *VEHICLE_KEYS)
+WITH_ARGUMENT = {"windows": "ID", "evidence": "ID", "command": "NAME"}
 JPEG = "image/jpeg"
 DIGEST_POLL_S = 0.2
 """Between questions whether the service has read a window: as often as its recorder looks for one."""
+OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d+")
+"""What windows and red events are called: their pair, and a time in nanoseconds."""
 
 PICTURE_KEYS = ("overlay", "evidence")
 """Keys whose answer may be a picture, for `--output`."""
@@ -50,11 +56,11 @@ def run(options: Options) -> int:
     """Asks and shows the answers; 1 if a command was not accepted.
 
     Raises:
-        UsageError: no such key, or it is not clear of which pair.
+        UsageError: no such key, what was typed makes no key, or it is not clear of which pair.
         NotFoundError: nobody answered.
         RemoteError: an error reply.
     """
-    keys = Keys(options.prefix, options.vehicle)
+    keys = _keys(options)
     head, _, argument = options.key.partition("/")
     whole = f"/{VERSION_CHUNK}/" in options.key
     if not whole and head == "windows" and argument:
@@ -69,6 +75,34 @@ def run(options: Options) -> int:
     return _show(replies, kind, options, key)
 
 
+def _keys(options: Options) -> Keys:
+    """The keys that are asked for, once everything typed is known to fit into one.
+
+    Raises:
+        UsageError: it does not; names what.
+    """
+    if not math.isfinite(options.timeout_s):
+        raise UsageError(f"--timeout {options.timeout_s}: give a number of seconds")
+    keys = Keys(options.prefix, options.vehicle)
+    for typed in (options.prefix, options.vehicle, options.key, options.pair):
+        if typed is not None:
+            key_expression(typed)
+    head, _, argument = options.key.partition("/")
+    of_several = head in WITH_ARGUMENT and argument
+    if not (f"/{VERSION_CHUNK}/" in options.key or options.key in PLAIN_KEYS or of_several):
+        known = ", ".join((*PLAIN_KEYS, *(f"{name}/{what}" for name, what in WITH_ARGUMENT.items())))
+        raise UsageError(f"unknown key {options.key}; known: {known}, or a whole key expression with {VERSION_CHUNK}")
+    return keys
+
+
+def _pair_of(session: zenoh.Session, options: Options, keys: Keys, named: str) -> str:
+    """Of which pair a window or a red event is: the one given, that in its name, else the vehicle's only one."""
+    if options.pair is not None:
+        return options.pair
+    found = OF_PAIR.fullmatch(named)
+    return found["pair"] if found else _only_pair(session, options, keys)
+
+
 def _resolve(session: zenoh.Session, options: Options, keys: Keys) -> tuple[str, str | None]:
     """The key expression, and what kind of reply is shown in words (None: as it comes)."""
     head, _, argument = options.key.partition("/")
@@ -79,13 +113,10 @@ def _resolve(session: zenoh.Session, options: Options, keys: Keys) -> tuple[str,
     if options.key in PAIR_KEYS:
         return f"{keys.root}/{options.pair or '*'}/{options.key}", options.key
     if head == "command" and argument:
-        return keys.command(options.pair or _only_pair(session, options, keys), argument), "command"
+        return single_key(keys.command(options.pair or _only_pair(session, options, keys), argument)), "command"
     if head == "evidence" and argument:
-        return keys.evidence_of(options.pair or argument.rpartition("-")[0], argument), "event"
-    if head == "overlay":
-        raise UsageError("say where to with --output FILE.jpg")
-    known = ", ".join((*PAIR_KEYS, "windows/ID", "evidence/ID", "overlay", *VEHICLE_KEYS, "command/NAME"))
-    raise UsageError(f"unknown key {options.key}; known: {known}, or a whole key expression with {VERSION_CHUNK}")
+        return keys.evidence_of(_pair_of(session, options, keys, argument), argument), "event"
+    raise UsageError("say where to with --output FILE.jpg")
 
 
 def _only_pair(session: zenoh.Session, options: Options, keys: Keys) -> str:
@@ -161,8 +192,8 @@ def _save_picture(options: Options, keys: Keys, head: str, argument: str) -> int
         if head == "overlay":
             key = keys.overlay(options.pair or _only_pair(session, options, keys))
         else:
-            key = keys.evidence_of(options.pair or argument.rpartition("-")[0], argument)
-        reply = ask_one(session, _selector(key, options.params), options.timeout_s)
+            key = keys.evidence_of(_pair_of(session, options, keys, argument), argument)
+        reply = ask_one(session, _selector(single_key(key), options.params), options.timeout_s)
     if reply.encoding != JPEG:
         raise UsageError("the answer is no picture: give --param overlay=before or overlay=after")
     path = Path(str(options.output))
@@ -181,7 +212,8 @@ def _download(options: Options, keys: Keys, window_id: str) -> int:
     if options.output is None:
         raise UsageError("say where to with --output FILE")
     with connected([options.connect], options.timeout_s) as session, console.progress(counted=False) as bars:
-        pair = options.pair or window_id.rpartition("-")[0]
+        pair = _pair_of(session, options, keys, window_id)
+        single_key(keys.window(pair, window_id))
         task = bars.add_task(window_id, note="")
         info = download_window(
             session,

@@ -28,10 +28,6 @@ def open_source(spec: str) -> Recording:
             from coec.sources.kitti_raw import open_kitti_raw
 
             return open_kitti_raw(parsed)
-        case "synthetic":
-            from coec.sources.synthetic import open_synthetic
-
-            return open_synthetic(parsed.query)
         case "sim":
             from coec.simulation.source import open_sim
 

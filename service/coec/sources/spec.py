@@ -14,10 +14,9 @@ FORMS = """accepted forms of a source:
   kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
   kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
   FOLDER or dataset.yaml                        images and clouds listed in a manifest
-  synthetic:?seed=0                             a seeded recording that needs no data
   sim:seed=1&seconds=60&camera=fisheye700&...   a seeded drive through a town that does not exist (extra `sim`)"""
 
-LAYOUTS = ("kitti360", "kitti-raw", "synthetic", "sim")
+LAYOUTS = ("kitti360", "kitti-raw", "sim")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,7 @@ def parse_spec(text: str) -> SourceSpec:
     # A simulated drive has no path: the question mark may be left out.
     place = f"?{rest.removeprefix('?')}" if layout == "sim" else rest if layout else text
     location, _, query = place.partition("?")
-    if not location and layout not in ("synthetic", "sim"):
+    if not location and layout != "sim":
         raise UsageError(f"no path in source {text!r}\n{FORMS}")
     return SourceSpec(text, layout, Path(location).expanduser(), _parse_query(query, text))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import queue
-import socket
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -17,15 +16,14 @@ from coec.adapters.zenoh.bus import JSON, MSGPACK, SLOW_QUERIES_WAITING, Answer,
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError, NotFoundError
 from fakes import wait_until
+from ports import free_port
 
 DEADLINE_S = 20.0
 
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""From windows to a baseline, on a synthetic street whose truth is known, and from its limits to detection."""
+"""From windows to a baseline, on a simulated street whose truth is known, and from its limits to detection."""
 
 from __future__ import annotations
 

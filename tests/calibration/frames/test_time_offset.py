@@ -8,23 +8,56 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from calibration.conftest import pairs_of
+from calibration.conftest import window_of
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.types import Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
+from coec.simulation.drive import SimulatedDrive
+from coec.simulation.source import open_sim
+from coec.sources import open_source
+from coec.sources.spec import parse_spec
+from drives import drawn_source
 
 CONFIG = CalibrationConfig()
-STEADY = "synthetic:?seed=3&frames=6&width=640&period_s=8.571428571"
-"""A frame at the same place of every bend, where the vehicle goes straight on: one wavelength of 60 m at 7 m/s."""
+DRIVE = "sim:seed=0&seconds=600&camera_hz=0.5&lidar_hz=0.5&camera=fisheye700&lidar=32"
+BENDS = 14
+"""Enough frames for the roll, which an offset in a bend could be taken for."""
+
+
+def turn_rates_radps(drive: SimulatedDrive) -> NDArray[np.float64]:
+    """(N,) true turn rate of the vehicle at each camera frame."""
+    apart_ns = 10_000_000
+
+    def rate(stamp_ns: int) -> float:
+        before, after = drive.true_pose(stamp_ns - apart_ns), drive.true_pose(stamp_ns + apart_ns)
+        return float(se3.rotation_log(before[:3, :3].T @ after[:3, :3])[2] / (2e-9 * apart_ns))
+
+    return np.array([rate(stamp_ns) for stamp_ns in drive.camera_stamps_ns])
 
 
 @pytest.fixture(scope="module")
-def bends() -> Window:
-    """Enough frames for the roll, which an offset in a bend could be taken for."""
-    return pairs_of("synthetic:?seed=3&frames=14&width=800")[1]
+def in_order_of_turning() -> list[int]:
+    """The camera frames of ten minutes, from the sharpest turn to the right to the sharpest to the left."""
+    drive = open_sim(parse_spec(DRIVE).query)
+    return [int(index) for index in turn_rates_radps(drive).argsort()]
+
+
+@pytest.fixture(scope="module")
+def bends(in_order_of_turning: list[int]) -> Window:
+    """The sharpest turns to both sides."""
+    sharpest = (*in_order_of_turning[: BENDS // 2], *in_order_of_turning[-BENDS // 2 :])
+    return window_of(drawn_source(DRIVE, sharpest))
+
+
+@pytest.fixture(scope="module")
+def straight(in_order_of_turning: list[int]) -> Window:
+    """Frames that were taken while the vehicle went straight on."""
+    middle = len(in_order_of_turning) // 2
+    return window_of(drawn_source(DRIVE, tuple(in_order_of_turning[middle - 3 : middle + 3])))
 
 
 def late(window: Window, offset_s: float) -> Window:
@@ -56,8 +89,8 @@ def test_shifting_the_stamps_shifts_the_offset(bends: Window) -> None:
     assert moved == pytest.approx(0.05, abs=0.002)
 
 
-def test_a_straight_drive_does_not_show_it() -> None:
-    found = estimate(late(pairs_of(STEADY)[1], 0.04))
+def test_a_straight_drive_does_not_show_it(straight: Window) -> None:
+    found = estimate(late(straight, 0.04))
     assert not found.observable
     assert "straight" in found.reason
 
@@ -98,7 +131,7 @@ def test_same_input_same_bits(bends: Window) -> None:
 @pytest.mark.parametrize("camera", ["image_00", "image_01"])
 @pytest.mark.parametrize("offset_s", [0.0, 0.04])
 def test_an_offset_is_recovered_on_a_recording(sample_data: Path, camera: str, offset_s: float) -> None:
-    window = pairs_of(f"kitti360:{sample_data / 'kitti360'}?camera={camera}")[1]
+    window = window_of(open_source(f"kitti360:{sample_data / 'kitti360'}?camera={camera}"))
     found = estimate(late(window, offset_s))
     assert found.observable, found.reason
     assert abs(found.offset_s - offset_s) <= 3.0 * found.sigma_s
@@ -106,7 +139,7 @@ def test_an_offset_is_recovered_on_a_recording(sample_data: Path, camera: str, o
 
 
 def test_the_straight_part_of_a_recording_does_not_show_it(sample_data: Path) -> None:
-    window = pairs_of(f"kitti360:{sample_data / 'kitti360'}?camera=image_00")[1]
+    window = window_of(open_source(f"kitti360:{sample_data / 'kitti360'}?camera=image_00"))
     straight = tuple(
         pair for pair in window.pairs if pair.motion is not None and abs(pair.motion.angular_radps[2]) < radians(2.0)
     )

@@ -16,7 +16,7 @@ from coec.cli.convert import configuration_for
 from coec.config import CalibrationConfig, Config, DepthConfig, ObjectiveConfig, SearchConfig
 from coec.sources import open_source
 
-source = "synthetic:?frames=6&width=160&period_s=2"
+source = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"
 window = windows.load(source, None, 25, lambda *_: None).window
 pair = configuration_for(open_source(source), window.T_camera_lidar_start, None)
 settings = dict(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=4.0))

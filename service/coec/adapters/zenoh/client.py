@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import zenoh
 
-from coec.errors import CoecError, DecodeError, NotFoundError
+from coec.errors import CoecError, DecodeError, NotFoundError, UsageError
 from coec.schemas.base import from_json, from_msgpack
 from coec.schemas.replies import ErrorReply
 
 JSON = "application/json"
+ENDPOINT = re.compile(r"[a-z0-9-]+/[^\s/].*")
+"""PROTOCOL/ADDRESS, as Zenoh writes it."""
+
 TIMEOUT_PAYLOAD = b"Timeout"
 """What Zenoh itself replies with when nobody finished the query in time."""
 
@@ -46,8 +50,12 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
     """A client session on the first of the routers that answers, closed at the end.
 
     Raises:
-        ConnectionFailedError: none answered within `wait_s`, or an endpoint is malformed.
+        UsageError: an endpoint is malformed.
+        ConnectionFailedError: none answered within `wait_s`.
     """
+    for endpoint in endpoints:
+        if not ENDPOINT.fullmatch(endpoint):
+            raise UsageError(f"{endpoint!r} is no endpoint of a router: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447")
     zenoh.init_log_from_env_or("off")
     settings = zenoh.Config()
     settings.insert_json5("mode", '"client"')
@@ -68,14 +76,47 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
         session.close()
 
 
+def key_expression(text: str) -> str:
+    """A key, or an expression that stands for several, as it was given.
+
+    Raises:
+        UsageError: it is none; says why.
+    """
+    if "?" in text:
+        raise UsageError(f"{text!r} is no key: parameters are given apart (`coec query KEY --param NAME=VALUE`)")
+    try:
+        zenoh.KeyExpr(text)
+    except zenoh.ZError as error:
+        raise UsageError(f"{text!r} is no key: {_first_clause(str(error))}") from error
+    return text
+
+
+def single_key(text: str) -> str:
+    """A key that names one thing, as it was given.
+
+    Raises:
+        UsageError: it is no key, or an expression that stands for several.
+    """
+    if "*" in key_expression(text):
+        raise UsageError(f"{text!r} stands for several keys: name one, without `*`")
+    return text
+
+
+def _first_clause(text: str) -> str:
+    """What Zenoh says of a key, without the place in its source."""
+    return text.partition(" at /")[0].partition("`: ")[2] or text
+
+
 def ask(session: zenoh.Session, selector: str, timeout_s: float, payload: bytes | None = None) -> list[Reply]:
     """Every answer to a query, in the order of their keys; none is an empty list.
 
     Raises:
+        UsageError: the selector does not begin with a key expression.
         RemoteError: somebody replied with an error, or did not answer within `timeout_s` and nobody else did.
     """
     # The nearest complete queryable answers for a key; a key expression is meant for all of them.
-    target = zenoh.QueryTarget.ALL if "*" in selector.partition("?")[0] else zenoh.QueryTarget.BEST_MATCHING
+    key = key_expression(selector.partition("?")[0])
+    target = zenoh.QueryTarget.ALL if "*" in key else zenoh.QueryTarget.BEST_MATCHING
     encoding = JSON if payload is not None else None
     replies: list[Reply] = []
     timed_out = False
@@ -109,8 +150,9 @@ def ask_one(session: zenoh.Session, selector: str, timeout_s: float, payload: by
 def nobody(selector: str) -> NotFoundError:
     """The error of a query that nobody answered."""
     return NotFoundError(
-        f"nobody answered {selector.partition('?')[0]}: check that `coec run` is up and connected to the same router, "
-        "that vehicle, prefix and pair are right (`coec query status`), and that access control lets you ask"
+        f"nobody answered {selector.partition('?')[0]}: check that `coec run` is up (it answers a second or two after "
+        "its start) and connected to the same router, that vehicle, prefix and pair are right (`coec query status`), "
+        "and that access control lets you ask"
     )
 
 

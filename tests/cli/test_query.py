@@ -1,0 +1,185 @@
+"""`coec query`: what was typed is checked before anything is asked, and what was answered is said."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from cli.conftest import SMALL, Coec
+from coec.adapters.zenoh.bus import JSON, Answer, Bus, Route, open_session
+from coec.config import LimitsConfig, ZenohConfig
+from coec.errors import NotFoundError
+from coec.schemas.base import Message, to_json
+from coec.schemas.keys import Keys, parse_range_selector
+from coec.schemas.replies import PairStatus, StatusReply, StorageStatus, WindowInfo, WindowsReply, WorkerStatus
+from ports import free_port
+
+DEADLINE_S = 20.0
+KEYS = Keys("coec", "vehicle")
+WINDOW = bytes(range(256))
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """Nobody is there yet."""
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture(scope="module")
+def vehicle() -> Iterator[str]:
+    """The endpoint of a vehicle with the pair `front` and one window."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    session = open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
+    bus = Bus(session)
+    for thread in (bus.thread, bus.drawing_thread):
+        thread.start()
+    serve_status(bus, "front")
+    info = WindowInfo(
+        window_id="front-1", size_bytes=len(WINDOW), sha256=hashlib.sha256(WINDOW).hexdigest(), pairs=1, decision=None
+    )
+    serve_document(bus, KEYS.windows("front"), WindowsReply(vehicle="vehicle", pair="front", windows=(info,)))
+    bus.serve(KEYS.window("front", "*"), window_routes)
+    bus.serve(KEYS.evidence_of("front", "*"), no_event)
+    yield endpoint
+    bus.undeclare_inputs()
+    for thread in (bus.thread, bus.drawing_thread):
+        thread.request_stop()
+        assert thread.join(DEADLINE_S)
+    bus.undeclare_queryables()
+    assert bus.close(DEADLINE_S)
+
+
+def serve_document(bus: Bus, key: str, document: Message) -> None:
+    route = Route(key, lambda _: Answer(to_json(document), JSON), quick=True)
+    bus.serve(key, lambda _: [route])
+
+
+def serve_status(bus: Bus, *pairs: str) -> None:
+    status = StatusReply(
+        version="0",
+        vehicle="vehicle",
+        state="running",
+        started_ns=0,
+        uptime_s=1.0,
+        config_hash="0",
+        pairs=tuple(PairStatus(name=name) for name in pairs),
+        worker=WorkerStatus(state="idle"),
+        storage=StorageStatus(bytes_used=0, bytes_free=0),
+    )
+    serve_document(bus, KEYS.status, status)
+
+
+def window_routes(key: str) -> Sequence[Route]:
+    def answer(parameters: str) -> Answer:
+        chosen = parse_range_selector(parameters)
+        return Answer(WINDOW[chosen.offset : chosen.offset + chosen.length], "application/octet-stream")
+
+    return [Route(key, lambda request: answer(request.parameters), quick=False)]
+
+
+def no_event(_: str) -> Sequence[Route]:
+    raise NotFoundError("no event of this name is kept")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("windows/a//b", "--output", "w.mcap"), "'windows/a//b' is no key: empty chunks"),
+        (("windows/", "--output", "w.mcap"), "empty chunks"),
+        (("evidence/x#1", "--output", "e.jpg"), "forbidden characters"),
+        (("windows/*", "--output", "w.mcap", "--pair", "front"), "stands for several keys"),
+        (("overlay", "--pair", "*", "--output", "o.jpg"), "stands for several keys"),
+        (("health?limit=2",), "--param"),
+        (("health", "--pair", "a//b"), "'a//b' is no key"),
+        (("health", "--vehicle", ""), "is no key"),
+        (("health", "--prefix", "/coec"), "leading and trailing slashes"),
+        (("coec/@v1//status",), "empty chunks"),
+        (("nonsense",), "known: extrinsic, health"),
+        (("health", "--param", "limit"), "NAME=VALUE"),
+        (("command/calibrate", "--payload", "{"), "not JSON"),
+        (("overlay",), "--output FILE.jpg"),
+        (("health", "--output", "h.jpg"), "--output belongs to"),
+        (("health", "--timeout", "inf"), "--timeout inf"),
+    ],
+)
+def test_what_is_no_question_is_a_usage_error_and_writes_nothing(
+    coec: Coec,
+    vehicle: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = coec("query", *arguments, "--connect", vehicle)
+    assert outcome.status == 2
+    assert said in outcome.err
+    assert "Traceback" not in outcome.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_endpoint_that_is_none_is_a_usage_error(coec: Coec) -> None:
+    outcome = coec("query", "health", "--connect", "localhost")
+    assert outcome.status == 2
+    assert "'localhost' is no endpoint of a router: write PROTOCOL/ADDRESS" in outcome.err
+
+
+def test_without_a_router_it_says_what_to_start(coec: Coec, endpoint: str) -> None:
+    outcome = coec("query", "health", "--connect", endpoint, "--timeout", "0.2", "--json")
+    assert outcome.status == 1
+    assert outcome.document["error"]["code"] == "not_connected"
+    assert f"no Zenoh router answered at {endpoint}" in outcome.err
+    assert "start `coec run --embedded-router`" in outcome.err
+
+
+def test_a_router_without_a_service_says_what_to_check(coec: Coec, endpoint: str) -> None:
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig()):
+        outcome = coec("query", "health", "--connect", endpoint, "--json")
+    assert outcome.status == 1
+    assert outcome.document["error"]["code"] == "not_found"
+    assert "nobody answered coec/@v1/vehicle/*/health: check that `coec run` is up" in outcome.err
+
+
+def test_a_window_is_downloaded_and_verified(coec: Coec, vehicle: str, tmp_path: Path) -> None:
+    path = tmp_path / "w.mcap"
+    outcome = coec("query", "windows/front-1", "--output", path, "--connect", vehicle)
+    assert outcome.status == 0
+    assert path.read_bytes() == WINDOW
+    assert "verified" in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("windows/nosuch", "pair front has no window nosuch: see `coec query windows`"),
+        ("windows/front-2", "pair front has no window front-2"),
+        ("evidence/xx", "no event of this name is kept"),
+        ("evidence/front-2", "no event of this name is kept"),
+        ("windows/rear-2", "nobody answered coec/@v1/vehicle/rear/windows"),
+    ],
+)
+def test_what_the_service_does_not_have_is_what_it_answered(
+    coec: Coec, vehicle: str, tmp_path: Path, key: str, said: str
+) -> None:
+    outcome = coec("query", key, "--output", tmp_path / "x", "--connect", vehicle, "--json")
+    assert outcome.status == 1
+    assert outcome.document["error"]["code"] == "not_found"
+    assert said in outcome.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_several_pairs_one_has_to_be_named(coec: Coec, endpoint: str, tmp_path: Path) -> None:
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig()) as session:
+        serve_status(Bus(session), "front", "rear")
+        outcome = coec("query", "windows/nosuch", "--output", tmp_path / "x", "--connect", endpoint)
+    assert outcome.status == 2
+    assert "several pairs are served, name one with --pair: front, rear" in outcome.err
+
+
+def test_a_recording_is_not_played_to_a_key_that_is_none(coec: Coec, endpoint: str) -> None:
+    outcome = coec("play", SMALL, "--pair", "a//b", "--connect", endpoint)
+    assert outcome.status == 2
+    assert "'sensors/a//b/camera' is no key" in outcome.err

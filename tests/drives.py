@@ -1,0 +1,121 @@
+"""Simulated drives for tests: each is drawn once, and kept under pytest's cache until something it is made of changes.
+
+A drive is made of every module of coec that `coec.simulation.drive` reaches by its imports, and of the libraries that
+draw it: their bytes and versions name the folder, so nobody has to remember to empty it.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import os
+import pickle
+import shutil
+import sys
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import TypeVar
+
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.simulation.source import open_sim
+from coec.sources.recording import FramewiseRecording, Message, RecordedFrame
+from coec.sources.spec import parse_spec
+from conftest import REPOSITORY
+
+F = TypeVar("F")
+
+SERVICE = REPOSITORY / "service"
+CACHE = REPOSITORY / ".pytest_cache" / "d" / "drives"
+"""Where `pytest --cache-clear` clears."""
+
+LIBRARIES = ("embreex", "numba", "numpy", "opencv-python-headless")
+
+
+def drawn(query: dict[str, str], cameras: tuple[int, ...] | None = None) -> FramewiseRecording:
+    """The recording that `coec.simulation.source.open_sim` opens, its frames drawn once.
+
+    Args:
+        query: of a SOURCE `sim:...`.
+        cameras: indices of the camera frames that are wanted, with what belongs to them; None = all.
+
+    Raises:
+        ValueError: pictures and sweeps do not come in pairs: such a drive has other uses than this.
+    """
+    return _drawn(tuple(sorted(query.items())), cameras)
+
+
+def drawn_source(source: str, cameras: tuple[int, ...] | None = None) -> FramewiseRecording:
+    """The recording of a SOURCE argument `sim:...`, as `drawn`."""
+    return drawn(parse_spec(source).query, cameras)
+
+
+@functools.lru_cache(maxsize=8)
+def _drawn(query: tuple[tuple[str, str], ...], cameras: tuple[int, ...] | None) -> FramewiseRecording:
+    drive = open_sim(dict(query))
+    name = hashlib.sha256(repr((query, cameras)).encode()).hexdigest()[:16]
+    path = CACHE / _fingerprint() / f"{name}.pickle"
+    if path.is_file():
+        messages: list[Message] = pickle.loads(path.read_bytes())
+    else:
+        messages = list(drive.messages(cameras))
+        _keep(path, messages)
+    pictures = [message for message in messages if isinstance(message, CameraFrame)]
+    sweeps = [message for message in messages if isinstance(message, LidarFrame)]
+    frames = tuple(
+        RecordedFrame(picture.stamp_ns, partial(_same, picture), sweep.stamp_ns, partial(_same, sweep))
+        for picture, sweep in zip(pictures, sweeps, strict=True)
+    )
+    motions = tuple(message for message in messages if isinstance(message, EgoMotion))
+    return FramewiseRecording(drive.name, drive.rig, drive.T_camera_lidar_start, frames, motions)
+
+
+def _same(frame: F) -> F:
+    return frame
+
+
+def _keep(path: Path, messages: list[Message]) -> None:
+    if CACHE.is_dir():
+        for folder in CACHE.iterdir():
+            if folder != path.parent:
+                shutil.rmtree(folder)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(f".{os.getpid()}")
+    part.write_bytes(pickle.dumps(messages, protocol=pickle.HIGHEST_PROTOCOL))
+    part.replace(path)
+
+
+@functools.cache
+def _fingerprint() -> str:
+    """Of everything that a drive is made of."""
+    digest = hashlib.sha256(sys.version.encode())
+    for library in LIBRARIES:
+        digest.update(f"{library} {version(library)}\n".encode())
+    for path in sorted(modules_behind(SERVICE / "coec" / "simulation" / "drive.py")):
+        digest.update(f"{path.relative_to(SERVICE)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def modules_behind(path: Path) -> set[Path]:
+    """The files of coec that a module reaches by its imports, wherever in them an import stands; itself among them."""
+    found: set[Path] = set()
+    waiting = [path]
+    while waiting:
+        now = waiting.pop()
+        if now in found:
+            continue
+        found.add(now)
+        for node in ast.walk(ast.parse(now.read_bytes())):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module is not None:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            else:
+                continue
+            for name in names:
+                chunks = name.split(".")
+                for depth in range(1, len(chunks) + 1):
+                    place = SERVICE.joinpath(*chunks[:depth])
+                    waiting += [file for file in (place / "__init__.py", place.with_suffix(".py")) if file.is_file()]
+    return found

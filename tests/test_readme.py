@@ -1,0 +1,320 @@
+"""The README as somebody meets it who types it: every command is run, and what it says is compared with what is shown.
+
+A fenced block is `console` (typed here) or `text` (not). In a console block a line `$ COMMAND  # remark` is typed, the
+lines below it are what it says, and a line `…` stands for any number of lines. Every command runs as it is written,
+except those of `FORMS`; each block runs in a folder of its own, beside which the sample recordings lie.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import pytest
+
+from conftest import REPOSITORY
+from e2e.processes import environment
+from ports import free_port
+
+README = REPOSITORY / "README.md"
+SAMPLES = "../shared/data"
+ELLIPSIS = "…"
+
+ABSOLUTE, RELATIVE = 0.03, 0.1
+"""How far a number may be from the one shown: its unit is degrees, metres or a count, and processors round differently.
+Durations, instants, digests, and how full the open window is depend on the machine and the moment: not compared."""
+
+PATIENCE_S = 300.0
+"""For a block; the longest takes 40 s on two idle cores."""
+LONG_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command of a block, and the lines that it is shown to say."""
+
+    command: str
+    shown: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of the README."""
+
+    line: int
+    language: str
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a command is run that is not run as it is written.
+
+    Attributes:
+        instead: what is typed in the gate; the slow form types what is written.
+        until: a person looks again until the answer holds this.
+        status: exit status of `instead`.
+        always: whether `instead` is typed in the slow form, too.
+    """
+
+    instead: str | None = None
+    until: str | None = None
+    status: int = 0
+    always: bool = False
+
+
+def options_known(command: str) -> Form:
+    """Of a command that needs more than a page can bring along: its options are looked up in its help."""
+    words = shlex.split(command)
+    options = [word for word in words if word.startswith("--")]
+    asked = " ".join(f"&& grep -q -e {option} help.txt" for option in options)
+    return Form(f"COLUMNS=200 coec {words[1]} --help > help.txt {asked}", always=True)
+
+
+DIRECTIONS = (
+    f'coec evaluate "kitti360:{SAMPLES}/kitti360?camera=image_00" --depth stereo --objective mi '
+    "--rotation-deg 10 --directions 200 --output out"
+)
+SIM_DRIVE = "coec sim drive --seed 3 --seconds 60 --fault step:30:rx=3 --output drive.mcap"
+SIM_CALIBRATE = 'coec calibrate "sim:seed=3&seconds=60&camera_hz=0.4&lidar_hz=0.4" --perturb 3,-3,2'
+COMMISSION = "coec commission SOURCE... --output rig.json"
+DIAGNOSE = "coec diagnose SOURCE --rig rig.json"
+ASSESS = "coec models assess network.onnx SOURCE --output DIR"
+NETWORK = f"{SAMPLES}/depth/tcsmallnet_dyn.onnx"
+
+FORMS = {
+    # These set up a virtual environment, and run what is tested here: the demonstration by tests/cli/test_demo.py.
+    "deploy/demo": Form("bash -n $REPOSITORY/deploy/demo", always=True),
+    "tests/run": Form("bash -n $REPOSITORY/tests/run", always=True),
+    DIRECTIONS: Form(DIRECTIONS.replace("200", "2")),
+    SIM_DRIVE: Form(SIM_DRIVE.replace("60", "0.5").replace("step:30", "step:0.2")),
+    # Two frames are too few for an uncertainty: the verdict is negative.
+    SIM_CALIBRATE: Form(f"{SIM_CALIBRATE} --frames 2", status=1),
+    COMMISSION: options_known(COMMISSION),
+    DIAGNOSE: options_known(DIAGNOSE),
+    # A service that has no router to connect to runs on; it is stopped as soon as it says that it is ready.
+    "coec run --config coec.yaml": Form(
+        "coproc SERVICE { exec coec run --config coec.yaml; }; PID=$SERVICE_PID\n"
+        "until [[ $line == *ready* ]]; do read -r line <&${SERVICE[0]} || break; done; kill $PID; wait $PID",
+        always=True,
+    ),
+    "coec query health": Form(until=" healthy since"),
+    "coec models show network.onnx": Form(f"coec models show {NETWORK}", always=True),
+    ASSESS: Form(f'coec models assess {NETWORK} "kitti360:{SAMPLES}/kitti360?camera=image_00" --frames 2', always=True),
+}
+
+
+def blocks() -> list[Block]:
+    """Of the README, in order."""
+    found: list[Block] = []
+    inside: list[str] | None = None
+    begin, language = 0, ""
+    for number, line in enumerate(README.read_text().splitlines(), start=1):
+        if not line.startswith("```"):
+            if inside is not None:
+                inside.append(line)
+        elif inside is None:
+            inside, begin, language = [], number, line.removeprefix("```")
+        else:
+            found.append(Block(begin, language, steps(inside) if language == "console" else ()))
+            inside = None
+    assert inside is None, f"the block of line {begin} has no end"
+    return found
+
+
+def steps(lines: list[str]) -> tuple[Step, ...]:
+    """The commands of a block."""
+    found: list[tuple[str, list[str]]] = []
+    going_on = False
+    for line in lines:
+        if going_on:
+            found[-1] = (found[-1][0].removesuffix("\\") + line.strip(), [])
+        elif line.startswith("$ "):
+            found.append((line.removeprefix("$ ").strip(), []))
+        else:
+            assert found, f"a console block begins with a command, not with {line!r}"
+            found[-1][1].append(line.rstrip())
+        going_on = found[-1][0].endswith("\\")
+    return tuple(Step(without_remark(command), tuple(shown)) for command, shown in found)
+
+
+def without_remark(command: str) -> str:
+    """As a shell reads it."""
+    return re.split(r"\s+#\s", command)[0].strip()
+
+
+CONSOLE = [block for block in blocks() if block.language == "console"]
+
+
+def test_every_block_says_whether_it_is_typed() -> None:
+    assert [block.line for block in blocks() if block.language not in ("console", "text")] == []
+    assert all(block.steps for block in CONSOLE)
+
+
+def test_no_form_is_left_of_a_command_that_is_gone() -> None:
+    typed = {step.command for block in CONSOLE for step in block.steps}
+    assert set(FORMS) - typed == set()
+
+
+@pytest.mark.parametrize("block", CONSOLE, ids=lambda block: f"line-{block.line}")
+def test_a_block_does_what_it_says(block: Block, tmp_path: Path) -> None:
+    play_through(block, tmp_path, PATIENCE_S, short=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "block",
+    [b for b in CONSOLE if any((f := FORMS.get(step.command)) and f.instead and not f.always for step in b.steps)],
+    ids=lambda block: f"line-{block.line}",
+)
+def test_a_long_block_does_what_it_says(block: Block, tmp_path: Path) -> None:
+    play_through(block, tmp_path, LONG_S, short=False)
+
+
+@pytest.mark.parametrize(
+    ("shown", "said", "equal"),
+    [
+        ("rx pitch  -0.789  0.015  deg", "rx pitch   -0.777  0.014 deg ", True),
+        ("rx pitch  -0.789  0.015  deg", "rx pitch   +0.789  0.015 deg ", False),
+        ("verdict accepted", "verdict failed", False),
+        ("load 0.22 s  total 1.55 s", "load 13.2 s  total 17.1 s", True),
+        ("72 evaluations, tolerance_reached", "75 evaluations, tolerance_reached", True),
+        ("72 evaluations, tolerance_reached", "372 evaluations, tolerance_reached", False),
+        ("sim-1600000000010000000: identical", "sim-1600000000020000000: identical", False),
+        ("healthy since 2026-11-22 07:36:08Z", "healthy since 2027-01-01 00:00:00Z", True),
+        ("sha256 d46f4…  verified", "sha256 0123456789 verified", True),
+        ("sigma_deg  0.020 ≤ 0.250 ✓", "sigma_deg  0.020 ≤ 0.250 ✗", False),
+    ],
+)
+def test_lines_are_compared_by_their_words_and_within_tolerance(shown: str, said: str, equal: bool) -> None:
+    assert fits(shown, said) is equal
+
+
+def test_an_ellipsis_stands_for_any_lines_and_nothing_else_does() -> None:
+    assert missing(("a", "…", "d"), "a\nb\nc\nd\n") is None
+    assert missing(("a", "d"), "a\nb\nd\n") is not None
+    assert missing(("a",), "a\nb\n") is not None
+    assert missing(("a", "…"), "a\nb\n") is None
+    assert missing(("…", "d"), "a\nb\n") is not None
+
+
+# ------------------------------------------------------------------------------------------------------ typing
+def play_through(block: Block, folder: Path, patience_s: float, *, short: bool) -> None:
+    """Types a block in a shell of its own, then looks at what came of it."""
+    data = Path(os.environ.get("COEC_SAMPLE_DATA") or REPOSITORY.parent / "shared" / "data")
+    if not data.is_dir() and any(SAMPLES in typed(step, short=short).command for step in block.steps):
+        pytest.skip(f"needs the sample recordings: {data} is absent; COEC_SAMPLE_DATA may name another folder")
+    cwd = folder / "checkout"
+    cwd.mkdir()
+    (folder / "shared").mkdir()
+    (folder / "shared" / "data").symlink_to(data)
+    spoken = folder / "said"
+    spoken.mkdir()
+    lines = ["set -m", "trap 'kill $(jobs -p) 2> /dev/null; wait' EXIT"]
+    for number, step in enumerate(block.steps):
+        lines += shell_lines(typed(step, short=short), FORMS.get(step.command, Form()), spoken / str(number))
+    path = os.pathsep.join([str(shim(folder)), os.environ["PATH"]])
+    run_shell("\n".join(lines), cwd, environment() | {"PATH": path, "REPOSITORY": str(REPOSITORY)}, patience_s)
+    for number, step in enumerate(block.steps):
+        chosen = typed(step, short=short)
+        out, err = ((spoken / f"{number}.{stream}").read_text() for stream in ("out", "err"))
+        wanted = FORMS[step.command].status if step.command in FORMS and chosen.command != step.command else 0
+        status = int((spoken / f"{number}.status").read_text())
+        assert status == wanted, f"{chosen.command}\nexit status {status}\n{out}{err}"
+        assert "Traceback" not in err, err
+        if chosen.shown:
+            complaint = missing(chosen.shown, out)
+            assert complaint is None, f"{chosen.command}\n{complaint}\nit says\n{out}"
+
+
+def typed(step: Step, *, short: bool) -> Step:
+    """What is typed for a step of the README."""
+    form = FORMS.get(step.command, Form())
+    return Step(form.instead, ()) if form.instead is not None and (short or form.always) else step
+
+
+def shell_lines(step: Step, form: Form, said: Path) -> list[str]:
+    """The command, with what it says and its exit status in files."""
+    if step.command.endswith("&"):
+        return [f": > {said}.out; : > {said}.err; echo 0 > {said}.status", step.command]
+    # A redirection of the command itself comes later, and wins.
+    told = f"{{ {step.command}\n}} > {said}.out 2> {said}.err; echo $? > {said}.status"
+    if form.until is None:
+        return [told]
+    return ["for _ in $(seq 100); do", told, f"grep -q {shlex.quote(form.until)} {said}.out && break; done"]
+
+
+def shim(folder: Path) -> Path:
+    """A folder with `coec`: that of this checkout, on a port that is free, where a page can only name the usual one."""
+    endpoint = f"127.0.0.1:{free_port()}"
+    path = folder / "bin" / "coec"
+    path.parent.mkdir()
+    path.write_text(
+        "#!/bin/bash\n"
+        f"case $1 in run | play) sed -i s/127.0.0.1:7447/{endpoint}/ ./*.yaml ;; esac\n"
+        f'[ "$1" = query ] && set -- "$@" --connect tcp/{endpoint}\n'
+        f'exec {shlex.quote(sys.executable)} -m coec "$@"\n'
+    )
+    path.chmod(0o755)
+    return path.parent
+
+
+def run_shell(script: str, cwd: Path, env: dict[str, str], patience_s: float) -> None:
+    """A shell to its end; nothing that it started is left behind."""
+    with subprocess.Popen(["bash", "-c", script], cwd=cwd, env=env, stderr=subprocess.DEVNULL) as shell:
+        try:
+            shell.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            for process in [*psutil.Process(shell.pid).children(recursive=True), psutil.Process(shell.pid)]:
+                process.kill()
+            pytest.fail(f"not done after {patience_s:g} s:\n{script}")
+
+
+# --------------------------------------------------------------------------------------------------- comparing
+NUMBER = re.compile(r"(?<![\w.])[+-]?\d+(?:\.\d+)?(?![\w])")
+PASSING = (
+    (re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\dZ"), "INSTANT"),
+    (re.compile(r"\d+(\.\d+)? (s|min|h|d)\b"), "DURATION"),
+    (re.compile(r"sha256 [0-9a-f]+…?"), "sha256 DIGEST"),
+    (re.compile(r"open window \d+ %"), "open window SHARE"),
+)
+LONGEST_MEASURE = 12
+"""Digits: more are a name."""
+
+
+def missing(shown: tuple[str, ...], said: str) -> str | None:
+    """What of the shown lines was not said, or said beside them; None when all is as shown."""
+    rest = [line.rstrip() for line in said.splitlines() if line.strip()]
+    any_lines = False
+    for line in (line for line in shown if line.strip()):
+        if line.strip() == ELLIPSIS:
+            any_lines = True
+            continue
+        place = next((index for index, real in enumerate(rest) if fits(line, real)), None)
+        if place is None or (place > 0 and not any_lines):
+            return f"the README shows {line!r}, it says {rest[0] if rest else 'nothing more'!r}"
+        del rest[: place + 1]
+        any_lines = False
+    return f"the README does not show {rest[0]!r}" if rest and not any_lines else None
+
+
+def fits(shown: str, said: str) -> bool:
+    """Whether two lines have the same words, and the same numbers within the tolerance."""
+    for pattern, name in PASSING:
+        shown, said = pattern.sub(name, shown), pattern.sub(name, said)
+    if NUMBER.sub("#", shown).split() != NUMBER.sub("#", said).split():
+        return False
+    return all(near(a, b) for a, b in zip(NUMBER.findall(shown), NUMBER.findall(said), strict=True))
+
+
+def near(shown: str, said: str) -> bool:
+    """Whether a number is the one shown, within the tolerance; so long a one is a name."""
+    if len(shown) > LONGEST_MEASURE:
+        return shown == said
+    return abs(float(shown) - float(said)) <= ABSOLUTE + RELATIVE * abs(float(shown))
