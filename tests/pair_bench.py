@@ -299,7 +299,7 @@ class Bench:
 
     def do(self, name: str, **arguments: Any) -> str:
         with ThreadPoolExecutor(1) as other:
-            told = other.submit(self.pair.command, name, arguments, "the test")
+            told = other.submit(self.pair.commands.carry_out, name, arguments, "the test")
             while not told.done():
                 self.settle()
         self.settle()

@@ -143,7 +143,9 @@ class Daemon:
                 "config": self._config.model_dump(mode="json"),
             }
         )
-        VehicleAnswers(self._keys, self._pairs, lambda: self._status, self._metrics, config).declare(self._bus)
+        answers = {name: pair.answers for name, pair in self._pairs.items()}
+        commands = {name: pair.commands for name, pair in self._pairs.items()}
+        VehicleAnswers(self._keys, answers, commands, lambda: self._status, self._metrics, config).declare(self._bus)
         for pair_config in self._config.pairs:
             pair = self._pairs[pair_config.name]
             pair.stream.thread.start()

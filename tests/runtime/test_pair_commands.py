@@ -106,7 +106,7 @@ def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, mon
     selected = bench.pair.stream.report.chosen.selected
     assert selected >= 5
     monkeypatch.setattr(commands, "TIMEOUT_S", 0.0)
-    told = bench.pair.command("calibrate", {}, "the test")
+    told = bench.pair.commands.carry_out("calibrate", {}, "the test")
     assert (told.accepted, told.code) == (False, "busy")
     bench.settle()
     assert (bench.pair.stream.report.chosen.selected, bench.recorder.recorded) == (selected, 0)

@@ -8,7 +8,6 @@ recorder's queue and the mailbox; what is asked of the worker comes back through
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 from coec.adapters.files.rig import rig_of
 from coec.adapters.system.logs import LossCounter
@@ -27,7 +26,6 @@ from coec.runtime.ingest.chooser import Chooser
 from coec.runtime.ingest.stream import Stream
 from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder, RecordingPlan
-from coec.schemas.replies import Acknowledgement
 
 _log = logging.getLogger(__name__)
 
@@ -93,10 +91,6 @@ class Pair:
     def threads(self) -> tuple[ServiceThread, ...]:
         """All of them."""
         return self.stream.thread, self.recorder.thread, self.decider.thread
-
-    def command(self, name: str, arguments: dict[str, Any], sender: str) -> Acknowledgement:
-        """See `Commands`."""
-        return self.commands.carry_out(name, arguments, sender)
 
     def take_sample(self, stream: str, payload: bytes, encoding: str) -> None:
         """A sample came: microseconds, on the network's thread."""

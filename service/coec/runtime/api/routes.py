@@ -11,9 +11,9 @@ from coec.adapters.zenoh.bus import Answer, Bus, Request, Route
 from coec.errors import UsageError
 from coec.runtime.api import metrics as metrics_text
 from coec.runtime.api import payloads
+from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.snapshots import Snapshot, answer_of
-from coec.runtime.pair import Pair
 from coec.schemas.keys import (
     Format,
     Keys,
@@ -34,7 +34,8 @@ class VehicleAnswers:
     def __init__(
         self,
         keys: Keys,
-        pairs: Mapping[str, Pair],
+        pairs: Mapping[str, PairAnswers],
+        commands: Mapping[str, Commands],
         status: Callable[[], Snapshot],
         metrics: Callable[[], bytes],
         config: Snapshot,
@@ -42,12 +43,13 @@ class VehicleAnswers:
         """`status()` and `config` are serialised before; `metrics()` is rendered when asked."""
         self._keys = keys
         self._pairs = pairs
+        self._commands = commands
         self._vehicle_routes = {
             keys.status: Route(keys.status, lambda request: status().answer(_format(request)), quick=True),
             keys.config: Route(keys.config, lambda request: config.answer(_format(request)), quick=True),
             keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), quick=False),
         }
-        self._pair_routes = {name: self._readable(pair.answers) for name, pair in pairs.items()}
+        self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
 
     def declare(self, bus: Bus) -> None:
         """Serve everything on the bus. The last queryable is there for the keys of pairs that are not: it does not
@@ -77,11 +79,11 @@ class VehicleAnswers:
             return matching if key.endswith("/overlay") else [route for route in matching if not route.draws]
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
-            return [Route(key, self._window(self._pairs[pair].answers, address.argument), quick=False)]
+            return [Route(key, self._window(self._pairs[pair], address.argument), quick=False)]
         if address.resource == "command":
-            return [Route(key, self._command(self._pairs[pair], str(address.argument)), quick=False)]
+            return [Route(key, self._command(self._commands[pair], str(address.argument)), quick=False)]
         if address.resource == "evidence" and address.argument is not None:
-            return [Route(key, self._evidence(self._pairs[pair].answers, address.argument), quick=False)]
+            return [Route(key, self._evidence(self._pairs[pair], address.argument), quick=False)]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_unknown(self, key: str) -> Sequence[Route]:
@@ -123,11 +125,11 @@ class VehicleAnswers:
 
         return answer
 
-    def _command(self, pair: Pair, name: str) -> Callable[[Request], Answer]:
+    def _command(self, commands: Commands, name: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
             form = _format(request)
             arguments = payloads.parse(name, request.payload)
-            return answer_of(pair.command(name, arguments, payloads.sender_of(request.attachment)), form)
+            return answer_of(commands.carry_out(name, arguments, payloads.sender_of(request.attachment)), form)
 
         return answer
 
