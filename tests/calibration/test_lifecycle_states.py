@@ -19,6 +19,7 @@ EDGES: dict[Event, tuple[HealthState, ...]] = {
     Event.NO_OBJECTION: (U, H, S, S, U, U),
     Event.SUSPECTED: (S, S, S, M, S, S),
     Event.MOUNT_MOVED: (M, M, M, M, M, M),
+    Event.AT_ODDS: (D, D, S, M, D, D),
     Event.DATA_CAUSE: (D, D, D, M, D, D),
     Event.OVERDUE: (U, D, D, M, D, A),
     Event.AGED: (U, A, A, M, A, A),

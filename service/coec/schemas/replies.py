@@ -204,7 +204,7 @@ class CheckReply(Part):
         description="of the local optimum from commissioned (deg, m); null before commissioning"
     )
     drift_sigma: Maybe6 | None = Field(description="standard deviations of `drift` (deg, m)")
-    outcome: Literal["unknown", "clear", "suspect", "confirmed"] = Field(description="of all checks so far")
+    outcome: Literal["unknown", "clear", "at_odds", "suspect", "confirmed"] = Field(description="of all checks so far")
     evidence: float = Field(description="for a moved mount, in independent checks")
     state: HealthState = Field(description="of the pair after the check")
 

@@ -28,6 +28,8 @@ def page() -> str:
         f"one with faint edges adds {change_detector.WEAK_SHARE:g}.\n"
         f"`suspect` from {change_detector.SUSPECT_AT:g} on, `miscalibrated` from {change_detector.CONFIRMED_AT:g} on, "
         f"clear again below {change_detector.CLEAR_BELOW:g}; never more than {change_detector.MOST:g}.\n"
+        f"Flagged checks that put the mount in different places do not add up: from {change_detector.AT_ODDS_AT:g} on the\n"
+        "monitor is at odds with itself, and tells nothing.\n"
         f"A cause in the data is believed from {change_detector.BLIND_AT:g} on; dirt is one after the same blocks\n"
         f"of the image have shown no contrast for {sensor_faults.DIRTY_CHECKS:g} checks.\n\n"
         f"## Causes\n\n{told}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.lifecycle import policy
 from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
-from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation, diagnose
+from coec.calibration.monitor.change_detector import ACCUSING, Finding, MonitorState, Observation, diagnose
 from coec.calibration.monitor.change_detector import after_observation as check_taken
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
@@ -216,7 +216,7 @@ def _tracked(state: PairState, estimate: Estimate, rules: Rules) -> Track:
 
 def _accused_elsewhere(state: PairState, estimate: Estimate, rules: Rules) -> bool:
     """Whether the monitor speaks against what is served, and the estimate is too far from it for both to be right."""
-    accused = state.monitor.outcome in (Finding.SUSPECT, Finding.CONFIRMED)
+    accused = state.monitor.outcome in ACCUSING
     return accused and not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
 
 
@@ -284,6 +284,9 @@ def after_observation(state: PairState, observation: Observation) -> PairState:
     if monitor.outcome is Finding.SUSPECT:
         text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to tell."
         return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
+    if monitor.outcome is Finding.AT_ODDS:
+        text = "The latest checks accuse the mount, but each of something else; a window is being taken to tell."
+        return _unless_red(state, Event.AT_ODDS, Reason("checks_at_odds", text))
     # Against an accepted window that contradicts what is served the word of the monitor is not enough.
     if monitor.outcome is Finding.CLEAR and (state.pending is None or not state.pending.contradicts):
         if state.proven:

@@ -44,6 +44,7 @@ class Event(StrEnum):
     NO_OBJECTION = "monitor_no_objection"
     SUSPECTED = "monitor_suspects"
     MOUNT_MOVED = "monitor_confirms"
+    AT_ODDS = "monitor_at_odds"
     DATA_CAUSE = "data_cause"
     OVERDUE = "check_overdue"
     AGED = "aged"
@@ -62,6 +63,7 @@ MEANING: Mapping[Event, str] = MappingProxyType(
         Event.NO_OBJECTION: "the monitor sees nothing wrong with an extrinsic that no window has confirmed",
         Event.SUSPECTED: "the monitor suspects that the mount has moved",
         Event.MOUNT_MOVED: "the monitor is certain that the mount has moved",
+        Event.AT_ODDS: "the monitor accuses the mount, but at every check of something else",
         Event.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
         Event.OVERDUE: "no check has been completed for three periods of the monitor",
         Event.AGED: "no check has been completed for `stale_after_s`",
@@ -87,6 +89,7 @@ _ROWS: Mapping[Event, tuple[HealthState, ...]] = {
     Event.NO_OBJECTION: (_U, _H, _S, _S, _U, _U),
     Event.SUSPECTED: (_S, _S, _S, _M, _S, _S),
     Event.MOUNT_MOVED: (_M, _M, _M, _M, _M, _M),
+    Event.AT_ODDS: (_D, _D, _S, _M, _D, _D),
     Event.DATA_CAUSE: (_D, _D, _D, _M, _D, _D),
     Event.OVERDUE: (_U, _D, _D, _M, _D, _A),
     Event.AGED: (_U, _A, _A, _M, _A, _A),

@@ -24,6 +24,14 @@ repaired mount clears within three checks, too. A bad frame is in at most one ch
 WEAK_SHARE = 0.5
 """A flagged check whose edges are faint counts half, and confirms nothing: a full solve has to."""
 
+AT_ODDS_AT = 1.0
+"""Checks at odds with what the ones before them said of the mount: two that contradict each other tell nothing."""
+
+SAME_SIGMA, SAME_SHARE = 3.5, 0.25
+"""Two flagged checks speak of the same mount when their rotations differ by less than so many standard deviations of a
+difference, and this share of the larger: far from the extrinsic the local optimum is found less exactly. A mount that
+has moved says the same at every check; a tunnel or an open road says something else every time."""
+
 BLIND_AT = 1.2
 """Evidence by which a cause in the data is believed: more than one check."""
 
@@ -33,12 +41,19 @@ def _unknown() -> NDArray[np.float64]:
 
 
 class Finding(StrEnum):
-    """What the checks so far say. `unknown`: nothing was seen that could tell."""
+    """What the checks so far say. `unknown`: nothing was seen that could tell. `at_odds`: each puts the mount
+    elsewhere."""
 
     UNKNOWN = "unknown"
     CLEAR = "clear"
+    AT_ODDS = "at_odds"
     SUSPECT = "suspect"
     CONFIRMED = "confirmed"
+
+
+ACCUSING = frozenset({Finding.SUSPECT, Finding.CONFIRMED, Finding.AT_ODDS})
+"""Findings that make a window wanted soon, and one that is elsewhere a second witness. A mount that moved beyond the
+reach of a check is at odds with itself, too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +106,8 @@ class MonitorState:
         outcome: see there.
         blind: the same for every cause in the data, by code.
         dirt: the same for every block of the image that was dirty in all checks since, by its number.
-        offset: running mean of the flagged offsets (rad, m); empty without one.
+        offset: running mean of the flagged offsets that agree (rad, m); empty without one.
+        at_odds: flagged checks in a row that did not agree with it.
         last_stamps_ns: of the pairs of the last check.
         stood: whether the vehicle stood at the end of the last check.
     """
@@ -101,6 +117,7 @@ class MonitorState:
     blind: Mapping[str, float] = field(default_factory=dict)
     dirt: Mapping[str, float] = field(default_factory=dict)
     offset: tuple[float, ...] = ()
+    at_odds: float = 0.0
     last_stamps_ns: tuple[int, ...] = ()
     stood: bool = False
 
@@ -126,15 +143,34 @@ def after_observation(state: MonitorState, observation: Observation) -> MonitorS
     if codes:
         # Neither for nor against: the data cannot tell.
         return after
-    if told_before or (not observation.flagged and observation.weak):
+    if told_before or fresh == 0.0 or (not observation.flagged and observation.weak):
         return after
-    step = fresh * (WEAK_SHARE if observation.weak else 1.0)
-    most = max(state.evidence, SUSPECT_AT) if observation.weak else MOST
-    evidence = min(max(state.evidence + (step if observation.flagged else -step), 0.0), most)
-    offset = (
-        _mean(state.offset, observation.offset, step / max(evidence, step)) if observation.flagged else state.offset
-    )
-    return replace(after, evidence=evidence, outcome=_outcome(state.outcome, evidence), offset=offset)
+    after = _weighed(after, observation, fresh * (WEAK_SHARE if observation.weak else 1.0))
+    return replace(after, outcome=_outcome(state.outcome, after.evidence, after.at_odds))
+
+
+def _weighed(state: MonitorState, observation: Observation, step: float) -> MonitorState:
+    """The evidence after a check that counts `step`: for the mount that the flagged ones before it speak of, or, where
+    they contradict each other, for the one that more speaks for."""
+    if not observation.flagged:
+        return replace(state, evidence=max(state.evidence - step, 0.0), at_odds=0.0)
+    if state.evidence == 0.0 or _same_mount(state.offset, observation):
+        most = max(state.evidence, SUSPECT_AT) if observation.weak else MOST
+        evidence = min(state.evidence + step, most)
+        offset = _mean(state.offset, observation.offset, step / max(evidence, step))
+        return replace(state, evidence=evidence, offset=offset, at_odds=max(state.at_odds - step, 0.0))
+    at_odds = min(state.at_odds + step, MOST)
+    if state.evidence - step > step:
+        return replace(state, evidence=state.evidence - step, at_odds=at_odds)
+    return replace(state, evidence=step, offset=_mean((), observation.offset, 1.0), at_odds=at_odds)
+
+
+def _same_mount(offset: tuple[float, ...], observation: Observation) -> bool:
+    """Whether a check puts the mount, up to its own uncertainty, where those before it did."""
+    told, now = np.array(offset[:3]), observation.offset[:3]
+    sigma = float(np.sqrt(2.0 * np.nansum(observation.sigma[:3] ** 2)))
+    apart, farther = float(np.linalg.norm(told - now)), max(float(np.linalg.norm(told)), float(np.linalg.norm(now)))
+    return apart <= SAME_SIGMA * sigma + SAME_SHARE * farther
 
 
 def diagnose(state: MonitorState) -> Cause | None:
@@ -153,7 +189,7 @@ def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: floa
     return {block: min(dirt.get(block, 0.0) + fresh, DIRTY_CHECKS + 1.0) for block in sorted(dirty)}
 
 
-def _outcome(before: Finding, evidence: float) -> Finding:
+def _outcome(before: Finding, evidence: float, at_odds: float) -> Finding:
     """With hysteresis: what was suspected stays so until little speaks for it."""
     if evidence >= CONFIRMED_AT:
         return Finding.CONFIRMED
@@ -161,7 +197,7 @@ def _outcome(before: Finding, evidence: float) -> Finding:
         return before
     if evidence >= SUSPECT_AT or (before is Finding.SUSPECT and evidence >= CLEAR_BELOW):
         return Finding.SUSPECT
-    return Finding.CLEAR
+    return Finding.AT_ODDS if at_odds >= AT_ODDS_AT else Finding.CLEAR
 
 
 def _mean(before: tuple[float, ...], offset: NDArray[np.float64], share: float) -> tuple[float, ...]:

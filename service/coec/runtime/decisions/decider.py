@@ -22,7 +22,7 @@ from coec.adapters.system.threads import ServiceThread
 from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Drift
 from coec.calibration.lifecycle import HealthState, PairState, Rules
-from coec.calibration.monitor.change_detector import Finding
+from coec.calibration.monitor.change_detector import ACCUSING
 from coec.calibration.types import Decision, Reason
 from coec.config import CalibrationConfig, PairConfig
 from coec.runtime.decisions.incident_pictures import IncidentPictures
@@ -411,7 +411,7 @@ class Decider:
         is wanted: soon when the monitor's word has become worse, or a window did not settle it."""
         self._stream.adopt(taken.served)
         before, after = taken.before, taken.after
-        if after.monitor.outcome not in (Finding.SUSPECT, Finding.CONFIRMED) or after.flagged_since_ns is None:
+        if after.monitor.outcome not in ACCUSING or after.flagged_since_ns is None:
             self._stream.calm()
             return
         waiting = after.pending is not None and after.pending.contradicts
