@@ -42,8 +42,7 @@ OVER_S = 3.0
 """Into the next slice: its first pair is then certain, and the slice before has ended."""
 
 KITTI_SPEED = 20.0
-"""Times as fast as recorded: the ten pairs lie 6 to 23 s apart, and are some MB each: more at once than a link
-holds."""
+"""Times as fast as recorded: the ten pairs lie 6 to 23 s apart, and are some MB each: too much for a burst."""
 
 COMPUTED_S = 0.2
 """Processor time after which the worker is in that middle."""

@@ -86,7 +86,7 @@ def write_landscape(folder: Path, bench: Bench, title: str, heard: Callable[[int
     sight = sight_of(window, bench.depth, bench.images, bench.configuration, Silence())
     named = profiles.landscapes(sight, bench.configuration)
     seen = profiles.views(named, bench.reference, bench.configuration.search.dof, heard)
-    output.write(folder / "landscape.png", curves.landscape(seen, f"{title}\nabout the source's calibration"))
+    output.write(folder / "profiles.png", curves.landscape(seen, f"{title}\nabout the source's calibration"))
 
 
 def _write_overlays(folder: Path, bench: Bench, outcomes: Sequence[Outcome]) -> None:

@@ -59,7 +59,7 @@ def test_a_state_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> None:
     state = held(after_estimate(initial_state(RIG), estimate(1), 0, NEVER))
-    monitor = MonitorState(1 / 3, Finding.SUSPECT, {"dark": 0.1}, {"40": 2.5}, (0.1, 0.2), (5, 6))
+    monitor = MonitorState(1 / 3, Finding.SUSPECT, {"dark": 0.1}, {"40": 2.5}, (0.1, 0.2), 0.5, (5, 6))
     state = replace(state, monitor=monitor, flagged_since_ns=4, changes=(Change(3, (0.1,) * 6),))
     StateStore(tmp_path, "test").remember(RIG, state, CLOCKS)
     first = (tmp_path / "state.json").read_bytes()
