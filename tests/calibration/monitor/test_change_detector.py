@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation, after_observation, diagnose
@@ -23,20 +24,30 @@ OFFSET = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def seen(
-    stamps: Sequence[int], flagged: bool = True, weak: bool = False, causes: tuple[Cause, ...] = ()
+    stamps: Sequence[int],
+    flagged: bool = True,
+    weak: bool = False,
+    causes: tuple[Cause, ...] = (),
+    offset: NDArray[np.float64] = OFFSET,
+    standing: bool = False,
 ) -> Observation:
     return Observation(
         stamp_ns=stamps[-1],
         pair_stamps_ns=tuple(stamps),
         metrics=(),
-        offset=OFFSET,
+        offset=offset,
         sigma=np.full(6, 0.001),
         distance2=9.0 if flagged else 0.1,
         flagged=flagged,
         weak=weak,
         flagged_by_paper=None,
         causes=causes,
+        standing_stamps_ns=tuple(stamps) if standing else (),
     )
+
+
+def turned(*degrees: float) -> NDArray[np.float64]:
+    return np.radians([*degrees, 0.0, 0.0, 0.0])
 
 
 def after(*observations: Observation) -> MonitorState:
@@ -67,6 +78,34 @@ class TestEvidence:
         assert state.outcome is Finding.CONFIRMED
         assert diagnose(state) == BENT_MOUNT
         assert state.offset == pytest.approx(tuple(OFFSET))
+
+    def test_checks_that_put_the_mount_in_different_places_do_not_add_up(self) -> None:
+        # As in a tunnel and on an open road of a simulated drive, where the mount is right.
+        places = [turned(0.0, -0.4, -2.4), turned(0.9, -0.2, -0.1), turned(4.6, -0.3, -2.2), turned(-1.4, -5.2, 0.3)]
+        state = after(*(fresh(n, offset=place) for n, place in enumerate(places)))
+        assert state.outcome is Finding.AT_ODDS
+        assert state.evidence <= 1.0
+        assert after_observation(state, fresh(9, flagged=False)).outcome is Finding.CLEAR
+
+    @pytest.mark.parametrize("knock", [turned(1.0, 0.0, 0.0), turned(2.0, -2.0, 1.0), turned(5.0, -4.0, 3.0)])
+    def test_a_knock_of_any_size_is_the_same_at_every_check(self, knock: NDArray[np.float64]) -> None:
+        rng = np.random.default_rng(0)
+        # What checks of simulated drives differ by, 0.1° and a twentieth of the knock.
+        spread = np.radians(0.1) + 0.05 * np.abs(knock).max()
+        checks = [fresh(n, offset=knock + np.r_[rng.normal(0.0, spread, 3), 0, 0, 0]) for n in range(3)]
+        assert after(*checks).outcome is Finding.CONFIRMED
+
+    def test_one_check_elsewhere_takes_a_suspicion_back_and_does_not_make_another(self) -> None:
+        state = after(fresh(0), fresh(1), fresh(2, offset=turned(-4.0, 3.0, 0.0)))
+        assert (state.outcome, state.evidence, state.at_odds) == (Finding.SUSPECT, 1.0, 1.0)
+        again = after_observation(after_observation(state, fresh(3)), fresh(4))
+        assert again.outcome is Finding.SUSPECT
+        assert after_observation(after_observation(again, fresh(5)), fresh(6)).outcome is Finding.CONFIRMED
+
+    def test_of_one_place_there_is_one_check_however_long_the_vehicle_stands_there(self) -> None:
+        state = after(fresh(0, flagged=False), *(fresh(n, standing=True) for n in range(1, 10)))
+        assert (state.outcome, state.evidence) == (Finding.CLEAR, 1.0)
+        assert after_observation(state, fresh(10)).outcome is Finding.SUSPECT
 
     def test_checks_at_the_same_pairs_are_one_check(self) -> None:
         assert after(*[seen([1, 2, 3, 4])] * 10).outcome is Finding.CLEAR

@@ -10,15 +10,15 @@ from coec.calibration.types import Reason
 from coec.runtime.decisions.progress import Progress
 from coec.runtime.ingest.chooser import Chosen
 from coec.runtime.ingest.decoder import CAMERA, LIDAR, StreamCounts
-from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.runtime.ingest.stream_statistics import StreamStatistics
 
 S = 1_000_000_000
 PERIOD_S = 5.0
 
 
-def report(camera: int = 0, lidar: int = 0, refused: int = 0, pairs: int = 0, checks: int = 0) -> StreamReport:
+def report(camera: int = 0, lidar: int = 0, refused: int = 0, pairs: int = 0, checks: int = 0) -> StreamStatistics:
     streams = {CAMERA: StreamCounts(camera, camera - refused), LIDAR: StreamCounts(lidar, lidar)}
-    return StreamReport(streams=streams, pairs=pairs, chosen=Chosen(checks=checks, last_ns=1000 * S), pace=1.0)
+    return StreamStatistics(streams=streams, pairs=pairs, chosen=Chosen(checks=checks, last_ns=1000 * S), pace=1.0)
 
 
 BEGIN = report()
@@ -70,7 +70,7 @@ def test_a_replay_slower_than_the_drive_has_as_much_longer() -> None:
         (ALL, "worker", "has not answered"),
     ],
 )
-def test_the_first_thing_that_stands_still_is_named(now: StreamReport, code: str, word: str) -> None:
+def test_the_first_thing_that_stands_still_is_named(now: StreamStatistics, code: str, word: str) -> None:
     late = begun().overdue(now, 116.0)
     assert late is not None
     assert late.code == f"overdue_{code}"

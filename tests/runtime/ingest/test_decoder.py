@@ -14,7 +14,7 @@ from coec.adapters.ros import cdr
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import IDENTITY, CameraConfig, CameraIntrinsics, EgoConfig, LidarConfig, LimitsConfig, PairConfig
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Intake
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
 from coec.runtime.ingest.inbox import Call, Inbox, Parcel
 
 MSGPACK, CDR = "application/msgpack", "application/cdr"
@@ -43,7 +43,7 @@ class Desk:
 
     def __init__(self) -> None:
         self.losses = LossCounter(logging.getLogger("test"), "front")
-        self.intake = Intake(PAIR, LimitsConfig(), self.losses)
+        self.intake = Decoder(PAIR, LimitsConfig(), self.losses)
         self._order = itertools.count()
 
     def take(self, stream: str, payload: bytes, encoding: str = "zenoh/bytes") -> object:

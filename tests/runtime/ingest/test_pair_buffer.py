@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame
-from coec.runtime.ingest.pair_buffer import HeldPairs, bytes_of
+from coec.runtime.ingest.pair_buffer import PairBuffer, bytes_of
 
 IMAGE = EncodedImage(ImageFormat.MONO8, 4, 2, bytes(8))
 
@@ -20,7 +20,7 @@ def test_bytes_are_those_of_images_and_points() -> None:
 
 
 def test_the_oldest_goes_first_and_waits_for_so_many_seconds_and_bytes() -> None:
-    held = HeldPairs(max_bytes=3 * bytes_of(pair(0)), max_wait_s=10.0)
+    held = PairBuffer(max_bytes=3 * bytes_of(pair(0)), max_wait_s=10.0)
     for stamp_ns in (1, 2, 3):
         held.add(pair(stamp_ns))
     assert not held.has_waited(100.0)

@@ -14,7 +14,7 @@ from coec.config import PairConfig
 from coec.runtime.api.extrinsic import axes_of
 from coec.runtime.decisions.decider import HELD, Known
 from coec.runtime.ingest.decoder import EGO
-from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.schemas import replies
 
 OLD_S = 5.0
@@ -46,7 +46,7 @@ class Told:
 
 def health_of(
     known: Known,
-    report: StreamReport,
+    report: StreamStatistics,
     losses: Mapping[tuple[str, str], int],
     troubles: tuple[Reason, ...],
     pair: PairConfig,
@@ -91,7 +91,7 @@ def with_troubles(health: Health, troubles: tuple[Reason, ...]) -> Health:
     return Health(HealthState.DEGRADED if worse else health.state, (*health.reasons, *troubles))
 
 
-def needs_of(report: StreamReport, pair: PairConfig, latest: Estimate | None) -> tuple[str, ...]:
+def needs_of(report: StreamStatistics, pair: PairConfig, latest: Estimate | None) -> tuple[str, ...]:
     """What is still missing, one sentence each. `latest` is the last estimate."""
     needs = []
     lacking = pair.window.min_pairs - report.chosen.selected
@@ -108,7 +108,7 @@ def needs_of(report: StreamReport, pair: PairConfig, latest: Estimate | None) ->
     return tuple(needs)
 
 
-def data_quality_of(report: StreamReport, losses: Mapping[tuple[str, str], int]) -> replies.DataQuality:
+def data_quality_of(report: StreamStatistics, losses: Mapping[tuple[str, str], int]) -> replies.DataQuality:
     """What the streams are like."""
     chosen, quality = report.chosen, report.chosen.quality
     drops = drops_of(losses, report.unpaired)

@@ -8,7 +8,7 @@ from typing import Literal
 from coec.runtime.api.health import drops_of
 from coec.runtime.decisions.decider import Known
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, StreamCounts
-from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.worker.jobs import Fate
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
@@ -17,7 +17,7 @@ from coec.schemas import replies
 def pair_status_of(
     name: str,
     known: Known,
-    report: StreamReport,
+    report: StreamStatistics,
     losses: Mapping[tuple[str, str], int],
     recorded: int,
     commands: dict[str, int],

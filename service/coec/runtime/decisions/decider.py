@@ -32,7 +32,7 @@ from coec.runtime.decisions.progress import Progress
 from coec.runtime.decisions.queue import DecisionQueue, Effect, Question, Take
 from coec.runtime.decisions.rig_baseline import RigBaseline
 from coec.runtime.ingest.chooser import Served
-from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import WindowStore, start_ns_of
 from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved, WrittenFile
@@ -51,7 +51,7 @@ class StreamSide(Protocol):
     """The stream of the pair. What decisions change for the pairs to come is called on its thread."""
 
     @property
-    def report(self) -> StreamReport:
+    def report(self) -> StreamStatistics:
         """What it last told of itself."""
 
     def call(self, effect: Effect) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from coec.calibration.types import Reason
 from coec.runtime.decisions.questions import WINDOW_PERIODS
 from coec.runtime.ingest.decoder import CAMERA, LIDAR
-from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.runtime.ingest.stream_statistics import StreamStatistics
 
 NS_PER_S = 1_000_000_000
 
@@ -36,18 +36,18 @@ class _Last:
 
     monotonic_s: float
     stamp_ns: int | None
-    report: StreamReport
+    report: StreamStatistics
 
 
 class Progress:
     """Of the checks of one pair. Belongs to the thread that decides."""
 
-    def __init__(self, period_s: float, monotonic_s: float, report: StreamReport) -> None:
+    def __init__(self, period_s: float, monotonic_s: float, report: StreamStatistics) -> None:
         self._period_s = period_s
         self._last = _Last(monotonic_s, None, report)
         self._failure: Reason | None = None
 
-    def completed(self, stamp_ns: int | None, monotonic_s: float, report: StreamReport) -> None:
+    def completed(self, stamp_ns: int | None, monotonic_s: float, report: StreamStatistics) -> None:
         """A check was completed, of pairs up to this sensor time; or a window, which is more."""
         self._last = _Last(monotonic_s, stamp_ns, report)
         self._failure = None
@@ -64,7 +64,7 @@ class Progress:
         """Since the last completed check, or the start."""
         return monotonic_s - self._last.monotonic_s
 
-    def overdue(self, report: StreamReport, monotonic_s: float) -> Reason | None:
+    def overdue(self, report: StreamStatistics, monotonic_s: float) -> Reason | None:
         """Why no check was completed for `PERIODS` periods, on the steady clock or on that of the sensors; None while
         there was one. A replay that is slower than the drive has as much longer."""
         pace = 1.0 if report.pace is None else min(max(report.pace, SLOWEST_PACE), 1.0)
@@ -80,7 +80,7 @@ class Progress:
         code, why = self._cause(report)
         return Reason(f"overdue_{code}", f"No check has been completed for {max(silent_s, unseen_s):.0f} s: {why}")
 
-    def _cause(self, now: StreamReport) -> tuple[str, str]:
+    def _cause(self, now: StreamStatistics) -> tuple[str, str]:
         """What has stood still since the last completed check, first in the order of a frame's way."""
         then = self._last.report
         for stream in (CAMERA, LIDAR):

@@ -33,7 +33,7 @@ class StreamCounts:
     accepted: int
 
 
-class Intake:
+class Decoder:
     """Decodes and checks the samples of one pair's streams."""
 
     def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:

@@ -7,7 +7,7 @@ from collections import deque
 from coec.calibration.types import FramePair
 
 
-class HeldPairs:
+class PairBuffer:
     """A queue of pairs, oldest first; one thread uses it."""
 
     def __init__(self, max_bytes: int, max_wait_s: float) -> None:

@@ -13,11 +13,11 @@ from coec.calibration.types import FramePair
 from coec.config import Config, PairConfig
 from coec.runtime.handover import Handover
 from coec.runtime.ingest.chooser import Chooser, Served
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Intake
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
 from coec.runtime.ingest.inbox import Call, Inbox
-from coec.runtime.ingest.pair_buffer import HeldPairs
+from coec.runtime.ingest.pair_buffer import PairBuffer
 from coec.runtime.ingest.sensor_clock import NS_PER_S, SensorClock
-from coec.runtime.ingest.stream_statistics import StreamReport
+from coec.runtime.ingest.stream_statistics import StreamStatistics
 
 T = TypeVar("T")
 
@@ -44,13 +44,13 @@ class Stream:
         depths = {CAMERA: FRAMES_WAITING, LIDAR: FRAMES_WAITING, EGO: MOTIONS_WAITING}
         self.inbox = Inbox(depths, lambda stream: losses.add(stream, "overrun"))
         self.thread = ServiceThread(f"ingest-{pair.name}", self._run)
-        self.report = StreamReport()
+        self.report = StreamStatistics()
         self._chooser = chooser
         self._has_room = has_room
-        self._intake = Intake(pair, config.limits, losses)
+        self._decoder = Decoder(pair, config.limits, losses)
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._clock = SensorClock()
-        self._held = HeldPairs(config.limits.max_held_bytes, config.worker.timeout_s)
+        self._held = PairBuffer(config.limits.max_held_bytes, config.worker.timeout_s)
         self._pairs = 0
         self._sync_error_s: float | None = None
 
@@ -120,7 +120,7 @@ class Stream:
             if isinstance(item, Call):
                 item.run()
             elif item is not None:
-                frame = self._intake.frame(item)
+                frame = self._decoder.frame(item)
                 if frame is not None:
                     self.take(self._pairer.push(frame))
             self.choose_next()
@@ -154,8 +154,8 @@ class Stream:
         """Renew the report."""
         silent = self._clock.is_silent(time.monotonic())
         rate_hz = self._clock.rate_hz
-        self.report = StreamReport(
-            streams={stream: self._intake.counts(stream) for stream in (CAMERA, LIDAR, EGO)},
+        self.report = StreamStatistics(
+            streams={stream: self._decoder.counts(stream) for stream in (CAMERA, LIDAR, EGO)},
             unpaired=dict(self._pairer.losses),
             pairs=self._pairs,
             held=len(self._held),

@@ -9,7 +9,7 @@ from coec.runtime.ingest.decoder import StreamCounts
 
 
 @dataclass(frozen=True, slots=True)
-class StreamReport:
+class StreamStatistics:
     """Counters since the start, and the latest figures.
 
     Attributes:
