@@ -45,6 +45,20 @@ BROKEN = (
 )
 """`coec` with a fault of the program in it: the first frame ends the thread that takes it."""
 
+STUBBORN = (
+    sys.executable,
+    "-c",
+    "import sys\n"
+    "from coec.adapters.zenoh.bus import Bus\n"
+    "from coec.runtime.pair import Pair\n"
+    "def broken(*_):\n"
+    "    raise RuntimeError('broken')\n"
+    "Bus.undeclare_inputs = Bus.undeclare_queryables = Pair.finish_window = broken\n"
+    "from coec.cli import main\n"
+    "sys.exit(main())",
+)
+"""`coec` whose end has three steps that raise."""
+
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
@@ -204,6 +218,19 @@ def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     health = from_msgpack(HealthReply, said[-1])
     (why,) = (reason for reason in health.reasons if reason.code == "thread_died")
     assert "broken" in why.text
+
+
+def test_the_end_goes_on_after_steps_that_raise(tmp_path: Path, drive: Drive, router: Router) -> None:
+    config = configured(tmp_path, drive, router)
+    with service(config, router, warm=False, program=STUBBORN) as running:
+        running.send(drive.frames)
+        running.until(running.counters, lambda pair: pair["selected"] >= SHORT_PAIRS - 1, "the pairs")
+        assert running.terminate() == 0
+        log = running.log.read_text()
+    for step in ("take no more samples", "finish a window", "take the answers away"):
+        assert f'"step": "{step}"' in log
+    assert '"message": "stopped"' in log
+    assert list((tmp_path / "state" / "windows").glob("*.mcap")), "the recorder was ended all the same"
 
 
 def test_every_wrong_question_gets_an_answer(idle: Service) -> None:

@@ -1,1 +1,1 @@
-"""One file per outside thing. Only here are wire models and foreign formats translated to and from values."""
+"""One folder per outside thing. Only here are wire models and foreign formats translated to and from values."""
