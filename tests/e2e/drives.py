@@ -1,4 +1,4 @@
-"""Simulated drives for the tests of the running service: each is rendered once in a run."""
+"""Simulated drives for the tests of the running service: each is drawn once."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from coec.calibration.types import CameraFrame
 from coec.config import CalibrationConfig, DepthConfig, MonitorConfig, PolicyConfig, WindowConfig
 from coec.geometry.se3 import inverse, rotation_angle_rad
 from coec.simulation.source import open_sim
+from coec.sources.spec import parse_spec
+from drives import drawn_source
 from e2e.processes import Router, write_configuration
 
 if TYPE_CHECKING:
@@ -63,8 +65,8 @@ class Drive:
 @cache
 def rendered(query: str) -> Drive:
     """The drive of `sim:QUERY`."""
-    recording = open_sim(dict(part.split("=", 1) for part in query.split("&")))
-    return Drive(f"sim:{query}", recording, tuple(recording.messages()))
+    source = f"sim:{query}"
+    return Drive(source, open_sim(parse_spec(source).query), tuple(drawn_source(source).messages()))
 
 
 def later(frames: Sequence[Frame], seconds: float) -> list[Frame]:

@@ -94,15 +94,19 @@ class Stream:
 
     def finish_pairs(self) -> None:
         """Look at every pair that has come, whatever it waits for. For the stream's thread, or after its end."""
-        self.take(self._pairer.flush())
+        self._hold(self._pairer.flush())
         while self._held:
             self._chooser.choose(self._held.take())
 
     def take(self, pairs: list[FramePair]) -> None:
-        """Pairs came: they wait their turn."""
+        """Pairs came: they tell the time, and wait their turn."""
+        for pair in pairs:
+            self._clock.observe(pair.stamp_ns, time.monotonic())
+        self._hold(pairs)
+
+    def _hold(self, pairs: list[FramePair]) -> None:
         for pair in pairs:
             self._pairs += 1
-            self._clock.observe(pair.stamp_ns, time.monotonic())
             self._sync_error_s = (pair.camera.stamp_ns - pair.lidar.stamp_ns) / NS_PER_S
             self._held.add(pair)
 
@@ -146,7 +150,8 @@ class Stream:
         now_ns = self._clock.silent_now_ns(time.monotonic())
         if now_ns is None or now_ns < end_ns + GRACE_NS:
             return
-        self.take(self._pairer.flush())
+        # They are certain because nothing came for long: now is not when they came.
+        self._hold(self._pairer.flush())
         if not self._held:
             self._chooser.advance(now_ns, end_ns)
 
