@@ -3,6 +3,7 @@ told, and left to people. Sensor time is compressed."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -47,7 +48,8 @@ def test_a_step_is_noticed_corrected_and_remembered(tmp_path: Path, drive: Drive
         states = {entry["code"]: (entry["stamp_ns"] - step_ns) / NS_PER_S for entry in running.entries("state")}
         assert [entry["code"] for entry in running.entries("state")][:1] == ["healthy"], "no false alarm"
         assert 0 < states["suspect"] <= states["miscalibrated"] < NOTICED_S
-        assert states["miscalibrated"] < states["healthy"]
+        # The window that repairs it may end with the check that was certain.
+        assert states["miscalibrated"] <= states["healthy"]
         assert running.health()["state"] == "healthy"
         assert drive.error_deg(running.extrinsic(), SECONDS) < MAX_ERROR_DEG
 
@@ -63,7 +65,7 @@ def test_a_step_is_noticed_corrected_and_remembered(tmp_path: Path, drive: Drive
             assert drawn.encoding == "image/jpeg"
             assert drawn.payload[:3] == b"\xff\xd8\xff"
 
-        back = running.command("rollback")
+        back = running.command("rollback", json.dumps({"to": before["window_id"]}).encode())
         assert back["code"] == "rolled_back"
         assert running.extrinsic()["camera_from_lidar"] == before["camera_from_lidar"]
         assert running.health()["state"] == "unknown"

@@ -41,11 +41,11 @@ def test_three_periods_on_the_steady_clock() -> None:
     assert progress.overdue(ALL, 117.0) is None
 
 
-def test_on_the_clock_of_the_sensors_a_replay_may_run_ahead_of_the_answers_by_two_periods_more() -> None:
+def test_on_the_clock_of_the_sensors_a_replay_may_run_ahead_of_the_answers_by_a_period_more() -> None:
     progress = begun()
-    ahead = replace(ALL, pace=10.0, chosen=replace(ALL.chosen, last_ns=1025 * S))
+    ahead = replace(ALL, pace=10.0, chosen=replace(ALL.chosen, last_ns=1020 * S))
     assert progress.overdue(ahead, 101.0) is None
-    late = replace(ahead, chosen=replace(ahead.chosen, last_ns=1025 * S + 1))
+    late = replace(ahead, chosen=replace(ahead.chosen, last_ns=1020 * S + 1))
     assert progress.overdue(late, 101.0) is not None
     progress.time_stepped_back()
     assert progress.overdue(late, 101.0) is None, "stamps of before tell nothing any more"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from coec.calibration.types import Reason
-from coec.runtime.decisions.questions import WINDOW_PERIODS
+from coec.runtime.decisions.questions import ANSWER_PERIODS
 from coec.runtime.ingest.decoder import CAMERA, LIDAR
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 
@@ -74,7 +74,7 @@ class Progress:
             unseen_s = (report.chosen.last_ns - self._last.stamp_ns) / NS_PER_S
         late = silent_s > PERIODS * self._period_s / pace
         # By so much the stream may run ahead of an answer.
-        late |= unseen_s > (PERIODS + WINDOW_PERIODS) * self._period_s
+        late |= unseen_s > (PERIODS + ANSWER_PERIODS) * self._period_s
         if not late:
             return None
         code, why = self._cause(report)

@@ -24,9 +24,9 @@ _log = logging.getLogger(__name__)
 
 NS_PER_S = 1_000_000_000
 
-WINDOW_PERIODS = 2
-"""Periods of the monitor after the end of a window from which on its result counts in the choice of further pairs: at
-10 s more than a solve takes, so that a live stream does not wait. The result of a check counts after one period."""
+ANSWER_PERIODS = 1
+"""Periods of the monitor after which the answer to a check or a window counts in the choice of further pairs: more than
+either takes at 5 s. Where it takes longer, the stream waits, and its pairs are held."""
 
 GRACE_S = 30.0
 """Beyond the deadline that the worker keeps: how long an answer may take from there to here, and a window to the disk,
@@ -72,13 +72,14 @@ class Questions:
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
         """Is `served` right, by these pairs? Asked at a sensor time."""
         standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
-        question = self._queue.ask(stamp_ns + self._period_ns, self._expires_s(jobs.Kind.CHECK))
+        question = self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.CHECK))
         ended = partial(self._decides.checked, question, served.epoch, standing)
         self._worker.ask(jobs.check(self._pair.name, served.T_camera_lidar, pairs, self._post(ended)))
 
-    def window(self, window_id: str, stamp_ns: int) -> None:
-        """What does a window say that ends at a sensor time? It is on its way to the disk."""
-        self._queue.ask(stamp_ns + WINDOW_PERIODS * self._period_ns, self._expires_s(jobs.Kind.SOLVE), window_id)
+    def window(self, window_id: str, stamp_ns: int) -> int:
+        """What does a window say that ends at a sensor time? It is on its way to the disk. From when on its answer
+        counts, sensor time."""
+        return self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.SOLVE), window_id).due_ns
 
     def prefetch(self, frame: bytes) -> None:
         """The depth of a camera frame (native msgpack) will be needed."""
@@ -129,6 +130,9 @@ class Questions:
 
     def _post(self, ended: Callable[[JobOutcome], None]) -> Callable[[JobOutcome], None]:
         return lambda outcome: self._mailbox.post(partial(ended, outcome))
+
+    def _due_ns(self, stamp_ns: int) -> int:
+        return stamp_ns + ANSWER_PERIODS * self._period_ns
 
     def _expires_s(self, kind: jobs.Kind) -> float:
         return time.monotonic() + jobs.DEADLINE_S[kind] + GRACE_S

@@ -7,6 +7,7 @@ has taken effect. So a drive that is replayed, at any rate, on any machine, cuts
 from __future__ import annotations
 
 import logging
+from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,6 +24,10 @@ from coec.runtime.ingest.sensor_clock import SensorClock
 
 _log = logging.getLogger(__name__)
 
+CHECKS_WAITING = 4
+"""Checks that may wait for the answer to a window, 15 MB each: of the period in which it is awaited there is one, and
+one more for each further window that ends meanwhile."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Served:
@@ -38,8 +43,8 @@ class Asks(Protocol):
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
         """Is `served` right, by these pairs? Asked at a sensor time."""
 
-    def window(self, window_id: str, stamp_ns: int) -> None:
-        """What does a window say that ends at a sensor time?"""
+    def window(self, window_id: str, stamp_ns: int) -> int:
+        """What does a window say that ends at a sensor time? From when on its answer counts, sensor time."""
 
     def prefetch(self, frame: bytes) -> None:
         """The depth of a camera frame (native msgpack) will be needed."""
@@ -114,6 +119,8 @@ class Chooser:
         self._urgency = Urgency(pair.monitor, pair.window)
         self._pace = SensorClock()
         self._last_ns: int | None = None
+        self._unasked: deque[tuple[FramePair, ...]] = deque(maxlen=CHECKS_WAITING)
+        self._window_due_ns = 0
         self._frozen = False
         self._checks = 0
         self._steps_back = 0
@@ -170,8 +177,11 @@ class Chooser:
         self._frozen |= self._cutter.rejections["frozen"] > frozen_before
         check = self._sampler.offer(pair)
         if check is not None:
-            self._checks += 1
-            self._asks.check(check, self._served, pair.stamp_ns)
+            if len(self._unasked) == CHECKS_WAITING:
+                self._losses.add("monitor", "check_superseded")
+            self._unasked.append(check)
+        if pair.stamp_ns >= self._window_due_ns:
+            self._ask_checks(pair.stamp_ns)
 
     def advance(self, now_ns: int, end_ns: int) -> None:
         """The streams are silent, and it would be `now_ns` by now: the slice that ends at `end_ns` is over."""
@@ -206,10 +216,18 @@ class Chooser:
         self._steps_back += 1
         self._losses.add("monitor", "time_stepped_back", detail="the clock of the sensors stepped back")
         self._urgency.calm()
+        self._window_due_ns = stamp_ns
         self._asks.time_stepped_back(stamp_ns)
 
     def _has_stepped_back(self, stamp_ns: int) -> bool:
         return self._last_ns is not None and stamp_ns < self._last_ns
+
+    def _ask_checks(self, stamp_ns: int) -> None:
+        """Have the latest pairs checked at what is served. While a window is about to change that, they wait: they
+        would be judged at what is no longer served."""
+        while self._unasked:
+            self._checks += 1
+            self._asks.check(self._unasked.popleft(), self._served, stamp_ns)
 
     def _select(self, event: PairSelected, T_camera_lidar: Matrix4) -> None:
         self._recorder.add(event.window_id, event.pair, T_camera_lidar)
@@ -219,7 +237,7 @@ class Chooser:
     def _end(self, event: SliceEnded, stamp_ns: int) -> None:
         """A slice ended, at this sensor time: what it holds goes to the disk, and from there to the worker."""
         if event.complete:
-            self._asks.window(event.window_id, stamp_ns)
+            self._window_due_ns = self._asks.window(event.window_id, stamp_ns)
         fields = {"window": event.window_id, "pairs": event.pairs, "complete": event.complete}
         _log.info("a slice ended", extra={"fields": fields})
         self._recorder.end(event)
