@@ -79,7 +79,7 @@ def _keep(path: Path, messages: list[Message]) -> None:
     if CACHE.is_dir():
         for folder in CACHE.iterdir():
             if folder != path.parent:
-                shutil.rmtree(folder)
+                shutil.rmtree(folder, ignore_errors=True)  # the other half of the run may do the same
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(f".{os.getpid()}")
     part.write_bytes(pickle.dumps(messages, protocol=pickle.HIGHEST_PROTOCOL))
