@@ -22,7 +22,7 @@ from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFo
 from coec.config import CalibrationConfig, StateConfig
 from coec.errors import RecordingError
 from coec.geometry.cameras import build
-from coec.runtime.recording.recorder import PAIRS_WAITING, UNSOLVED_RESUMED, Recorder, RecordingPlan
+from coec.runtime.recording.recorder import PAIRS_WAITING, STUCK_S, UNSOLVED_RESUMED, Recorder, RecordingPlan
 from coec.runtime.recording.window_store import WindowStore
 from fakes import wait_until
 
@@ -268,3 +268,13 @@ def test_a_stop_does_not_wait_for_windows_that_are_being_read(tmp_path: Path) ->
     with bench.running():
         pass
     assert store.unread("front") == (store.path("front-1"),)
+
+
+def test_a_thread_that_the_disk_does_not_let_go_is_told(tmp_path: Path) -> None:
+    recorder = Bench(store_of(tmp_path)).recorder
+    assert recorder.trouble is None
+    recorder.thread._beat_s -= STUCK_S + 1.0  # since the last sign of life
+    assert recorder.trouble is not None
+    assert (recorder.trouble.code, "11 s" in recorder.trouble.text) == ("recording_stuck", True)
+    recorder.thread.beat()
+    assert recorder.trouble is None

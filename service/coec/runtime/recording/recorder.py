@@ -31,6 +31,9 @@ UNSOLVED_RESUMED = 4
 
 POLL_S = 0.2
 
+STUCK_S = 10.0
+"""Without a sign of life of the thread: it gives one several times a second, and between two writes."""
+
 DIGEST_BYTES = 4 * 2**20
 """Of a window that is read for its digest in one round, between pairs that come: 8 ms of hashing at 500 MB/s."""
 
@@ -92,8 +95,17 @@ class Recorder:
         self._lost: str | None = None
         self._latest: Path | None = None
         self.recorded = 0
-        self.trouble: Reason | None = None
+        self._trouble: Reason | None = None
         self.thread = ServiceThread(f"recorder-{plan.rig.pair}", self._run)
+
+    @property
+    def trouble(self) -> Reason | None:
+        """Why windows do not get to the disk; None while they do."""
+        silent_s = self.thread.silence_s
+        if self._trouble is None and silent_s > STUCK_S:
+            text = f"The disk has not answered for {silent_s:.0f} s: no window can be recorded."
+            return Reason("recording_stuck", text)
+        return self._trouble
 
     @property
     def latest(self) -> Path | None:
@@ -243,7 +255,7 @@ class Recorder:
 
     def _finished(self, recorded: RecordedWindow) -> None:
         self.recorded += 1
-        self.trouble = None
+        self._trouble = None
         self._latest = recorded.path
         self._store.add(recorded)
         fields = {"window": recorded.window_id, "pairs": recorded.pairs, "bytes": recorded.bytes}
@@ -255,13 +267,13 @@ class Recorder:
         if self._open is not None:
             self._open.writer.abandon()
             self._open = None
-            self.trouble = None  # what there was of it could be written
+            self._trouble = None  # what there was of it could be written
             self._losses.add("window", "too_few_pairs")
 
     def _lose(self, window_id: str, error: Exception) -> None:
         """Give the window up; the next one tries again."""
         self._lost = window_id
-        self.trouble = Reason("recording_failed", f"The last window could not be recorded: {error}")
+        self._trouble = Reason("recording_failed", f"The last window could not be recorded: {error}")
         self._losses.add("window", "recording_failed", detail=str(error))
         if self._open is not None:
             with contextlib.suppress(RecordingError, OSError):
