@@ -148,7 +148,7 @@ def test_a_state_and_windows_of_another_time(tmp_path: Path) -> None:
                 os.utime(window, (written_s - moved_s, written_s - moved_s))
         before = windows_of(folder)
         with watching(path, truth) as watch:
-            start = watch.samples[0]
+            start = watch.look()
             watch.play_through(onward, rate(), PATIENCE_S)
             samples = watch.samples
             first_check = next((one for one in samples if one.checks > start.checks), None)
