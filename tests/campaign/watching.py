@@ -20,7 +20,7 @@ import zenoh
 from campaign.drives import Drive, Truth
 from coec.adapters.frames.msgpack_frames import decode_ego
 from coec.adapters.zenoh.client import ask_one
-from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, WindowConfig, load_config
+from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, PolicyConfig, WindowConfig, load_config
 from coec.errors import CoecError
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
@@ -44,6 +44,8 @@ def configured(folder: Path, drive: Drive) -> Path:
         open_source(drive.source),
         free_endpoint(),
         calibration=CalibrationConfig(),
+        # A drive that goes round steps more in a minute than a policy allows in a day.
+        policy=PolicyConfig(apply="always"),
         window=WindowConfig(pairs=16, min_pairs=8, slice_s=32.0),
         monitor=MonitorConfig(period_s=PERIOD_S, pairs=5, min_pairs=4, urgent_slice_s=16.0),
     )
