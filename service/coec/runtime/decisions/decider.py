@@ -36,6 +36,7 @@ from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import WindowStore, start_ns_of
 from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved, WrittenFile
+from coec.runtime.worker.queue import STOPPING
 from coec.schemas.replies import CalibrationResult, CheckReply
 
 _log = logging.getLogger(__name__)
@@ -351,7 +352,7 @@ class Decider:
         )
 
     def _take_failure(self, reason: Reason, live: bool) -> Effect | None:
-        if reason.code == STOPPING:
+        if reason.code == STOPPING.code:
             return None  # the window stays on the disk, and is solved after the next start
         self._losses.add("window", reason.code, detail=reason.text)
         if not live:
@@ -426,9 +427,6 @@ class Decider:
         held = Reason(HELD, "The extrinsic is held by command.") if self._store.state.frozen else None
         return tuple(reason for reason in (*own, held) if reason is not None and reason.code not in said)
 
-
-STOPPING = "stopping"
-"""Code of the reason of a job that the end of the service ended."""
 
 HELD = "held"
 """Code of the reason that ails nothing."""

@@ -28,13 +28,12 @@ from coec.runtime.decisions.history import GENESIS, History, Kept
 from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.state_store import Clocks, StateStore
 from coec.runtime.ingest.chooser import Served
+from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
 from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, MetricsPoint
 
 _log = logging.getLogger(__name__)
-
-NS_PER_S = 1_000_000_000
 
 EntryKind = Literal["estimate", "extrinsic", "state", "command", "commissioned", "chain"]
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from coec.calibration.types import Reason
 from coec.runtime.decisions.questions import ANSWER_PERIODS
 from coec.runtime.ingest.decoder import CAMERA, LIDAR
+from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
-
-NS_PER_S = 1_000_000_000
 
 PERIODS = 3
 """Periods of the monitor without a completed check after which a pair is not green any more (ARCHITECTURE)."""

@@ -15,14 +15,13 @@ from coec.config import PairConfig
 from coec.runtime.decisions.mailbox import Mailbox
 from coec.runtime.decisions.queue import DecisionQueue, Question
 from coec.runtime.ingest.chooser import Served
+from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker import jobs
 from coec.runtime.worker.jobs import JobOutcome
 from coec.runtime.worker.supervisor import Worker
 
 _log = logging.getLogger(__name__)
-
-NS_PER_S = 1_000_000_000
 
 ANSWER_PERIODS = 1
 """Periods of the monitor after which the answer to a check or a window counts in the choice of further pairs: more than
