@@ -78,7 +78,14 @@ def test_the_first_thing_that_stands_still_is_named(now: StreamStatistics, code:
 
 
 @pytest.mark.parametrize(
-    ("failure", "code"), [("bad_model", "depth"), ("worker_failed", "worker"), ("bad_input", "data")]
+    ("failure", "code"),
+    [
+        ("bad_model", "depth"),
+        ("worker_failed", "worker"),
+        ("unsendable", "worker"),
+        ("unanswered", "worker"),
+        ("bad_input", "data"),
+    ],
 )
 def test_a_failure_is_named_by_whose_it_is(failure: str, code: str) -> None:
     progress = begun()

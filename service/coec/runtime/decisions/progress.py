@@ -9,10 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from coec.calibration.types import Reason
+from coec.errors import ModelError
 from coec.runtime.decisions.questions import ANSWER_PERIODS
 from coec.runtime.ingest.decoder import CAMERA, LIDAR
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
+from coec.runtime.worker.jobs import Fate
+from coec.runtime.worker.queue import BUSY, SUPERSEDED, WORKER_FAILED
 
 PERIODS = 3
 """Periods of the monitor without a completed check after which a pair is not green any more (ARCHITECTURE)."""
@@ -20,13 +23,13 @@ PERIODS = 3
 SLOWEST_PACE = 0.1
 """Of a replay, in seconds of sensor time a second: a slower one counts as standing still."""
 
-DEPTH_CODES = frozenset({"bad_model", "depth_missing"})
-"""Codes of failures that are the depth network's, or its maps'."""
+DEPTH_CODES = frozenset({ModelError.reply_code})
+"""Codes of failures that are the depth network's."""
 
 WORKER_CODES = frozenset(
-    {"worker_failed", "superseded", "deadline_passed", "internal_error", "stray_answer", "malformed_answer", "busy"}
+    {WORKER_FAILED, SUPERSEDED.code, BUSY.code, Fate.LATE.value, "internal_error", "unsendable", "unanswered"}
 )
-"""Codes of failures that are the worker's."""
+"""Codes of failures that are the worker's, or those of the way there and back."""
 
 
 @dataclass(slots=True)
