@@ -30,8 +30,10 @@ ABSOLUTE, RELATIVE = 0.03, 0.1
 """How far a number may be from the one shown: its unit is degrees, metres or a count, and processors round differently.
 Durations, instants, digests, and how full the open window is depend on the machine and the moment: not compared."""
 
-PATIENCE_S = 300.0
-"""For a block; the longest takes 40 s on two idle cores."""
+PATIENCE_S = 900.0
+"""For a block; the longest takes 40 s on two idle cores, and five minutes where seven others share them."""
+LOOK_AGAIN_S = 2
+"""Between two looks at an answer that is awaited: a look takes half a second of a core, which the service needs."""
 LONG_S = 3600.0
 
 
@@ -247,7 +249,11 @@ def shell_lines(step: Step, form: Form, said: Path) -> list[str]:
     told = f"{{ {step.command}\n}} > {said}.out 2> {said}.err; echo $? > {said}.status"
     if form.until is None:
         return [told]
-    return ["for _ in $(seq 100); do", told, f"grep -q {shlex.quote(form.until)} {said}.out && break; done"]
+    return [
+        "while true; do",
+        told,
+        f"grep -q {shlex.quote(form.until)} {said}.out && break; sleep {LOOK_AGAIN_S}; done",
+    ]
 
 
 def shim(folder: Path) -> Path:
