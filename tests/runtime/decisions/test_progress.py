@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from coec.calibration.types import Reason
-from coec.runtime.decisions.progress import Progress
+from coec.runtime.decisions.progress import Attempts, Progress
 from coec.runtime.ingest.chooser import Chosen
 from coec.runtime.ingest.decoder import CAMERA, LIDAR, StreamCounts
 from coec.runtime.ingest.stream_statistics import StreamStatistics
@@ -93,3 +93,16 @@ def test_a_failure_is_named_by_whose_it_is(failure: str, code: str) -> None:
     late = progress.overdue(ALL, 116.0)
     assert late is not None
     assert (late.code, late.text) == (f"overdue_{code}", "No check has been completed for 16 s: It went wrong.")
+
+
+def test_three_attempts_in_a_row_that_come_to_nothing_are_a_trouble_and_one_that_does_ends_it() -> None:
+    attempts = Attempts("windows", "windows_in_vain")
+    for text in ("No edges.", "No edges."):
+        attempts.failed(Reason("range_edges", text))
+    assert attempts.trouble is None
+    attempts.failed(Reason("overlap", "Too little in view."))
+    assert attempts.trouble == Reason("windows_in_vain", "The last 3 windows came to nothing. Too little in view.")
+    attempts.succeeded()
+    assert attempts.trouble is None
+    attempts.failed(Reason("overlap", "Too little in view."))
+    assert attempts.trouble is None, "it is counted from the beginning again"

@@ -28,7 +28,7 @@ from coec.config import CalibrationConfig, PairConfig
 from coec.runtime.decisions.incident_pictures import IncidentPictures
 from coec.runtime.decisions.mailbox import Mailbox
 from coec.runtime.decisions.pair_store import PairStore, Taken
-from coec.runtime.decisions.progress import Progress
+from coec.runtime.decisions.progress import Attempts, Progress
 from coec.runtime.decisions.queue import DecisionQueue, Effect, Question, Take
 from coec.runtime.decisions.rig_baseline import RigBaseline
 from coec.runtime.ingest.chooser import Served
@@ -43,9 +43,6 @@ _log = logging.getLogger(__name__)
 
 TICK_S = 1.0
 """Longest time between two looks at the clocks; health is never older than that while the thread lives."""
-
-IN_VAIN = 3
-"""Checks, or windows, in a row that came to nothing, from which on health says so."""
 
 
 class StreamSide(Protocol):
@@ -136,10 +133,8 @@ class Decider:
         self._latest_check: CheckReply | None = None
         self._checks = 0
         self._solved = 0
-        self._checks_in_vain = 0
-        self._windows_in_vain = 0
-        self._blind: Reason | None = None
-        self._unsolved: Reason | None = None
+        self._check_attempts = Attempts("checks", "monitor_blind")
+        self._window_attempts = Attempts("windows", "windows_in_vain")
         self._overdue: Reason | None = None
 
     def request_stop(self) -> None:
@@ -290,20 +285,16 @@ class Decider:
         if effect is None:
             self._losses.add("monitor", "check_overtaken")
             return None
-        self._checks_in_vain, self._blind = 0, None
+        self._check_attempts.succeeded()
         self._checks += 1
         self._latest_check = check_of(observation, self._store.state)
         self._store.note_check(self._latest_check)
         return effect
 
     def _check_in_vain(self, reason: Reason) -> None:
-        """Whoever cannot look must not go on saying that all is well."""
         self._losses.add("monitor", f"check_{reason.code}", detail=reason.text)
         self._progress.failed(reason)
-        self._checks_in_vain += 1
-        if self._checks_in_vain >= IN_VAIN:
-            text = f"The last {self._checks_in_vain} checks came to nothing. {reason.text}"
-            self._blind = Reason("monitor_blind", text)
+        self._check_attempts.failed(reason)
 
     def _take_result(self, answer: Solved, live: bool) -> Effect | None:
         result = answer.result
@@ -318,7 +309,7 @@ class Decider:
             self._calibrate_with(self._baseline.calibration)
         self._store.note_result(result)
         self._solved += 1
-        self._windows_in_vain, self._unsolved = 0, None
+        self._window_attempts.succeeded()
         latest = self._store.state.latest
         # A window of an earlier run is old news when a newer one has been evaluated.
         if live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
@@ -357,10 +348,7 @@ class Decider:
         self._losses.add("window", reason.code, detail=reason.text)
         if not live:
             return None
-        self._windows_in_vain += 1
-        if self._windows_in_vain >= IN_VAIN:
-            text = f"The last {self._windows_in_vain} windows came to nothing. {reason.text}"
-            self._unsolved = Reason("windows_in_vain", text)
+        self._window_attempts.failed(reason)
         return self._step(lambda state: lifecycle.after_failure(state, reason), None, completed=False)
 
     def _lost_question(self, question: Question) -> Take:
@@ -422,7 +410,13 @@ class Decider:
     # --- what ails --------------------------------------------------------------------------------------------------
 
     def _troubles(self) -> tuple[Reason, ...]:
-        own = (self._store.damage, self._baseline.trouble, self._blind, self._unsolved, self._overdue)
+        own = (
+            self._store.damage,
+            self._baseline.trouble,
+            self._check_attempts.trouble,
+            self._window_attempts.trouble,
+            self._overdue,
+        )
         said = {reason.code for reason in self._store.state.reasons}
         held = Reason(HELD, "The extrinsic is held by command.") if self._store.state.frozen else None
         return tuple(reason for reason in (*own, held) if reason is not None and reason.code not in said)

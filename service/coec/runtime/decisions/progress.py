@@ -23,6 +23,9 @@ PERIODS = 3
 SLOWEST_PACE = 0.1
 """Of a replay, in seconds of sensor time a second: a slower one counts as standing still."""
 
+IN_VAIN = 3
+"""Checks, or windows, in a row that came to nothing, from which on health says so."""
+
 DEPTH_CODES = frozenset({ModelError.reply_code})
 """Codes of failures that are the depth network's."""
 
@@ -30,6 +33,29 @@ WORKER_CODES = frozenset(
     {WORKER_FAILED, SUPERSEDED.code, BUSY.code, Fate.LATE.value, "internal_error", "unsendable", "unanswered"}
 )
 """Codes of failures that are the worker's, or those of the way there and back."""
+
+
+class Attempts:
+    """A kind of attempt, and how many of them came to nothing one after the other: whoever cannot look must not go on
+    saying that all is well. Belongs to the thread that decides."""
+
+    def __init__(self, what: str, code: str) -> None:
+        """`what` in the plural; `code` of the trouble."""
+        self._what = what
+        self._code = code
+        self._in_vain = 0
+        self.trouble: Reason | None = None
+
+    def failed(self, reason: Reason) -> None:
+        """One came to nothing."""
+        self._in_vain += 1
+        if self._in_vain >= IN_VAIN:
+            text = f"The last {self._in_vain} {self._what} came to nothing. {reason.text}"
+            self.trouble = Reason(self._code, text)
+
+    def succeeded(self) -> None:
+        """One came to something."""
+        self._in_vain, self.trouble = 0, None
 
 
 @dataclass(slots=True)
