@@ -45,8 +45,10 @@ def test_a_step_is_noticed_corrected_and_remembered(tmp_path: Path, drive: Drive
         running.send(drive.between(STEP_S, SECONDS + 1))
         running.rest()
         step_ns = drive.start_ns + STEP_S * NS_PER_S
-        states = {entry["code"]: (entry["stamp_ns"] - step_ns) / NS_PER_S for entry in running.entries("state")}
-        assert [entry["code"] for entry in running.entries("state")][:1] == ["healthy"], "no false alarm"
+        # On a busy machine a pair may also be degraded while answers are awaited: by the clock, not by sensor time.
+        told = [entry for entry in running.entries("state") if entry["stamp_ns"] is not None]
+        assert told[0]["code"] == "healthy", "no false alarm"
+        states = {entry["code"]: (entry["stamp_ns"] - step_ns) / NS_PER_S for entry in told}
         assert 0 < states["suspect"] <= states["miscalibrated"] < NOTICED_S
         # The window that repairs it may end with the check that was certain.
         assert states["miscalibrated"] <= states["healthy"]
