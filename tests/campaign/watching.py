@@ -218,10 +218,13 @@ class Watch:
 
 @contextmanager
 def watching(
-    path: Path, truth: Truth | None = None, extra_environment: dict[str, str] | None = None
+    path: Path,
+    truth: Truth | None = None,
+    extra_environment: dict[str, str] | None = None,
+    program: Sequence[str] = COMMAND,
 ) -> Iterator[Watch]:
-    """A service with this configuration whose worker is ready, and one who watches it."""
-    with _environment(extra_environment or {}), service(path, None) as running:
+    """A service with this configuration whose worker is ready, and one who watches it. `program` stands for `coec`."""
+    with _environment(extra_environment or {}), service(path, None, program=program) as running:
         watch = Watch(running, running.session, running.config, path, truth)
         ego = running.config.pairs[0].ego
         assert ego is not None

@@ -106,6 +106,13 @@ def show_metrics(metrics: dict[str, replies.MetricReply]) -> None:
         return
     figures = table("figure", "value", "limit", "", right=(1,))
     for name, metric in metrics.items():
-        limit = f"{'≥' if metric.at_least else '≤'} {figure(metric.limit)}"
-        figures.add_row(name, figure(metric.value), limit, Text("✓", "green") if metric.passed else Text("✗", "red"))
+        figures.add_row(name, figure(metric.value), *limit_of(metric))
     out.print(figures)
+
+
+def limit_of(metric: replies.MetricReply) -> tuple[str, Text]:
+    """The limit of a figure, and whether it keeps it; both empty where it has none, as before commissioning."""
+    if metric.limit is None:
+        return "", Text()
+    limit = f"{'≥' if metric.at_least else '≤'} {figure(metric.limit)}"
+    return limit, Text("✓", "green") if metric.passed else Text("✗", "red")

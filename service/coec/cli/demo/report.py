@@ -231,12 +231,7 @@ def _timeline(moments: Sequence[Moment], outcome: Ending) -> str:
 
 def _result(result: replies.CalibrationResult) -> str:
     rows = [
-        (
-            escape(name),
-            console.figure(metric.value),
-            f"{'≥' if metric.at_least else '≤'} {console.figure(metric.limit)}",
-            "✓" if metric.passed else "✗",
-        )
+        (escape(name), console.figure(metric.value), *map(str, console.limit_of(metric)))
         for name, metric in result.metrics.items()
     ]
     told = (

@@ -128,10 +128,5 @@ def _figures(seen: Seen) -> Table:
         if metric is None:
             table.add_row(name, "-", "", "")
             continue
-        if metric.limit is None:
-            table.add_row(name, console.figure(metric.value), "", "")
-            continue
-        limit = f"{'≥' if metric.at_least else '≤'} {console.figure(metric.limit)}"
-        mark = Text("✓", "green") if metric.passed else Text("✗", "red")
-        table.add_row(name, console.figure(metric.value), limit, mark)
+        table.add_row(name, console.figure(metric.value), *console.limit_of(metric))
     return table
