@@ -6,9 +6,11 @@ import json
 import queue
 import threading
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgpack
+import psutil
 import pytest
 import zenoh
 
@@ -186,6 +188,30 @@ def test_a_port_in_use_is_a_clear_error(bus: Bus, endpoint: str) -> None:
 
 def test_no_router_is_no_error(endpoint: str) -> None:
     open_session(ZenohConfig(connect=(endpoint,)), LimitsConfig()).close()
+
+
+@pytest.mark.parametrize("said", ['mode: "peer",', 'mode: "client",', ""])
+def test_a_file_that_names_no_door_opens_none(endpoint: str, bus: Bus, tmp_path: Path, said: str) -> None:
+    del bus  # a client wants a router
+    file = tmp_path / "zenoh.json5"
+    file.write_text(f'{{ {said} connect: {{ endpoints: ["{endpoint}"] }} }}')
+    before = listening()
+    with open_session(ZenohConfig(file=file), LimitsConfig()):
+        assert listening() == before
+
+
+def test_a_door_that_a_file_names_is_opened(tmp_path: Path) -> None:
+    port = free_port()
+    file = tmp_path / "zenoh.json5"
+    file.write_text(f'{{ mode: "peer", listen: {{ endpoints: ["tcp/127.0.0.1:{port}"] }} }}')
+    with open_session(ZenohConfig(file=file), LimitsConfig()):
+        assert ("127.0.0.1", port) in listening()
+
+
+def listening() -> set[tuple[str, int]]:
+    """Addresses and ports at which this process waits for others, of either protocol."""
+    sockets = psutil.Process().net_connections("inet")
+    return {tuple(one.laddr) for one in sockets if one.laddr and one.status in (psutil.CONN_LISTEN, psutil.CONN_NONE)}
 
 
 def test_the_attachment_of_a_query_is_handed_on(bus: Bus, client: zenoh.Session) -> None:

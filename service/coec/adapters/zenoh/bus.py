@@ -70,7 +70,8 @@ class Route:
 
 
 def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
-    """A peer that connects and reconnects to the router, or the router itself. What `config.file` says stands.
+    """A peer that connects and reconnects to the router, or the router itself. What `config.file` says stands; what it
+    does not say opens no door: nobody listens, and nobody is looked for, who was not told to.
 
     Raises:
         ConfigError: the file, an endpoint or a port cannot be used.
@@ -80,11 +81,17 @@ def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
         settings = zenoh.Config.from_file(config.file) if config.file else zenoh.Config()
         listen = config.listen if config.embedded_router else ()
         connect = tuple(endpoint for endpoint in config.connect if endpoint not in listen)
-        if config.file is None or json.loads(settings.get_json("mode")) is None:
-            settings.insert_json5("mode", json.dumps("router" if config.embedded_router else "peer"))
-            settings.insert_json5("listen/endpoints", json.dumps(listen))
-        if not json.loads(settings.get_json("connect/endpoints")):
-            settings.insert_json5("connect/endpoints", json.dumps(connect))
+        silent = {
+            "mode": "router" if config.embedded_router else "peer",
+            "listen/endpoints": listen,
+            "connect/endpoints": connect,
+            "scouting/gossip/enabled": False,
+        }
+        unsaid = zenoh.Config()
+        for key, value in silent.items():
+            # A peer listens on every interface by default, at any port.
+            if settings.get_json(key) == unsaid.get_json(key):
+                settings.insert_json5(key, json.dumps(value))
         settings.insert_json5("scouting/multicast/enabled", "false")
         settings.insert_json5("timestamping/enabled", "true")
         settings.insert_json5("transport/link/rx/max_message_size", str(limits.max_message_bytes))
