@@ -379,6 +379,11 @@ class ZenohConfig(Stage):
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     file: Path | None = None
 
+    @property
+    def router(self) -> tuple[str, ...]:
+        """Endpoints at which a client reaches the router that the service uses, or is."""
+        return self.listen if self.embedded_router else self.connect
+
 
 class Config(Stage):
     """The one configuration file of a daemon."""

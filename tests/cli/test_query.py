@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from coec.errors import NotFoundError
 from coec.schemas.base import Message, to_json
 from coec.schemas.keys import Keys, parse_range_selector
 from coec.schemas.replies import PairStatus, StatusReply, StorageStatus, WindowInfo, WindowsReply, WorkerStatus
+from conftest import REPOSITORY
 from ports import free_port
 
 DEADLINE_S = 20.0
@@ -119,6 +122,29 @@ def test_what_is_no_question_is_a_usage_error_and_writes_nothing(
     assert said in outcome.err
     assert "Traceback" not in outcome.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_health_check_of_the_image_asks_the_service_of_its_configuration(
+    coec: Coec, vehicle: str, endpoint: str, tmp_path: Path
+) -> None:
+    (written,) = re.findall(r"HEALTHCHECK .*?CMD (\[.*?\])", (REPOSITORY / "Dockerfile").read_text(), re.DOTALL)
+    program, *arguments = json.loads(written)
+    assert program == "coec"
+    shipped = (REPOSITORY / "deploy" / "coec.yaml").read_text()
+    mounted = tmp_path / "coec.yaml"
+    typed = [str(mounted) if argument == "/etc/coec/coec.yaml" else argument for argument in arguments]
+    for router, status in ((vehicle, 0), (endpoint, 1)):
+        mounted.write_text(shipped.replace("tcp/127.0.0.1:7447", router))
+        assert coec(*typed).status == status
+
+
+def test_what_is_typed_comes_before_the_configuration(coec: Coec, vehicle: str, endpoint: str, tmp_path: Path) -> None:
+    config = tmp_path / "coec.yaml"
+    shipped = (REPOSITORY / "deploy" / "coec.yaml").read_text()
+    config.write_text(shipped.replace("tcp/127.0.0.1:7447", endpoint).replace("vehicle: vehicle", "vehicle: other"))
+    typed = ("query", "status", "--config", str(config), "--connect", vehicle)
+    assert coec(*typed).status == 1, "nobody answers for `other`"
+    assert coec(*typed, "--vehicle", "vehicle").status == 0
 
 
 def test_an_endpoint_that_is_none_is_a_usage_error(coec: Coec) -> None:

@@ -40,9 +40,12 @@ Source = Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP, show_
 ConfigFile = Annotated[
     Path, typer.Option("--config", help="Configuration of the daemon (YAML).", metavar="FILE", show_default=False)
 ]
-Connect = Annotated[str, typer.Option(help="Zenoh endpoint of the router.", metavar="ENDPOINT")]
-
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
+"""As `config` has it, which takes too long to import for a help text."""
+
+Connect = Annotated[
+    str | None, typer.Option(help="Zenoh endpoint of the router.", metavar="ENDPOINT", show_default=DEFAULT_CONNECT)
+]
 
 
 class Encoding(StrEnum):
@@ -346,9 +349,7 @@ def _play(
     ] = None,
     rate: Annotated[float, typer.Option(help="Times recorded speed; 0 = without waiting.", min=0)] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Again and again; sensor time goes on.")] = False,
-    connect: Annotated[
-        str | None, typer.Option(help="Zenoh endpoint of the router.", metavar="ENDPOINT", show_default=DEFAULT_CONNECT)
-    ] = None,
+    connect: Connect = None,
     encoding: Annotated[Encoding, typer.Option(help="Of the frames.")] = Encoding.MSGPACK,
     start_now: Annotated[bool, typer.Option("--start-now", help="Shift the stamps so that they begin now.")] = False,
     as_json: Json = False,
@@ -383,9 +384,13 @@ def _query(
     pair: Annotated[
         str | None, typer.Option(help="All pairs if not given; needed for commands if there are several.")
     ] = None,
-    vehicle: Annotated[str, typer.Option()] = "vehicle",
-    prefix: Annotated[str, typer.Option()] = "coec",
-    connect: Connect = DEFAULT_CONNECT,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Of the service: names the vehicle, the prefix and the router.", metavar="FILE"),
+    ] = None,
+    vehicle: Annotated[str | None, typer.Option(show_default="vehicle")] = None,
+    prefix: Annotated[str | None, typer.Option(show_default="coec")] = None,
+    connect: Connect = None,
     param: Annotated[
         list[str] | None, typer.Option(help="Parameter of the query, for example limit=5; repeatable.", metavar="K=V")
     ] = None,
@@ -402,9 +407,7 @@ def _query(
     options = command.Options(
         key=key,
         pair=pair,
-        vehicle=vehicle,
-        prefix=prefix,
-        connect=connect,
+        service=command.asked_of(config, vehicle, prefix, connect),
         params=tuple(param or ()),
         payload=payload,
         timeout_s=timeout,

@@ -17,8 +17,7 @@ import numpy as np
 from coec.adapters.zenoh.client import connected, single_key
 from coec.adapters.zenoh.player import Frame, Played, Player, Streams, repeated
 from coec.calibration.types import CameraFrame, LidarFrame
-from coec.cli import DEFAULT_CONNECT
-from coec.config import Config, PairConfig, load_config
+from coec.config import Config, PairConfig, ZenohConfig, load_config
 from coec.errors import SourceError, UsageError
 from coec.reports import console
 from coec.sources import Recording, open_source
@@ -78,11 +77,9 @@ def _target(options: Options) -> tuple[PairConfig | None, tuple[str, ...]]:
     """The pair of the configuration, if there is one, and where to connect."""
     given = (options.connect,) if options.connect else None
     if options.config is None:
-        return None, given or (DEFAULT_CONNECT,)
+        return None, given or ZenohConfig().router
     config = load_config(options.config)
-    return _pair(config, options.pair), given or (
-        config.zenoh.listen if config.zenoh.embedded_router else config.zenoh.connect
-    )
+    return _pair(config, options.pair), given or config.zenoh.router
 
 
 def _pair(config: Config, name: str | None) -> PairConfig:

@@ -16,6 +16,7 @@ import zenoh
 
 from coec.adapters.files.output import OutputError
 from coec.adapters.zenoh.client import RemoteError, Reply, ask, ask_one, connected, key_expression, nobody, single_key
+from coec.config import Config, ZenohConfig, load_config
 from coec.errors import UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
@@ -37,14 +38,40 @@ PICTURE_KEYS = ("overlay", "evidence")
 
 
 @dataclass(frozen=True, slots=True)
+class Asked:
+    """Which service is asked. Of several endpoints of its router, one answers."""
+
+    vehicle: str
+    prefix: str
+    connect: tuple[str, ...]
+
+
+def asked_of(config: Path | None, vehicle: str | None, prefix: str | None, connect: str | None) -> Asked:
+    """The service of a configuration, or one with the default names; what else is given comes first.
+
+    Raises:
+        ConfigError: the configuration cannot be read.
+    """
+    if config is not None:
+        loaded = load_config(config)
+        usual = Asked(loaded.vehicle, loaded.prefix, loaded.zenoh.router)
+    else:
+        named = Config.model_fields
+        usual = Asked(named["vehicle"].default, named["prefix"].default, ZenohConfig().router)
+    return Asked(
+        usual.vehicle if vehicle is None else vehicle,
+        usual.prefix if prefix is None else prefix,
+        usual.connect if connect is None else (connect,),
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Options:
     """The arguments of the command; None = not given."""
 
     key: str
     pair: str | None
-    vehicle: str
-    prefix: str
-    connect: str
+    service: Asked
     params: tuple[str, ...]
     payload: str | None
     timeout_s: float
@@ -67,7 +94,7 @@ def run(options: Options) -> int:
         return _download(options, keys, argument)
     if options.output is not None:
         return _save_picture(options, keys, head, argument)
-    with connected([options.connect], options.timeout_s) as session:
+    with connected(options.service.connect, options.timeout_s) as session:
         key, kind = _resolve(session, options, keys)
         replies = ask(session, _selector(key, options.params), options.timeout_s, _payload(options.payload))
     if not replies:
@@ -83,8 +110,8 @@ def _keys(options: Options) -> Keys:
     """
     if not math.isfinite(options.timeout_s):
         raise UsageError(f"--timeout {options.timeout_s}: give a number of seconds")
-    keys = Keys(options.prefix, options.vehicle)
-    for typed in (options.prefix, options.vehicle, options.key, options.pair):
+    keys = Keys(options.service.prefix, options.service.vehicle)
+    for typed in (options.service.prefix, options.service.vehicle, options.key, options.pair):
         if typed is not None:
             key_expression(typed)
     head, _, argument = options.key.partition("/")
@@ -188,7 +215,7 @@ def _save_picture(options: Options, keys: Keys, head: str, argument: str) -> int
         raise UsageError(
             "--output belongs to windows/ID, overlay, and evidence/ID with --param overlay=before or after"
         )
-    with connected([options.connect], options.timeout_s) as session:
+    with connected(options.service.connect, options.timeout_s) as session:
         if head == "overlay":
             key = keys.overlay(options.pair or _only_pair(session, options, keys))
         else:
@@ -211,7 +238,7 @@ def _save_picture(options: Options, keys: Keys, head: str, argument: str) -> int
 def _download(options: Options, keys: Keys, window_id: str) -> int:
     if options.output is None:
         raise UsageError("say where to with --output FILE")
-    with connected([options.connect], options.timeout_s) as session, console.progress(counted=False) as bars:
+    with connected(options.service.connect, options.timeout_s) as session, console.progress(counted=False) as bars:
         pair = _pair_of(session, options, keys, window_id)
         single_key(keys.window(pair, window_id))
         task = bars.add_task(window_id, note="")
