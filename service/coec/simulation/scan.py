@@ -125,7 +125,7 @@ def even_deg(low_deg: float, high_deg: float, beams: int) -> tuple[float, ...]:
 
 def _columns(width_rad: float, columns: int, elevations_rad: tuple[float, ...], period_s: float) -> Fired:
     """Upright fans from the left to the right of a width."""
-    azimuth = width_rad * (0.5 - (np.arange(columns) + 0.5) / columns)
+    azimuth = width_rad / 2 - width_rad * (np.arange(columns) + 0.5) / columns
     up = np.asarray(elevations_rad)
     rays = np.stack(
         [
