@@ -79,3 +79,14 @@ def test_a_drive_that_cannot_be_drawn_is_a_row_with_its_reason(monkeypatch: pyte
     assert found.failure is not None
     assert "unknown camera 'box'" in found.failure
     assert found.windows == {}
+
+
+@pytest.mark.slow
+def test_several_processes_give_the_rows_of_one(coec: Coec, tmp_path: Path) -> None:
+    words = ("--only", "room-empty_*", "--frames", 2, "--dof", 3, "--json")
+    one, two = (
+        coec("sim", "matrix", "--output", tmp_path / str(jobs), "--jobs", jobs, *words).document for jobs in (1, 2)
+    )
+    assert one["drives"] == 2
+    for row_of_one, row_of_two in zip(one["rows"], two["rows"], strict=True):
+        assert row_of_one | {"cpu_s": 0.0} == row_of_two | {"cpu_s": 0.0}

@@ -615,10 +615,10 @@ def _sim_matrix(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Try estimator and monitor on 84 simulated drives that nobody tuned to: scenes, lenses, LiDARs, light, faults.
+    """Try estimator and monitor on simulated drives that nobody tuned to: scenes, lenses, LiDARs, light, faults.
 
-    A drive takes half a minute to a minute of one core. What is done is kept in DIR: call again to go on. A DIR holds
-    results of one state of the code; take another after a change.
+    A drive takes about half a minute of one core, the whole matrix most of an hour. What is done is kept in DIR: call
+    again to go on. A DIR holds results of one state of the code; take another after a change.
     """
     from coec.cli import sim_matrix as command
 
