@@ -207,7 +207,7 @@ def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_no
 
     # So long that it cannot be over before the window has been judged: see `pace.LEAD_NS`.
     quiet = DriveConfig(
-        seed=story.SEED, seconds=32.0, camera="fisheye600", lidar=64, camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
+        seed=story.SEED, seconds=32.0, camera="fisheye600", lidar="64", camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
         workshop=story.WORKSHOP,
     )  # fmt: skip
     monkeypatch.setattr(story, "drive_config", lambda: quiet)

@@ -26,7 +26,7 @@ from coec.sources.recording import Message
 
 
 def small(*faults: str, seconds: float = 1.0, depth: bool = False, **more: object) -> SimulatedDrive:
-    config = {"seed": 4, "camera": "fisheye128", "lidar": 16, "camera_hz": 5.0, "lidar_hz": 5.0} | more
+    config = {"seed": 4, "camera": "fisheye128", "lidar": "16", "camera_hz": 5.0, "lidar_hz": 5.0} | more
     chosen = tuple(parse_fault(text) for text in faults)
     return SimulatedDrive(DriveConfig(seconds=seconds, faults=chosen, depth=depth, **config))  # type: ignore[arg-type]
 
@@ -111,7 +111,7 @@ def share_consistent(drive: SimulatedDrive, pair: FramePair, *, compensated: boo
 
 @pytest.mark.parametrize("camera", ["fisheye500", "pinhole600x300"])
 def test_points_project_onto_their_depth_once_motion_is_compensated(camera: str) -> None:
-    drive = small(depth=True, camera=camera, seconds=0.3, lidar=32, camera_delay_s=0.03)
+    drive = small(depth=True, camera=camera, seconds=0.3, lidar="32", camera_delay_s=0.03)
     messages = list(drive.messages())
     exposed = pictures(messages)[1]
     motion = min((m for m in messages if isinstance(m, EgoMotion)), key=lambda m: abs(m.stamp_ns - exposed.stamp_ns))

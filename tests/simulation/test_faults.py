@@ -44,7 +44,7 @@ def test_the_words_of_a_fault(text: str, expected: faults.Fault) -> None:
         ("step:1:roll=1", "unknown setting 'roll'; it takes rx, ry, rz, tx, ty, tz"),
         ("step:1:rx=much", "rx must be a number"),
         ("step:1:rx=nan", "rx must be a number"),
-        ("drift:1:rx=1", "a drift needs an end"),
+        ("drift:1:rx=1", "drift needs an end"),
         ("frozen:1:share=1", "it takes no settings"),
         ("tunnel:1:light=1", "it takes no settings"),
         ("loss:1:share=2", "share must lie between 0 and 1"),

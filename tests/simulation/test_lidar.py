@@ -12,10 +12,13 @@ pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 from coec.simulation.lidar import LIDARS, LidarModel, sweep
 from coec.simulation.mesh import Material, Mesh, join, quads
 from coec.simulation.road import build_road
+from coec.simulation.scan import Raster, Rosette, Turn, even_deg
 from coec.simulation.scene import Scene
 from coec.simulation.sky import draw_sky
+from coec.simulation.weather import Air, rainy_air
 
-EXACT = replace(LIDARS[16], columns=720, noise_m=1e-9, dropout=0.0)
+TURN = Turn(even_deg(-15.0, 15.0, 16), columns=720)
+EXACT = LidarModel(TURN, reach_m=100.0, noise_m=1e-9, dropout=0.0)
 Poses = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -48,10 +51,11 @@ def test_points_lie_on_the_walls() -> None:
     x, y = np.abs(found.xyz_m[:, :2]).T
     np.testing.assert_allclose(np.maximum(x, y), 10.0, atol=0.06)  # a beam in a corner mixes both walls
     assert np.median(np.abs(np.maximum(x, y) - 10.0)) < 1e-4
-    assert len(found.xyz_m) == EXACT.columns * 16
+    assert len(found.xyz_m) == TURN.columns * 16
+    assert found.ring is not None
     assert set(found.ring.tolist()) == set(range(16))
     elevation = np.arctan2(found.xyz_m[:, 2], np.hypot(*found.xyz_m[:, :2].T))
-    np.testing.assert_allclose(elevation, np.asarray(EXACT.elevations_rad)[found.ring], atol=1e-5)
+    np.testing.assert_allclose(elevation, np.asarray(TURN.elevations_rad)[found.ring], atol=1e-5)
 
 
 def test_it_turns_clockwise_from_the_rear_and_is_stamped_as_it_checks_forward() -> None:
@@ -74,7 +78,7 @@ def test_motion_skews_the_sweep_by_what_the_time_of_each_point_says() -> None:
 def test_noise_and_dropouts_are_those_of_the_model() -> None:
     model = replace(EXACT, noise_m=0.05, dropout=0.3)
     found = sweep(a_scene(a_room()), model, moving(0.0), 0.0, np.random.default_rng(1))
-    assert len(found.xyz_m) == pytest.approx(0.7 * EXACT.columns * 16, rel=0.03)
+    assert len(found.xyz_m) == pytest.approx(0.7 * TURN.columns * 16, rel=0.03)
     middle = np.abs(np.arctan2(found.xyz_m[:, 1], found.xyz_m[:, 0])) < 0.5
     range_m = np.linalg.norm(found.xyz_m[middle], axis=1)
     along = range_m / (found.xyz_m[middle, 0] / 10.0)
@@ -84,6 +88,7 @@ def test_noise_and_dropouts_are_those_of_the_model() -> None:
 def test_dead_beams_measure_nothing() -> None:
     dead = np.arange(16) % 4 == 0
     found = sweep(a_scene(a_room()), EXACT, moving(0.0), 0.0, np.random.default_rng(0), dead)
+    assert found.ring is not None
     assert set(found.ring.tolist()) == set(np.flatnonzero(~dead).tolist())
 
 
@@ -91,7 +96,7 @@ def test_echoes_within_a_pulse_mix_and_others_do_not() -> None:
     def plate(x_m: float) -> Mesh:
         return quads([[[x_m, -3, -5], [x_m, 0.011, -5], [x_m, 0.011, 5], [x_m, -3, 5]]], 0.5, Material.PLASTER)
 
-    model = LidarModel((0.0,), columns=3600, noise_m=1e-9, dropout=0.0, divergence_rad=0.003)
+    model = LidarModel(Turn((0.0,), columns=3600), noise_m=1e-9, dropout=0.0, divergence_rad=0.003)
     for plate_m, mixed in ((9.68, True), (5.0, False)):
         scene = a_scene(join([a_room(), plate(plate_m)]))
         found = sweep(scene, model, moving(0.0), 0.0, np.random.default_rng(0))
@@ -109,3 +114,35 @@ def test_a_sign_answers_brighter_than_asphalt() -> None:
         return float(np.median(found.intensity))
 
     assert strength(Material.SIGN) > 3 * strength(Material.ASPHALT)
+
+
+@pytest.mark.parametrize("name", ["raster", "rosette"])
+def test_a_sensor_that_does_not_turn_sees_a_part_of_the_room_and_numbers_no_rings(name: str) -> None:
+    model = replace(LIDARS[name], noise_m=1e-9, dropout=0.0, divergence_rad=0.0)
+    found = sweep(a_scene(a_room()), model, moving(0.0), 0.0, np.random.default_rng(0))
+    assert found.ring is None
+    x, y = np.abs(found.xyz_m[:, :2]).T
+    np.testing.assert_allclose(np.maximum(x, y), 10.0, atol=1e-3)
+    away_deg = np.degrees(np.arctan2(np.abs(found.xyz_m[:, 1]), found.xyz_m[:, 0]))
+    assert 30.0 < away_deg.max() < 61.0
+    assert np.ptp(found.time_offset_s) == pytest.approx(model.period_s, rel=0.01)
+
+
+def test_only_the_rosette_looks_elsewhere_in_the_next_sweep() -> None:
+    for pattern, same in ((Rosette(), False), (Raster(2.0, (0.0, 0.1), 30), True), (TURN, True)):
+        first, second = (pattern.fired(time_s, 0.1).rays for time_s in (0.0, 0.1))
+        np.testing.assert_allclose(np.linalg.norm(second, axis=-1), 1.0, atol=1e-12)
+        assert np.array_equal(first, second) == same
+
+
+def test_rain_answers_some_rays_and_weakens_the_others() -> None:
+    room, model = a_scene(a_room(300.0)), replace(EXACT, reach_m=300.0)
+
+    def swept(air: Air) -> NDArray[np.float32]:
+        xyz_m = sweep(room, model, moving(0.0), 0.0, np.random.default_rng(0), air=air).xyz_m
+        return np.asarray(np.linalg.norm(xyz_m, axis=1))
+
+    clear, wet = swept(Air()), swept(rainy_air(40.0))
+    assert (clear > 60.0).all()
+    assert np.sum(wet < 60.0) / (16 * TURN.columns) == pytest.approx(40.0 * 6e-4, rel=0.3)
+    assert wet.max() < clear.max()

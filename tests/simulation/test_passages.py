@@ -12,6 +12,7 @@ from coec.simulation.faults import parse_fault
 from coec.simulation.parallel import messages_by
 from coec.simulation.passages import CLEAR_M, Passages, Span, passages
 from coec.simulation.scene import Town
+from coec.simulation.street import draw_style
 from coec.simulation.tunnel import HIGH_M, VERGE_M
 from coec.simulation.vehicle import P_EGO_LIDAR_M, Pace
 from simulation.test_drive import fingerprint, pictures, pixels, share_consistent, small, sweeps
@@ -19,13 +20,13 @@ from simulation.test_drive import fingerprint, pictures, pixels, share_consisten
 
 def at(second: float, *faults: str) -> tuple[NDArray[np.int64], LidarFrame]:
     """Picture and sweep at a second of a drive."""
-    drive = small(*faults, seconds=40.0, lidar=32, camera_hz=1.0, lidar_hz=1.0)
+    drive = small(*faults, seconds=40.0, lidar="32", camera_hz=1.0, lidar_hz=1.0)
     messages = list(drive.messages([round(second)]))
     return pixels(pictures(messages)[0]).astype(int), sweeps(messages)[0]
 
 
 def test_a_span_lies_where_the_vehicle_then_is() -> None:
-    pace = Pace(100.0, 0.5)
+    pace = Pace(100.0, 0.5, 8.5)
     found = passages((parse_fault("tunnel:5-9"), parse_fault("open_road:20")), pace, 30.0)
     ((tunnel,), (bare,)) = found.tunnels, found.open
     at_5, at_9, at_20, at_30 = pace.progress(np.array([5.0, 9.0, 20.0, 30.0]))
@@ -40,7 +41,7 @@ def test_a_span_lies_where_the_vehicle_then_is() -> None:
 def test_a_tunnel_is_near_dim_and_bare() -> None:
     street, _ = at(20, "dirt:0-1")
     picture, sweep = at(20, "tunnel:10-30")
-    style = Town(4, 100.0).style
+    style = draw_style(4)
     beside = np.abs(sweep.xyz_m[np.abs(sweep.xyz_m[:, 0]) < 8.0][:, 1])
     assert beside.max() < 2 * style.lane_m + VERGE_M
     above = sweep.xyz_m[:, 2][np.linalg.norm(sweep.xyz_m, axis=1) < 20.0]
@@ -50,7 +51,7 @@ def test_a_tunnel_is_near_dim_and_bare() -> None:
 
 @pytest.mark.parametrize("fault", ["tunnel:0-20", "open_road:0-20", "night:0-20"])
 def test_camera_and_lidar_see_the_same_place(fault: str) -> None:
-    drive = small(fault, depth=True, camera="pinhole600x300", seconds=6.0, lidar=32, camera_hz=1.0, lidar_hz=1.0)
+    drive = small(fault, depth=True, camera="pinhole600x300", seconds=6.0, lidar="32", camera_hz=1.0, lidar_hz=1.0)
     messages = list(drive.messages([4]))
     exposed, turn = pictures(messages)[0], sweeps(messages)[0]
     motion = min((m for m in messages if isinstance(m, EgoMotion)), key=lambda m: abs(m.stamp_ns - exposed.stamp_ns))

@@ -498,13 +498,24 @@ sim_app = typer.Typer(no_args_is_help=True, help="A vehicle that does not exist 
 app.add_typer(sim_app, name="sim")
 
 Seed = Annotated[int, typer.Option(help="Same seed, same bytes.", min=0)]
-SimCamera = Annotated[str, typer.Option(help="fisheyeW (185°, W×W pixels) or pinholeWxH (90° wide).", metavar="CAMERA")]
+SimCamera = Annotated[
+    str,
+    typer.Option(
+        help="fisheyeW (185°, W×W pixels), pinholeWxH (90° wide) or pinholeWxH@D (D degrees wide).", metavar="CAMERA"
+    ),
+]
+SimScene = Annotated[str, typer.Option(help="street, highway, garage or room.", metavar="SCENE")]
+SimSpeed = Annotated[
+    float | None,
+    typer.Option("--speed", help="Mean speed, m/s; 0 stands. Without it, as usual in the scene.", min=0, max=45),
+]
 Faults = Annotated[
     list[str] | None,
     typer.Option(
         "--fault",
         help="KIND:BEGIN[-END][:KEY=VALUE,...], repeatable: step:30:rx=3, drift:30-90:ry=2, dirt, dark, frozen, beams, "
-        "no-ego, offset, loss; poor stretches: tunnel:20-35, open_road:20-50, night:20-60.",
+        "no-ego, offset, offset_drift:10-60:seconds=0.05, loss; poor stretches: tunnel:20-35, open_road:20-50, "
+        "night:20-60, rain:20-60:mmph=20, low_sun:20-60.",
         metavar="FAULT",
     ),
 ]
@@ -516,7 +527,21 @@ def _sim_drive(
     seed: Seed = 0,
     seconds: Annotated[float, typer.Option(help="Length of the drive.", min=0.1)] = 60.0,
     camera: SimCamera = "fisheye700",
-    lidar: Annotated[int, typer.Option(help="Beams: 64, 32 or 16.")] = 64,
+    lidar: Annotated[
+        str, typer.Option(help="Beams: 16, 32, 64, 128; or without rings: raster, rosette.", metavar="LIDAR")
+    ] = "64",
+    scene: SimScene = "street",
+    speed_mps: SimSpeed = None,
+    rolling_shutter_s: Annotated[
+        float, typer.Option("--rolling-shutter", help="Seconds from the first row to the last.", min=0, max=0.1)
+    ] = 0.0,
+    intrinsics_off: Annotated[
+        str | None,
+        typer.Option(
+            help="What the rig is told of the focal length and the principal point is wrong by so many percent.",
+            metavar="FOCAL[,CX,CY]",
+        ),
+    ] = None,
     camera_hz: Annotated[float, typer.Option(help="Pictures per second.", min=0.01)] = 10.0,
     lidar_hz: Annotated[float, typer.Option(help="Sweeps per second.", min=0.01, max=10)] = 10.0,
     fault: Faults = None,
@@ -542,6 +567,10 @@ def _sim_drive(
         lidar_hz=lidar_hz,
         faults=tuple(fault or ()),
         workshop=workshop,
+        scene=scene,
+        speed_mps=speed_mps,
+        rolling_shutter_s=rolling_shutter_s,
+        intrinsics_off=intrinsics_off,
     )
     raise typer.Exit(command.drive(options, output, as_json=as_json))
 
@@ -552,14 +581,60 @@ def _sim_view(
     seed: Seed = 0,
     at_s: Annotated[float, typer.Option(help="Seconds into the drive.", min=0)] = 0.0,
     camera: SimCamera = "fisheye700",
+    scene: SimScene = "street",
+    speed_mps: SimSpeed = None,
     fault: Faults = None,
     as_json: Json = False,
 ) -> None:
     """Write one picture of a drive."""
     from coec.cli import sim as command
 
-    options = command.Options(seed=seed, seconds=at_s + 1.0, camera=camera, faults=tuple(fault or ()))
+    options = command.Options(
+        seed=seed, seconds=at_s + 1.0, camera=camera, scene=scene, speed_mps=speed_mps, faults=tuple(fault or ())
+    )
     raise typer.Exit(command.view(options, at_s, output, as_json=as_json))
+
+
+@sim_app.command("matrix")
+def _sim_matrix(
+    output: Annotated[
+        Path,
+        typer.Option(help="Folder for report.json, normalised.png and drives/.", metavar="DIR", show_default=False),
+    ],
+    only: Annotated[
+        str | None,
+        typer.Option(
+            help="Drives whose name fits: scene_lens_lidar_light_fault_sN with * and ?, as '*_night_*' or '*_s1'.",
+            metavar="PATTERN",
+        ),
+    ] = None,
+    dof: Annotated[
+        DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.", show_default="both")
+    ] = None,
+    frames: Annotated[int, typer.Option(help="Pairs of a window; a drive has two windows.", min=2, max=100)] = 10,
+    depth: Depth = None,
+    jobs: Annotated[
+        int | None, typer.Option(help="Processes, of one core and 1 GB each.", min=1, show_default="the cores")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Try estimator and monitor on simulated drives that nobody tuned to: scenes, lenses, LiDARs, light, faults.
+
+    A drive takes about half a minute of one core, the whole matrix most of an hour. What is done is kept in DIR: call
+    again to go on. A DIR holds results of one state of the code; take another after a change.
+    """
+    from coec.cli import sim_matrix as command
+
+    options = command.Options(
+        output=output,
+        only=only,
+        dof=None if dof is None else int(dof.value),
+        frames=frames,
+        depth=depth,
+        jobs=jobs,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
 
 
 @app.command("bench")

@@ -32,7 +32,11 @@ class Options:
     seed: int
     seconds: float
     camera: str
-    lidar: int = 64
+    lidar: str = "64"
+    scene: str = "street"
+    speed_mps: float | None = None
+    rolling_shutter_s: float = 0.0
+    intrinsics_off: str | None = None
     camera_hz: float = 10.0
     lidar_hz: float = 10.0
     faults: tuple[str, ...] = ()
@@ -40,12 +44,13 @@ class Options:
 
     def open(self) -> SimulatedDrive:
         """The drive. Raises UsageError, SourceError: see `open_sim`."""
-        names = ("seed", "seconds", "camera", "lidar", "camera_hz", "lidar_hz")
-        query = {name: str(getattr(self, name)) for name in names}
+        names = (
+            *("seed", "seconds", "camera", "lidar", "camera_hz", "lidar_hz", "scene", "speed_mps"),
+            *("rolling_shutter_s", "intrinsics_off", "workshop"),
+        )
+        query = {name: str(getattr(self, name)) for name in names if getattr(self, name) is not None}
         if self.faults:
             query["faults"] = ";".join(self.faults)
-        if self.workshop:
-            query["workshop"] = self.workshop
         return open_sim(query)
 
 

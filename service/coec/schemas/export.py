@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import evaluation, frames, replies
+from coec.schemas import evaluation, frames, matrix, replies
 from coec.schemas.base import Message
 
 FRAMES: tuple[type[Message], ...] = (frames.CameraFrame, frames.LidarFrame, frames.EgoMotion)
@@ -30,6 +30,7 @@ MESSAGES: tuple[type[Message], ...] = (
     evaluation.EvaluationReport,
     evaluation.ComparisonReport,
     evaluation.ModelAssessment,
+    matrix.MatrixReport,
 )
 
 

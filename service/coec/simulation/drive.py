@@ -20,32 +20,38 @@ from numpy.typing import NDArray
 from coec.adapters.images.codec import encode_depth_png, encode_jpeg
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.errors import UsageError
-from coec.geometry.cameras import Camera, build
+from coec.geometry.cameras import Camera, build, intrinsics_of, name_of
 from coec.geometry.se3 import inverse, perturb
 from coec.simulation import faults as wrong
-from coec.simulation.exposure import Lens, at_night, dirt_cover, expose
-from coec.simulation.faults import Fault, shifted
+from coec.simulation.exposure import Lens, against_the_sun, at_night, dirt_cover, expose
+from coec.simulation.faults import Fault, late_s, shifted
 from coec.simulation.lamps import around, headlights, night_sky
 from coec.simulation.lidar import LIDARS, LidarModel, sweep
 from coec.simulation.mesh import Floats
 from coec.simulation.passages import passages
-from coec.simulation.render import pixel_rays, render_radiance
+from coec.simulation.render import Exposure, pixel_rays, render_rows
 from coec.simulation.scene import Scene, Solid, Town
+from coec.simulation.sky import Sky
+from coec.simulation.surroundings import SCENES, Surroundings
 from coec.simulation.vehicle import T_ego_lidar, Trip, body, build_pace, build_trip, workshop_T_camera_lidar
+from coec.simulation.weather import CLEAR, SHOWER_S, Air, low_sun_sky, rained_lens, rainy_air, rainy_sky
 from coec.sources.recording import MOTION_REACH_NS, Message, chosen_indices
 
 Doubles = NDArray[np.float64]
 F = TypeVar("F", bound=Fault)
 
 START_NS = 1_600_000_000_000_000_000
-FARTHEST_MPS = 11.0
-"""No trip is faster: how much road to lay."""
+ROW_PARTS = 24
+"""Parts in which a rolling shutter takes its rows: at 10 m/s and 30 ms the camera moves 1.3 cm from one to the next,
+less than a pixel of anything beyond 3 m."""
 XI, ALPHA = -0.2, 0.6
 """Of the double sphere fisheye: near those of common lenses."""
 BODY = np.float32(0.05)
 """Share of the light of the horizon that the black body of the vehicle sends back."""
 DAYLIGHT = np.empty((0, 4, 3))
 """No headlights."""
+WIDE_DEG, PINHOLE_DEG = 90, (10, 120)
+"""Width of a pinhole camera unless told otherwise, and the least and greatest."""
 NEAREST_M = 1.0
 """Range whose inverse has the largest depth code, 65535."""
 SPEED_SCALE_SIGMA, SPEED_SIGMA_MPS = 0.004, 0.02
@@ -61,27 +67,39 @@ class DriveConfig:
 
     Attributes:
         seconds: length of the drive.
-        camera: `fisheyeW` (double sphere, W×W pixels), `pinholeWxH` (90° wide), or any camera.
+        scene: one of `surroundings.SCENES`.
+        camera: `fisheyeW` (double sphere, W×W pixels), `pinholeWxH` (90° wide), `pinholeWxH@D` (D degrees wide), or any
+            camera.
         half_view_deg: the lens sees this far off its axis: 92.5 for 185°.
-        lidar: a number of beams of `LIDARS`, or any model.
+        lidar: a name in `LIDARS`, or any model.
         camera_hz, lidar_hz, ego_hz: frames per second; a sweep always takes the turn of its model.
         camera_delay_s: the camera exposes this long after the stamp of its sweep.
+        speed_mps: mean speed, 0 stands; None = as usual in the scene.
+        traffic: whether anything else moves.
         start_m: where along the road the drive begins.
+        rolling_shutter_s: from the first row of a picture to the last; its stamp is that of the middle row.
+        intrinsics_off: (3,) percent by which the focal length of the rig (of itself) and its principal point (of width
+            and height) differ from those of the camera that takes the pictures.
         faults: see `faults`.
         workshop: (6,) ξ, degrees and metres about the camera axes, by which the calibration of the rig is wrong.
         depth: attach the exact depth of each picture.
     """
 
     seed: int = 0
+    scene: str = "street"
     seconds: float = 60.0
     camera: str | Camera = "fisheye700"
     half_view_deg: float = 92.5
-    lidar: int | LidarModel = 64
+    lidar: str | LidarModel = "64"
     camera_hz: float = 10.0
     lidar_hz: float = 10.0
     ego_hz: float = 50.0
     camera_delay_s: float = 0.01
+    speed_mps: float | None = None
+    traffic: bool = True
     start_m: float = 0.0
+    rolling_shutter_s: float = 0.0
+    intrinsics_off: tuple[float, float, float] = (0.0, 0.0, 0.0)
     faults: tuple[Fault, ...] = ()
     workshop: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     depth: bool = False
@@ -93,7 +111,9 @@ class SimulatedDrive:
 
     Attributes:
         config: as given.
-        rig: with the workshop's calibration as nominal and a mask of lens and body.
+        rig: with the workshop's calibration as nominal, the intrinsics that the workshop believes in, and a mask of
+            lens and body.
+        camera: that takes the pictures.
         configuration: None, as for every recording that is not a window.
 
     Raises:
@@ -109,9 +129,12 @@ class SimulatedDrive:
         self.config = config
         self.camera = _camera(config.camera, config.half_view_deg)
         self.lidar = _lidar(config.lidar)
-        pace = build_pace(config.seed, config.start_m)
+        surroundings = _surroundings(config)
+        speed_mps = surroundings.speed_mps if config.speed_mps is None else config.speed_mps
+        pace = build_pace(config.seed, config.start_m, speed_mps)
         poor = passages(config.faults, pace, config.seconds)
-        town = Town(config.seed, config.start_m + FARTHEST_MPS * config.seconds, poor)
+        reach_m = config.start_m + pace.fastest_mps * config.seconds
+        town = Town(config.seed, reach_m, poor, surroundings, traffic=config.traffic)
         self._town = town
         self._trip: Trip = build_trip(config.seed, town.road, town.lane_left_m(), pace)
         self._true = workshop_T_camera_lidar()
@@ -126,9 +149,8 @@ class SimulatedDrive:
         xi = np.array([*np.deg2rad(config.workshop[:3]), *config.workshop[3:]])
         usable = self._seen & ~self._own_body(self._true)
         mask = cv2.erode(np.pad(usable.astype(np.uint8), 2), np.ones((5, 5), np.uint8))[2:-2, 2:-2] > 0
-        self.rig = Rig(
-            "sim", self.camera, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask
-        )  # fmt: skip
+        told = _told(self.camera, config.intrinsics_off)
+        self.rig = Rig("sim", told, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask)
 
     @property
     def name(self) -> str:
@@ -184,8 +206,8 @@ class SimulatedDrive:
             for index in range(math.ceil(config.seconds * rate_hz)):
                 time_s = self._time_s(stream, index)
                 if not self._lost(stream, index, time_s):
-                    late_s = sum(f.seconds for f in self._now(wrong.Offset, time_s)) if stream == _CAMERA else 0.0
-                    plan.append((START_NS + round((time_s + late_s) * 1e9), stream, index))
+                    late = late_s(config.faults, time_s) if stream == _CAMERA else 0.0
+                    plan.append((START_NS + round((time_s + late) * 1e9), stream, index))
         return sorted(plan)
 
     def _time_s(self, stream: int, index: int) -> float:
@@ -230,9 +252,22 @@ class SimulatedDrive:
         at_m = float(self._trip.pace.progress(np.array([time_s]))[0])
         scene = self._town.scene(at_m, time_s, self._trip.pace.progress)
         night = any(self._now(wrong.Night, time_s))
-        scene.sky = night_sky(self._town.sky) if night else self._town.sky
+        sky = self._weather(time_s)
+        scene.sky = night_sky(sky) if night else sky
         scene.headlights = headlights(self._trip.poses(np.array([time_s]))[0]) if night else DAYLIGHT
         return scene
+
+    def _weather(self, time_s: float) -> Sky:
+        sky = self._town.sky
+        for sunny in self._now(wrong.LowSun, time_s):
+            ahead = self._trip.poses(np.array([sunny.begin_s]))[0]
+            sky = low_sun_sky(sky, math.atan2(ahead[1, 0], ahead[0, 0]))
+        rain = self._rain(time_s)
+        return rainy_sky(sky, rain) if rain else sky
+
+    def _rain(self, time_s: float) -> float:
+        """Millimetres an hour."""
+        return max((fault.mmph for fault in self._now(wrong.Rain, time_s)), default=0.0)
 
     def _expose(self, index: int, stamp_ns: int) -> CameraFrame:
         time_s = self._time_s(_CAMERA, index)
@@ -248,20 +283,18 @@ class SimulatedDrive:
     def _picture(self, index: int, stamp_ns: int) -> CameraFrame:
         time_s = self._time_s(_CAMERA, index)
         T_camera_lidar = shifted(self._true, self.config.faults, time_s)
-        T_ego_camera = _times(T_ego_lidar(), inverse(T_camera_lidar))
-        pose = _times(self._trip.poses(np.array([time_s]))[0], T_ego_camera)
+        exposures = self._rows(time_s, _times(T_ego_lidar(), inverse(T_camera_lidar)))
         view = math.radians(self.config.half_view_deg)
         scene = self._scene(time_s)
-        radiance = render_radiance(scene, self.camera, pose, time_s=time_s, half_view_rad=view)
+        radiance = render_rows(scene, self.camera, exposures, half_view_rad=view)
         hidden = self._own_body(T_camera_lidar)
-        share, lamps = around(scene, pose[:3, 3])
+        share, lamps = around(scene, exposures[len(exposures) // 2].T_world_camera[:3, 3])
         radiance.linear[hidden] = BODY * (np.float32(share) * np.array(scene.sky.horizon, np.float32) + lamps)
         light = math.prod(fault.light for fault in self._now(wrong.Dark, time_s))
-        covered = max((fault.share for fault in self._now(wrong.Dirt, time_s)), default=0.0)
         lens = at_night(self.config.lens) if any(self._now(wrong.Night, time_s)) else self.config.lens
-        pixels = expose(
-            radiance.linear, self._seen, lens, self._rng(131, index), light=light, dirt=self._cover(covered)
-        )
+        lens = against_the_sun(lens) if any(self._now(wrong.LowSun, time_s)) else lens
+        cover = self._cover(time_s)
+        pixels = expose(radiance.linear, self._seen, lens, self._rng(131, index), light=light, dirt=cover)
         size = (self.camera.width, self.camera.height)
         image = EncodedImage(ImageFormat.JPEG, *size, encode_jpeg(pixels, self.config.lens.jpeg_quality))
         depth = None
@@ -272,12 +305,27 @@ class SimulatedDrive:
             depth = EncodedImage(ImageFormat.PNG, *size, encode_depth_png(code.astype(np.uint16)))
         return CameraFrame(stamp_ns, "camera", image, sequence=index, depth=depth)
 
-    def _cover(self, share: float) -> Floats | None:
-        if share == 0.0:
-            return None
-        if share not in self._dirt:
-            self._dirt[share] = dirt_cover(self._seen.shape, share, self.config.seed)
-        return self._dirt[share]
+    def _rows(self, time_s: float, T_ego_camera: Matrix4) -> list[Exposure]:
+        """Where the camera is while it takes its rows."""
+        height, readout_s = self.camera.height, self.config.rolling_shutter_s
+        bounds = np.linspace(0, height, (min(ROW_PARTS, height) if readout_s else 1) + 1).round().astype(int)
+        times = time_s + readout_s * ((bounds[:-1] + bounds[1:]) / 2 / height - 0.5)
+        poses = self._trip.poses(times)
+        return [
+            Exposure(int(first), int(last), _times(pose, T_ego_camera), float(at_s))
+            for first, last, pose, at_s in zip(bounds[:-1], bounds[1:], poses, times, strict=True)
+        ]
+
+    def _cover(self, time_s: float) -> Floats | None:
+        """Dirt and drops on the lens, whichever hides more."""
+        covers = []
+        if share := max((fault.share for fault in self._now(wrong.Dirt, time_s)), default=0.0):
+            if share not in self._dirt:
+                self._dirt[share] = dirt_cover(self._seen.shape, share, self.config.seed)
+            covers.append(self._dirt[share])
+        if rain := self._rain(time_s):
+            covers.append(rained_lens(self._seen.shape, rain, self.config.seed, int(time_s / SHOWER_S)))
+        return np.maximum.reduce(covers) if covers else None
 
     def _own_body(self, T_camera_lidar: Matrix4) -> NDArray[np.bool_]:
         """(h, w): pixels that show the vehicle itself; depends on how the camera is mounted."""
@@ -295,9 +343,10 @@ class SimulatedDrive:
     def _sweep(self, index: int, stamp_ns: int) -> LidarFrame:
         time_s = self._time_s(_LIDAR, index)
         share = max((fault.share for fault in self._now(wrong.Beams, time_s)), default=0.0)
-        beams = len(self.lidar.elevations_rad)
-        dead = self._rng(132).random(beams) < share if share else None
-        found = sweep(self._scene(time_s), self.lidar, self._lidar_poses, time_s, self._rng(133, index), dead)
+        dead = self._rng(132).random(self.lidar.pattern.beams) < share if share else None
+        rain = self._rain(time_s)
+        air: Air = rainy_air(rain) if rain else CLEAR
+        found = sweep(self._scene(time_s), self.lidar, self._lidar_poses, time_s, self._rng(133, index), dead, air)
         return LidarFrame(
             stamp_ns, "lidar", found.xyz_m, found.intensity, found.ring, found.time_offset_s, sequence=index
         )  # fmt: skip
@@ -323,11 +372,23 @@ def _times(a: Matrix4, b: Matrix4) -> Matrix4:
     return product
 
 
-def _lidar(choice: int | LidarModel) -> LidarModel:
+def _surroundings(config: DriveConfig) -> Surroundings:
+    if config.scene not in SCENES:
+        raise UsageError(f"there is no scene {config.scene!r}; choose one of {', '.join(SCENES)}")
+    made = SCENES[config.scene](config.seed)
+    stretches = [fault for fault in config.faults if isinstance(fault, wrong.Tunnel | wrong.OpenRoad)]
+    if stretches and not made.poor:
+        raise UsageError(f"a tunnel or an open road is a stretch of a street, not of a {config.scene}")
+    if config.speed_mps == 0 and any(isinstance(fault, wrong.Tunnel) for fault in stretches):
+        raise UsageError("a standing vehicle comes into no tunnel: give it a speed")
+    return made
+
+
+def _lidar(choice: str | LidarModel) -> LidarModel:
     if isinstance(choice, LidarModel):
         return choice
     if choice not in LIDARS:
-        raise UsageError(f"there is no LiDAR of {choice} beams; choose one of {', '.join(map(str, LIDARS))}")
+        raise UsageError(f"there is no LiDAR {choice!r}; choose one of {', '.join(LIDARS)}")
     return LIDARS[choice]
 
 
@@ -336,14 +397,29 @@ def _camera(choice: str | Camera, half_view_deg: float) -> Camera:
         return choice
     if found := re.fullmatch(r"fisheye(\d{2,4})", choice):
         return fisheye(int(found[1]), half_view_deg)
-    if found := re.fullmatch(r"pinhole(\d{2,4})x(\d{2,4})", choice):
-        width, height = int(found[1]), int(found[2])
-        return build(
-            "pinhole", width=width, height=height, fx=width / 2, fy=width / 2, cx=(width - 1) / 2, cy=(height - 1) / 2
-        )
+    if found := re.fullmatch(r"pinhole(\d{2,4})x(\d{2,4})(?:@(\d{1,3}))?", choice):
+        width, height, wide_deg = int(found[1]), int(found[2]), int(found[3] or WIDE_DEG)
+        if PINHOLE_DEG[0] <= wide_deg <= PINHOLE_DEG[1]:
+            focal = width / 2 / math.tan(math.radians(wide_deg) / 2) if wide_deg != WIDE_DEG else width / 2
+            return build(
+                "pinhole", width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2
+            )
     raise UsageError(
-        f"unknown camera {choice!r}; write fisheye700 (any width) or pinhole1000x400 (any width and height)"
+        f"unknown camera {choice!r}; write fisheye700 (any width), pinhole1000x400 (any width and height, 90° wide) or "
+        f"pinhole640x400@40 (so many degrees wide, {PINHOLE_DEG[0]} to {PINHOLE_DEG[1]})"
     )
+
+
+def _told(camera: Camera, off_percent: tuple[float, float, float]) -> Camera:
+    """The camera as the workshop believes it to be."""
+    focal, across, down = (value / 100.0 for value in off_percent)
+    told = {
+        "fx": camera.fx * (1.0 + focal),
+        "fy": camera.fy * (1.0 + focal),
+        "cx": camera.cx + across * camera.width,
+        "cy": camera.cy + down * camera.height,
+    }
+    return build(name_of(camera), **intrinsics_of(camera) | told)
 
 
 def fisheye(width_px: int, half_view_deg: float) -> Camera:

@@ -25,6 +25,7 @@ class Lens:
         target: mean level to which the exposure is driven, linear, 0 to 1.
         gain: least and greatest factor on the light.
         jpeg_quality: 1 to 100.
+        flare: share of the light that the glass scatters over the whole picture.
     """
 
     blur_px: float = 0.55
@@ -34,11 +35,15 @@ class Lens:
     target: float = 0.22
     gain: tuple[float, float] = (0.15, 8.0)
     jpeg_quality: int = 90
+    flare: float = 0.0
 
 
 NIGHT_BLUR_PX, NIGHT_NOISE, NIGHT_FULL_WELL = 1.5, 1.5, 0.25
 """At night: point spread of an exposure of 30 ms on the way, pixels; factors on the read noise and on the electrons of
 full exposure, as of a sensor at 4 times its usual sensitivity."""
+LOW_SUN_FLARE, FLARE_LIGHT, FLARE_SPREAD = 0.15, 30.0, 0.12
+"""Of a lens that the sun shines into: the scattered share, the light above which a source scatters no more (the sun's
+disc in the units of `Sky`), and the standard deviation of where it goes, as a share of the height of the picture."""
 NIGHT_GAIN = 12.0
 NIGHT_TARGET = 0.08
 """Mean level: cameras leave the night dark."""
@@ -56,6 +61,11 @@ def at_night(lens: Lens) -> Lens:
     )
 
 
+def against_the_sun(lens: Lens) -> Lens:
+    """The lens with the sun in it, or just outside."""
+    return replace(lens, flare=LOW_SUN_FLARE)
+
+
 def expose(
     linear: Floats, seen: NDArray[np.bool_], lens: Lens, rng: np.random.Generator, *, light: float, dirt: Floats | None
 ) -> NDArray[np.uint8]:
@@ -67,6 +77,9 @@ def expose(
         dirt: (h, w) cover of the lens, 0 clean to 1 opaque.
     """
     light_in = np.minimum(linear, np.float32(4.0)) * np.float32(light)  # the sun's disc blooms, but not over everything
+    if lens.flare:
+        bright = np.minimum(linear, np.float32(FLARE_LIGHT)) * np.float32(lens.flare * light)
+        light_in += np.asarray(cv2.GaussianBlur(bright, (0, 0), FLARE_SPREAD * linear.shape[0]), np.float32)
     if dirt is not None:
         veil = cv2.GaussianBlur(light_in, (0, 0), linear.shape[0] / 25)
         cover = dirt[:, :, None]

@@ -113,6 +113,26 @@ class Night(Fault):
     """No light but the vehicle's headlights; the camera exposes for longer and amplifies: blur and noise."""
 
 
+@dataclass(frozen=True, slots=True)
+class Rain(Fault):
+    """It rains so much: hazy air, drops on the lens and before the LiDAR, weaker echoes."""
+
+    mmph: float = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class LowSun(Fault):
+    """The sun stands low before the vehicle, and scatters in the lens."""
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetDrift(Fault):
+    """The clock of the camera creeps: its stamps are evenly later and later from begin to end, by so many seconds in
+    the end, and stay so."""
+
+    seconds: float = 0.05
+
+
 KINDS: dict[str, type[Fault]] = {
     "step": Step,
     "drift": Drift,
@@ -126,13 +146,23 @@ KINDS: dict[str, type[Fault]] = {
     "tunnel": Tunnel,
     "open_road": OpenRoad,
     "night": Night,
+    "rain": Rain,
+    "low_sun": LowSun,
+    "offset_drift": OffsetDrift,
 }
+CREEPING = ("drift", "offset_drift")
+"""What grows from begin to end."""
 FORMS = (
     "step:30:rx=3,tz=0.1 | drift:30-90:ry=2 | dirt:30-60:share=0.3 | dark:30-60:light=0.02 | frozen:30-60 | "
     "beams:30-60:share=0.5 | no-ego:30-60 | offset:30-60:seconds=0.05 | loss:30-60:share=0.3 | "
-    "tunnel:20-35 | open_road:20-50 | night:20-60"
+    "offset_drift:10-60:seconds=0.05 | tunnel:20-35 | open_road:20-50 | night:20-60 | rain:20-60:mmph=20 | "
+    "low_sun:20-60"
 )
 """One of each, for help and errors."""
+
+
+HARDEST_RAIN_MMPH = 150.0
+"""A cloudburst."""
 
 
 def parse_fault(text: str) -> Fault:
@@ -150,8 +180,8 @@ def parse_fault(text: str) -> Fault:
     end_s = _number(text, "end", end) if dash else math.inf
     if not 0 <= begin_s < end_s:
         raise UsageError(f"fault {text!r}: it must begin at 0 s or later and end after that; write for example {FORMS}")
-    if kind == "drift" and math.isinf(end_s):
-        raise UsageError(f"fault {text!r}: a drift needs an end: write for example drift:30-90:ry=2")
+    if kind in CREEPING and math.isinf(end_s):
+        raise UsageError(f"fault {text!r}: {kind} needs an end: write for example drift:30-90:ry=2")
     known = [field.name for field in fields(KINDS[kind])][2:]
     values: dict[str, float] = {}
     for setting in filter(None, settings.split(",")):
@@ -163,6 +193,8 @@ def parse_fault(text: str) -> Fault:
     for key in ("share", "light"):
         if not 0 <= values.get(key, 0.0) <= 1:
             raise UsageError(f"fault {text!r}: {key} must lie between 0 and 1")
+    if not 0 <= values.get("mmph", 0.0) <= HARDEST_RAIN_MMPH:
+        raise UsageError(f"fault {text!r}: mmph must lie between 0 and {HARDEST_RAIN_MMPH:g}")
     return KINDS[kind](begin_s, end_s, **values)
 
 
@@ -181,8 +213,24 @@ def shifted(T_camera_lidar: NDArray[np.float64], faults: tuple[Fault, ...], time
     result = T_camera_lidar
     for fault in faults:
         if isinstance(fault, Drift):
-            share = min(max((time_s - fault.begin_s) / (fault.end_s - fault.begin_s), 0.0), 1.0)
+            share = _share(fault, time_s)
             result = perturb(result, share * fault.xi()) if share > 0 else result
         elif isinstance(fault, Step) and fault.active(time_s):
             result = perturb(result, fault.xi())
     return result
+
+
+def late_s(faults: tuple[Fault, ...], time_s: float) -> float:
+    """By how much the stamp of a camera frame that is taken at a time is late."""
+    total = 0.0
+    for fault in faults:
+        if isinstance(fault, Offset) and fault.active(time_s):
+            total += fault.seconds
+        elif isinstance(fault, OffsetDrift):
+            total += fault.seconds * _share(fault, time_s)
+    return total
+
+
+def _share(fault: Fault, time_s: float) -> float:
+    """How much of a creeping fault there is, 0 to 1."""
+    return min(max((time_s - fault.begin_s) / (fault.end_s - fault.begin_s), 0.0), 1.0)

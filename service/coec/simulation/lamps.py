@@ -14,7 +14,7 @@ from coec.geometry.compiler import njit, prange
 from coec.simulation.mesh import Floats
 from coec.simulation.scene import Hits, Scene
 from coec.simulation.sky import Sky
-from coec.simulation.tunnel import HIGH_M, SPINE_M
+from coec.simulation.tunnel import SPINE_M
 
 Doubles = NDArray[np.float64]
 
@@ -46,7 +46,8 @@ def incident(scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits) ->
     share, lamps = np.ones(len(directions), np.float32), np.zeros(len(directions), np.float32)
     origin = np.asarray(origin_m, np.float64)
     for room in scene.bores:
-        _in_bore(origin, directions, hits.range_m, hits.normal, room.spine, room.half_m, share, lamps)
+        _in_bore(origin, directions, hits.range_m, hits.normal, room.spine, room.half_m,
+                 room.high_m, room.light, share, lamps)  # fmt: skip
     if len(scene.headlights):
         _headlit(origin, directions, hits.range_m, hits.normal, scene.headlights, lamps)
     return Incident(share, lamps)
@@ -75,8 +76,8 @@ def headlights(T_world_ego: Matrix4) -> Doubles:
 
 @njit(cache=True, parallel=True)
 def _in_bore(
-    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, spine: Doubles, half_m: float, share: Floats,
-    lamps: Floats,
+    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, spine: Doubles, half_m: float, high_m: float,
+    light: float, share: Floats, lamps: Floats,
 ) -> None:  # fmt: skip
     last = len(spine) - 1
     for i in prange(len(directions)):
@@ -94,15 +95,15 @@ def _in_bore(
         left = (y - spine[j, 1]) * spine[j, 3] - (x - spine[j, 0]) * spine[j, 4]
         up = z - spine[j, 2]
         # A wall is straight between the points of its mesh, the spine is not.
-        if place < 0.0 or place > last or abs(left) > half_m + 0.1 or up > HIGH_M + 0.05:
+        if place < 0.0 or place > last or abs(left) > half_m + 0.1 or up > high_m + 0.05:
             continue
         deep_m = SPINE_M * min(place, last - place)
         share[i] = min(share[i], MOUTH_SHARE * math.exp(-deep_m / MOUTH_DEPTH_M))
-        above = max(HIGH_M - up, 0.0)
+        above = max(high_m - up, 0.0)
         away = max(math.sqrt(left * left + above * above), 0.3)
         sideways = normal[i, 1] * spine[j, 3] - normal[i, 0] * spine[j, 4]
         facing = max((above * normal[i, 2] - left * sideways) / away, 0.0)
-        lamps[i] += STRIP_LIGHT * facing / away + STRIP_BOUNCE
+        lamps[i] += light * (STRIP_LIGHT * facing / away + STRIP_BOUNCE)
 
 
 @njit(cache=True, parallel=True)

@@ -1,4 +1,4 @@
-"""A spinning LiDAR: every column of a turn is measured from where the vehicle is at that instant."""
+"""A LiDAR: every ray of a sweep is measured from where the vehicle is at that instant, through the air as it is."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.simulation.mesh import Floats, Material
+from coec.simulation.scan import Pattern, Raster, Rosette, Turn, even_deg
 from coec.simulation.scene import Hits, Scene
+from coec.simulation.weather import CLEAR, DROP_M, DROP_REFLECTANCE, Air
 
 Doubles = NDArray[np.float64]
 
@@ -30,14 +32,10 @@ REFLECTANCE[[Material.MARKING, Material.SIGN, Material.GLASS, Material.LAMP]] = 
 
 @dataclass(frozen=True, slots=True)
 class LidarModel:
-    """Data of a sensor: angles in radians, lengths in metres.
+    """Data of a sensor: lengths in metres. `divergence_rad` is half the opening angle of a beam; `dropout` is the share
+    of its measurements that fail without a reason."""
 
-    `elevations_rad` from the lowest beam up; `columns` per turn of `period_s`, clockwise from the rear, so that the
-    middle of the turn, its stamp, looks forward. `divergence_rad` is half the opening angle of a beam.
-    """
-
-    elevations_rad: tuple[float, ...]
-    columns: int
+    pattern: Pattern
     period_s: float = 0.1
     reach_m: float = 120.0
     nearest_m: float = 1.0
@@ -46,16 +44,17 @@ class LidarModel:
     dropout: float = 0.01
 
 
-def _spread(low_deg: float, high_deg: float, beams: int) -> tuple[float, ...]:
-    return tuple(float(angle) for angle in np.deg2rad(np.linspace(low_deg, high_deg, beams)))
-
-
-LIDARS: dict[int, LidarModel] = {
-    64: LidarModel(_spread(-24.8, 2.0, 64), columns=1800),
-    32: LidarModel(_spread(-25.0, 15.0, 32), columns=1800, reach_m=100.0),
-    16: LidarModel(_spread(-15.0, 15.0, 16), columns=1800, reach_m=100.0),
+LIDARS: dict[str, LidarModel] = {
+    "64": LidarModel(Turn(even_deg(-24.8, 2.0, 64), columns=1800)),
+    "32": LidarModel(Turn(even_deg(-25.0, 15.0, 32), columns=1800), reach_m=100.0),
+    "16": LidarModel(Turn(even_deg(-15.0, 15.0, 16), columns=1800), reach_m=100.0),
+    "128": LidarModel(Turn(even_deg(-25.0, 15.0, 128), columns=1800), noise_m=0.015),
+    "raster": LidarModel(Raster(np.radians(120.0), even_deg(-12.5, 12.5, 126), columns=600)),
+    "rosette": LidarModel(Rosette()),
 }
-"""By number of beams; angles as those of HDL-64E, a common 32-beam sensor and VLP-16."""
+"""By number of beams, angles as those of HDL-64E, a common 32-beam sensor, VLP-16 and a common 128-beam sensor. And two
+that do not turn and number no rings: a mirror's raster of 120° x 25° at 0.2°, as of long-range automotive sensors, and
+the rosette of two turning prisms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,13 +64,13 @@ class Sweep:
     Attributes:
         xyz_m: (N, 3) float32.
         intensity: (N,) float32, 0 to 1.
-        ring: (N,) uint16, 0 the lowest beam.
+        ring: (N,) uint16, 0 the lowest beam; None of a sensor that numbers none.
         time_offset_s: (N,) float32, from the stamp of the turn.
     """
 
     xyz_m: Floats
     intensity: Floats
-    ring: NDArray[np.uint16]
+    ring: NDArray[np.uint16] | None
     time_offset_s: Floats
 
 
@@ -82,26 +81,20 @@ def sweep(
     time_s: float,
     rng: np.random.Generator,
     dead: NDArray[np.bool_] | None = None,
+    air: Air = CLEAR,
 ) -> Sweep:
-    """One turn whose middle is at `time_s`.
+    """One sweep whose middle is at `time_s`.
 
     Args:
         poses: (N, 4, 4) from the LiDAR to the world at times (N,).
         dead: (beams,) beams that measure nothing.
+        air: what the light goes through.
     """
-    beams = len(model.elevations_rad)
-    azimuth = np.pi - 2 * np.pi * (np.arange(model.columns) + 0.5) / model.columns
-    offset_s = -model.period_s * azimuth / (2 * np.pi)
+    beams = model.pattern.beams
+    fired = model.pattern.fired(time_s, model.period_s)
+    rays, offset_s = fired.rays, fired.offset_s
+    columns = len(offset_s)
     pose = poses(time_s + offset_s)
-    up = np.asarray(model.elevations_rad)
-    rays = np.stack(
-        [
-            np.outer(np.cos(azimuth), np.cos(up)),
-            np.outer(np.sin(azimuth), np.cos(up)),
-            np.broadcast_to(np.sin(up), (model.columns, beams)),
-        ],
-        axis=-1,
-    )
     times = np.repeat(time_s + offset_s, beams)
     origins = np.repeat(pose[:, :3, 3], beams, axis=0)
 
@@ -109,26 +102,39 @@ def sweep(
         turned = np.einsum("nij,nj->ni", pose[chosen // beams, :3, :3], local).astype(np.float32)
         return scene.cast(origins[chosen], turned, times[chosen], model.reach_m)
 
-    everything = np.arange(model.columns * beams)
+    everything = np.arange(columns * beams)
     flat = rays.reshape(-1, 3)
     hits = cast(flat, everything)
     range_m = hits.range_m.astype(np.float64)
     strength = _reflectance(scene, hits) * _cosine(hits, flat, pose, beams)
-    edge = np.flatnonzero(_jumps(range_m.reshape(model.columns, beams)).ravel())
+    edge = np.flatnonzero(_jumps(range_m.reshape(columns, beams)).ravel())
     range_m[edge], strength[edge] = _cones(model, flat[edge], edge, range_m[edge], strength[edge], cast, scene)
     with np.errstate(invalid="ignore"):
-        seen = np.isfinite(range_m) & (range_m > model.nearest_m) & (strength / range_m**2 > WEAKEST)
+        echo = strength / range_m**2 * np.exp(-2.0 * air.extinction_per_m * range_m)
+        seen = np.isfinite(range_m) & (range_m > model.nearest_m) & (echo > WEAKEST)
     seen &= rng.random(len(range_m)) >= model.dropout
     if dead is not None:
-        seen &= ~np.tile(dead, model.columns)
+        seen &= ~np.tile(dead, columns)
     noise = rng.normal(0.0, model.noise_m, len(range_m))
+    if air.drops:
+        _rained(air, model, range_m, strength, seen, rng)
     measured = (range_m + noise)[seen]
     return Sweep(
         (flat[seen] * measured[:, None]).astype(np.float32),
         np.clip(strength[seen] + 0.02 * noise[seen] / model.noise_m, 0.0, 1.0).astype(np.float32),
-        np.tile(np.arange(beams, dtype=np.uint16), model.columns)[seen],
+        np.tile(np.arange(beams, dtype=np.uint16), columns)[seen] if model.pattern.ringed else None,
         np.repeat(offset_s, beams)[seen].astype(np.float32),
     )
+
+
+def _rained(
+    air: Air, model: LidarModel, range_m: Doubles, strength: Doubles, seen: NDArray[np.bool_], rng: np.random.Generator
+) -> None:
+    """Puts drops in the way of some of the rays, in place: they answer instead of what lies behind them."""
+    drop_m = model.nearest_m + rng.exponential(DROP_M, len(range_m))
+    hit = (rng.random(len(range_m)) < air.drops) & (drop_m < range_m)
+    range_m[hit], strength[hit] = drop_m[hit], DROP_REFLECTANCE
+    seen[hit] = True
 
 
 def _reflectance(scene: Scene, hits: Hits) -> Doubles:

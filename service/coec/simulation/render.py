@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -101,6 +102,15 @@ def tone(linear: Floats, exposure: float) -> NDArray[np.uint8]:
     return np.asarray(_tone(linear.reshape(-1), float(exposure))).reshape(linear.shape)
 
 
+class Exposure(NamedTuple):
+    """Rows `first` to `last` (excluded) of a picture, taken from `T_world_camera` (4, 4) at `time_s`."""
+
+    first: int
+    last: int
+    T_world_camera: Matrix4
+    time_s: float
+
+
 def render_radiance(
     scene: Scene,
     camera: Camera,
@@ -111,24 +121,53 @@ def render_radiance(
     smooth_edges: bool = True,
 ) -> Radiance:
     """See `render_view`."""
+    whole = Exposure(0, camera.height, T_world_camera, time_s)
+    return render_rows(scene, camera, [whole], half_view_rad=half_view_rad, smooth_edges=smooth_edges)
+
+
+def render_rows(
+    scene: Scene,
+    camera: Camera,
+    exposures: Sequence[Exposure],
+    *,
+    half_view_rad: float = np.pi,
+    smooth_edges: bool = True,
+) -> Radiance:
+    """A picture whose rows are taken one after the other, as by a rolling shutter: each part from where the camera is
+    at its own time. `exposures` cover the rows once."""
     rays = pixel_rays(camera, half_view_rad)
-    rotation = np.ascontiguousarray(T_world_camera[:3, :3], np.float64)
-    origin = np.asarray(T_world_camera[:3, 3], np.float64)
-    directions = _rotated(rays.directions, rotation)
-    hits = scene.cast(origin, directions, time_s)
-    light = _lit(scene, origin, directions, hits, time_s, rays.pixel_rad)
-    size = camera.height * camera.width
+    size, shape = camera.height * camera.width, (camera.height, camera.width)
     linear = np.zeros((size, 3), np.float32)
-    linear[rays.pixel] = light
     range_m = np.full(size, np.nan, np.float32)
-    range_m[rays.pixel] = np.where(hits.triangle < 0, np.float32(np.nan), hits.range_m)
-    shape = (camera.height, camera.width)
+    for part in exposures:
+        chosen = _rows(rays.pixel, part, camera)
+        rotation, origin = _placed(part)
+        directions = _rotated(rays.directions[chosen], rotation)
+        hits = scene.cast(origin, directions, part.time_s)
+        linear[rays.pixel[chosen]] = _lit(scene, origin, directions, hits, part.time_s, rays.pixel_rad)
+        range_m[rays.pixel[chosen]] = np.where(hits.triangle < 0, np.float32(np.nan), hits.range_m)
     if smooth_edges:
         seen = np.zeros(size, bool)
         seen[rays.pixel] = True
         edge = np.flatnonzero(_edges(linear.reshape(*shape, 3), range_m.reshape(shape), seen.reshape(shape)).ravel())
-        linear[edge] = _supersampled(scene, camera, rotation, origin, edge, linear[edge], time_s, rays.pixel_rad)
+        for part in exposures:
+            pixels = edge[_rows(edge, part, camera)]
+            rotation, origin = _placed(part)
+            linear[pixels] = _supersampled(
+                scene, camera, rotation, origin, pixels, linear[pixels], part.time_s, rays.pixel_rad
+            )
     return Radiance(linear.reshape(*shape, 3), range_m.reshape(shape))
+
+
+def _rows(pixels: NDArray[np.int64], part: Exposure, camera: Camera) -> slice:
+    """Which of some pixels, ascending, lie in the rows of a part."""
+    first, last = np.searchsorted(pixels, (part.first * camera.width, part.last * camera.width))
+    return slice(int(first), int(last))
+
+
+def _placed(part: Exposure) -> tuple[Doubles, Doubles]:
+    """Rotation (3, 3) and origin (3,) of a part, as the compiled code takes them."""
+    return np.ascontiguousarray(part.T_world_camera[:3, :3], np.float64), np.asarray(part.T_world_camera[:3, 3])
 
 
 def _lit(scene: Scene, origin: Doubles, directions: Floats, hits: Hits, time_s: float, pixel_rad: float) -> Floats:

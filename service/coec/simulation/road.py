@@ -45,13 +45,13 @@ class Road:
         return np.stack([x - left * np.sin(heading), y + left * np.cos(heading), z + up], axis=-1)
 
 
-def build_road(seed: int, begin_m: float, end_m: float) -> Road:
-    """The road of a seed between two arc lengths."""
+def build_road(seed: int, begin_m: float, end_m: float, calmer: float = 1.0) -> Road:
+    """The road of a seed between two arc lengths; `calmer`: its bends and slopes are so many times longer."""
     rng = np.random.default_rng([seed, 100])
     s: Doubles = begin_m + STEP_M * np.arange(int(np.ceil((end_m - begin_m) / STEP_M)) + 2, dtype=np.float64)
-    length = rng.uniform(SHORTEST_BEND_M, LONGEST_BEND_M, 3) * np.array([1.3, 1.0, 0.7])
+    length = calmer * rng.uniform(SHORTEST_BEND_M, LONGEST_BEND_M, 3) * np.array([1.3, 1.0, 0.7])
     heading = _waves(rng, s, HEADING_RAD, length)
-    slope = _waves(rng, s, GRADE, rng.uniform(150.0, 400.0, 2))
+    slope = _waves(rng, s, GRADE, calmer * rng.uniform(150.0, 400.0, 2))
     middle = (heading[1:] + heading[:-1]) / 2
     flat = STEP_M * np.column_stack([np.cos(middle), np.sin(middle), (slope[1:] + slope[:-1]) / 2])
     position = np.concatenate([np.zeros((1, 3)), np.cumsum(flat, axis=0)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,26 +10,21 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import ArrayLike, NDArray
 
 from coec.geometry.compiler import njit
-from coec.simulation import props
 from coec.simulation.mesh import Floats, Mesh, join
 from coec.simulation.passages import Passages
 from coec.simulation.road import Road, build_road
 from coec.simulation.sky import Sky, draw_sky
-from coec.simulation.street import NO_PASSAGES, STRETCH_M, Stretch, Style, backdrop, build_stretch, draw_style
-from coec.simulation.tunnel import Bore, bore
+from coec.simulation.street import NO_PASSAGES, STRETCH_M, Stretch, backdrop
+from coec.simulation.surroundings import Street, Surroundings
+from coec.simulation.traffic import MODELS, Mover, Progress
+from coec.simulation.tunnel import Bore
 
 Doubles = NDArray[np.float64]
-Progress = Callable[[Doubles], Doubles]
-"""Arc length in metres at times in seconds."""
 
 BEHIND, AHEAD = 3, 4
 """Stretches kept behind and ahead of the one that the vehicle is in: at least 144 m each way."""
 RAYS_AT_ONCE = 1 << 18
 """Rays per call of Embree: bounds the memory of an image of any size."""
-MODELS = 10
-ONCOMING_MPS, ONCOMING_GAP_M = 9.0, 55.0
-OWN_GAPS_M = (34.0, 71.0, 113.0, -27.0)
-"""Places of the other cars in the own lane, ahead of the vehicle."""
 MISSED = -1
 
 
@@ -47,23 +41,6 @@ class Hits:
     range_m: Floats
     triangle: NDArray[np.int32]
     normal: Floats
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mover:
-    """A car on its way: which model, where along the road at a time, in which lane."""
-
-    model: int
-    progress: Progress
-    left_m: float
-    oncoming: bool
-
-    def poses(self, road: Road, time_s: Doubles) -> Doubles:
-        """(N, 4): x, y, z in metres and heading in radians."""
-        s = self.progress(time_s)
-        xyz = road.points(s, self.left_m, 0.0)
-        heading = road.at(s)[:, 3] + (np.pi if self.oncoming else 0.0)
-        return np.column_stack([xyz, heading])
 
 
 class Solid:
@@ -181,18 +158,29 @@ class Scene:
 
 
 class Town:
-    """The streets of one seed. Builds what is around a place, and keeps only that."""
+    """The surroundings of one road. Builds what is around a place, and keeps only that."""
 
-    def __init__(self, seed: int, length_m: float = 1000.0, passages: Passages = NO_PASSAGES) -> None:
+    def __init__(
+        self,
+        seed: int,
+        length_m: float = 1000.0,
+        passages: Passages = NO_PASSAGES,
+        surroundings: Surroundings | None = None,
+        *,
+        traffic: bool = True,
+    ) -> None:
+        """Streets, unless other surroundings are given; `traffic`: whether anything moves there."""
         self.seed = seed
-        self.style: Style = draw_style(seed)
+        self.surroundings: Surroundings = Street(seed) if surroundings is None else surroundings
         self.sky: Sky = draw_sky(seed)
         margin = STRETCH_M * (BEHIND + AHEAD + 2) + 300.0
-        self.road = build_road(seed, -margin, length_m + margin)
+        self.road = build_road(seed, -margin, length_m + margin, self.surroundings.calmer)
         self._passages = passages
-        self._bores = tuple(bore(self.road, span, self.style.lane_m) for span in passages.tunnels)
+        self._traffic = traffic
+        # As far as the road is laid, but for a little: what keeps the sky off has no mouth in sight.
+        self._bores = self.surroundings.bores(self.road, -margin + 1.0, length_m + margin - 1.0, passages)
         rng = np.random.default_rng([seed, 103])
-        self._models = [Solid(props.car(rng)) for _ in range(MODELS)]
+        self._models = [Solid(self.surroundings.look(rng)) for _ in range(MODELS)]
         self._stretches: dict[int, Stretch] = {}
         self._scene: tuple[int, Scene] | None = None
 
@@ -202,8 +190,8 @@ class Town:
         return len(self._stretches)
 
     def lane_left_m(self) -> float:
-        """Middle of the own (right) lane, to the left of the centre line: negative."""
-        return -self.style.lane_m / 2
+        """Where the vehicle drives, to the left of the centre line; in the right lane negative."""
+        return self.surroundings.left_m
 
     def scene(self, at_m: float, time_s: float = 0.0, progress: Progress | None = None) -> Scene:
         """The street around arc length `at_m`, with traffic at `time_s`.
@@ -215,14 +203,15 @@ class Town:
             self._scene = (place, self._build(place))
         scene = self._scene[1]
         own = progress if progress is not None else _steady(at_m, time_s)
-        scene.movers = tuple(self._traffic(at_m, time_s, own))
+        movers = self.surroundings.movers(at_m, time_s, own) if self._traffic else ()
+        scene.movers = tuple(mover for mover in movers if not self._on_cleared(mover, time_s))
         return scene
 
     def _build(self, place: int) -> Scene:
         wanted = range(place - BEHIND, place + AHEAD + 1)
         # In the order of the road, wherever the vehicle comes from: the order of triangles shows in the bytes.
         kept = {
-            index: self._stretches.get(index) or build_stretch(self.seed, index, self.road, self.style, self._passages)
+            index: self._stretches.get(index) or self.surroundings.build(index, self.road, self._passages)
             for index in wanted
         }
         self._stretches = kept
@@ -235,21 +224,6 @@ class Town:
         street = join([*parts, backdrop().placed(0, 0, min(lowest, 0.0), 0)])
         return Scene(self.road, self.sky, origin, street, self._models, self._bores)
 
-    def _traffic(self, at_m: float, time_s: float, own: Progress) -> list[Mover]:
-        lane = self.style.lane_m / 2
-        movers = []
-        for place, gap in enumerate(OWN_GAPS_M):
-            rng = np.random.default_rng([self.seed, 104, place])
-            if rng.random() < 0.75:
-                movers.append(Mover(int(rng.integers(MODELS)), _shifted(own, gap), -lane, oncoming=False))
-        middle = int(np.floor((at_m + ONCOMING_MPS * time_s) / ONCOMING_GAP_M))
-        for number in range(middle - 1, middle + 3):
-            rng = np.random.default_rng([self.seed, 105, number + 2**20])
-            if rng.random() < 0.6:
-                start = number * ONCOMING_GAP_M + rng.uniform(0, ONCOMING_GAP_M - 12)
-                movers.append(Mover(int(rng.integers(MODELS)), _against(float(start)), lane, oncoming=True))
-        return [mover for mover in movers if not self._on_cleared(mover, time_s)]
-
     def _on_cleared(self, mover: Mover, time_s: float) -> bool:
         place_m = float(mover.progress(np.array([time_s]))[0])
         return any(span.holds(place_m) for span in self._passages.cleared())
@@ -257,14 +231,6 @@ class Town:
 
 def _steady(at_m: float, since_s: float) -> Progress:
     return lambda time_s: at_m + 8.0 * (time_s - since_s)
-
-
-def _shifted(progress: Progress, gap_m: float) -> Progress:
-    return lambda time_s: progress(time_s) + gap_m
-
-
-def _against(start_m: float) -> Progress:
-    return lambda time_s: start_m - ONCOMING_MPS * time_s
 
 
 def _turned(vectors: NDArray[np.floating], angle_rad: Doubles) -> Floats:

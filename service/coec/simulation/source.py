@@ -16,23 +16,31 @@ NUMBERS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**31 - 1),
     "seconds": (0.1, 86400),
     "half_view_deg": (20, 110),
-    "lidar": (1, 1024),
     "camera_hz": (0.01, 100),
     "lidar_hz": (0.01, 10),
     "ego_hz": (0.1, 1000),
     "camera_delay_s": (0, 1),
     "start_m": (0, 1e6),
+    "speed_mps": (0, 45),
+    "rolling_shutter_s": (0, 0.1),
 }
 """Query keys with a number: least and greatest value. The defaults are those of `DriveConfig`."""
-WHOLE = ("seed", "lidar")
-WORDS = ("camera", "faults", "workshop", "depth")
+WHOLE = ("seed",)
+NAMES = ("scene", "camera", "lidar")
+"""Query keys with a name; which names there are, `DriveConfig` says."""
+SWITCHES = ("depth", "traffic")
+WORDS = (*NAMES, *SWITCHES, "faults", "workshop", "intrinsics_off")
+
+
+MOST_OFF_PERCENT = 20.0
+"""A camera that is told wrong by more is another camera."""
 
 
 def open_sim(query: dict[str, str]) -> SimulatedDrive:
     """The drive of `sim:KEY=VALUE&...`; every key may be left out.
 
-    `faults` are separated by `;` (see `faults.FORMS`), `workshop` is rx,ry,rz[,tx,ty,tz] in degrees and metres, `depth`
-    is `yes` or `no`.
+    `faults` are separated by `;` (see `faults.FORMS`), `workshop` is rx,ry,rz[,tx,ty,tz] in degrees and metres,
+    `intrinsics_off` is FOCAL[,CX,CY] in percent, `depth` and `traffic` are `yes` or `no`.
 
     Raises:
         UsageError: an unknown key, or a value that does not fit; names the key.
@@ -46,16 +54,18 @@ def open_sim(query: dict[str, str]) -> SimulatedDrive:
         raise UsageError(f"unknown query key {', '.join(unknown)} of a simulated drive; known: {', '.join(known)}")
     values: dict[str, object] = {key: _number(key, query[key]) for key in NUMBERS if key in query}
     values |= {key: int(query[key]) for key in WHOLE if key in query}
-    if "camera" in query:
-        values["camera"] = query["camera"]
+    values |= {key: query[key] for key in NAMES if key in query}
     if "faults" in query:
         values["faults"] = tuple(parse_fault(text) for text in query["faults"].split(";"))
     if "workshop" in query:
         values["workshop"] = _six(query["workshop"])
-    if "depth" in query:
-        if query["depth"] not in ("yes", "no"):
-            raise UsageError(f"depth={query['depth']} of a simulated drive: write yes or no")
-        values["depth"] = query["depth"] == "yes"
+    if "intrinsics_off" in query:
+        values["intrinsics_off"] = _three(query["intrinsics_off"])
+    for key in SWITCHES:
+        if key in query:
+            if query[key] not in ("yes", "no"):
+                raise UsageError(f"{key}={query[key]} of a simulated drive: write yes or no")
+            values[key] = query[key] == "yes"
     return SimulatedDrive(DriveConfig(**values))  # type: ignore[arg-type]  # checked key by key above
 
 
@@ -78,10 +88,26 @@ def _number(key: str, text: str) -> float:
 
 
 def _six(text: str) -> tuple[float, ...]:
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (3, 6) or not all(math.isfinite(number) for number in numbers):
+    numbers = _numbers(text)
+    if len(numbers) not in (3, 6):
         raise UsageError(f"workshop={text} of a simulated drive: write rx,ry,rz or rx,ry,rz,tx,ty,tz (degrees, metres)")
     return (*numbers, 0.0, 0.0, 0.0)[:6]
+
+
+def _three(text: str) -> tuple[float, ...]:
+    numbers = _numbers(text)
+    if len(numbers) not in (1, 3) or max(map(abs, numbers)) > MOST_OFF_PERCENT:
+        raise UsageError(
+            f"intrinsics_off={text} of a simulated drive: write FOCAL or FOCAL,CX,CY in percent, "
+            f"each {MOST_OFF_PERCENT:g} at most"
+        )
+    return (*numbers, 0.0, 0.0)[:3]
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """The finite numbers of a list; none where one of them is not."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return ()
+    return numbers if all(math.isfinite(number) for number in numbers) else ()

@@ -32,23 +32,32 @@ SPINE_M = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bore:
-    """The room inside a tunnel.
+    """The room inside a tunnel, or whatever else has a ceiling with a strip of lamps over the middle of the road.
 
     Attributes:
         spine: (K, 5) points of the road's middle at every `SPINE_M` from one mouth to the other: x, y, z in metres
             (world), cosine and sine of the heading.
         half_m: from the middle to a wall.
+        high_m: from the road to the ceiling.
+        light: of its lamps, in that of a tunnel's.
     """
 
     spine: Doubles
     half_m: float
+    high_m: float = HIGH_M
+    light: float = 1.0
 
 
 def bore(road: Road, span: Span, lane_m: float) -> Bore:
     """The room of the tunnel of a span, on a road with lanes of this width."""
-    s = np.linspace(span.begin_m, span.end_m, max(round((span.end_m - span.begin_m) / SPINE_M), 1) + 1)
+    return bore_of(road, span.begin_m, span.end_m, lane_m + VERGE_M, HIGH_M, 1.0)
+
+
+def bore_of(road: Road, begin_m: float, end_m: float, half_m: float, high_m: float, light: float) -> Bore:
+    """A room along the road between two places."""
+    s = np.linspace(begin_m, end_m, max(round((end_m - begin_m) / SPINE_M), 1) + 1)
     x, y, z, heading, _ = np.moveaxis(road.at(s), -1, 0)
-    return Bore(np.column_stack([x, y, z, np.cos(heading), np.sin(heading)]), lane_m + VERGE_M)
+    return Bore(np.column_stack([x, y, z, np.cos(heading), np.sin(heading)]), half_m, high_m, light)
 
 
 def dig(site: Site, span: Span, part: Span, lane_m: float) -> None:

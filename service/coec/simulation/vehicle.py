@@ -15,14 +15,16 @@ from coec.simulation.road import Road
 
 Doubles = NDArray[np.float64]
 
-SPEED_MPS, SPEED_SWING, SPEED_PERIOD_S = 8.5, 0.25, 31.0
-"""Mean speed, the share by which it swings about it, and how fast."""
+SPEED_SWING, SPEED_PERIOD_S = 0.25, 31.0
+"""The share by which the speed swings about its mean, and how fast."""
 WANDER_M, WANDER_PERIOD_M = 0.25, 83.0
 """The vehicle sways this far within its lane."""
 PITCH_RAD, PITCH_HZ = 0.004, (1.3, 0.41)
 ROLL_RAD, ROLL_HZ = 0.003, (1.1, 0.33)
 HEAVE_M, HEAVE_HZ = 0.008, 1.2
-"""Movements on the springs: usual for a car on an even street."""
+"""Movements on the springs: usual for a car on an even street at `LIVELY_MPS`."""
+LIVELY_MPS = 8.5
+"""Slower, the springs move less in proportion; a standing vehicle is still."""
 TWIST_STEP_S = 0.005
 """Half the span of the central difference that gives velocities."""
 
@@ -41,17 +43,29 @@ class Pace:
     Attributes:
         start_m: arc length at time 0.
         phase: of the swing of its speed, radians.
+        speed_mps: mean speed; 0 stands.
     """
 
     start_m: float
     phase: float
+    speed_mps: float
+
+    @property
+    def liveliness(self) -> float:
+        """How much the vehicle moves on its springs, 0 to 1."""
+        return min(self.speed_mps / LIVELY_MPS, 1.0)
+
+    @property
+    def fastest_mps(self) -> float:
+        """It is never faster."""
+        return self.speed_mps * (1.0 + SPEED_SWING)
 
     def progress(self, time_s: Doubles) -> Doubles:
         """Arc length, metres."""
         omega = 2 * np.pi / SPEED_PERIOD_S
-        swing = SPEED_MPS * SPEED_SWING / omega
+        swing = self.speed_mps * SPEED_SWING / omega
         result: Doubles = (
-            self.start_m + SPEED_MPS * time_s + swing * (np.cos(self.phase) - np.cos(omega * time_s + self.phase))
+            self.start_m + self.speed_mps * time_s + swing * (np.cos(self.phase) - np.cos(omega * time_s + self.phase))
         )
         return result
 
@@ -79,9 +93,10 @@ class Trip:
         left = self.left_m + WANDER_M * np.sin(wave)
         turn = np.arctan(WANDER_M * 2 * np.pi / WANDER_PERIOD_M * np.cos(wave))
         heading = self.road.at(s)[:, 3] + turn
-        pitch = -self.road.at(s)[:, 4] + _swing(time, PITCH_RAD, PITCH_HZ, self.phases[2:4])
-        roll = _swing(time, ROLL_RAD, ROLL_HZ, self.phases[4:6])
-        heave = HEAVE_M * np.sin(2 * np.pi * HEAVE_HZ * time + self.phases[6])
+        lively = self.pace.liveliness
+        pitch = -self.road.at(s)[:, 4] + _swing(time, lively * PITCH_RAD, PITCH_HZ, self.phases[2:4])
+        roll = _swing(time, lively * ROLL_RAD, ROLL_HZ, self.phases[4:6])
+        heave = lively * HEAVE_M * np.sin(2 * np.pi * HEAVE_HZ * time + self.phases[6])
         result = np.zeros((len(time), 4, 4))
         result[:, :3, :3] = _rotations(heading, pitch, roll)
         result[:, :3, 3] = self.road.points(s, left, heave)
@@ -96,9 +111,9 @@ class Trip:
         return linear, rotation_log(turned) / (2 * TWIST_STEP_S)
 
 
-def build_pace(seed: int, start_m: float) -> Pace:
+def build_pace(seed: int, start_m: float, speed_mps: float) -> Pace:
     """The pace of a seed."""
-    return Pace(start_m, float(_phases(seed)[0]))
+    return Pace(start_m, float(_phases(seed)[0]), speed_mps)
 
 
 def build_trip(seed: int, road: Road, left_m: float, pace: Pace) -> Trip:

@@ -69,7 +69,7 @@ def drive_config() -> DriveConfig:
         seed=SEED,
         seconds=LONGEST_S,
         camera="fisheye700",
-        lidar=64,
+        lidar="64",
         camera_hz=PAIR_HZ,
         lidar_hz=PAIR_HZ,
         ego_hz=EGO_HZ,

@@ -1,0 +1,129 @@
+"""`coec sim matrix`: many simulated drives, one table of what the estimator and the monitor make of them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from coec.adapters.files import output
+from coec.config import CalibrationConfig
+from coec.errors import CoecError, DecodeError, UsageError
+from coec.evaluation import matrix, matrix_drives, matrix_run
+from coec.evaluation.matrix_drives import MatrixDrive
+from coec.evaluation.matrix_run import CHECK_PAIRS, WINDOWS, Settings
+from coec.reports import console, matrix_plots, matrix_tables
+from coec.schemas.base import from_json, to_json
+from coec.schemas.matrix import MatrixRow
+from coec.simulation.source import require_extra
+
+THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+"""Variables that say how many threads a library starts; read when it is imported."""
+
+
+class MatrixError(CoecError):
+    """The matrix could not be run to its end."""
+
+    reply_code = "matrix_failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given: every drive, three and six degrees of freedom, all cores, the
+    network that comes with coec."""
+
+    output: Path
+    only: str | None = None
+    dof: int | None = None
+    frames: int = 10
+    depth: str | None = None
+    jobs: int | None = None
+    as_json: bool = False
+
+
+def run(options: Options) -> int:
+    """Runs the drives that have no result in the folder yet, and writes report.json and a picture there.
+
+    Raises:
+        UsageError: no drive fits.
+        SourceError: the optional extra is not installed.
+        OutputError: a file cannot be written.
+        MatrixError: a process died.
+    """
+    require_extra()
+    if WINDOWS * options.frames < CHECK_PAIRS:
+        raise UsageError(f"--frames {options.frames}: a check needs {CHECK_PAIRS} pairs, {WINDOWS} windows have fewer")
+    drives = matrix_drives.chosen(options.only)
+    if not drives:
+        names = ", ".join(drive.name for drive in matrix_drives.DRIVES[:3])
+        raise UsageError(f"no drive of the matrix is called {options.only!r}; they are called {names}, ...")
+    dofs = matrix.DOFS if options.dof is None else (options.dof,)
+    settings = Settings(dofs, options.frames, options.depth or CalibrationConfig().depth.model)
+    rows = {drive.name: row for drive in drives if (row := _kept(options.output, drive, settings)) is not None}
+    waiting = [drive for drive in drives if drive.name not in rows]
+    with console.progress() as bars:
+        task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
+        for row in _run(waiting, settings, min(options.jobs or os.cpu_count() or 1, max(len(waiting), 1))):
+            output.write(_path(options.output, row.name), to_json(row))
+            rows[row.name] = row
+            bars.update(task, advance=1, note=row.name)
+    report = matrix.report([rows[drive.name] for drive in drives])
+    output.write(options.output / "report.json", to_json(report))
+    output.write(options.output / "normalised.png", matrix_plots.normalised(report))
+    if options.as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        matrix_tables.show(report)
+    return 0
+
+
+def _path(folder: Path, name: str) -> Path:
+    return folder / "drives" / f"{name}.json"
+
+
+def _kept(folder: Path, drive: MatrixDrive, settings: Settings) -> MatrixRow | None:
+    """The row of a drive that was run before with these settings; a damaged one is run again."""
+    try:
+        row = from_json(MatrixRow, _path(folder, drive.name).read_bytes())
+    except (OSError, DecodeError):
+        return None
+    return row if row.settings == settings.fingerprint else None
+
+
+def _run(drives: Sequence[MatrixDrive], settings: Settings, jobs: int) -> Iterator[MatrixRow]:
+    """The rows of the drives, as they are finished, each made by one of `jobs` processes on one core."""
+    if jobs == 1:
+        yield from (matrix_run.run(drive, settings) for drive in drives)
+        return
+    with _one_thread_each():
+        pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))
+        try:
+            for done in as_completed([pool.submit(matrix_run.run, drive, settings) for drive in drives]):
+                yield done.result()
+        except BrokenProcessPool as error:
+            raise MatrixError(
+                "a process that ran a drive died, for want of memory perhaps: start again with fewer --jobs, the "
+                "drives that are done are kept"
+            ) from error
+        finally:  # also where the caller has gone before the end
+            pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """The processes that are begun in here keep to one core: the others have drives of their own."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

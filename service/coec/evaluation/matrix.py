@@ -1,0 +1,179 @@
+"""Statistics of the matrix of drives: from rows to figures, nothing else.
+
+An estimate is as good as it says where its errors, each over the sigma that it claims, are spread as a normal
+distribution of variance one. Errors and sigmas are those of the accepted windows: only they would be served.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from math import fsum, sqrt
+from statistics import median
+from typing import Literal
+
+from coec.schemas.matrix import (
+    AxisStatistics,
+    GroupStatistics,
+    MatrixReport,
+    MatrixRow,
+    SolvedWindow,
+    SolveStatistics,
+    Watched,
+    WatchStatistics,
+)
+
+HIT_DEG, HIT_M = 0.5, 0.10
+"""A hit is at most so far from the truth."""
+WRONG_DEG, WRONG_M, WRONG_SIGMAS = 0.3, 0.10, 4.0
+"""An accepted window is wrong on an axis where it is off by more than this and by more than so many sigmas."""
+AXES: tuple[Literal["rx", "ry", "rz", "tx", "ty", "tz"], ...] = ("rx", "ry", "rz", "tx", "ty", "tz")
+DOFS: tuple[Literal[3, 6], ...] = (3, 6)
+PROPERTIES: dict[str, Callable[[MatrixRow], str]] = {
+    "scene": lambda row: row.scene,
+    "lens": lambda row: row.lens,
+    "lidar": lambda row: row.lidar,
+    "light": lambda row: row.light,
+    "fault": lambda row: row.fault,
+}
+
+Solves = list[tuple[MatrixRow, int, SolvedWindow]]
+"""Windows, each with its drive and its place there."""
+
+
+def is_hit(rotation_deg: float, translation_m: float, dof: int) -> bool:
+    """Whether an error is that of a hit; the translation counts where it was searched."""
+    return rotation_deg <= HIT_DEG and (dof == 3 or translation_m <= HIT_M)
+
+
+def report(rows: Sequence[MatrixRow]) -> MatrixReport:
+    """All figures of the rows, in the order of `rows`."""
+    solves = [of_solves(dof, _solves(rows, dof)) for dof in DOFS if any(str(dof) in row.windows for row in rows)]
+    moves = dict.fromkeys(watch.moved for row in rows for watch in row.watched)
+    watched = [
+        of_watches(moved, [(row.name, watch) for row in rows for watch in row.watched if watch.moved == moved])
+        for moved in moves
+    ]
+    return MatrixReport(
+        drives=len(rows),
+        failed={row.name: row.failure for row in rows if row.failure is not None},
+        solves=tuple(solves),
+        watched=tuple(watched),
+        rows=tuple(rows),
+    )
+
+
+def of_solves(dof: Literal[3, 6], solves: Solves) -> SolveStatistics:
+    """Of the windows of one number of degrees of freedom."""
+    accepted = [window for _, _, window in solves if window.accepted]
+    wrong = [text for row, place, window in solves for text in wrong_axes(f"{row.name}#{place + 1}", window)]
+    return SolveStatistics(
+        dof=dof,
+        windows=len(solves),
+        hits=sum(window.hit for _, _, window in solves),
+        accepted=len(accepted),
+        accepted_hits=sum(window.hit for window in accepted),
+        accepted_wrong=_wrong(solves),
+        wrong=tuple(wrong),
+        axes=tuple(of_axis(axis, accepted) for axis in range(dof)),
+        groups=tuple(_groups(solves)),
+        reasons=dict(sorted(Counter(code for _, _, window in solves for code in window.reasons).items())),
+    )
+
+
+def of_axis(axis: int, windows: Iterable[SolvedWindow]) -> AxisStatistics:
+    """Errors on one axis against what was claimed."""
+    both = [(window.error[axis], window.sigma[axis]) for window in windows]
+    known = [(error, sigma) for error, sigma in both if error is not None and sigma is not None and sigma > 0.0]
+    errors, sigmas = [error for error, _ in known], [sigma for _, sigma in known]
+    normalised = normalised_errors(axis, windows)
+    rms, mean_sigma = _rms(errors), _mean(sigmas)
+    return AxisStatistics(
+        axis=AXES[axis],
+        windows=len(known),
+        bias=_mean(errors),
+        rms=rms,
+        mean_sigma=mean_sigma,
+        sigma_over_rms=mean_sigma / rms if rms and mean_sigma is not None else None,
+        rms_normalised=_rms(normalised),
+        within_1=_within(normalised, 1.0),
+        within_2=_within(normalised, 2.0),
+        within_3=_within(normalised, 3.0),
+    )
+
+
+def normalised_errors(axis: int, windows: Iterable[SolvedWindow]) -> list[float]:
+    """Errors on an axis over the sigmas that were claimed, of the windows that claim one."""
+    both = [(window.error[axis], window.sigma[axis]) for window in windows]
+    return [error / sigma for error, sigma in both if error is not None and sigma is not None and sigma > 0.0]
+
+
+def wrong_axes(name: str, window: SolvedWindow) -> list[str]:
+    """The axes on which an accepted window is wrong, each with its figures; none of a refused one."""
+    if not window.accepted:
+        return []
+    found = []
+    for axis, (error, sigma) in enumerate(zip(window.error, window.sigma, strict=True)):
+        unit, limit = ("deg", WRONG_DEG) if axis < 3 else ("m", WRONG_M)
+        if error is not None and abs(error) > max(limit, WRONG_SIGMAS * (sigma or 0.0)):
+            found.append(f"{name} {AXES[axis]} {error:+.3f} ± {sigma or 0.0:.3f} {unit}")
+    return found
+
+
+def of_watches(moved: str, watches: Sequence[tuple[str, Watched]]) -> WatchStatistics:
+    """Of all checks of one served pose, by the names of their drives."""
+    told = sum(watch.checks - watch.blind for _, watch in watches)
+    hours = fsum(watch.seconds for _, watch in watches) / 3600.0
+    alarms = sum(watch.alarms for _, watch in watches)
+    delays = [watch.delay_checks for _, watch in watches if watch.delay_checks is not None]
+    right = moved == "right"
+    return WatchStatistics(
+        moved=moved,
+        drives=len(watches),
+        checks=sum(watch.checks for _, watch in watches),
+        flagged=sum(watch.flagged for _, watch in watches) / told if told else None,
+        blind=sum(watch.blind for _, watch in watches),
+        alarms=alarms,
+        alarmed=len(delays),
+        hours=hours,
+        alarms_per_hour=alarms / hours if hours > 0.0 else None,
+        median_delay_checks=float(median(delays)) if delays else None,
+        names=tuple(name for name, watch in watches if bool(watch.alarms) is right),
+    )
+
+
+def _solves(rows: Sequence[MatrixRow], dof: Literal[3, 6]) -> Solves:
+    key: Literal["3", "6"] = "3" if dof == 3 else "6"
+    return [(row, place, window) for row in rows for place, window in enumerate(row.windows.get(key, ()))]
+
+
+def _groups(solves: Solves) -> Iterable[GroupStatistics]:
+    for of, value_of in PROPERTIES.items():
+        for value in dict.fromkeys(value_of(row) for row, _, _ in solves):
+            some = [solve for solve in solves if value_of(solve[0]) == value]
+            found = [window.rotation_deg for _, _, window in some if window.rotation_deg is not None]
+            yield GroupStatistics(
+                of=of,
+                value=value,
+                windows=len(some),
+                hits=sum(window.hit for _, _, window in some),
+                accepted=sum(window.accepted for _, _, window in some),
+                accepted_wrong=_wrong(some),
+                median_deg=median(found) if found else None,
+            )
+
+
+def _wrong(solves: Solves) -> int:
+    return sum(bool(wrong_axes(row.name, window)) for row, _, window in solves)
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return fsum(values) / len(values) if values else None
+
+
+def _rms(values: Sequence[float]) -> float | None:
+    return sqrt(fsum(value * value for value in values) / len(values)) if values else None
+
+
+def _within(normalised: Sequence[float], sigmas: float) -> float | None:
+    return sum(abs(value) <= sigmas for value in normalised) / len(normalised) if normalised else None

@@ -1,0 +1,150 @@
+"""The matrix: simulated drives of many scenes, lenses, LiDARs, lights and faults, as data.
+
+Nothing of the project is tuned to them. Seeds are beyond those of training, demonstration and tests.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+SEEDS = (500_001, 500_002, 500_003)
+"""Held out: each kind of drive takes `SEEDS_EACH` of them, in turn."""
+SEEDS_EACH = 2
+
+LENSES = {
+    "fisheye": "camera=fisheye700",
+    "wide": "camera=pinhole640x400",
+    "60deg": "camera=pinhole640x400@60",
+    "45deg": "camera=pinhole640x400@45",
+    "30deg": "camera=pinhole640x400@30",
+}
+SCENES = {
+    "street": "",
+    "street-standing": "speed_mps=0",
+    "street-parked": "speed_mps=0&traffic=no",
+    "highway": "scene=highway",
+    "garage": "scene=garage",
+    "garage-standing": "scene=garage&speed_mps=0",
+    "room": "scene=room",
+    "room-standing": "scene=room&speed_mps=0",
+    "room-empty": "scene=room&speed_mps=0&traffic=no",
+    "tunnel": "faults=tunnel:0",
+    "open-road": "faults=open_road:0",
+}
+LIGHTS = {"day": "", "night": "faults=night:0", "rain": "faults=rain:0:mmph=25", "low-sun": "faults=low_sun:0"}
+FAULTS = {
+    "none": "",
+    "focal": "intrinsics_off=2",
+    "centre": "intrinsics_off=0,0.5,-0.5",
+    "rolling": "rolling_shutter_s=0.03",
+    "clock": "faults=offset_drift:0-40:seconds=0.04",
+    "late": "faults=offset:0:seconds=0.03",
+    "no-ego": "faults=no-ego:0",
+    "beams": "faults=beams:0:share=0.5",
+    "dirt": "faults=dirt:0:share=0.25",
+    "step": "faults=step:12:rx=1,ry=-1",
+}
+"""By name, the words of a `sim:` SOURCE. A step of 1.4° lies in the first of two windows."""
+
+MOVING_MOUNT = ("step",)
+"""Faults after which the truth is another: no pose is right all along."""
+
+
+@dataclass(frozen=True, slots=True)
+class MatrixDrive:
+    """A kind of drive and its seed. The words are keys of `SCENES`, `LENSES`, `LIGHTS` and `FAULTS`."""
+
+    scene: str
+    lens: str
+    lidar: str
+    light: str
+    fault: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """What it is called: all its words."""
+        words = (self.scene, self.lens, self.lidar, self.light, self.fault, f"s{SEEDS.index(self.seed) + 1}")
+        return "_".join(words)
+
+    @property
+    def moving_mount(self) -> bool:
+        """Whether the truth changes on the way."""
+        return self.fault in MOVING_MOUNT
+
+    def source(self, seconds: float, hertz: float, *, depth: bool) -> str:
+        """The SOURCE that draws it: pictures and sweeps this often; `depth`: with exact depth maps."""
+        words = [f"seed={self.seed}", f"seconds={seconds:g}", f"camera_hz={hertz:g}", f"lidar_hz={hertz:g}"]
+        words += ["ego_hz=20", f"lidar={self.lidar}", *(["depth=yes"] if depth else [])]
+        faults = []
+        for part in (SCENES[self.scene], LENSES[self.lens], LIGHTS[self.light], FAULTS[self.fault]):
+            for word in filter(None, part.split("&")):
+                faults.append(word.removeprefix("faults=")) if word.startswith("faults=") else words.append(word)
+        return "sim:" + "&".join([*words, *([f"faults={';'.join(faults)}"] if faults else [])])
+
+
+KINDS: tuple[tuple[str, str, str, str, str], ...] = (
+    # LiDARs, in a street.
+    ("street", "fisheye", "64", "day", "none"),
+    ("street", "fisheye", "32", "day", "none"),
+    ("street", "fisheye", "16", "day", "none"),
+    ("street", "wide", "128", "day", "none"),
+    ("street", "wide", "raster", "day", "none"),
+    ("street", "wide", "rosette", "day", "none"),
+    # Lenses.
+    ("street", "wide", "64", "day", "none"),
+    ("street", "60deg", "64", "day", "none"),
+    ("street", "45deg", "128", "day", "none"),
+    ("street", "30deg", "128", "day", "none"),
+    ("street", "60deg", "raster", "day", "none"),
+    # Light and weather.
+    ("street", "fisheye", "64", "night", "none"),
+    ("street", "wide", "32", "night", "none"),
+    ("street", "fisheye", "64", "rain", "none"),
+    ("street", "wide", "raster", "rain", "none"),
+    ("street", "wide", "64", "low-sun", "none"),
+    ("street", "fisheye", "32", "low-sun", "none"),
+    # Standing.
+    ("street-standing", "fisheye", "64", "day", "none"),
+    ("street-parked", "wide", "32", "day", "none"),
+    ("room-standing", "wide", "16", "day", "none"),
+    ("room-empty", "fisheye", "16", "day", "none"),
+    ("garage-standing", "fisheye", "64", "day", "none"),
+    # Indoors, on the move.
+    ("garage", "fisheye", "64", "day", "none"),
+    ("garage", "wide", "32", "day", "none"),
+    ("garage", "wide", "rosette", "day", "none"),
+    ("room", "fisheye", "32", "day", "none"),
+    ("room", "wide", "16", "day", "none"),
+    # Little to see.
+    ("highway", "wide", "64", "day", "none"),
+    ("highway", "60deg", "128", "rain", "none"),
+    ("highway", "fisheye", "64", "night", "none"),
+    ("tunnel", "fisheye", "64", "day", "none"),
+    ("open-road", "wide", "64", "day", "none"),
+    # Faults.
+    ("street", "wide", "64", "day", "focal"),
+    ("street", "fisheye", "64", "day", "centre"),
+    ("street", "wide", "64", "day", "rolling"),
+    ("street", "fisheye", "64", "day", "clock"),
+    ("street", "wide", "32", "day", "late"),
+    ("street", "fisheye", "64", "day", "no-ego"),
+    ("street", "wide", "64", "day", "beams"),
+    ("street", "fisheye", "64", "day", "dirt"),
+    ("street", "fisheye", "64", "day", "step"),
+    ("street", "wide", "64", "day", "step"),
+)
+"""Scene, lens, LiDAR, light, fault."""
+
+DRIVES: tuple[MatrixDrive, ...] = tuple(
+    MatrixDrive(*kind, SEEDS[(place + turn) % len(SEEDS)])
+    for turn in range(SEEDS_EACH)
+    for place, kind in enumerate(KINDS)
+)
+"""Every kind with its first seed comes before any with its second: half a run has seen them all."""
+
+
+def chosen(pattern: str | None) -> tuple[MatrixDrive, ...]:
+    """The drives whose name fits a pattern of the shell (`*`, `?`); all for None."""
+    return DRIVES if pattern is None else tuple(drive for drive in DRIVES if fnmatchcase(drive.name, pattern))

@@ -1,0 +1,211 @@
+"""One drive of the matrix: drawn, its windows solved from wrong starts, its monitor tried at right and wrong poses."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import degrees, inf, radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.adapters.depth.maps import STEREO, CachedDepth, open_depth
+from coec.adapters.images.codec import CachedGreys, GreyImages
+from coec.calibration.calibrator import calibrate
+from coec.calibration.estimators import sight_of
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.monitor.change_detector import Finding, MonitorState, after_observation
+from coec.calibration.monitor.check import check_at, gather
+from coec.calibration.monitor.check_verdict import MIN_PAIRS, judge_check
+from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.types import Decision, FramePair, Matrix4, Window
+from coec.config import CalibrationConfig, LimitsConfig, PairingConfig
+from coec.errors import CoecError, SourceError
+from coec.evaluation.matrix import is_hit
+from coec.evaluation.matrix_drives import MatrixDrive
+from coec.geometry import se3
+from coec.geometry.vectors import random_direction
+from coec.schemas.matrix import MatrixRow, SolvedWindow, Watched
+from coec.schemas.replies import Maybe6
+from coec.simulation.source import open_sim
+from coec.sources.spec import parse_spec
+
+if TYPE_CHECKING:
+    from coec.simulation.drive import SimulatedDrive
+
+WINDOWS = 2
+"""Of a drive, one after the other."""
+PAIR_S = 2.0
+"""Between two pairs: at 8 m/s another place each time."""
+START_DEG, START_M = (2.0, 10.0), (0.0, 0.1)
+"""Least and greatest error of a start, in a random direction."""
+CHECK_PAIRS = MIN_PAIRS
+"""Pairs of a check, all of them new: as few as a check takes, so that a short drive has several."""
+MOVES_DEG = (("right", 0.0), ("0.5 deg", 0.5), ("1 deg", 1.0))
+"""By name: by how much the served pose is turned from the truth, about a random axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What decides the rows beside the drives: degrees of freedom, pairs of a window, the depth model."""
+
+    dofs: tuple[int, ...]
+    frames: int
+    depth: str
+
+    @property
+    def fingerprint(self) -> str:
+        """Equal for equal results."""
+        return f"dof {self.dofs}, {WINDOWS} windows of {self.frames}, depth {self.depth}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stage:
+    """A drawn drive, ready to be solved: all its pairs, and what reads them once for all."""
+
+    drive: SimulatedDrive
+    pairs: tuple[FramePair, ...]
+    depth: DepthModel
+    images: ImageReader
+
+    def window(self, pairs: Sequence[FramePair], start: Matrix4) -> Window:
+        """A window of some pairs whose start and nominal calibration are the same: nothing tells the truth."""
+        rig = replace(self.drive.rig, T_camera_lidar_nominal=start)
+        return Window(f"{rig.pair}-{pairs[0].stamp_ns}", rig, start, tuple(pairs))
+
+
+def run(drive: MatrixDrive, settings: Settings) -> MatrixRow:
+    """The row of a drive; whatever goes wrong is its `failure`."""
+    began_s = time.process_time()
+    seconds = WINDOWS * settings.frames * PAIR_S
+    source = drive.source(seconds, 1.0 / PAIR_S, depth=settings.depth == STEREO)
+    row = MatrixRow(
+        name=drive.name, scene=drive.scene, lens=drive.lens, lidar=drive.lidar, light=drive.light, fault=drive.fault,
+        seed=drive.seed, source=source, windows={}, watched=(), settings=settings.fingerprint, cpu_s=0.0,
+    )  # fmt: skip
+    update: dict[str, object] = {}
+    try:
+        stage = _draw(source, settings)
+        configuration = _configuration(settings)
+        update["windows"] = {str(dof): _solved(stage, drive, settings, dof, configuration) for dof in settings.dofs}
+        update["watched"] = () if drive.moving_mount else _watched(stage, drive, configuration)
+    except CoecError as error:
+        update["failure"] = f"{type(error).__name__}: {error}"
+    return row.model_copy(update={**update, "cpu_s": time.process_time() - began_s})
+
+
+def _configuration(settings: Settings) -> CalibrationConfig:
+    values = CalibrationConfig().model_dump()
+    # One process draws and solves one drive: its thread is its own.
+    values["depth"] |= {"model": settings.depth, "threads": 1}
+    return CalibrationConfig.model_validate(values)
+
+
+def _draw(source: str, settings: Settings) -> _Stage:
+    made = open_sim(parse_spec(source).query)
+    pairer = Pairer(PairingConfig(), expects_motion=True)
+    pairs = [pair for message in made.messages() for pair in pairer.push(message)] + pairer.flush()
+    if len(pairs) < 2:
+        raise SourceError(f"{made.name}: {len(pairs)} pairs of a picture and a sweep; lost: {dict(pairer.losses)}")
+    depth = CachedDepth(open_depth(_configuration(settings).depth, LimitsConfig()), len(pairs))
+    return _Stage(made, tuple(pairs), depth, CachedGreys(GreyImages(LimitsConfig()), len(pairs)))
+
+
+def _solved(
+    stage: _Stage, drive: MatrixDrive, settings: Settings, dof: int, base: CalibrationConfig
+) -> tuple[SolvedWindow, ...]:
+    configuration = base.model_copy(update={"search": base.search.model_copy(update={"dof": dof})})
+    rows = []
+    for place in range(WINDOWS):
+        pairs = stage.pairs[place * settings.frames : (place + 1) * settings.frames]
+        if not pairs:
+            continue
+        truth = stage.drive.truth(pairs[-1].stamp_ns)
+        rng = np.random.default_rng([_number_of(drive.name), place, dof])
+        xi = np.zeros(6)
+        xi[:3] = radians(float(rng.uniform(*START_DEG))) * random_direction(rng)
+        if dof == 6:
+            xi[3:] = float(rng.uniform(*START_M)) * random_direction(rng)
+        rows.append(_solve(stage, pairs, truth, xi, dof, configuration))
+    return tuple(rows)
+
+
+def _solve(
+    stage: _Stage,
+    pairs: Sequence[FramePair],
+    truth: Matrix4,
+    xi: NDArray[np.float64],
+    dof: int,
+    configuration: CalibrationConfig,
+) -> SolvedWindow:
+    start = se3.perturb(truth, xi)
+    row = SolvedWindow(
+        pairs=len(pairs), start_deg=degrees(float(np.linalg.norm(xi[:3]))), start_m=float(np.linalg.norm(xi[3:])),
+        accepted=False, hit=False, rotation_deg=None, translation_m=None, error=_maybe(np.full(6, np.nan)),
+        sigma=_maybe(np.full(6, np.nan)), reasons=(), evaluations=0, failure=None,
+    )  # fmt: skip
+    try:
+        estimate = calibrate(stage.window(pairs, start), stage.depth, stage.images, configuration, Silence())
+    except CoecError as refused:
+        return row.model_copy(update={"failure": f"{type(refused).__name__}: {refused}"})
+    error = se3.difference(estimate.optimum.T_camera_lidar, truth)
+    rotation_deg, translation_m = degrees(float(np.linalg.norm(error[:3]))), float(np.linalg.norm(error[3:]))
+    return row.model_copy(
+        update={
+            "accepted": estimate.verdict.decision is Decision.ACCEPTED,
+            "hit": is_hit(rotation_deg, translation_m, dof),
+            "rotation_deg": rotation_deg,
+            "translation_m": translation_m,
+            "error": _maybe(np.where(estimate.solved, error, np.nan)),
+            "sigma": _maybe(np.where(estimate.solved, estimate.sigma, np.nan)),
+            "reasons": tuple(reason.code for reason in estimate.verdict.reasons),
+            "evaluations": estimate.optimum.evaluations,
+        }
+    )
+
+
+def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig) -> tuple[Watched, ...]:
+    """The checks of an uncommissioned rig that serves the truth, or a pose beside it."""
+    if len(stage.pairs) < CHECK_PAIRS:
+        return ()
+    truth = stage.drive.truth(stage.pairs[0].stamp_ns)
+    window = stage.window(stage.pairs, truth)
+    evidence = gather(sight_of(window, stage.depth, stage.images, configuration, Silence()))
+    rows = []
+    for number, (name, turn_deg) in enumerate(MOVES_DEG):
+        rng = np.random.default_rng([_number_of(drive.name), 1000 + number])
+        pose = se3.perturb(truth, np.concatenate([radians(turn_deg) * random_direction(rng), np.zeros(3)]))
+        state, delay = MonitorState(), None
+        checks = flagged = blind = alarms = 0
+        for first in range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS):
+            part = evidence.of(range(first, first + CHECK_PAIRS))
+            seen = judge_check(part, check_at(part, pose, configuration), pose, None)
+            before, state = state, after_observation(state, seen)
+            checks += 1
+            flagged += seen.flagged and not seen.causes
+            blind += bool(seen.causes)
+            if state.outcome is Finding.CONFIRMED and before.outcome is not Finding.CONFIRMED:
+                alarms += 1
+                delay = checks if delay is None else delay
+        rows.append(
+            Watched(
+                moved=name, checks=checks, flagged=flagged, blind=blind, alarms=alarms,
+                seconds=(stage.pairs[-1].stamp_ns - stage.pairs[0].stamp_ns) * 1e-9, delay_checks=delay,
+            )
+        )  # fmt: skip
+    return tuple(rows)
+
+
+def _number_of(name: str) -> int:
+    """A seed that depends on the name alone, so that a drive draws the same whatever others are run."""
+    return zlib.crc32(name.encode())
+
+
+def _maybe(values: NDArray[np.float64]) -> Maybe6:
+    """Radians to degrees, what is no number to null."""
+    scaled = [*np.degrees(values[:3]), *values[3:]]
+    rx, ry, rz, tx, ty, tz = (float(value) if abs(value) < inf else None for value in scaled)
+    return rx, ry, rz, tx, ty, tz

@@ -1,0 +1,96 @@
+"""What moves by itself: cars on the road, people in a room. Everything follows from the seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.simulation.road import Road
+
+Doubles = NDArray[np.float64]
+Progress = Callable[[Doubles], Doubles]
+"""Arc length in metres at times in seconds."""
+
+MODELS = 10
+"""Looks of what moves."""
+ONCOMING_MPS, ONCOMING_GAP_M = 9.0, 55.0
+OWN_GAPS_M = (34.0, 71.0, 113.0, -27.0)
+"""Places of the other cars in the own lane, ahead of the vehicle."""
+FAR_GAPS_M = (62.0, 118.0, -48.0)
+"""The same on a highway: two seconds and a half apart."""
+HIGHWAY_MPS, HIGHWAY_GAP_M = 27.0, 130.0
+"""Of the traffic that comes the other way."""
+WALKERS, WALK_M, WALK_S = 3, 1.8, 7.0
+"""People in a room: how many, how far they go to and fro, and how long that takes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mover:
+    """Something on its way: which model, where along the road at a time, how far left of the centre line."""
+
+    model: int
+    progress: Progress
+    left_m: float
+    oncoming: bool
+
+    def poses(self, road: Road, time_s: Doubles) -> Doubles:
+        """(N, 4): x, y, z in metres and heading in radians."""
+        s = self.progress(time_s)
+        xyz = road.points(s, self.left_m, 0.0)
+        heading = road.at(s)[:, 3] + (np.pi if self.oncoming else 0.0)
+        return np.column_stack([xyz, heading])
+
+
+def in_street(seed: int, at_m: float, time_s: float, own: Progress, lane_m: float) -> Iterator[Mover]:
+    """Cars in the own lane and cars that come, lanes of this width."""
+    left = lane_m / 2
+    yield from _ahead(seed, own, OWN_GAPS_M, -left)
+    yield from _coming(seed, at_m, time_s, left, ONCOMING_MPS, ONCOMING_GAP_M)
+
+
+def on_highway(seed: int, at_m: float, time_s: float, own: Progress, own_left_m: float) -> Iterator[Mover]:
+    """Few cars, far apart, in the own lane and beyond the median."""
+    yield from _ahead(seed, own, FAR_GAPS_M, own_left_m)
+    yield from _coming(seed, at_m, time_s, -own_left_m, HIGHWAY_MPS, HIGHWAY_GAP_M)
+
+
+def in_room(seed: int, own: Progress, half_m: float) -> Iterator[Mover]:
+    """People who walk to and fro before the vehicle, between the walls at ± half the width."""
+    for number in range(WALKERS):
+        rng = np.random.default_rng([seed, 107, number])
+        ahead, phase = float(rng.uniform(2.5, 7.0)), float(rng.uniform(0, 2 * np.pi))
+        left = float(rng.uniform(-1, 1)) * (half_m - 1.0)
+        yield Mover(
+            int(rng.integers(MODELS)), _to_and_fro(_shifted(own, ahead), phase), left, oncoming=bool(number % 2)
+        )
+
+
+def _ahead(seed: int, own: Progress, gaps_m: tuple[float, ...], left_m: float) -> Iterator[Mover]:
+    for place, gap in enumerate(gaps_m):
+        rng = np.random.default_rng([seed, 104, place])
+        if rng.random() < 0.75:
+            yield Mover(int(rng.integers(MODELS)), _shifted(own, gap), left_m, oncoming=False)
+
+
+def _coming(seed: int, at_m: float, time_s: float, left_m: float, speed_mps: float, every_m: float) -> Iterator[Mover]:
+    middle = int(np.floor((at_m + speed_mps * time_s) / every_m))
+    for number in range(middle - 1, middle + 3):
+        rng = np.random.default_rng([seed, 105, number + 2**20])
+        if rng.random() < 0.6:
+            start = number * every_m + rng.uniform(0, every_m - 12)
+            yield Mover(int(rng.integers(MODELS)), _against(float(start), speed_mps), left_m, oncoming=True)
+
+
+def _shifted(progress: Progress, gap_m: float) -> Progress:
+    return lambda time_s: progress(time_s) + gap_m
+
+
+def _against(start_m: float, speed_mps: float) -> Progress:
+    return lambda time_s: start_m - speed_mps * time_s
+
+
+def _to_and_fro(about: Progress, phase: float) -> Progress:
+    return lambda time_s: about(time_s) + WALK_M * np.sin(2 * np.pi * time_s / WALK_S + phase)
