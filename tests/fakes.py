@@ -74,6 +74,8 @@ _OBSERVATION = {
     "metrics": [{"name": "mi", "value": 0.5, "limit": 0.1, "at_least": True}],
     "offset": _array([6], [0.25, 0.0, 0.0, 0.0, 0.0, float("nan")]),
     "sigma": _array([6], [0.5] * 6),
+    "noise": _array([6], [0.4] * 6),
+    "place": _array([6], [0.3] * 6),
     "distance2": 0.125,
     "flagged": False,
     "weak": False,

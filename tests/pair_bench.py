@@ -146,6 +146,8 @@ class KnowingWorker:
             metrics=(),
             offset=offset,
             sigma=np.full(6, 1e-3),
+            noise=np.full(6, 8e-4),
+            place=np.full(6, 5e-4),
             distance2=float(np.abs(offset).max() / 0.005),
             flagged=bool(np.abs(offset).max() > 0.005),
             weak=False,

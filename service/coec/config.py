@@ -290,11 +290,19 @@ class MonitorConfig(Stage):
     urgent_slice_s: float = Field(
         default=30.0, gt=0, le=3600, description="slice of the window that is taken as soon as the monitor suspects, s"
     )
+    hours_between_false_alarms: float = Field(
+        default=100.0, gt=0, description="a right mount is called moved by checks once in so many hours, or more rarely"
+    )
+    hours_between_false_suspicions: float = Field(
+        default=2.0, gt=0, description="a right mount is suspected once in so many hours, or more rarely"
+    )
 
     @model_validator(mode="after")
     def _counts_agree(self) -> MonitorConfig:
         if self.min_pairs > self.pairs:
             raise ValueError("min_pairs must not exceed pairs")
+        if self.hours_between_false_suspicions > self.hours_between_false_alarms:
+            raise ValueError("hours_between_false_suspicions must not exceed hours_between_false_alarms")
         return self
 
 

@@ -33,7 +33,7 @@ from coec.calibration.lifecycle import (
 from coec.calibration.monitor.change_detector import Finding, Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import Decision, Estimate, Optimum, Reason, Rig, StopReason, Verdict
-from coec.config import PolicyConfig, TrackerConfig
+from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.geometry import se3
 from coec.geometry.cameras import build
 
@@ -43,8 +43,8 @@ LATE_NS = 10_000 * S
 CRASH = Reason("worker_failed", "The worker crashed twice.")
 OVERLAP = Reason("overlap", "too little")
 
-RULES = Rules(PolicyConfig(), TrackerConfig())
-NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig())
+RULES = Rules(PolicyConfig(), TrackerConfig(), MonitorConfig())
+NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())
 
 RIG = Rig(
     "front",
@@ -96,8 +96,10 @@ def check(stamp_s: int, flagged: bool = False, cause: str | None = None) -> Obse
         stamp_ns=stamp_s * S,
         pair_stamps_ns=tuple((stamp_s - i) * S for i in range(4, -1, -1)),
         metrics=(),
-        offset=np.zeros(6),
+        offset=np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]) if flagged else np.zeros(6),
         sigma=np.full(6, 1e-3),
+        noise=np.full(6, 8e-4),
+        place=np.full(6, 5e-4),
         distance2=9.0 if flagged else 0.1,
         flagged=flagged,
         weak=False,
@@ -107,7 +109,7 @@ def check(stamp_s: int, flagged: bool = False, cause: str | None = None) -> Obse
 
 
 def watched(state: PairState, *checks: Observation) -> PairState:
-    return reduce(after_observation, checks, state)
+    return reduce(lambda before, one: after_observation(before, one, RULES), checks, state)
 
 
 def flagged_from(stamp_s: int, count: int) -> list[Observation]:
@@ -326,7 +328,7 @@ def test_a_step_beyond_the_limits_waits_for_a_person() -> None:
 
 
 def test_the_steps_of_a_day_add_up() -> None:
-    rules = Rules(PolicyConfig(max_step_deg=2.0, max_per_day_deg=3.0), TrackerConfig())
+    rules = Rules(PolicyConfig(max_step_deg=2.0, max_per_day_deg=3.0), TrackerConfig(), MonitorConfig())
     state = solved(initial_state(RIG), estimate(1.9, 100), rules)
     state = reduce(lambda s, e: solved(s, e, rules), [estimate(0.2, 300), estimate(0.2, 500)], state)
     assert [reason.code for reason in state.reasons] == ["candidate_waits", "day_exhausted"]

@@ -13,6 +13,7 @@ import pytest
 from baselines import a_baseline
 from coec.adapters.files.baseline_file import save_baseline
 from coec.calibration.commissioning.baseline import learned_hash
+from coec.calibration.monitor.change_detector import alarm_levels
 from coec.calibration.types import (
     Reason,
 )
@@ -198,7 +199,7 @@ def test_every_check_can_be_read_afterwards(bench: Bench) -> None:
     ]
     suspect = next(check for check in history.checks if check.state == "suspect")
     assert (suspect.outcome, suspect.flagged) == ("suspect", True)
-    assert suspect.evidence >= 1.5
+    assert suspect.evidence >= alarm_levels(bench.config.pairs[0].monitor).suspect
     told = bench.answers.history(STEP_S * S, 2**63 - 1, 3).checks
     assert told == history.checks[-3:]
     health = bench.answers.health_reply

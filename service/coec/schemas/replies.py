@@ -198,14 +198,17 @@ class CheckReply(Part):
     metrics: dict[str, MetricReply] = Field(description="by name")
     first_derivative: Maybe6 = Field(description="f' at the pose: dMI, nats per rad or m")
     second_derivative: Maybe6 = Field(description="f'' at the pose: -d²MI, nats per rad² or m²")
-    offset: Maybe6 = Field(description="from the pose to the local optimum, bias removed where known (deg, m)")
+    offset: Maybe6 = Field(
+        description="from the pose to where the check puts the mount, bias removed where known (deg, m): rotations of "
+        "the optimum over rotations, translations of that over all axes"
+    )
     sigma: Maybe6 = Field(description="standard deviations of `offset` (deg, m)")
     drift: Maybe6 | None = Field(
         description="of the local optimum from commissioned (deg, m); null before commissioning"
     )
     drift_sigma: Maybe6 | None = Field(description="standard deviations of `drift` (deg, m)")
     outcome: Literal["unknown", "clear", "at_odds", "suspect", "confirmed"] = Field(description="of all checks so far")
-    evidence: float = Field(description="for a moved mount, in independent checks")
+    evidence: float = Field(description="for a moved mount, log-likelihood ratio in nats, of all checks so far")
     state: HealthState = Field(description="of the pair after the check")
 
 

@@ -22,14 +22,16 @@ from coec.calibration.lifecycle import (
     initial_state,
 )
 from coec.calibration.monitor.change_detector import Finding, MonitorState
+from coec.calibration.monitor.hypotheses import Hypotheses, Hypothesis
+from coec.calibration.monitor.likelihood import Belief
 from coec.calibration.types import Decision, Reason, Rig
-from coec.config import PolicyConfig, TrackerConfig
+from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import StateError
 from coec.runtime.decisions.state_store import Clocks, StateStore
 from estimates import RIG, estimate
 
-RULES = Rules(PolicyConfig(apply="always"), TrackerConfig())
-NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig())
+RULES = Rules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
+NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())
 CLOCKS = Clocks(77, 88, 99)
 
 
@@ -59,7 +61,9 @@ def test_a_state_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> None:
     state = held(after_estimate(initial_state(RIG), estimate(1), 0, NEVER))
-    monitor = MonitorState(1 / 3, Finding.SUSPECT, {"dark": 0.1}, {"40": 2.5}, (0.1, 0.2), 0.5, (5, 6))
+    belief = Belief((1 / 3, 0.1, -0.0), (1e-9, 0.2, 0.3), 0.7)
+    tests = Hypotheses(belief, (Hypothesis(1, 2.5, 1 / 7, belief, belief),), (0.1, 0.2, 0.3))
+    monitor = MonitorState(Finding.SUSPECT, tests, Hypotheses(), {"dark": 0.1}, {"40": 2.5}, 0.5, (5, 6), stood=True)
     state = replace(state, monitor=monitor, flagged_since_ns=4, changes=(Change(3, (0.1,) * 6),))
     StateStore(tmp_path, "test").remember(RIG, state, CLOCKS)
     first = (tmp_path / "state.json").read_bytes()

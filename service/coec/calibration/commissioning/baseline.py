@@ -28,6 +28,9 @@ UNCOMMISSIONED_BIAS = np.array([radians(0.12)] * 3 + [0.03] * 3)
 """Standard deviation of the estimator's unknown bias on a rig (rad, m): on the recordings tried up to 0.28° and 2 cm
 lie between the vendor's calibration and the edges."""
 
+STREET = np.array([radians(0.04)] * 3 + [0.01] * 3)
+"""Standard deviation by which streets differ in where they put the camera (rad, m): disjoint halves of the recordings
+tried agree within 0.05° over rotations."""
 
 PIXEL_SHARE = 0.3
 """Share of a pixel that the local optimum may be off for the pixels alone, whatever the scenes of a commissioning say:
@@ -56,6 +59,10 @@ class Accuracy:
         """(6,) standard deviation of the offset of a check at so many pairs, less the bias."""
         variance = self.spread**2 / max(pairs, 1) + self.bias_sigma**2 + FLOOR**2
         return np.asarray(np.sqrt(variance))
+
+    def noise(self, pairs: int) -> NDArray[np.float64]:
+        """(6,) the part of that which is new at every check."""
+        return np.asarray(np.sqrt(self.spread**2 / max(pairs, 1) + FLOOR**2))
 
     def distance2(self, offset: NDArray[np.float64], pairs: int) -> float:
         """Squared distance of an offset (6,) from the bias in standard deviations, over the axes that were searched."""
@@ -107,6 +114,11 @@ def pixel_floor(camera: Camera) -> NDArray[np.float64]:
     """(6,) standard deviation that the pixels of a camera leave to any check, however many pairs it has (rad, m)."""
     off_rad = PIXEL_SHARE * pixel_rad(camera)
     return of_both(off_rad)
+
+
+def street_sigma(camera: Camera) -> NDArray[np.float64]:
+    """(6,) standard deviation of what the local optima of all checks of one street have in common (rad, m)."""
+    return np.asarray(np.hypot(STREET, pixel_floor(camera)))
 
 
 def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:

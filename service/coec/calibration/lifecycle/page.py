@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from coec.calibration.lifecycle.states import MEANING, STATES, HealthState, markdown
-from coec.calibration.monitor import change_detector, sensor_faults
+from coec.calibration.monitor import change_detector, hypotheses, sensor_faults
 from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, Cause
+from coec.config import MonitorConfig
+
+_DEFAULT = MonitorConfig()
+_LEVELS = change_detector.alarm_levels(_DEFAULT)
 
 
 def page() -> str:
@@ -24,12 +28,19 @@ def page() -> str:
         "Rows: what happens. Columns: the state in which it happens. · means that nothing changes.\n\n"
         f"{markdown()}\n"
         "## What the monitor needs\n\n"
-        "Checks add up: a flagged check of pairs that were not counted yet adds 1, a clear one takes 1 off, a flagged\n"
-        f"one with faint edges adds {change_detector.WEAK_SHARE:g}.\n"
-        f"`suspect` from {change_detector.SUSPECT_AT:g} on, `miscalibrated` from {change_detector.CONFIRMED_AT:g} on, "
-        f"clear again below {change_detector.CLEAR_BELOW:g}; never more than {change_detector.MOST:g}.\n"
-        f"Flagged checks that put the mount in different places do not add up: from {change_detector.AT_ODDS_AT:g} on\n"
-        "the monitor is at odds with itself, and tells nothing.\n"
+        "Evidence is the log-likelihood ratio of a mount that has moved, some time ago and somewhere, against one\n"
+        "that has not (`evidence` of a check, nats). Every check counts by the share of its pairs that are new,\n"
+        f"between {hypotheses.LEAST_STEP:+g} and {hypotheses.MOST_STEP:+g}; one with faint edges may make a mount\n"
+        "suspect and confirms nothing. How much it takes follows from how often a right mount may be accused:\n"
+        f"the logarithm of the tests, {change_detector.QUESTIONS} at every check, that begin in\n"
+        "`monitor.hours_between_false_suspicions` for `suspect`, in `monitor.hours_between_false_alarms` for\n"
+        f"`miscalibrated`: {_LEVELS.suspect:.1f} and {_LEVELS.confirmed:.1f} with a check every\n"
+        f"{_DEFAULT.period_s:g} s, {_DEFAULT.hours_between_false_suspicions:g} h and "
+        f"{_DEFAULT.hours_between_false_alarms:g} h; clear again below {_LEVELS.clear:.1f}, never more than "
+        f"{_LEVELS.most:.1f}.\n"
+        f"From {change_detector.AT_ODDS_AT:g} flagged checks in a row on (one with faint edges is "
+        f"{change_detector.WEAK_SHARE:g}) that do not\n"
+        "add up to that, as they put the mount elsewhere every time, the monitor is at odds with itself.\n"
         f"A cause in the data is believed from {change_detector.BLIND_AT:g} on; dirt is one after the same blocks\n"
         f"of the image have shown no contrast for {sensor_faults.DIRTY_CHECKS:g} checks.\n\n"
         f"## Causes\n\n{told}"

@@ -15,12 +15,20 @@ from numpy.typing import NDArray
 
 from coec.calibration.lifecycle import policy
 from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
-from coec.calibration.monitor.change_detector import ACCUSING, Finding, MonitorState, Observation, diagnose
+from coec.calibration.monitor.change_detector import (
+    ACCUSING,
+    AlarmLevels,
+    Finding,
+    MonitorState,
+    Observation,
+    alarm_levels,
+    diagnose,
+)
 from coec.calibration.monitor.change_detector import after_observation as check_taken
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
 from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
-from coec.config import PolicyConfig, TrackerConfig
+from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import CoecError
 from coec.geometry import se3
 
@@ -91,6 +99,12 @@ class Rules:
 
     policy: PolicyConfig
     tracker: TrackerConfig
+    monitor: MonitorConfig
+
+    @property
+    def alarm(self) -> AlarmLevels:
+        """What the evidence of checks has to come to."""
+        return alarm_levels(self.monitor)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,9 +277,9 @@ def _confirmed(state: PairState) -> PairState:
 # --- the monitor, and time ------------------------------------------------------------------------------------------
 
 
-def after_observation(state: PairState, observation: Observation) -> PairState:
+def after_observation(state: PairState, observation: Observation, rules: Rules) -> PairState:
     """The monitor checked the served extrinsic. One check decides nothing: `MonitorState` adds them up."""
-    monitor = check_taken(state.monitor, observation)
+    monitor = check_taken(state.monitor, observation, rules.alarm)
     since_ns = state.flagged_since_ns
     if observation.flagged and not observation.causes:
         if since_ns is None:
@@ -285,7 +299,7 @@ def after_observation(state: PairState, observation: Observation) -> PairState:
         text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to tell."
         return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
     if monitor.outcome is Finding.AT_ODDS:
-        text = "The latest checks accuse the mount, but each of something else; a window is being taken to tell."
+        text = "The latest checks accuse the mount, but do not add up to a move; a window is being taken to tell."
         return _unless_red(state, Event.AT_ODDS, Reason("checks_at_odds", text))
     # Against an accepted window that contradicts what is served the word of the monitor is not enough.
     if monitor.outcome is Finding.CLEAR and (state.pending is None or not state.pending.contradicts):

@@ -63,7 +63,7 @@ MEANING: Mapping[Event, str] = MappingProxyType(
         Event.NO_OBJECTION: "the monitor sees nothing wrong with an extrinsic that no window has confirmed",
         Event.SUSPECTED: "the monitor suspects that the mount has moved",
         Event.MOUNT_MOVED: "the monitor is certain that the mount has moved",
-        Event.AT_ODDS: "the monitor accuses the mount, but at every check of something else",
+        Event.AT_ODDS: "checks accuse the mount, but do not add up to a move",
         Event.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
         Event.OVERDUE: "no check has been completed for three periods of the monitor",
         Event.AGED: "no check has been completed for `stale_after_s`",

@@ -1,7 +1,7 @@
 """Is the extrinsic that is served still right? A sequential decision over short checks, one every few seconds.
 
-It adds up the evidence of checks of pairs that were not counted yet (Page 1954, "Continuous inspection schemes"): one
-bad frame decides nothing. Each check was judged by itself (`check_verdict`).
+Evidence is the log-likelihood ratio of "the mount has moved" against "it has not" (`hypotheses`), over checks of pairs
+that were not counted yet. Its thresholds follow from how often a right mount may be accused (`alarm_levels`).
 """
 
 from __future__ import annotations
@@ -9,31 +9,43 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from math import isfinite, log, radians
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.baseline import Drift
+from coec.calibration.monitor.hypotheses import MOST_STEP, Axes, Hypotheses, after_check
+from coec.calibration.monitor.likelihood import FARTHER, WEAK_TIMES, Three, Told, three
 from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, DIRTY_CHECKS, DIRTY_SHARE, LENS_DIRTY, Cause
 from coec.calibration.types import Metric
+from coec.config import MonitorConfig
 
-SUSPECT_AT, CONFIRMED_AT, CLEAR_BELOW, MOST = 1.5, 2.5, 0.5, 3.5
-"""Evidence in independent checks: to become suspect and confirmed, below which it clears again, and at most, so that a
-repaired mount clears within three checks, too. A bad frame is in at most one check and its overlap with the next."""
+ROTATIONS = Axes(three([radians(2.5)] * 3), (three([radians(0.3)] * 3), three([radians(2.0)] * 3)))
+TRANSLATIONS = Axes((0.1, 0.1, 0.1), ((0.03, 0.03, 0.03), (0.1, 0.1, 0.1)))
+"""What bad checks say, as on simulated drives through tunnels, open roads and nights; and the moves that are looked
+for: what a mount creeps by, and what a knock does (rad, m)."""
+
+QUESTIONS = len(ROTATIONS.moves) + len(TRANSLATIONS.moves)
+"""Hypotheses that begin at every check: each may accuse."""
+
+CLEARS_AT = 0.4
+"""Share of the evidence that makes a mount suspect, below which it clears again."""
+
+ABOVE = 4.0
+"""Nats above the evidence that confirms, which is the most: a repaired mount clears within three checks."""
 
 WEAK_SHARE = 0.5
-"""A flagged check whose edges are faint counts half, and confirms nothing: a full solve has to."""
+"""A flagged check with faint edges counts half of another where checks are at odds with each other."""
 
-AT_ODDS_AT = 1.0
-"""Checks at odds with what the ones before them said of the mount: two that contradict each other tell nothing."""
+AT_ODDS_AT, MOST_AT_ODDS = 1.5, 3.0
+"""Flagged checks in a row at which, while they do not add up to a move, they are at odds: two; and the most."""
 
-SAME_SIGMA, SAME_SHARE = 3.5, 0.25
-"""Two flagged checks speak of the same mount when their rotations differ by less than so many standard deviations of a
-difference, and this share of the larger: far from the extrinsic the local optimum is found less exactly. A mount that
-has moved says the same at every check; a tunnel or an open road says something else every time."""
+BLIND_AT, MOST_BLIND = 1.2, 3.5
+"""Evidence in independent checks by which a cause in the data is believed: more than one; and the most, so that a
+cause that went away is forgotten after three."""
 
-BLIND_AT = 1.2
-"""Evidence by which a cause in the data is believed: more than one check."""
+S_PER_H = 3600.0
 
 
 def _unknown() -> NDArray[np.float64]:
@@ -41,8 +53,8 @@ def _unknown() -> NDArray[np.float64]:
 
 
 class Finding(StrEnum):
-    """What the checks so far say. `unknown`: nothing was seen that could tell. `at_odds`: each puts the mount
-    elsewhere."""
+    """What the checks so far say. `unknown`: nothing was seen that could tell. `at_odds`: they accuse the mount,
+    but do not add up to a move."""
 
     UNKNOWN = "unknown"
     CLEAR = "clear"
@@ -64,8 +76,12 @@ class Observation:
         stamp_ns: of the last pair.
         pair_stamps_ns: of all of them, ascending.
         metrics: every figure with its limit.
-        offset: (6,) from the current pose to the local optimum, the estimator's bias removed where known (rad, m).
+        offset: (6,) from the current pose to where the check puts the mount, the estimator's bias removed where known
+            (rad, m): rotations of the optimum over rotations, translations of that over all axes. To first order the
+            errors of the one do not tell those of the other.
         sigma: (6,) its standard deviation.
+        noise: (6,) the part of it that is new at every check.
+        place: (6,) the part that all checks of a street share; the rest is the rig's.
         distance2: squared distance in standard deviations over its limit: above 1 is flagged.
         flagged: the pose is wrong, or the data are.
         weak: the edges at the local optimum are fainter than they should be.
@@ -84,6 +100,8 @@ class Observation:
     metrics: tuple[Metric, ...]
     offset: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    place: NDArray[np.float64]
     distance2: float
     flagged: bool
     weak: bool
@@ -98,31 +116,65 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True)
+class AlarmLevels:
+    """Evidence, nats, at which a mount is suspect, and at which it has moved."""
+
+    suspect: float
+    confirmed: float
+
+    @property
+    def clear(self) -> float:
+        """Below it a suspicion is over."""
+        return CLEARS_AT * self.suspect
+
+    @property
+    def most(self) -> float:
+        """More is not counted."""
+        return self.confirmed + ABOVE
+
+
+def alarm_levels(config: MonitorConfig) -> AlarmLevels:
+    """The levels that a right mount comes to once in the stated hours on average, or more rarely, at a check per
+    period: the logarithm of the number of hypotheses that begin in that time. No single check comes to any of them."""
+
+    def once_in(hours: float) -> float:
+        return log(max(QUESTIONS * hours * S_PER_H / config.period_s, 1.0))
+
+    suspect = max(once_in(config.hours_between_false_suspicions), MOST_STEP + 1.0)
+    return AlarmLevels(suspect, max(once_in(config.hours_between_false_alarms), suspect + 1.0))
+
+
+@dataclass(frozen=True, slots=True)
 class MonitorState:
     """What the checks so far add up to: plain values that go through JSON as they are.
 
     Attributes:
-        evidence: in independent checks that say the mount is bent, floor 0.
         outcome: see there.
-        blind: the same for every cause in the data, by code.
+        turned, shifted: the hypotheses of the rotations and of the translations.
+        blind: evidence of every cause in the data, in independent checks, by code.
         dirt: the same for every block of the image that was dirty in all checks since, by its number.
-        offset: running mean of the flagged offsets that agree (rad, m); empty without one.
-        at_odds: flagged checks in a row that did not agree with it.
+        at_odds: flagged checks in a row.
         last_stamps_ns: of the pairs of the last check.
         stood: whether the vehicle stood at the end of the last check.
     """
 
-    evidence: float = 0.0
     outcome: Finding = Finding.UNKNOWN
+    turned: Hypotheses = field(default_factory=Hypotheses)
+    shifted: Hypotheses = field(default_factory=Hypotheses)
     blind: Mapping[str, float] = field(default_factory=dict)
     dirt: Mapping[str, float] = field(default_factory=dict)
-    offset: tuple[float, ...] = ()
     at_odds: float = 0.0
     last_stamps_ns: tuple[int, ...] = ()
     stood: bool = False
 
+    @property
+    def evidence(self) -> float:
+        """Log-likelihood ratio of the move that most speaks for, nats; 0 where nothing speaks for one."""
+        leading = (hypotheses.leading for hypotheses in (self.turned, self.shifted))
+        return max((0.0, *(test.evidence for test in leading if test is not None)))
 
-def after_observation(state: MonitorState, observation: Observation) -> MonitorState:
+
+def after_observation(state: MonitorState, observation: Observation, levels: AlarmLevels) -> MonitorState:
     """The state after one more check. It counts by the share of its pairs that the last one did not hold; while the
     vehicle stands, only the first says something new of the mount."""
     counted, standing = set(state.last_stamps_ns), set(observation.standing_stamps_ns)
@@ -135,42 +187,52 @@ def after_observation(state: MonitorState, observation: Observation) -> MonitorS
     if sum(run >= DIRTY_CHECKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
         codes.add(LENS_DIRTY.code)
     blind = {
-        code: min(max(state.blind.get(code, 0.0) + (fresh if code in codes else -fresh), 0.0), MOST)
+        code: min(max(state.blind.get(code, 0.0) + (fresh if code in codes else -fresh), 0.0), MOST_BLIND)
         for code in {*state.blind, *codes}
     }
     blind = {code: blind[code] for code in sorted(blind) if blind[code] > 0.0}
     after = replace(state, blind=blind, dirt=dirt, last_stamps_ns=observation.pair_stamps_ns, stood=stands)
-    if codes:
-        # Neither for nor against: the data cannot tell.
+    if codes or told_before or fresh == 0.0:
+        # Neither for nor against: the data cannot tell, or have told before.
         return after
-    if told_before or fresh == 0.0 or (not observation.flagged and observation.weak):
-        return after
-    after = _weighed(after, observation, fresh * (WEAK_SHARE if observation.weak else 1.0))
-    return replace(after, outcome=_outcome(state.outcome, after.evidence, after.at_odds))
+    after = _weighed(after, observation, fresh, levels)
+    return replace(after, outcome=_outcome(state.outcome, after, levels))
 
 
-def _weighed(state: MonitorState, observation: Observation, step: float) -> MonitorState:
-    """The evidence after a check that counts `step`: for the mount that the flagged ones before it speak of, or, where
-    they contradict each other, for the one that more speaks for."""
+def _weighed(state: MonitorState, observation: Observation, fresh: float, levels: AlarmLevels) -> MonitorState:
+    """The hypotheses after a check that counts by `fresh`. Where its edges are faint it may make the mount suspect,
+    but does not confirm: a full solve has to."""
+    most = levels.suspect if observation.weak else levels.most
+    after = []
+    for hypotheses, axes, first in ((state.turned, ROTATIONS, 0), (state.shifted, TRANSLATIONS, 3)):
+        told = _told(observation, slice(first, first + 3), hypotheses.before)
+        if told is not None:
+            hypotheses = after_check(hypotheses, told, axes, fresh, most)
+        after.append(hypotheses)
+    step = fresh * (WEAK_SHARE if observation.weak else 1.0)
     if not observation.flagged:
-        return replace(state, evidence=max(state.evidence - step, 0.0), at_odds=0.0)
-    if state.evidence == 0.0 or _same_mount(state.offset, observation):
-        most = max(state.evidence, SUSPECT_AT) if observation.weak else MOST
-        evidence = min(state.evidence + step, most)
-        offset = _mean(state.offset, observation.offset, step / max(evidence, step))
-        return replace(state, evidence=evidence, offset=offset, at_odds=max(state.at_odds - step, 0.0))
-    at_odds = min(state.at_odds + step, MOST)
-    if state.evidence - step > step:
-        return replace(state, evidence=state.evidence - step, at_odds=at_odds)
-    return replace(state, evidence=step, offset=_mean((), observation.offset, 1.0), at_odds=at_odds)
+        at_odds = state.at_odds if observation.weak else 0.0
+    else:
+        at_odds = min(state.at_odds + step, MOST_AT_ODDS)
+    return replace(state, turned=after[0], shifted=after[1], at_odds=at_odds)
 
 
-def _same_mount(offset: tuple[float, ...], observation: Observation) -> bool:
-    """Whether a check puts the mount, up to its own uncertainty, where those before it did."""
-    told, now = np.array(offset[:3]), observation.offset[:3]
-    sigma = float(np.sqrt(2.0 * np.nansum(observation.sigma[:3] ** 2)))
-    apart, farther = float(np.linalg.norm(told - now)), max(float(np.linalg.norm(told)), float(np.linalg.norm(now)))
-    return apart <= SAME_SIGMA * sigma + SAME_SHARE * farther
+def _told(observation: Observation, axes: slice, before: Three | None) -> Told | None:
+    """What a check tells of three axes; None where it does not tell all of them."""
+    columns = (observation.offset, observation.sigma, observation.noise, observation.place)
+    offset, sigma, noise, place = ([float(value) for value in column[axes]] for column in columns)
+    if not all(isfinite(value) for value in (*offset, *sigma, *noise, *place)) or min(noise) <= 0.0:
+        return None
+    times = WEAK_TIMES if observation.weak else 1.0
+    farther2 = sum((FARTHER * value) ** 2 for value in offset)
+    return Told(
+        offset=three(offset),
+        noise=three([(times * n) ** 2 + farther2 for n in noise]),
+        place=three([p * p for p in place]),
+        rig=three([max(s * s - n * n, p * p) for s, n, p in zip(sigma, noise, place, strict=True)]),
+        before=before,
+        weak=observation.weak,
+    )
 
 
 def diagnose(state: MonitorState) -> Cause | None:
@@ -189,18 +251,13 @@ def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: floa
     return {block: min(dirt.get(block, 0.0) + fresh, DIRTY_CHECKS + 1.0) for block in sorted(dirty)}
 
 
-def _outcome(before: Finding, evidence: float, at_odds: float) -> Finding:
+def _outcome(before: Finding, after: MonitorState, levels: AlarmLevels) -> Finding:
     """With hysteresis: what was suspected stays so until little speaks for it."""
-    if evidence >= CONFIRMED_AT:
+    evidence = after.evidence
+    if evidence >= levels.confirmed:
         return Finding.CONFIRMED
-    if before is Finding.CONFIRMED and evidence >= CLEAR_BELOW:
+    if before is Finding.CONFIRMED and evidence >= levels.clear:
         return before
-    if evidence >= SUSPECT_AT or (before is Finding.SUSPECT and evidence >= CLEAR_BELOW):
+    if evidence >= levels.suspect or (before is Finding.SUSPECT and evidence >= levels.clear):
         return Finding.SUSPECT
-    return Finding.AT_ODDS if at_odds >= AT_ODDS_AT else Finding.CLEAR
-
-
-def _mean(before: tuple[float, ...], offset: NDArray[np.float64], share: float) -> tuple[float, ...]:
-    if not before:
-        return tuple(float(value) for value in offset)
-    return tuple((1.0 - share) * old + share * float(new) for old, new in zip(before, offset, strict=True))
+    return Finding.AT_ODDS if after.at_odds >= AT_ODDS_AT else Finding.CLEAR

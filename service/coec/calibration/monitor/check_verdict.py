@@ -9,12 +9,14 @@ from __future__ import annotations
 from math import degrees, inf
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coec.calibration.commissioning.baseline import (
     Accuracy,
     Baseline,
     Drift,
     MonitorLimits,
+    street_sigma,
     uncommissioned,
 )
 from coec.calibration.commissioning.quantiles import chi2_quantile
@@ -89,8 +91,10 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
         stamp_ns=stamps_ns[-1],
         pair_stamps_ns=stamps_ns,
         metrics=metrics,
-        offset=seen.offset_pose - accuracy.bias,
-        sigma=accuracy.sigma(seen.pairs),
+        offset=_of_both(seen.offset_rotation - rotation.expected, seen.offset_pose - accuracy.bias),
+        sigma=_of_both(rotation.sigma(seen.pairs), accuracy.sigma(seen.pairs)),
+        noise=_of_both(rotation.noise(seen.pairs), accuracy.noise(seen.pairs)),
+        place=street_sigma(camera),
         distance2=max(of_rotation, of_pose),
         flagged=flagged,
         weak=weak,
@@ -112,6 +116,11 @@ def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: Monitor
         rotation.distance2(seen.offset_rotation, seen.pairs) / within,
         pose.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose,
     )
+
+
+def _of_both(of_rotation: NDArray[np.float64], of_pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6,) the rotations of the one, the translations of the other."""
+    return np.concatenate([of_rotation[:ROTATION_DOF], of_pose[ROTATION_DOF:]])
 
 
 def edges_per_pair(seen: Check) -> float:

@@ -55,7 +55,7 @@ class Commands:
         self._pair = pair
         self._vehicle = vehicle
         self._rig = rig
-        self._rules = lifecycle.Rules(pair.policy, pair.tracker)
+        self._rules = lifecycle.Rules(pair.policy, pair.tracker, pair.monitor)
         self._decider = decider
         self._mailbox = mailbox
         self._store = store

@@ -116,7 +116,7 @@ class Decider:
         """`calibrate_with` says how the next windows are to be calibrated; `tell` hears what is known, whenever
         something may have changed and once a second."""
         self.thread = ServiceThread(f"decisions-{pair.name}", self._run)
-        self._rules = Rules(pair.policy, pair.tracker)
+        self._rules = Rules(pair.policy, pair.tracker, pair.monitor)
         self._stale_after_s = stale_after_s
         self._store = store
         self._baseline = baseline
@@ -276,7 +276,7 @@ class Decider:
             self._calibrate_with(self._baseline.calibration)
         observation = replace(answer.observation, standing_stamps_ns=standing_ns)
         effect = self._step(
-            lambda state: lifecycle.after_observation(state, observation),
+            lambda state: lifecycle.after_observation(state, observation, self._rules),
             observation.stamp_ns,
             completed=True,
             epoch=epoch,

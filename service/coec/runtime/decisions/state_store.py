@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 import threading
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import rig_to_json
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState, Provenance, Status
-from coec.calibration.monitor.change_detector import Finding, MonitorState
+from coec.calibration.monitor.change_detector import MonitorState
 from coec.calibration.tracker import track_from_dict, track_to_dict
 from coec.calibration.types import Reason, Rig
 from coec.errors import CoecError, StateError
@@ -67,7 +67,7 @@ class StoredPair(Part):
     frozen: bool = False
     proven: bool = False
     track: dict[str, Any] | None = None
-    monitor: dict[str, Any] | None = None
+    monitor: MonitorState = MonitorState()
     flagged_since_ns: int | None = None
     changes: tuple[StoredChange, ...] = ()
     since_wall_ns: int | None = None
@@ -154,7 +154,7 @@ class StateStore:
             frozen=state.frozen,
             proven=state.proven,
             track=track_to_dict(state.track) if state.track else None,
-            monitor=asdict(state.monitor),
+            monitor=state.monitor,
             flagged_since_ns=state.flagged_since_ns,
             changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
             since_wall_ns=clocks.since_wall_ns,
@@ -214,14 +214,7 @@ def _state_of(stored: StoredPair) -> PairState:
         frozen=stored.frozen,
         proven=stored.proven,
         track=track_from_dict(stored.track) if stored.track else None,
-        monitor=_monitor_of(stored.monitor) if stored.monitor else MonitorState(),
+        monitor=stored.monitor,
         flagged_since_ns=stored.flagged_since_ns,
         changes=tuple(Change(change.stamp_ns, change.step) for change in stored.changes),
     )
-
-
-def _monitor_of(document: dict[str, Any]) -> MonitorState:
-    """JSON knows lists only, the state is made of tuples."""
-    values: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in document.items()}
-    values["outcome"] = Finding(values["outcome"])
-    return MonitorState(**values)

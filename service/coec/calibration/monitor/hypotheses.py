@@ -1,0 +1,126 @@
+"""Has the mount moved, when, and to where? One question for three axes at a time, asked again at every check.
+
+After Page (1954) and Lorden (1971): at every check begins a test of "it moved just now" against "it did not", which
+goes on for ever or ends by accusing. Where to is not known: each test learns it as it goes, and predicts every check
+from those before it (Lorden and Pollak 2005, nonanticipating estimation). Under a right mount the likelihood ratio of
+such a test is a martingale, so it comes to e^h in a share of at most e^-h of them (Ville), and by Lorden's theorem the
+mean run between false accusations is at least e^h checks: the threshold is the logarithm of a number of checks.
+
+A right mount is not a point: the optimum of a check lies a little elsewhere in every street, and so it does at all
+neighbouring checks. Both sides of a test learn where; the one without a move may be elsewhere by no more than streets
+differ. So what streets do is no evidence, however long it lasts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from coec.calibration.monitor.likelihood import Belief, Three, Told, plus, score, three
+
+LEAST_STEP, MOST_STEP = -5.0, 6.0
+"""Nats that a check may speak against a test and for it: none decides alone, and three acquit."""
+
+THINNING = 2.0
+"""Ratio of the ages of neighbouring tests: the older, the sparser, as it matters less when exactly a move was."""
+
+OLDEST = 8192
+"""Checks after which a test ends: eleven hours at one every five seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """Three axes that are tested together.
+
+    Attributes:
+        reach: standard deviation of what a bad check says, per axis (rad or m).
+        moves: standard deviations of the moves that are looked for: small ones and large ones.
+    """
+
+    reach: Three
+    moves: tuple[Three, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """ "It moved just before `age` checks."
+
+    Attributes:
+        kind: which of the moves.
+        age: checks since, those that count in part by that part.
+        evidence: log-likelihood ratio, nats.
+        moved, right: where the mount is, had it moved, and had it not.
+    """
+
+    kind: int
+    age: float
+    evidence: float
+    moved: Belief
+    right: Belief
+
+
+@dataclass(frozen=True, slots=True)
+class Hypotheses:
+    """All that go on over three axes, the youngest first, and where a right mount has been so far."""
+
+    right: Belief | None = None
+    running: tuple[Hypothesis, ...] = ()
+    before: Three | None = None
+
+    @property
+    def leading(self) -> Hypothesis | None:
+        """The one with the most evidence; the oldest of equals."""
+        return max(reversed(self.running), key=lambda test: test.evidence, default=None)
+
+
+def after_check(tests: Hypotheses, told: Told, axes: Axes, share: float, most: float) -> Hypotheses:
+    """The tests after one more check that counts by `share`, 0 to 1. None comes to more evidence than `most`; a weak
+    check raises none above it, and none that was above falls to it by that."""
+    right = tests.right if tests.right is not None else Belief((0.0, 0.0, 0.0), told.rig)
+    begun = [_begun(kind, right, told, axes) for kind in range(len(axes.moves))]
+    running = [_continued(test, told, axes, share, most) for test in (*begun, *tests.running)]
+    scored = score(told, right.wider(told.place), axes.reach)
+    # Neighbouring checks say the same of their street: what they say of the rig is worth no more than a street.
+    of_rig = plus(told.noise, told.place)
+    learnt = right.after(replace(told, noise=of_rig), scored, share)
+    least = three([max(v, n / OLDEST) for v, n in zip(learnt.variance, of_rig, strict=True)])
+    learnt = replace(learnt, variance=least)
+    return Hypotheses(learnt, _thinned(running), told.offset)
+
+
+def _begun(kind: int, right: Belief, told: Told, axes: Axes) -> Hypothesis:
+    street = right.wider(told.place)
+    moves = three([sigma * sigma for sigma in axes.moves[kind]])
+    return Hypothesis(kind, 0.0, 0.0, street.wider(moves), street)
+
+
+def _continued(test: Hypothesis, told: Told, axes: Axes, share: float, most: float) -> Hypothesis:
+    moved, right = (score(told, belief, axes.reach) for belief in (test.moved, test.right))
+    step = min(max(moved.log_density - right.log_density, LEAST_STEP), MOST_STEP)
+    evidence = test.evidence + share * step
+    if step > 0.0:
+        evidence = min(evidence, max(most, test.evidence))
+    return Hypothesis(
+        test.kind,
+        test.age + share,
+        evidence,
+        test.moved.after(told, moved, share),
+        test.right.after(told, right, share),
+    )
+
+
+def _thinned(running: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Per kind of move tests at ages that grow by a factor; always the one that leads, of every kind."""
+    kept: list[Hypothesis] = []
+    for kind in sorted({test.kind for test in running}):
+        of_kind = [test for test in running if test.kind == kind and test.age <= OLDEST]
+        leading = max(reversed(of_kind), key=lambda test: test.evidence)
+        sparse: list[Hypothesis] = []
+        for place, test in enumerate(of_kind):
+            older = of_kind[place + 1].age if place + 1 < len(of_kind) else None
+            # The next one would still be near enough to the last that was kept.
+            crowded = sparse and older is not None and older <= THINNING * sparse[-1].age
+            if test is leading or not crowded:
+                sparse.append(test)
+        kept += sparse
+    return tuple(kept)
