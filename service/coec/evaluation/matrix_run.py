@@ -17,12 +17,12 @@ from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.monitor.change_detector import Finding, MonitorState, after_observation
+from coec.calibration.monitor.change_detector import Finding, MonitorState, after_observation, alarm_levels
 from coec.calibration.monitor.check import check_at, gather
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, judge_check
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Decision, FramePair, Matrix4, Window
-from coec.config import CalibrationConfig, LimitsConfig, PairingConfig
+from coec.config import CalibrationConfig, LimitsConfig, MonitorConfig, PairingConfig
 from coec.errors import CoecError, SourceError
 from coec.evaluation.matrix import is_hit
 from coec.evaluation.matrix_drives import MatrixDrive
@@ -174,7 +174,7 @@ def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig
     truth = stage.drive.truth(stage.pairs[0].stamp_ns)
     window = stage.window(stage.pairs, truth)
     evidence = gather(sight_of(window, stage.depth, stage.images, configuration, Silence()))
-    rows = []
+    levels, rows = alarm_levels(MonitorConfig()), []
     for number, (name, turn_deg) in enumerate(MOVES_DEG):
         rng = np.random.default_rng([_number_of(drive.name), 1000 + number])
         pose = se3.perturb(truth, np.concatenate([radians(turn_deg) * random_direction(rng), np.zeros(3)]))
@@ -183,7 +183,7 @@ def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig
         for first in range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS):
             part = evidence.of(range(first, first + CHECK_PAIRS))
             seen = judge_check(part, check_at(part, pose, configuration), pose, None)
-            before, state = state, after_observation(state, seen)
+            before, state = state, after_observation(state, seen, levels)
             checks += 1
             flagged += seen.flagged and not seen.causes
             blind += bool(seen.causes)
