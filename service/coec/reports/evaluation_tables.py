@@ -10,6 +10,7 @@ from typing import Any
 
 from coec.calibration.types import Matrix4
 from coec.evaluation import statistics
+from coec.evaluation.detection import RIGHT
 from coec.evaluation.statistics import Outcome
 from coec.geometry import se3
 from coec.reports import console
@@ -190,8 +191,15 @@ def show_detection(detection: DetectionReport) -> None:
         table.add_row(row.name, str(row.checks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
     console.out.print(table)
     console.show(
-        f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other"
+        f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other; "
+        "no pair is in both"
     )
+    right = next((row for row in detection.moves if row.name == RIGHT), None)
+    if right is not None:
+        console.show(
+            "equation (2) is shown for comparison and decides nothing: it flags "
+            f"{100 * right.flagged_by_paper:.1f} % of right extrinsics"
+        )
 
 
 def _show_halves(halves: HalvesReport, dof: int) -> None:

@@ -80,11 +80,13 @@ class DetectionRow(Part):
     name: str = Field(description="`right`, or how far the extrinsic was moved")
     checks: Count
     flagged: float = Field(ge=0, le=1, description="by the distance of the local optimum")
-    flagged_by_paper: float = Field(ge=0, le=1, description="by equation (2) with learned limits")
+    flagged_by_paper: float = Field(
+        ge=0, le=1, description="by equation (2) with learned limits; for comparison, it decides nothing"
+    )
 
 
 class DetectionReport(Part):
-    """How well a wrong extrinsic is seen: limits learned on one half of the pairs, tried on the other."""
+    """How well a wrong extrinsic is seen: limits learned on one half of the pairs, tried on the other; none in both."""
 
     splits: Count
     pairs: Count = Field(description="camera-LiDAR pairs that were split in two")

@@ -193,7 +193,9 @@ class CheckReply(Part):
     pair_stamps_ns: tuple[int, ...] = Field(description="of all of them, ns, ascending")
     flagged: bool = Field(description="the pose is wrong, or the data are")
     weak: bool = Field(description="the edges are fainter than they should be: the check counts less")
-    flagged_by_paper: bool | None = Field(description="equation (2); null until the rig is commissioned")
+    flagged_by_paper: bool | None = Field(
+        description="equation (2), for comparison: it decides nothing; null until the rig is commissioned"
+    )
     causes: tuple[Reason, ...] = Field(description="what is wrong with the data; such a check says nothing of the pose")
     metrics: dict[str, MetricReply] = Field(description="by name")
     first_derivative: Maybe6 = Field(description="f' at the pose: dMI, nats per rad or m")
