@@ -10,8 +10,8 @@ from coec.calibration.confidence.ridges import widened
 from landscapes import Array, landscape, paraboloids
 
 SHAPE = (20, 16, 3)
-TOP = 2.5e-4
-"""Half the width of the hill on the table, radians: two and a half standard deviations of its own."""
+TOP = 1.5e-4
+"""Half the width of the hill on the table, radians: one and a half standard deviations of its own."""
 
 
 def maxima(rng: np.random.Generator) -> Array:
