@@ -18,7 +18,7 @@ def solved(matrix: Rows, right: Sequence[float]) -> list[float]:
     Raises:
         ValueError: the matrix is not positive definite.
     """
-    return _solved(cholesky(matrix), right)
+    return _solved(_cholesky(matrix), right)
 
 
 def inverted(matrix: Rows) -> list[list[float]]:
@@ -27,7 +27,7 @@ def inverted(matrix: Rows) -> list[list[float]]:
     Raises:
         ValueError: the matrix is not positive definite.
     """
-    factor, n = cholesky(matrix), len(matrix)
+    factor, n = _cholesky(matrix), len(matrix)
     # The inverse is symmetric: its columns are its rows.
     return [_solved(factor, [float(row == column) for row in range(n)]) for column in range(n)]
 
@@ -72,12 +72,8 @@ def _rotate(a: list[list[float]], vectors: list[list[float]], p: int, q: int) ->
     a[p][q] = a[q][p] = 0.0
 
 
-def cholesky(matrix: Rows) -> list[list[float]]:
-    """L (n, n) of the symmetric positive definite matrix L·Lᵀ (n, n), zeros above the diagonal.
-
-    Raises:
-        ValueError: the matrix is not positive definite.
-    """
+def _cholesky(matrix: Rows) -> list[list[float]]:
+    """L (n, n) of the matrix L·Lᵀ, zeros above the diagonal."""
     n = len(matrix)
     factor = [[0.0] * n for _ in range(n)]
     for i in range(n):
