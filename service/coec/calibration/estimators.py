@@ -192,7 +192,8 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     if at_rim(found.T_camera_lidar, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
     summits = (
-        Rivals(finest, best.T_camera_lidar, tuple(end.T_camera_lidar for end in settled if end is not best)),
+        # The pose before the search, too: where the window cannot tell it from what was found, it has told nothing.
+        Rivals(finest, best.T_camera_lidar, (*(e.T_camera_lidar for e in settled if e is not best), start)),
         Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
     )
     return Found(finest, found, metrics, summits)

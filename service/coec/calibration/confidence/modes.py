@@ -1,4 +1,4 @@
-"""Other summits that the search came to, and that the window cannot tell from the best one."""
+"""Other poses that the search came to, or from, and that the window cannot tell from the best one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SAME_HILL = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rivals:
-    """Summits of one objective: the best (4, 4) and `others` (4, 4) of the same basin."""
+    """Poses under one objective: the best (4, 4) and `others` (4, 4) that might have been it."""
 
     objective: Divisible
     best: Matrix4
