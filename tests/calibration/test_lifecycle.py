@@ -32,7 +32,7 @@ from coec.calibration.lifecycle import (
 )
 from coec.calibration.monitor.change_detector import Finding, Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
-from coec.calibration.types import Decision, Estimate, Optimum, Reason, Rig, StopReason, Verdict
+from coec.calibration.types import Decision, Estimate, Optimum, Reason, Rig, StopReason, Uncertainty, Verdict
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.geometry import se3
 from coec.geometry.cameras import build
@@ -78,7 +78,7 @@ def estimate(turned_deg: float, stamp_s: int = 100, decision: Decision = Decisio
         ),
         verdict=Verdict(decision, (), reasons),
         correction=xi,
-        sigma=np.array([5e-4] * 3 + [np.nan] * 3),
+        uncertainty=Uncertainty.independent(np.array([5e-4] * 3 + [np.nan] * 3)),
         solved=np.arange(6) < 3,
         unobservable=np.zeros(6, np.bool_),
         compensation={},

@@ -6,13 +6,14 @@ from collections import Counter
 
 import numpy as np
 
+from coec.calibration.confidence.uncertainty import measure_uncertainty
 from coec.calibration.estimators import ESTIMATORS, sight_of
 from coec.calibration.frames.motion_compensation import compensation
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.search.observability import unobservable, without
 from coec.calibration.types import Compensation, Estimate, Optimum, Window
-from coec.calibration.verdict import judge, shape_metrics
+from coec.calibration.verdict import counted_once, judge, shape_metrics
 from coec.config import CalibrationConfig, config_hash
 from coec.errors import CalibrationError
 from coec.geometry import se3
@@ -35,27 +36,33 @@ def calibrate(
     # P_i and D_i, the objective and its maximum.
     sight = sight_of(window, depth, images, config, progress)
     found = ESTIMATORS[config.objective.kind](sight, config)
-    search, curvature = found.search, measure_curvature(found.objective, found.search.T_camera_lidar, dof)
-    blind = unobservable(curvature, dof, config.verdict)
+    objective, search, every = found.objective, found.search, tuple(range(dof))
+    curvature = measure_curvature(objective, search.T_camera_lidar, dof)
+    uncertainty = measure_uncertainty(objective, search.T_camera_lidar, every, found.rivals, sight.window)
+    blind = unobservable(curvature, uncertainty.sigma, dof, config.verdict)
     if blind:
-        search = without(blind, search, found.objective, window.T_camera_lidar_start, config.search, progress)
-        curvature = measure_curvature(found.objective, search.T_camera_lidar, dof, blind)
+        search = without(blind, search, objective, window.T_camera_lidar_start, config.search, progress)
+        curvature = measure_curvature(objective, search.T_camera_lidar, dof, blind)
+        told = tuple(axis for axis in every if axis not in blind)
+        uncertainty = measure_uncertainty(objective, search.T_camera_lidar, told, found.rivals, sight.window)
     pose = search.T_camera_lidar
     # Self-diagnosis, equation (2).
-    at_optimum = found.objective.evaluate(pose)
-    metrics = (*found.metrics, *shape_metrics(at_optimum, curvature, config.verdict))
-    verdict = judge(metrics, search.stop_reason)
+    at_optimum = objective.evaluate(pose)
+    looks, pairs = uncertainty.looks, len(window.pairs)
+    of_objective = counted_once(found.metrics, looks, pairs)
+    metrics = (*of_objective, *shape_metrics(at_optimum, curvature, uncertainty.sigma, config.verdict))
+    verdict = judge(metrics, search.stop_reason, looks, pairs)
     progress.step("diagnosis", 1, 1)
 
     outcomes = Counter(compensation(pair, window.rig, enabled=config.motion_compensation) for pair in window.pairs)
     return Estimate(
         window_id=window.window_id,
         data_stamp_ns=window.stamp_ns,
-        pairs=len(window.pairs),
+        pairs=pairs,
         optimum=Optimum(
             T_camera_lidar=pose,
             score=at_optimum.score,
-            score_at_start=found.objective.evaluate(window.T_camera_lidar_start).score,
+            score_at_start=objective.evaluate(window.T_camera_lidar_start).score,
             mi=at_optimum.mi,
             overlap=at_optimum.overlap,
             points_in_view=at_optimum.points_in_view,
@@ -66,7 +73,7 @@ def calibrate(
         ),
         verdict=verdict,
         correction=se3.difference(pose, window.rig.T_camera_lidar_nominal),
-        sigma=curvature.sigma,
+        uncertainty=uncertainty,
         solved=(np.arange(6) < dof) & ~np.isin(np.arange(6), blind),
         unobservable=np.isin(np.arange(6), blind),
         compensation={outcome.value: outcomes[outcome] for outcome in Compensation},

@@ -11,14 +11,15 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.modes import Rivals
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
 from coec.calibration.objective.edges import build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
+    Divisible,
     Features,
     MutualInformation,
-    Objective,
     SearchBox,
     build_mutual_information,
     distance_and_depth,
@@ -121,11 +122,13 @@ def _masked(sight: Sight) -> Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What an estimator found: its objective, the search on it, and the metrics that only this objective has."""
+    """What an estimator found: its objective, the search on it, the metrics that only this objective has, and the other
+    summits that it came to within the basin."""
 
-    objective: Objective
+    objective: Divisible
     search: SearchResult
     metrics: tuple[Metric, ...]
+    rivals: tuple[Rivals, ...] = ()
 
 
 Estimator = Callable[[Sight, CalibrationConfig], Found]
@@ -184,11 +187,16 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
     settled = [polish_in_turn(fusion.settling, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
     finest = fusion.settling[-1]
-    found = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
-    found = replace(found, evaluations=sum(end.evaluations for end in (*ends, *settled)))
+    best = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
+    found = replace(best, evaluations=sum(end.evaluations for end in (*ends, *settled)))
     if at_rim(found.T_camera_lidar, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
-    return Found(finest, found, metrics)
+    summits = (
+        # The pose before the search, too: where the window cannot tell it from what was found, it has told nothing.
+        Rivals(finest, best.T_camera_lidar, (*(e.T_camera_lidar for e in settled if e is not best), start)),
+        Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
+    )
+    return Found(finest, found, metrics, summits)
 
 
 def runner_up(contrast: float, rivals: Sequence[float]) -> float:

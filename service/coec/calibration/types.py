@@ -9,6 +9,7 @@ z forward). Stamps are sensor time in integer nanoseconds.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -161,6 +162,7 @@ class Rig:
         T_lidar_ego: (4, 4) maps ego-frame coordinates to LiDAR coordinates; carries ego-motion to the sensor.
         mask: (height, width) bool or None; False = ignore this pixel (vehicle body, outside the lens).
         sweep: azimuth timing, or None when unknown or when the clouds carry per-point time.
+        camera_residual_px: what `camera` misses of the lens that it was fitted to, root mean square, pixels.
     """
 
     pair: str
@@ -171,6 +173,7 @@ class Rig:
     T_lidar_ego: Matrix4
     mask: NDArray[np.bool_] | None = None
     sweep: SweepTiming | None = None
+    camera_residual_px: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -289,12 +292,68 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """How far a pose may be off, about the camera axes, radians and metres.
+
+    Attributes:
+        noise: (6, 6) covariance of what differs from window to window; NaN on axes that were not told.
+        systematic: by its name, (6,) the shift by one standard deviation of an error that windows have in common.
+        looks: how many independent looks the frames of the window are worth; NaN where that is not known.
+    """
+
+    noise: NDArray[np.float64]
+    systematic: Mapping[str, NDArray[np.float64]]
+    looks: float
+
+    @classmethod
+    def unknown(cls) -> Uncertainty:
+        """On every axis."""
+        return cls(np.full((6, 6), np.nan), {}, np.nan)
+
+    @classmethod
+    def independent(cls, sigma: NDArray[np.float64]) -> Uncertainty:
+        """Noise alone, its axes uncorrelated: standard deviations (6,), NaN where an axis is not told."""
+        told = np.isfinite(sigma)
+        noise = np.where(told[:, None] & told, np.diag(np.where(told, sigma, 0.0) ** 2), np.nan)
+        return cls(noise, {}, np.nan)
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(6, 6) of both together."""
+        shared = np.zeros((6, 6))
+        for name in sorted(self.systematic):  # to the bit the same, in whatever order they were kept
+            shared += self.systematic[name][:, None] * self.systematic[name]
+        return self.noise + shared
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """(6,) standard deviations of both together; NaN on axes that were not told."""
+        return np.sqrt(self.covariance.diagonal())
+
+    @property
+    def pitch_height(self) -> float:
+        """Correlation of the errors of rx and ty, -1 to 1; NaN where either was not told. Only what is near tells a
+        turn from a shift."""
+        return self._correlation(0, 4)
+
+    @property
+    def yaw_side(self) -> float:
+        """The same of ry and tx."""
+        return self._correlation(1, 3)
+
+    def _correlation(self, one: int, other: int) -> float:
+        covariance, sigma = self.covariance, self.sigma
+        size = float(sigma[one] * sigma[other])
+        return float(covariance[one, other]) / size if size > 0.0 else np.nan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The immutable result of calibrating one window.
 
     Attributes:
         correction: (6,) rotation vector (rad) and translation (m) from the nominal calibration, about the camera axes.
-        sigma: (6,) standard deviation per axis (rad, m); NaN where it was not estimated.
+        uncertainty: of the pose; unknown on axes that were not solved.
         solved: (6,) bool, the axes that were searched and found.
         unobservable: (6,) bool, the translations that were searched but that the window does not tell: along these
             axes of the camera its centre, -Rᵀ·t in LiDAR coordinates, is that of the start.
@@ -309,9 +368,14 @@ class Estimate:
     optimum: Optimum
     verdict: Verdict
     correction: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    uncertainty: Uncertainty
     solved: NDArray[np.bool_]
     unobservable: NDArray[np.bool_]
     compensation: dict[str, int]
     depth_identity: str
     config_hash: str
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """(6,) standard deviation per axis (rad, m); NaN where it was not estimated."""
+        return self.uncertainty.sigma

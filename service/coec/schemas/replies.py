@@ -17,6 +17,7 @@ Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 Maybe6 = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
+Maybe6x6 = tuple[Maybe6, Maybe6, Maybe6, Maybe6, Maybe6, Maybe6]
 Flags6 = tuple[bool, bool, bool, bool, bool, bool]
 Count = Annotated[int, Field(ge=0)]
 Counts = dict[str, Count]
@@ -112,7 +113,19 @@ class CalibrationResult(Message):
     correction: Vector6 = Field(description="rx ry rz (deg), tx ty tz (m), from the nominal calibration")
     sigma: Maybe6 = Field(description="standard deviations (deg, m); null where not estimated")
     correction_rad_m: Vector6 = Field(description="`correction` in rad and m, exact")
-    sigma_rad_m: Maybe6 = Field(description="`sigma` in rad and m, exact")
+    noise: Maybe6x6 = Field(
+        description="covariance (rad, m), exact, of what differs from window to window; null: unknown"
+    )
+    systematic: dict[str, Vector6] = Field(
+        description="by its name, the shift (rad, m) by one standard deviation of an error that windows have in common"
+    )
+    correlation_pitch_height: float | None = Field(
+        description="of the errors of rx and ty; null where either is unknown"
+    )
+    correlation_yaw_side: float | None = Field(description="of the errors of ry and tx; null where either is unknown")
+    independent_looks: float | None = Field(
+        description="how many independent looks the pairs are worth: near 1 where the vehicle stood; null: unknown"
+    )
     solved: Flags6 = Field(description="axes that the search found")
     unobservable: Flags6 = Field(
         description="axes that were searched but that the window does not tell: kept as before"
@@ -166,6 +179,12 @@ class ExtrinsicReply(Message):
     status: Status = Field(description="of the latest attempt; not_accepted before the first")
     percent_complete: float = Field(ge=0, le=100, description="of the open window")
     axes: Axes
+    correlation_pitch_height: float | None = Field(
+        default=None, description="of the errors of rx and ty; null where either is unknown"
+    )
+    correlation_yaw_side: float | None = Field(
+        default=None, description="of the errors of ry and tx; null where either is unknown"
+    )
     valid_from_ns: int = Field(description="sensor time from which it holds, ns; 0 for nominal")
     data_stamp_ns: int | None = Field(description="last contributing pair, ns; null for nominal")
     window_id: str | None = Field(description="the window it came from; null for nominal")
