@@ -110,7 +110,9 @@ def build_edges(
     weight = np.concatenate([edges.weight for edges in found])
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
     finest = min(finest, coarsest + 1 - BANDS)
-    sharp, whole, *of_bands = _maps(EdgeScales(lit, finest, coarsest), greys, len(pairs))
+    # The third column of a rotation is where it takes the third axis.
+    scales = EdgeScales(lit, finest, coarsest, upright=rig.T_camera_lidar_nominal[:2, 2])
+    sharp, whole, *of_bands = _maps(scales, greys, len(pairs))
     points_m = np.ascontiguousarray(xyz_m.T)
 
     def frames(level: int, maps: NDArray[np.int8], chosen: NDArray[np.int64]) -> EdgeFrames:
