@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
-from coec.calibration.objective.edges import build_edges
+from coec.calibration.objective.edges import EdgeWitness, build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
     Features,
@@ -121,11 +121,13 @@ def _masked(sight: Sight) -> Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What an estimator found: its objective, the search on it, and the metrics that only this objective has."""
+    """What an estimator found: its objective, the search on it, the metrics that only this objective has, and the edges
+    of the window where it looked at them."""
 
     objective: Objective
     search: SearchResult
     metrics: tuple[Metric, ...]
+    edges: EdgeWitness | None = None
 
 
 Estimator = Callable[[Sight, CalibrationConfig], Found]
@@ -188,7 +190,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     found = replace(found, evaluations=sum(end.evaluations for end in (*ends, *settled)))
     if at_rim(found.T_camera_lidar, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
-    return Found(finest, found, metrics)
+    return Found(finest, found, metrics, edges)
 
 
 def runner_up(contrast: float, rivals: Sequence[float]) -> float:

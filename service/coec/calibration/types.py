@@ -289,6 +289,21 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MovedWithin:
+    """The camera moved while a window was taken: two poses, one after the other, explain it, and one does not.
+
+    Attributes:
+        last_before_ns, first_after_ns: stamps of the pairs between which it moved.
+        T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after; turned about the camera's centre.
+    """
+
+    last_before_ns: int
+    first_after_ns: int
+    T_before: Matrix4
+    T_after: Matrix4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The immutable result of calibrating one window.
 
@@ -301,6 +316,7 @@ class Estimate:
         compensation: how many pairs ended with which `Compensation`, by name.
         depth_identity: sha256 of the network, or `precomputed`.
         config_hash: of everything that decides the result.
+        moved: what the window was refused for, if the camera moved within it; None otherwise.
     """
 
     window_id: str
@@ -315,3 +331,4 @@ class Estimate:
     compensation: dict[str, int]
     depth_identity: str
     config_hash: str
+    moved: MovedWithin | None = None

@@ -9,17 +9,23 @@ a rig is commissioned.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import degrees, radians
+from types import MappingProxyType
 
 import numpy as np
 
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.search.change_point import ChangePoint
 from coec.calibration.types import Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 """Places of both in ξ = [rx ry rz tx ty tz]."""
+
+MOVED = "moved_within_window"
+"""Metric of a change within the window, and code of the reason that refuses a window for it."""
 
 _MEANING = {
     "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",
@@ -32,6 +38,7 @@ _MEANING = {
     "sigma_deg": "the frames disagree on a rotation, or are too few to tell",
     "sigma_m": "the frames disagree on a translation, or are too few to tell",
     "overlap": "too few LiDAR points are in view",
+    MOVED: "the camera moved while the window was taken",
 }
 
 
@@ -54,6 +61,15 @@ def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictC
     return tuple(metrics)
 
 
+def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Metric, ...]:
+    """What the likeliest change within the window gains over no change; nothing where changes were not looked for. A
+    change of the scene gains nothing, nor does a turn below `min_change_deg`: scenes differ by that without a knock."""
+    if change is None:
+        return ()
+    gain = change.gain if change.of_camera and degrees(change.turn_rad) >= limits.min_change_deg else 0.0
+    return (Metric(MOVED, gain, limits.max_change_gain, at_least=False),)
+
+
 def _newton_step(curvature: Curvature, axes: slice) -> float:
     """Largest |f'| / f'' over some axes, those not searched apart: how far away each axis alone puts its maximum;
     infinite without one."""
@@ -62,10 +78,14 @@ def _newton_step(curvature: Curvature, axes: slice) -> float:
     return float(np.max(np.abs(first) / second)) if (second > 0.0).all() else float("inf")
 
 
-def judge(metrics: tuple[Metric, ...], stop: StopReason) -> Verdict:
-    """Equation (2) over the metrics of the objective and of its optimum."""
+def judge(metrics: tuple[Metric, ...], stop: StopReason, details: Mapping[str, str] = MappingProxyType({})) -> Verdict:
+    """Equation (2) over the metrics of the objective and of its optimum; `details` say more of what a metric means in
+    this window, by its name."""
     reasons = [
-        Reason(metric.name, f"{_MEANING[metric.name]}: {metric.value:.3g}, limit {metric.limit:.3g}")
+        Reason(
+            metric.name,
+            f"{_MEANING[metric.name]}{details.get(metric.name, '')}: {metric.value:.3g}, limit {metric.limit:.3g}",
+        )
         for metric in metrics
         if not metric.passed
     ]

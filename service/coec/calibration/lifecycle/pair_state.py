@@ -178,8 +178,12 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     state = replace(state, latest=estimate, failures=())
     if estimate.verdict.decision is Decision.FAILED:
         state = replace(state, status=Status.FAILED)
-        elsewhere = not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
-        if estimate.verdict.cannot_tell or not elsewhere:
+        moved = estimate.moved
+        if moved is None and estimate.verdict.cannot_tell:
+            return state
+        # Where the camera moved within the window, its end tells where it is now.
+        latest = estimate.optimum.T_camera_lidar if moved is None else moved.T_after
+        if agrees(state.T_camera_lidar, latest, rules.policy):
             return state
         return _unless_red(state, Event.REFUSED_ELSEWHERE, *estimate.verdict.reasons)
     state = replace(state, status=Status.ACCEPTED)
@@ -195,6 +199,16 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     # A track of one window is that window, to the last bit.
     pose = estimate.optimum.T_camera_lidar if track.windows <= 1 else track.T_camera_lidar
     return _applied_or_waiting(state, pose, estimate, rules.policy)
+
+
+def window_wanted_since(state: PairState) -> int | None:
+    """Since when (sensor time) pairs are wanted for a window that has to come soon; None where none has to: what is
+    served is suspected by the monitor, or by the latest window, within which the camera moved."""
+    if state.monitor.outcome in ACCUSING and state.flagged_since_ns is not None:
+        return state.flagged_since_ns
+    moved = None if state.latest is None else state.latest.moved
+    suspected = state.health in (HealthState.SUSPECT, HealthState.MISCALIBRATED)
+    return moved.first_after_ns if moved is not None and suspected else None
 
 
 def after_failure(state: PairState, reason: Reason) -> PairState:
