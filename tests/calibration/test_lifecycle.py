@@ -194,6 +194,14 @@ def test_a_window_at_whose_end_the_camera_is_where_it_is_served_speaks_against_n
     assert window_wanted_since(state) is None
 
 
+def test_a_window_that_cannot_tell_for_another_reason_is_no_witness_of_a_knock() -> None:
+    knocked = moved_within(0.5, 3.0)
+    doubtful = replace(knocked, verdict=replace(knocked.verdict, reasons=(KNOCK, OVERLAP)))
+    state = solved(HEALTHY, doubtful)
+    assert state.health is HealthState.HEALTHY
+    assert window_wanted_since(state) is None
+
+
 def test_a_window_is_wanted_no_longer_once_one_was_accepted_or_the_monitor_is_clear() -> None:
     knocked = solved(HEALTHY, moved_within(0.5, 3.0))
     assert window_wanted_since(solved(knocked, estimate(0.5, 400))) is None

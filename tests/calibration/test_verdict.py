@@ -8,8 +8,8 @@ import pytest
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.types import Decision, Metric, StopReason, Verdict
-from coec.calibration.verdict import MOVED, change_metric, judge, shape_metrics
+from coec.calibration.types import MOVED, Decision, Metric, StopReason, Verdict
+from coec.calibration.verdict import change_metric, judge, shape_metrics
 from coec.config import VerdictConfig
 from coec.geometry import se3
 
@@ -102,9 +102,11 @@ def test_peakedness_is_the_curvature_over_the_score() -> None:
     assert whole == pytest.approx(250.0 * np.radians(1.0) ** 2 / 1.4)
 
 
-def changed(gain: float = 9.0, turn_deg: float = 1.0, support: float = 8.0, likeness: float = 0.9) -> ChangePoint:
+def changed(
+    gain: float = 9.0, turn_deg: float = 1.0, support: float = 8.0, loss: float = 0.3, likeness: float = 0.9
+) -> ChangePoint:
     after = se3.perturbation(np.radians([turn_deg, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    return ChangePoint(3, np.eye(4), after, gain, support, likeness)
+    return ChangePoint(3, np.eye(4), after, gain, support, loss, likeness, blur_rad=np.radians(0.5))
 
 
 def verdict_after(change: ChangePoint | None) -> Verdict:
@@ -120,8 +122,15 @@ def test_a_knock_within_the_window_refuses_it_and_says_when() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [changed(gain=2.0), changed(turn_deg=0.2), changed(support=3.0), changed(likeness=0.3), None],
-    ids=["chance", "small", "nothing to see", "the scene changed", "not looked for"],
+    [
+        changed(gain=2.0),
+        changed(turn_deg=0.2),
+        changed(support=3.0),
+        changed(likeness=0.3),
+        changed(turn_deg=3.0),
+        None,
+    ],
+    ids=["chance", "small", "nothing to see", "the scene changed", "far and yet alike", "not looked for"],
 )
 def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
     assert verdict_after(change).decision is Decision.ACCEPTED

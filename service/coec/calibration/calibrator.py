@@ -13,8 +13,8 @@ from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.search.change_point import ChangePoint, change_point
 from coec.calibration.search.observability import unobservable, without
-from coec.calibration.types import Compensation, Estimate, MovedWithin, Optimum, Window
-from coec.calibration.verdict import MOVED, change_metric, judge, shape_metrics
+from coec.calibration.types import MOVED, Compensation, Estimate, MovedWithin, Optimum, Window
+from coec.calibration.verdict import change_metric, judge, shape_metrics
 from coec.config import CalibrationConfig, config_hash
 from coec.errors import CalibrationError
 from coec.geometry import se3

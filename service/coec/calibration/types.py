@@ -273,6 +273,13 @@ ELSEWHERE = frozenset({"newton_step_deg", "newton_step_m", *(stop.value for stop
 whether there is one. Every other reason says that the window cannot tell."""
 
 
+MOVED = "moved_within_window"
+"""Code of the reason that refuses a window within which the camera moved."""
+
+TWO_POSES = ELSEWHERE | {MOVED, "runner_up"}
+"""Codes of the reasons that a window has which holds two poses, and tells both well."""
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """Equation (2): every metric beside its limit, and the reasons when it failed (empty when accepted)."""
@@ -280,6 +287,12 @@ class Verdict:
     decision: Decision
     metrics: tuple[Metric, ...]
     reasons: tuple[Reason, ...]
+
+    @property
+    def tells_two_poses(self) -> bool:
+        """Of a refused window: the camera moved within it, and nothing else is wrong with it."""
+        codes = {reason.code for reason in self.reasons}
+        return MOVED in codes and codes <= TWO_POSES
 
     @property
     def cannot_tell(self) -> bool:

@@ -18,14 +18,11 @@ import numpy as np
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.types import Decision, Metric, Reason, StopReason, Verdict
+from coec.calibration.types import MOVED, Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 """Places of both in ξ = [rx ry rz tx ty tz]."""
-
-MOVED = "moved_within_window"
-"""Metric of a change within the window, and code of the reason that refuses a window for it."""
 
 _MEANING = {
     "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",
