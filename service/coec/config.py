@@ -229,6 +229,15 @@ class VerdictConfig(Stage):
         le=1,
         description="edge contrast of the next best basin over the best one's; above: ambiguous",
     )
+    max_change_gain: float = Field(
+        default=3.5,
+        gt=0,
+        description="what two poses, one after the other, may score more than one, in standard deviations of a frame's "
+        "score; above: the camera moved within the window (fused)",
+    )
+    min_change_deg: float = Field(
+        default=0.4, ge=0, description="a smaller turn within a window does not refuse it (fused)"
+    )
 
 
 class TimeOffsetConfig(Stage):

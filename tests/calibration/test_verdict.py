@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
-from coec.calibration.types import Decision, Metric, StopReason, Verdict
-from coec.calibration.verdict import counted_once, judge, shape_metrics
+from coec.calibration.search.change_point import ChangePoint
+from coec.calibration.types import MOVED, Decision, Metric, StopReason, Verdict
+from coec.calibration.verdict import change_metric, counted_once, judge, shape_metrics
 from coec.config import VerdictConfig
+from coec.geometry import se3
 
 LIMITS = VerdictConfig()
 GOOD = Evaluation(score=1.4, frame_scores=np.full(10, 1.4), mi=1.4, overlap=0.9, points_in_view=10_000)
@@ -116,3 +118,43 @@ def test_range_edges_that_frames_have_in_common_count_once() -> None:
     once = {metric.name: metric.value for metric in counted_once(found, 2.0, FRAMES)}
     assert once == {"range_edges": 600.0, "edge_contrast": OUTSTANDING[0].value}
     assert counted_once(found, float("nan"), FRAMES) == found
+
+
+def changed(
+    gain: float = 9.0, turn_deg: float = 1.0, support: float = 8.0, loss: float = 0.3, likeness: float = 0.9
+) -> ChangePoint:
+    after = se3.perturbation(np.radians([turn_deg, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    return ChangePoint(3, np.eye(4), after, gain, support, loss, likeness, blur_rad=np.radians(0.5))
+
+
+def verdict_after(change: ChangePoint | None) -> Verdict:
+    return judge(
+        change_metric(change, LIMITS),
+        StopReason.TOLERANCE,
+        FRAMES,
+        FRAMES,
+        {MOVED: ", by 1.0° between 20.4 and 21.6 s"},
+    )
+
+
+def test_a_knock_within_the_window_refuses_it_and_says_when() -> None:
+    verdict = verdict_after(changed())
+    (reason,) = verdict.reasons
+    assert reason.code == "moved_within_window"
+    assert "the camera moved while the window was taken, by 1.0° between 20.4 and 21.6 s: 9, limit" in reason.text
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        changed(gain=2.0),
+        changed(turn_deg=0.2),
+        changed(support=3.0),
+        changed(likeness=0.3),
+        changed(turn_deg=3.0),
+        None,
+    ],
+    ids=["chance", "small", "nothing to see", "the scene changed", "far and yet alike", "not looked for"],
+)
+def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
+    assert verdict_after(change).decision is Decision.ACCEPTED

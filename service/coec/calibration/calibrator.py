@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from math import degrees
 
 import numpy as np
 
@@ -11,9 +12,10 @@ from coec.calibration.estimators import ESTIMATORS, sight_of
 from coec.calibration.frames.motion_compensation import compensation
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
+from coec.calibration.search.change_point import ChangePoint, change_point
 from coec.calibration.search.observability import unobservable, without
-from coec.calibration.types import Compensation, Estimate, Optimum, Window
-from coec.calibration.verdict import counted_once, judge, shape_metrics
+from coec.calibration.types import MOVED, Compensation, Estimate, MovedWithin, Optimum, Window
+from coec.calibration.verdict import change_metric, counted_once, judge, shape_metrics
 from coec.config import CalibrationConfig, config_hash
 from coec.errors import CalibrationError
 from coec.geometry import se3
@@ -48,10 +50,16 @@ def calibrate(
     pose = search.T_camera_lidar
     # Self-diagnosis, equation (2).
     at_optimum = objective.evaluate(pose)
+    change = None if found.edges is None else change_point(found.edges, pose)
     looks, pairs = uncertainty.looks, len(window.pairs)
-    of_objective = counted_once(found.metrics, looks, pairs)
-    metrics = (*of_objective, *shape_metrics(at_optimum, curvature, uncertainty.sigma, config.verdict))
-    verdict = judge(metrics, search.stop_reason, looks, pairs)
+    metrics = (
+        *counted_once(found.metrics, looks, pairs),
+        *shape_metrics(at_optimum, curvature, uncertainty.sigma, config.verdict),
+        *change_metric(change, config.verdict),
+    )
+    moved = None if change is None else _moved(change, window)
+    details = {} if moved is None else {MOVED: _told(moved, window)}
+    verdict = judge(metrics, search.stop_reason, looks, pairs, details)
     progress.step("diagnosis", 1, 1)
 
     outcomes = Counter(compensation(pair, window.rig, enabled=config.motion_compensation) for pair in window.pairs)
@@ -81,4 +89,18 @@ def calibrate(
         config_hash=config_hash(
             config.objective, config.search, config.verdict, str(config.motion_compensation), depth.identity
         ),
+        moved=moved if any(reason.code == MOVED for reason in verdict.reasons) else None,
     )
+
+
+def _moved(change: ChangePoint, window: Window) -> MovedWithin:
+    before, after = (window.pairs[index].stamp_ns for index in (change.first_late - 1, change.first_late))
+    return MovedWithin(before, after, change.T_before, change.T_after)
+
+
+def _told(moved: MovedWithin, window: Window) -> str:
+    turn_deg = degrees(se3.rotation_angle_rad(moved.T_after @ se3.inverse(moved.T_before)))
+    before_s, after_s = (
+        (stamp_ns - window.pairs[0].stamp_ns) / 1e9 for stamp_ns in (moved.last_before_ns, moved.first_after_ns)
+    )
+    return f", by {turn_deg:.1f}° between {before_s:.1f} and {after_s:.1f} s after its first pair"

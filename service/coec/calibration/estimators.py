@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coec.calibration.confidence.modes import Rivals
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
-from coec.calibration.objective.edges import build_edges
+from coec.calibration.objective.edges import EdgeWitness, build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
     Divisible,
@@ -122,13 +122,14 @@ def _masked(sight: Sight) -> Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What an estimator found: its objective, the search on it, the metrics that only this objective has, and the other
-    summits that it came to within the basin."""
+    """What an estimator found: its objective, the search on it, the metrics that only this objective has, the other
+    summits that it came to within the basin, and the edges of the window where it looked at them."""
 
     objective: Divisible
     search: SearchResult
     metrics: tuple[Metric, ...]
     rivals: tuple[Rivals, ...] = ()
+    edges: EdgeWitness | None = None
 
 
 Estimator = Callable[[Sight, CalibrationConfig], Found]
@@ -196,7 +197,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
         Rivals(finest, best.T_camera_lidar, (*(e.T_camera_lidar for e in settled if e is not best), start)),
         Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
     )
-    return Found(finest, found, metrics, summits)
+    return Found(finest, found, metrics, summits, edges)
 
 
 def runner_up(contrast: float, rivals: Sequence[float]) -> float:

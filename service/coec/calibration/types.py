@@ -276,6 +276,13 @@ ELSEWHERE = frozenset({"newton_step_deg", "newton_step_m", *(stop.value for stop
 whether there is one. Every other reason says that the window cannot tell."""
 
 
+MOVED = "moved_within_window"
+"""Code of the reason that refuses a window within which the camera moved."""
+
+TWO_POSES = ELSEWHERE | {MOVED, "runner_up"}
+"""Codes of the reasons that a window has which holds two poses, and tells both well."""
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """Equation (2): every metric beside its limit, and the reasons when it failed (empty when accepted)."""
@@ -283,6 +290,12 @@ class Verdict:
     decision: Decision
     metrics: tuple[Metric, ...]
     reasons: tuple[Reason, ...]
+
+    @property
+    def tells_two_poses(self) -> bool:
+        """Of a refused window: the camera moved within it, and nothing else is wrong with it."""
+        codes = {reason.code for reason in self.reasons}
+        return MOVED in codes and codes <= TWO_POSES
 
     @property
     def cannot_tell(self) -> bool:
@@ -348,6 +361,21 @@ class Uncertainty:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MovedWithin:
+    """The camera moved while a window was taken: two poses, one after the other, explain it, and one does not.
+
+    Attributes:
+        last_before_ns, first_after_ns: stamps of the pairs between which it moved.
+        T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after; turned about the camera's centre.
+    """
+
+    last_before_ns: int
+    first_after_ns: int
+    T_before: Matrix4
+    T_after: Matrix4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The immutable result of calibrating one window.
 
@@ -360,6 +388,7 @@ class Estimate:
         compensation: how many pairs ended with which `Compensation`, by name.
         depth_identity: sha256 of the network, or `precomputed`.
         config_hash: of everything that decides the result.
+        moved: what the window was refused for, if the camera moved within it; None otherwise.
     """
 
     window_id: str
@@ -374,6 +403,7 @@ class Estimate:
     compensation: dict[str, int]
     depth_identity: str
     config_hash: str
+    moved: MovedWithin | None = None
 
     @property
     def sigma(self) -> NDArray[np.float64]:

@@ -9,15 +9,18 @@ a rig is commissioned.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from math import degrees, isfinite, radians
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
-from coec.calibration.types import Decision, Metric, Reason, StopReason, Verdict
+from coec.calibration.search.change_point import ChangePoint
+from coec.calibration.types import MOVED, Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
@@ -40,6 +43,7 @@ _MEANING = {
     "sigma_deg": "what was seen does not settle a rotation, or is too little to tell",
     "sigma_m": "what was seen does not settle a translation, or is too little to tell",
     "overlap": "too few LiDAR points are in view",
+    MOVED: "the camera moved while the window was taken",
 }
 
 
@@ -77,6 +81,15 @@ def shape_metrics(
     return tuple(metrics)
 
 
+def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Metric, ...]:
+    """What the likeliest change within the window gains over no change; nothing where changes were not looked for. A
+    change of the scene gains nothing, nor does a turn below `min_change_deg`: scenes differ by that without a knock."""
+    if change is None:
+        return ()
+    gain = change.gain if change.of_camera and degrees(change.turn_rad) >= limits.min_change_deg else 0.0
+    return (Metric(MOVED, gain, limits.max_change_gain, at_least=False),)
+
+
 def _newton_step(curvature: Curvature, axes: slice) -> float:
     """Largest |f'| / f'' over some axes, those not searched apart: how far away each axis alone puts its maximum;
     infinite without one."""
@@ -85,11 +98,21 @@ def _newton_step(curvature: Curvature, axes: slice) -> float:
     return float(np.max(np.abs(first) / second)) if (second > 0.0).all() else float("inf")
 
 
-def judge(metrics: tuple[Metric, ...], stop: StopReason, looks: float, frames: int) -> Verdict:
+def judge(
+    metrics: tuple[Metric, ...],
+    stop: StopReason,
+    looks: float,
+    frames: int,
+    details: Mapping[str, str] = MappingProxyType({}),
+) -> Verdict:
     """Equation (2) over the metrics of the objective and of its optimum. A window that is too uncertain because its
-    `frames` are worth few independent `looks` is told to need motion."""
+    `frames` are worth few independent `looks` is told to need motion. `details` say more of what a metric means in this
+    window, by its name."""
     reasons = [
-        Reason(metric.name, f"{_MEANING[metric.name]}: {metric.value:.3g}, limit {metric.limit:.3g}")
+        Reason(
+            metric.name,
+            f"{_MEANING[metric.name]}{details.get(metric.name, '')}: {metric.value:.3g}, limit {metric.limit:.3g}",
+        )
         for metric in metrics
         if not metric.passed
     ]

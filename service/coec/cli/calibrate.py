@@ -91,7 +91,7 @@ def run(options: Options) -> int:
     Raises:
         CoecError: there is no result.
     """
-    xi = None if options.perturb is None else windows.perturbation_of(options.perturb)
+    xi = None if options.perturb is None else windows.vector_of("--perturb", options.perturb)
     with console.progress() as bars:
         times = StageTimes(bars)
         loaded = windows.load(

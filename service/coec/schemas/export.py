@@ -29,6 +29,7 @@ MESSAGES: tuple[type[Message], ...] = (
     replies.CalibrationReport,
     evaluation.EvaluationReport,
     evaluation.ComparisonReport,
+    evaluation.ClosureReport,
     evaluation.ModelAssessment,
     matrix.MatrixReport,
 )

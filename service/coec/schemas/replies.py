@@ -98,6 +98,15 @@ class Verdict(Part):
 # --- one result ---------------------------------------------------------------------------------------------
 
 
+class MovedWithin(Part):
+    """The camera moved while the window was taken."""
+
+    last_before_ns: int = Field(description="stamp of the last pair before it moved, ns")
+    first_after_ns: int = Field(description="stamp of the first pair after it, ns")
+    before: Transform = Field(description="camera_from_lidar that fits the pairs before it; turned, not shifted")
+    after: Transform = Field(description="likewise after it")
+
+
 class CalibrationResult(Message):
     """The result of calibrating one window. State, history, the window's file and `coec calibrate` carry the
     same."""
@@ -145,6 +154,9 @@ class CalibrationResult(Message):
     compensation: Counts = Field(description="pairs by outcome of motion compensation")
     depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
     config_hash: str = Field(description="of everything that decides the result")
+    moved: MovedWithin | None = Field(
+        default=None, description="set where the window was refused because the camera moved within it"
+    )
 
 
 class CalibrationReport(CalibrationResult):

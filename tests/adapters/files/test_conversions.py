@@ -15,6 +15,7 @@ from coec.calibration.types import (
     Decision,
     Estimate,
     Metric,
+    MovedWithin,
     Optimum,
     Reason,
     Rig,
@@ -77,6 +78,15 @@ def estimate(seed: int = 0, **changes: Any) -> Estimate:
         config_hash="0123456789abcdef",
     )
     return dataclasses.replace(built, **changes)
+
+
+def test_a_move_within_the_window_travels_with_the_result() -> None:
+    rng = np.random.default_rng(3)
+    moved = MovedWithin(11, 12, perturbation(rng.normal(size=6)), perturbation(rng.normal(size=6)))
+    sent = estimate(moved=moved)
+    read = from_json(CalibrationResult, to_json(result_of(sent, RIG, "truck-7")))
+    assert same(estimate_of(read).moved, moved)
+    assert estimate_of(result_of(estimate(), RIG, "truck-7")).moved is None
 
 
 def same(one: Any, other: Any) -> bool:

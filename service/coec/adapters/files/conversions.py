@@ -18,6 +18,7 @@ from coec.calibration.types import (
     Estimate,
     Matrix4,
     Metric,
+    MovedWithin,
     Optimum,
     Reason,
     Rig,
@@ -87,6 +88,16 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         compensation=dict(estimate.compensation),
         depth_identity=estimate.depth_identity,
         config_hash=estimate.config_hash,
+        moved=None if estimate.moved is None else _moved_of(estimate.moved),
+    )
+
+
+def _moved_of(moved: MovedWithin) -> replies.MovedWithin:
+    return replies.MovedWithin(
+        last_before_ns=moved.last_before_ns,
+        first_after_ns=moved.first_after_ns,
+        before=transform_of(moved.T_before),
+        after=transform_of(moved.T_after),
     )
 
 
@@ -127,7 +138,12 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
         compensation=dict(result.compensation),
         depth_identity=result.depth_identity,
         config_hash=result.config_hash,
+        moved=None if result.moved is None else _moved_within(result.moved),
     )
+
+
+def _moved_within(moved: replies.MovedWithin) -> MovedWithin:
+    return MovedWithin(moved.last_before_ns, moved.first_after_ns, matrix_of(moved.before), matrix_of(moved.after))
 
 
 def metric_of(metric: Metric) -> replies.MetricReply:
