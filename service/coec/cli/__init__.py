@@ -316,6 +316,24 @@ def _diagnose(
     raise typer.Exit(command.run(options))
 
 
+@app.command("alarms")
+def _alarms(
+    hours: Annotated[float, typer.Option(help="Hours of driving with a right mount.", min=0.1)] = 100.0,
+    steps: Annotated[int, typer.Option(help="Drawn steps of every size.", min=1)] = 20,
+    period_s: Annotated[float, typer.Option("--period", help="Seconds between checks.")] = 5.0,
+    between_h: Annotated[float, typer.Option("--between", help="Hours between false alarms, as configured.")] = 100.0,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for alarms.json and delay.png.", metavar="DIR", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """How often the monitor accuses a mount that is right, and how soon it notices one that moved (drawn checks)."""
+    from coec.cli import alarms as command
+
+    options = command.Options(hours, steps, period_s, between_h, output, as_json)
+    raise typer.Exit(command.run(options))
+
+
 @app.command("paper")
 def _paper(
     source: Source,

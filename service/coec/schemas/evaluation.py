@@ -146,6 +146,36 @@ class ClosureReport(Message):
     elapsed_s: dict[str, float] = Field(description="by stage, s")
 
 
+class FalseAlarmsRow(Part):
+    """Of a right mount: how often the evidence came to what is stated to be an alarm in so many hours."""
+
+    stated_h: float
+    driven_h: float = Field(description="drawn checks, hours of driving")
+    alarms: Count
+
+
+class DelayRow(Part):
+    """From a step of the mount to the check that notices it, s; null where it is not noticed in time."""
+
+    step_deg: float
+    steps: Count
+    suspect_s: Spread
+    confirmed_s: Spread
+
+
+class AlarmsReport(Message):
+    """What `coec alarms --json` prints: the change detector on drawn streams of checks."""
+
+    period_s: float = Field(description="between checks, s")
+    hours_between_false_alarms: float = Field(description="as configured")
+    hours_between_false_suspicions: float = Field(description="as configured")
+    false: tuple[FalseAlarmsRow, ...]
+    delays: tuple[DelayRow, ...]
+    creep_deg_per_h: float = Field(description="of a mount that turns steadily")
+    creep_suspect_h: Spread = Field(description="until it is suspected, h; null where not in time")
+    creep_confirmed_h: Spread = Field(description="until it is confirmed, h")
+
+
 class EvaluationReport(Message):
     """What `coec evaluate --json` prints: solves from starts all around the source's calibration, on one window."""
 

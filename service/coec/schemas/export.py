@@ -27,6 +27,7 @@ MESSAGES: tuple[type[Message], ...] = (
     replies.ErrorReply,
     replies.CalibrationResult,
     replies.CalibrationReport,
+    evaluation.AlarmsReport,
     evaluation.EvaluationReport,
     evaluation.ComparisonReport,
     evaluation.ClosureReport,
