@@ -150,7 +150,7 @@ def refitted(window: Window, model: str) -> tuple[Window, CameraFit]:
     rig: Rig = window.rig
     fit = fit_double_sphere(rig.camera)
     quality = CameraFit(FITTED, name_of(rig.camera), fit.residual_rms_px, fit.residual_max_px, fit.coverage)
-    fitted = replace(rig, camera=fit.camera, camera_residual_px=fit.residual_rms_px)
+    fitted = replace(rig, camera=fit.camera, camera_residual_px=fit.residual_max_px)
     return replace(window, rig=fitted), quality
 
 
