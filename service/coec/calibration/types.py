@@ -162,7 +162,7 @@ class Rig:
         T_lidar_ego: (4, 4) maps ego-frame coordinates to LiDAR coordinates; carries ego-motion to the sensor.
         mask: (height, width) bool or None; False = ignore this pixel (vehicle body, outside the lens).
         sweep: azimuth timing, or None when unknown or when the clouds carry per-point time.
-        camera_residual_px: what `camera` misses of the lens that it was fitted to, root mean square, pixels.
+        camera_residual_px: what `camera` misses of the lens that it was fitted to, at most, pixels.
     """
 
     pair: str

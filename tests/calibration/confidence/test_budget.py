@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from coec.calibration.confidence.budget import COLUMN_SHARE, EDGE_PX, STAMP_S, TERMS, systematic
-from coec.calibration.confidence.grain import Grain, column_rad
+from coec.calibration.confidence.grain import LENS_PX, Grain, column_rad, grain_of
 from coec.calibration.objective.cells import SightLines
-from coec.calibration.types import LidarFrame
+from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Window
+from estimates import RIG
 from landscapes import Array
 
 FRAMES = 4
@@ -75,6 +76,18 @@ def test_a_lens_that_misses_its_camera_is_told_in_proportion(rng: np.random.Gene
     sight = street(rng)
     good, poor = shifts(sight, 3), shifts(sight, 3, replace(GRAIN, lens_px=10.0))
     np.testing.assert_allclose(poor["lens_across"], 200.0 * good["lens_across"], rtol=1e-9)
+
+
+def test_what_a_fitted_camera_misses_is_in_the_budget() -> None:
+    sweep = LidarFrame(0, "lidar", np.zeros((0, 3), np.float32))
+    image = EncodedImage(ImageFormat.MONO8, 4, 3, bytes(12))
+    pair = FramePair(CameraFrame(0, "camera", image), sweep)
+    window = Window("w", RIG, RIG.T_camera_lidar_nominal, (pair,))
+    missing = replace(window, rig=replace(RIG, camera_residual_px=33.7))
+    good, poor = (grain_of(one, RIG.T_camera_lidar_nominal) for one in (window, missing))
+    assert good.lens_px == LENS_PX
+    assert poor.lens_px == pytest.approx(33.7 / np.sqrt(3.0), rel=1e-3)
+    np.testing.assert_array_equal(good.velocity_mps, np.zeros((1, 3)))
 
 
 def test_nothing_in_view_determines_nothing() -> None:

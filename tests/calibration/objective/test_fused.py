@@ -10,6 +10,7 @@ from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.estimators import SAME_BASIN_RAD
 from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.objective.cells import COLUMNS, ROWS
 from coec.calibration.objective.edges import EdgeWitness
 from coec.calibration.objective.fused import OTHER_POSES, FusedObjective, Fusion, Scale
 from coec.calibration.objective.mutual_information import (
@@ -143,6 +144,17 @@ def test_the_frames_average_to_the_score(sharp_street: Window, fused: FusedObjec
         at = fused.evaluate(from_start(sharp_street, 2, turn_deg).T_camera_lidar_start)
         assert at.frame_scores.shape == (len(sharp_street.pairs),)
         assert at.frame_scores.mean() == pytest.approx(at.score)
+
+
+def test_its_cells_sum_to_the_objective_but_for_a_constant(sharp_street: Window, fused: FusedObjective) -> None:
+    truth = sharp_street.T_camera_lidar_start
+    cells = fused.cells(truth)
+    assert cells.at(truth).shape == (len(sharp_street.pairs), COLUMNS * ROWS + 1)
+    poses = [truth, *sample_reach(truth, SearchBox(np.radians(1.0), 0.0), 4)]
+    rest = [cells.at(pose).sum(axis=1).mean() - fused.evaluate(pose).score for pose in poses]
+    np.testing.assert_allclose(rest, rest[0], atol=1e-9)
+    in_front = cells.sight.p_camera[:, 2] > 0.0
+    assert in_front.mean() > 0.9
 
 
 def test_what_is_said_about_depth_is_what_the_depth_witness_says(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot
+from math import hypot, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +37,15 @@ class Grain:
 
 
 def grain_of(window: Window, T_camera_lidar: Matrix4) -> Grain:
-    """Of a window, its camera at `T_camera_lidar` (4, 4)."""
+    """Of a window, its camera at `T_camera_lidar` (4, 4).
+
+    Of a fitted camera any miss up to its largest is as likely as another where the edges happen to lie: they gather on
+    the horizon and at the rim, and the fit was best for all of the image.
+    """
     velocity_mps, turn_radps = _rates(window, T_camera_lidar)
     return Grain(
         pixel_rad=pixel_rad(window.rig.camera),
-        lens_px=hypot(LENS_PX, window.rig.camera_residual_px),
+        lens_px=hypot(LENS_PX, window.rig.camera_residual_px / sqrt(3.0)),
         column_rad=column_rad(window.pairs[0].lidar),
         velocity_mps=velocity_mps,
         turn_radps=turn_radps,
