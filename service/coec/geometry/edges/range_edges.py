@@ -4,6 +4,12 @@ Every point is compared with its two neighbours along the scan line, which are f
 are sorted by row (the ring where the cloud has one, else a band of elevation) and azimuth, and within a band only
 points of nearly the same elevation are neighbours. So organised, unorganised, 16- and 128-beam clouds are all treated
 alike.
+
+The silhouette passes between the last beam that came back from the near surface and the first that went by: half a
+spacing outside of the last near point, wherever that happened to lie. A beam is a cone, though, and comes back from the
+near surface as soon as some of it falls there: that half is less by what spills over (`SPILL_RAD`). Where beams lie too
+far apart for that (`WIDE_RAD`), the last near point stands for the edge. What both neighbours of a point lie behind is
+thinner than two spacings: one edge, a ridge, at the point itself.
 """
 
 from __future__ import annotations
