@@ -27,6 +27,7 @@ from coec.calibration.objective.mutual_information import (
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.search.global_search import at_rim, find_basins
 from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
+from coec.calibration.search.mount_prior import log_prior
 from coec.calibration.types import DepthMap, Matrix4, Metric, StopReason, Window
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, DecodeError
@@ -36,8 +37,8 @@ from coec.geometry.thinning import thinned
 
 Seen = TypeVar("Seen")
 
-POLISHED_BASINS = 6
-"""Basins that are polished on the fused objective: the true one was never below the second place."""
+POLISHED_BASINS = 5
+"""Basins that are polished on the fused objective beside the start's: the true one was never below the second place."""
 
 SETTLED_POSES = 2
 """Poses of the best basin that are settled: with six degrees of freedom, blurred edges can lead one of them astray (to
@@ -171,10 +172,19 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     fusion = Fusion(edges, depth, start, reach)
     ranked = sorted(((fusion.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
     to_rank = near(config.search, fusion.ranking[-1])
-    ends = [polish_in_turn(fusion.ranking, basin, to_rank, progress) for _, basin in ranked[:POLISHED_BASINS]]
+    # The neighbourhood of the start, whatever the charts say of it.
+    begun = [start, *(basin for _, basin in ranked[:POLISHED_BASINS])]
+    ends = [polish_in_turn(fusion.ranking, basin, to_rank, progress) for basin in begun]
     polished = [(fusion.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
-    # A maximum outside of the reach is a rival, but what is asked for lies inside.
-    _, pose = max(polished, key=lambda end: (not at_rim(end[1], start, reach), end[0]))
+
+    def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:
+        rank, pose = end
+        # A rank is an improbability: half its square, in nats, is what the window says against chance. A maximum
+        # outside of the reach is a rival, but what is asked for lies inside.
+        told = 0.5 * rank**2 + log_prior(pose, start, window.start_known_to_rad)
+        return not at_rim(pose, start, reach), told
+
+    _, pose = max(polished, key=preferred)
     contrast = fusion.edge_contrast(pose)
     rivals = [
         fusion.edge_contrast(other) for _, other in (*polished, *ranked[POLISHED_BASINS:]) if _differ(other, pose)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,13 +182,15 @@ class Window:
     """The pairs of one slice of sensor time, in order of their stamps, and the extrinsic that was current then.
 
     `T_camera_lidar_start` (4, 4) is where the search starts: it is part of the window, so that a replay starts there
-    too.
+    too. `start_known_to_rad` is how far it usually is from
+    the truth: half a turn where it is a guess.
     """
 
     window_id: str
     rig: Rig
     T_camera_lidar_start: Matrix4
     pairs: tuple[FramePair, ...]
+    start_known_to_rad: float = pi
 
     @property
     def stamp_ns(self) -> int:

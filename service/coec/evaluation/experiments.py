@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import radians
+from math import pi, radians
 
 from rich.progress import Progress
 
@@ -77,9 +77,9 @@ class Bench:
         return self.window.rig.T_camera_lidar_nominal
 
     def solve(self, start: Matrix4, frames: Sequence[int] | None = None) -> Outcome:
-        """From one start, on all frames or on those with the given indices."""
+        """From one start, as a guess, on all frames or on those with the given indices."""
         pairs = self.window.pairs if frames is None else tuple(self.window.pairs[index] for index in frames)
-        window = replace(self.window, T_camera_lidar_start=start, pairs=pairs)
+        window = replace(self.window, T_camera_lidar_start=start, start_known_to_rad=pi, pairs=pairs)
         began_s = time.perf_counter()
         try:
             estimate = calibrate(window, self.depth, self.images, self.configuration, Silence())

@@ -113,8 +113,9 @@ def vector_of(option: str, text: str) -> NDArray[np.float64]:
 
 
 def started_at(window: Window, xi: NDArray[np.float64]) -> Window:
-    """The window with its start moved by ξ (6,), on the left."""
-    return replace(window, T_camera_lidar_start=se3.perturb(window.T_camera_lidar_start, xi))
+    """The window with its start moved by ξ (6,), on the left: a guess, then."""
+    start = se3.perturb(window.T_camera_lidar_start, xi)
+    return replace(window, T_camera_lidar_start=start, start_known_to_rad=math.pi)
 
 
 def rotation_error_deg(T_a: Matrix4, T_b: Matrix4) -> float:

@@ -247,9 +247,9 @@ def test_edges_that_cross_the_scan_lines_stand_above_those_along_them() -> None:
         return float(level[30, 34:38].max()), float(level[34:38, 30].max())
 
     side, top = strength_of(np.array([0.0, -1.0]))
-    assert side > 1.4 * top > 0.0
+    assert side > 1.15 * top > 0.0
     lying_side, lying_top = strength_of(np.array([1.0, 0.0]))
-    assert lying_top > 1.4 * lying_side > 0.0
+    assert lying_top > 1.15 * lying_side > 0.0
     even_side, even_top = strength_of(np.zeros(2))
     assert even_side == pytest.approx(even_top, rel=0.05)
 

@@ -82,7 +82,7 @@ def edges_of_beams(columns_deg: float, spill_rad: float, phase: float) -> NDArra
     return np.asarray(np.arctan2(at_m[:, 1], at_m[:, 0]))
 
 
-@pytest.mark.parametrize("columns_deg", [0.1, 0.2, 0.35])
+@pytest.mark.parametrize("columns_deg", [0.1, 0.17, 0.2])
 def test_over_all_ways_that_beams_can_fall_an_edge_is_where_the_silhouette_is(columns_deg: float) -> None:
     """On average; a single one is off by half a spacing at most. The last beam on the pole lies inside by that much."""
     outside = [
@@ -91,6 +91,13 @@ def test_over_all_ways_that_beams_can_fall_an_edge_is_where_the_silhouette_is(co
     assert {len(found) for found in outside} == {2}
     assert np.degrees(np.mean(outside)) == pytest.approx(0.0, abs=0.02 * columns_deg)
     assert np.degrees(np.max(np.abs(outside))) <= 0.51 * columns_deg
+
+
+def test_between_beams_that_are_far_apart_the_last_near_one_is_the_edge() -> None:
+    """Such a sensor measures a pole as far out as half a column beside it."""
+    half_rad = np.radians(0.35) / 2.0
+    outside = [np.abs(edges_of_beams(0.35, half_rad, phase)) - 0.1 for phase in np.linspace(0.0, 1.0, 40, False)]
+    assert np.degrees(np.mean(outside)) == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize("with_ring", [True, False])

@@ -1,11 +1,11 @@
 """How much of an edge there is at every pixel, at several scales: what range edges are laid onto.
 
-Gradient magnitude, that along the axis of the LiDAR counted less, clipped, divided by its local mean (so that a hedge does not outshine a house), and of that the
-bands of a Laplacian pyramid (Burt, Adelson 1983): each level blurred by two pixels, less the next level. What is wider
-than a level's blur is the layout of the scene, rich in edges below the horizon and poor above, which fits many wrong
-poses: without it the true pose stands twice as far from the others (measured: 12 against 4.3 standard deviations on a
-suburban street, 7.5 against 3.9 in a garage, 4.9 against 1.8 on one raw fisheye frame, where the layout preferred a
-wrong pose).
+Gradient magnitude, less of what lies along the axis of the LiDAR, clipped, divided by its local mean (so that a hedge
+does not outshine a house), and of that the bands of a Laplacian pyramid (Burt, Adelson 1983): each level blurred by two
+pixels, less the next level. What is wider than a level's blur is the layout of the scene, rich in edges below the
+horizon and poor above, which fits many wrong poses: without it the true pose stands twice as far from the others
+(measured: 12 against 4.3 standard deviations on a suburban street, 7.5 against 3.9 in a garage, 4.9 against 1.8 on one
+raw fisheye frame, where the layout preferred a wrong pose).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from coec.geometry.thinning import thinned
 CLIP_SHARE = 0.95
 """Gradients are clipped at this quantile: reflections and lamps would outweigh the rest."""
 
-UPRIGHT_SHARE = 0.5
-"""Of a gradient along the axis of the LiDAR, so much counts. Range jumps are found along its scan lines, and what they
-belong to crosses those: with a half, and with none, the truth stands out by a fifth more on simulated drives. A half
-and not none: roofs and kerbs, which slant, tell pitch, roll and height (with none, roll scatters by half as much again
-in three degrees of freedom)."""
+UPRIGHT_SHARE = math.sqrt(0.5)
+"""Of a gradient along the axis of the LiDAR, so much counts: half of its energy. Range jumps are found along its scan
+lines, and what they belong to crosses those. Not less: roofs and kerbs, which slant, tell pitch, roll and height
+(without them, roll scatters by a third more on simulated drives), and slow traffic under a bridge is mostly such
+edges."""
 
 SAMPLES = 100_000
 """Pixels of an image from which that quantile (flat ones apart) and the mean gradient are taken."""
@@ -99,8 +99,8 @@ class EdgeScales:
             lit: (h, w) bool; False = ignore this pixel.
             finest: halvings of the resolution of the first level.
             coarsest: halvings of the resolution of the last level.
-            upright: (2,) right and down, what the image shows of a unit vector along the axis of the LiDAR; nothing, and
-                no gradient counts less, where the camera looks along it.
+            upright: (2,) right and down, what the image shows of a unit vector along the axis of the LiDAR; nothing
+                where the camera looks along it, and no gradient counts less.
         """
         self._upright = upright.astype(np.float32)
         self._inner = _eroded(lit)

@@ -4,6 +4,12 @@ Every point is compared with its two neighbours along the scan line, which are f
 are sorted by row (the ring where the cloud has one, else a band of elevation) and azimuth, and within a band only
 points of nearly the same elevation are neighbours. So organised, unorganised, 16- and 128-beam clouds are all treated
 alike.
+
+The silhouette passes between the last beam that came back from the near surface and the first that went by: half a
+spacing outside of the last near point, wherever that happened to lie. A beam is a cone, though, and comes back from the
+near surface as soon as some of it falls there: that half is less by what spills over (`SPILL_RAD`). Where beams lie too
+far apart for that (`WIDE_RAD`), the last near point stands for the edge. What both neighbours of a point lie behind is
+thinner than two spacings: one edge, a ridge, at the point itself.
 """
 
 from __future__ import annotations
@@ -42,11 +48,15 @@ MAX_WEIGHT_M = 3.0
 MIN_RANGE_M = 2.0
 """Nearer points are the vehicle itself."""
 
-SPILL_RAD = math.radians(0.03)
-"""How far the axis of a beam passes a near surface that it still measures. Beams open by 0.06 to 0.09° to either side
-(data sheets of spinning sensors: 2 to 3 mrad in all). Of two echoes the stronger one counts; it falls with the square
-of the range, so that of the nearer surface wins with a third of the beam for a wall half as far again, and with less
-before one farther away: a third to a half of the half angle."""
+SPILL_RAD = math.radians(0.06)
+"""How far the axis of a beam passes a near surface that it still measures: the half angle of a beam of 2 mrad (data
+sheets of spinning sensors: 2 to 3 mrad in all). Of two echoes the stronger one counts, and that of the nearer surface
+is the stronger one with little of the beam."""
+
+WIDE_RAD = math.radians(0.25)
+"""Beams farther apart than this tell nothing of where between them a silhouette passes: either a return is missing, or
+the sensor has few columns and gathers light over all of each, so that near surfaces grow by half a column (an OS1 of
+1024 columns, 0.35° apart: half a column farther out, other poses fit its garage nearly as well as the true one)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +124,8 @@ def _jumps(
                     if jump > least:
                         highest = max(highest, jump)
                         sides += 1
-                        turn = step * (0.5 * abs(azimuth[j] - azimuth[k]) - SPILL_RAD)
+                        gap = abs(azimuth[j] - azimuth[k])
+                        turn = step * (0.5 * gap - SPILL_RAD) if gap <= WIDE_RAD else 0.0
                     break
         if sides > 0:
             index[found] = k
