@@ -69,10 +69,6 @@ MIN_LIKENESS = 0.6
 a change of the scene does not: in a tunnel the lines along the way fit many a pose. Of simulated knocks of 0.5 to 3° in
 17 windows 98 % are more alike than this."""
 
-FAR_BLURS, MIN_FAR_LOSS = 3.0, 0.45
-"""Two poses so many blurs apart share little: either side loses at least this share of its score at the other's. 60 of
-those 62 knocks that were this far did; lines along the way, as in a tunnel, lose 0.2 to 0.4."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChangePoint:
@@ -83,9 +79,7 @@ class ChangePoint:
         T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after it best.
         gain: what two poses score more than one, in standard deviations of a frame's score.
         support: mean score of the frames on the side that scores less, at the pose of its side.
-        loss: share of its score that a side loses at the pose of the other, the lesser of both.
-        likeness: this share over that of the other side.
-        blur_rad: of the edges by which this was told.
+        likeness: what a side loses of its score at the pose of the other: the lesser share over the larger one.
     """
 
     first_late: int
@@ -93,9 +87,7 @@ class ChangePoint:
     T_after: Matrix4
     gain: float
     support: float
-    loss: float
     likeness: float
-    blur_rad: float
 
     @property
     def turn_rad(self) -> float:
@@ -105,8 +97,6 @@ class ChangePoint:
     @property
     def of_camera(self) -> bool:
         """Whether it is a change of the camera, rather than of the scene."""
-        if self.turn_rad >= FAR_BLURS * self.blur_rad and self.loss < MIN_FAR_LOSS:
-            return False
         return self.support >= MIN_SUPPORT and self.likeness >= MIN_LIKENESS
 
 
@@ -134,9 +124,7 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
         T_after,
         gain=before + after - together,
         support=min(before / (last_early + 1), after / (len(early) - last_early - 1)),
-        loss=min(losses),
         likeness=min(losses) / max(losses) if min(losses) > 0.0 else 0.0,
-        blur_rad=blur_rad,
     )
 
 
