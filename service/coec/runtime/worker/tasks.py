@@ -85,8 +85,8 @@ class Solver:
             search = pair.calibration.search.model_copy(update={"max_evaluations": WARM_UP_EVALUATIONS})
             configuration = pair.calibration.model_copy(update={"search": search})
             rig = _small(self._rigs[pair.name])
-            # A check runs every kernel that a calibration runs but one, which its uncertainty takes. An invented one need
-            # not lead anywhere.
+            # A check runs every kernel that a calibration runs but one, which its uncertainty takes. An invented one
+            # need not lead anywhere.
             project(rig.camera, np.ones((1, 3)))
             with contextlib.suppress(CalibrationError, DecodeError):
                 observe(_invented_window(rig), _Ramp(), self._images, configuration, None)
