@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coec.calibration.types import Decision, Estimate, Metric, Optimum, Rig, StopReason, Verdict
+from coec.calibration.types import Decision, Estimate, Metric, Optimum, Rig, StopReason, Uncertainty, Verdict
 from coec.geometry import se3
 from coec.geometry.cameras import build
 
@@ -39,7 +39,7 @@ def estimate(window: int, decision: Decision = Decision.ACCEPTED) -> Estimate:
         ),
         verdict=Verdict(decision, (Metric("mi", 1 / 3, 0.1, True),), ()),
         correction=rng.normal(size=6),
-        sigma=np.full(6, np.nan),
+        uncertainty=Uncertainty.unknown(),
         solved=np.arange(6) < 3,
         unobservable=np.zeros(6, np.bool_),
         compensation={"done": 3},

@@ -106,15 +106,17 @@ def mutual_information_of_frame(
 
 
 # ------------------------------------------------------------------------------------------------ edge alignment
-def sobel_magnitude(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """|∇I| in grey values per pixel; zero on the border."""
+def sobel_magnitude(grey: NDArray[np.uint8], upright: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    """|∇I| in grey values per pixel, of which the part along `upright` (2,), a unit vector or shorter, counts `share`;
+    zero on the border."""
     image = grey.astype(np.float64)
     out = np.zeros(grey.shape)
     across = np.array([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8.0
     for y in range(1, grey.shape[0] - 1):
         for x in range(1, grey.shape[1] - 1):
             patch = image[y - 1 : y + 2, x - 1 : x + 2]
-            out[y, x] = np.hypot((across * patch).sum(), (across.T * patch).sum())
+            gradient = np.array([(across * patch).sum(), (across.T * patch).sum()])
+            out[y, x] = np.sqrt(gradient @ gradient - (1.0 - share**2) * (gradient @ upright) ** 2)
     return out
 
 

@@ -27,6 +27,7 @@ from coec.calibration.types import (
     LidarFrame,
     Matrix4,
     Reason,
+    Uncertainty,
 )
 from coec.config import CalibrationConfig, Config, LimitsConfig
 from coec.geometry import se3
@@ -231,7 +232,7 @@ class InstantRecorder:
             data_stamp_ns=stamps[-1],
             optimum=replace(made.optimum, T_camera_lidar=pose),
             correction=se3.difference(pose, NOMINAL),
-            sigma=np.array([5e-4] * 3 + [np.nan] * 3),
+            uncertainty=Uncertainty.independent(np.array([5e-4] * 3 + [np.nan] * 3)),
         )
         self._on_recorded(ended.window_id, self.latest, True)
 

@@ -209,7 +209,7 @@ class VerdictConfig(Stage):
     min_mi_over_unrelated: float = Field(default=1.2, gt=0, description="MI over the MI with other frames' depth maps")
     max_newton_step_deg: float = Field(default=0.25, gt=0, description="|f'|/f'': distance to the zero of f', degrees")
     max_newton_step_m: float = Field(default=0.02, gt=0, description="|f'|/f'' of the translations, metres (6 dof)")
-    max_sigma_deg: float = Field(default=0.25, gt=0, description="largest standard deviation of a rotation, degrees")
+    max_sigma_deg: float = Field(default=0.3, gt=0, description="largest standard deviation of a rotation, degrees")
     max_sigma_m: float = Field(default=0.1, gt=0, description="largest standard deviation of a translation, m (6 dof)")
     min_peakedness_per_deg2: float = Field(default=0.01, description="f''/score, per degree²; least of the rotations")
     min_overlap: float = Field(
@@ -218,7 +218,7 @@ class VerdictConfig(Stage):
     min_range_edges: int = Field(
         default=1000,
         ge=1,
-        description="range jumps of the window's sweeps; a few hundred fit wrong poses by chance (fused)",
+        description="independent range jumps of the window's sweeps; a few hundred fit wrong poses by chance (fused)",
     )
     min_edge_contrast: float = Field(
         default=6.0, gt=0, description="edge significance, in standard deviations of that of other poses (fused)"
@@ -228,6 +228,15 @@ class VerdictConfig(Stage):
         gt=0,
         le=1,
         description="edge contrast of the next best basin over the best one's; above: ambiguous",
+    )
+    max_change_gain: float = Field(
+        default=3.5,
+        gt=0,
+        description="what two poses, one after the other, may score more than one, in standard deviations of a frame's "
+        "score; above: the camera moved within the window (fused)",
+    )
+    min_change_deg: float = Field(
+        default=0.4, ge=0, description="a smaller turn within a window does not refuse it (fused)"
     )
 
 
@@ -262,10 +271,6 @@ class TrackerConfig(Stage):
 
     prior_deg: float = Field(default=10.0, gt=0, le=180, description="how far the first extrinsic may be off")
     prior_m: float = Field(default=0.3, gt=0, le=10, description="how far the first extrinsic may be off")
-    floor_deg: float = Field(
-        default=0.1, ge=0, description="error that all windows of a scene share; averaging does not lower sigma below"
-    )
-    floor_m: float = Field(default=0.03, ge=0, description="the same for translations")
     drift_deg_per_sqrt_h: float = Field(
         default=0.01, ge=0, description="creep of the mount, a random walk; 0 = every window counts for ever"
     )

@@ -198,3 +198,27 @@ def test_progress_is_told(street: Window, stereo: DepthModel) -> None:
     estimate = calibrate(street, stereo, GREY, CONFIG, listener)
     assert listener.heard["depth"] == len(street.pairs)
     assert listener.heard["search"] == estimate.optimum.evaluations
+
+
+def knocked(window: Window, first_late: int, turn_deg: float) -> Window:
+    """The window as if the mount had turned in pitch before the pair `first_late`: its sweeps are turned back."""
+    T_before = window.rig.T_camera_lidar_nominal
+    T_after = se3.perturb(T_before, np.radians([turn_deg, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    back = (se3.inverse(T_after) @ T_before).astype(np.float32)
+    late = tuple(
+        replace(pair, lidar=replace(pair.lidar, xyz_m=pair.lidar.xyz_m @ back[:3, :3].T + back[:3, 3]))
+        for pair in window.pairs[first_late:]
+    )
+    return replace(window, pairs=(*window.pairs[:first_late], *late))
+
+
+def test_a_window_that_holds_a_knock_is_refused_and_says_when_it_was(sharp_street: Window, stereo: DepthModel) -> None:
+    estimate = solve(knocked(sharp_street, 7, 2.0), stereo, CalibrationConfig())
+    assert estimate.verdict.decision is Decision.FAILED
+    (reason,) = (reason for reason in estimate.verdict.reasons if reason.code == "moved_within_window")
+    assert "between 42.0 and 49.0 s after its first pair" in reason.text
+    moved, pairs = estimate.moved, sharp_street.pairs
+    assert moved is not None
+    assert (moved.last_before_ns, moved.first_after_ns) == (pairs[6].stamp_ns, pairs[7].stamp_ns)
+    turn = np.degrees(se3.difference(moved.T_after, moved.T_before)[:3])
+    np.testing.assert_allclose(turn, [2.0, 0.0, 0.0], atol=0.4)

@@ -29,10 +29,21 @@ from coec.calibration.lifecycle import (
     restored,
     rolled_back,
     time_stepped_back,
+    window_wanted_since,
 )
 from coec.calibration.monitor.change_detector import Finding, Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
-from coec.calibration.types import Decision, Estimate, Optimum, Reason, Rig, StopReason, Verdict
+from coec.calibration.types import (
+    Decision,
+    Estimate,
+    MovedWithin,
+    Optimum,
+    Reason,
+    Rig,
+    StopReason,
+    Uncertainty,
+    Verdict,
+)
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.geometry import se3
 from coec.geometry.cameras import build
@@ -42,6 +53,7 @@ DAY_S = 86_400.0
 LATE_NS = 10_000 * S
 CRASH = Reason("worker_failed", "The worker crashed twice.")
 OVERLAP = Reason("overlap", "too little")
+KNOCK = Reason("moved_within_window", "the camera moved")
 
 RULES = Rules(PolicyConfig(), TrackerConfig(), MonitorConfig())
 NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())
@@ -78,7 +90,7 @@ def estimate(turned_deg: float, stamp_s: int = 100, decision: Decision = Decisio
         ),
         verdict=Verdict(decision, (), reasons),
         correction=xi,
-        sigma=np.array([5e-4] * 3 + [np.nan] * 3),
+        uncertainty=Uncertainty.independent(np.array([5e-4] * 3 + [np.nan] * 3)),
         solved=np.arange(6) < 3,
         unobservable=np.zeros(6, np.bool_),
         compensation={},
@@ -169,6 +181,49 @@ def test_a_window_that_cannot_tell_is_no_evidence(before: PairState, code: str) 
     verdict = Verdict(Decision.FAILED, (), (Reason(code, "too little"), Reason("newton_step_deg", "sloped")))
     state = solved(before, replace(refused, verdict=verdict))
     assert (state.health, state.reasons) == (before.health, before.reasons)
+
+
+def moved_within(before_deg: float, after_deg: float, stamp_s: int = 300) -> Estimate:
+    """A window that was refused as the camera turned within it; it was solved to the pose before."""
+    refused = estimate(before_deg, stamp_s, Decision.FAILED)
+    moved = MovedWithin(
+        (stamp_s - 20) * S, (stamp_s - 18) * S, pose_of(estimate(before_deg)), pose_of(estimate(after_deg))
+    )
+    return replace(refused, verdict=Verdict(Decision.FAILED, (), (KNOCK,)), moved=moved)
+
+
+def test_a_window_that_saw_a_knock_speaks_against_what_is_served_and_wants_the_next_one_soon() -> None:
+    state = solved(HEALTHY, moved_within(0.5, 3.0))
+    assert state.health is HealthState.SUSPECT
+    assert state.reasons == (KNOCK,)
+    assert np.array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
+    assert window_wanted_since(state) == (300 - 18) * S
+
+
+def test_a_window_at_whose_end_the_camera_is_where_it_is_served_speaks_against_nothing() -> None:
+    state = solved(HEALTHY, moved_within(3.0, 0.5))
+    assert state.health is HealthState.HEALTHY
+    assert window_wanted_since(state) is None
+
+
+def test_a_window_that_cannot_tell_for_another_reason_is_no_witness_of_a_knock() -> None:
+    knocked = moved_within(0.5, 3.0)
+    doubtful = replace(knocked, verdict=replace(knocked.verdict, reasons=(KNOCK, OVERLAP)))
+    state = solved(HEALTHY, doubtful)
+    assert state.health is HealthState.HEALTHY
+    assert window_wanted_since(state) is None
+
+
+def test_a_window_is_wanted_no_longer_once_one_was_accepted_or_the_monitor_is_clear() -> None:
+    knocked = solved(HEALTHY, moved_within(0.5, 3.0))
+    assert window_wanted_since(solved(knocked, estimate(0.5, 400))) is None
+    assert window_wanted_since(watched(knocked, *clear_from(310, 3))) is None
+
+
+def test_the_monitor_says_since_when_a_window_is_wanted() -> None:
+    state = watched(HEALTHY, *clear_from(200, 2), *flagged_from(300, 6))
+    assert state.flagged_since_ns is not None
+    assert window_wanted_since(state) == state.flagged_since_ns
 
 
 def test_a_refused_window_in_which_another_pose_stands_out_is_a_suspicion() -> None:

@@ -4,24 +4,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
-from coec.calibration.types import Decision, Metric, StopReason, Verdict
-from coec.calibration.verdict import judge, shape_metrics
+from coec.calibration.search.change_point import ChangePoint
+from coec.calibration.types import MOVED, Decision, Metric, StopReason, Verdict
+from coec.calibration.verdict import change_metric, counted_once, judge, shape_metrics
 from coec.config import VerdictConfig
+from coec.geometry import se3
 
 LIMITS = VerdictConfig()
 GOOD = Evaluation(score=1.4, frame_scores=np.full(10, 1.4), mi=1.4, overlap=0.9, points_in_view=10_000)
 PEAK = Curvature(
     first_derivative=np.array([0.1, -0.1, 0.05, np.nan, np.nan, np.nan]),
     second_derivative=np.array([250.0, 260.0, 300.0, np.nan, np.nan, np.nan]),
-    sigma=np.array([6e-4, 6e-4, 1e-3, np.nan, np.nan, np.nan]),
 )
+SHARP = np.array([6e-4, 6e-4, 1e-3, np.nan, np.nan, np.nan])
+VAGUE, UNKNOWN = 100.0 * SHARP, np.full(6, np.nan)
+FRAMES = 10
 SLOPE = replace(PEAK, first_derivative=PEAK.first_derivative * 100)
 PLAIN = replace(PEAK, first_derivative=PEAK.first_derivative / 100, second_derivative=PEAK.second_derivative / 100)
-VAGUE = replace(PEAK, sigma=PEAK.sigma * 100)
-UNKNOWN = replace(PEAK, sigma=np.full(6, np.nan))
 OUTSTANDING = (
     Metric("edge_contrast", 9.0, LIMITS.min_edge_contrast, at_least=True),
     Metric("runner_up", 0.5, LIMITS.max_runner_up, at_least=False),
@@ -33,8 +36,10 @@ def verdict_on(
     curvature: Curvature = PEAK,
     stop: StopReason = StopReason.TOLERANCE,
     of_objective: tuple[Metric, ...] = OUTSTANDING,
+    sigma: NDArray[np.float64] = SHARP,
+    looks: float = float(FRAMES),
 ) -> Verdict:
-    return judge((*of_objective, *shape_metrics(evaluation, curvature, LIMITS)), stop)
+    return judge((*of_objective, *shape_metrics(evaluation, curvature, sigma, LIMITS)), stop, looks, FRAMES)
 
 
 def test_a_peak_with_everything_in_view_is_accepted() -> None:
@@ -53,8 +58,8 @@ def test_a_peak_with_everything_in_view_is_accepted() -> None:
         (verdict_on(curvature=PLAIN), "peakedness_per_deg2"),
         (verdict_on(stop=StopReason.AT_BOUND), "optimum_at_bound"),
         (verdict_on(stop=StopReason.EVALUATIONS), "evaluations_exhausted"),
-        (verdict_on(curvature=VAGUE), "sigma_deg"),
-        (verdict_on(curvature=UNKNOWN), "sigma_deg"),
+        (verdict_on(sigma=VAGUE), "sigma_deg"),
+        (verdict_on(sigma=UNKNOWN, looks=np.nan), "sigma_deg"),
         (verdict_on(of_objective=(replace(OUTSTANDING[0], value=3.0),)), "edge_contrast"),
         (verdict_on(of_objective=(replace(OUTSTANDING[1], value=0.95),)), "runner_up"),
         (verdict_on(of_objective=(Metric("mi_over_unrelated", 1.1, 1.2, at_least=True),)), "mi_over_unrelated"),
@@ -94,7 +99,59 @@ def test_a_peak_of_a_score_that_is_not_above_zero_is_none(score: float) -> None:
 
 def test_peakedness_is_the_curvature_over_the_score() -> None:
     np.testing.assert_allclose(PEAK.peakedness(2.0), PEAK.second_derivative[:3] / 2.0)
-    half = {m.name: m.value for m in shape_metrics(replace(GOOD, score=2.8), PEAK, LIMITS)}["peakedness_per_deg2"]
-    whole = {m.name: m.value for m in shape_metrics(GOOD, PEAK, LIMITS)}["peakedness_per_deg2"]
+    half = {m.name: m.value for m in shape_metrics(replace(GOOD, score=2.8), PEAK, SHARP, LIMITS)}[
+        "peakedness_per_deg2"
+    ]
+    whole = {m.name: m.value for m in shape_metrics(GOOD, PEAK, SHARP, LIMITS)}["peakedness_per_deg2"]
     assert half == pytest.approx(whole / 2.0)
     assert whole == pytest.approx(250.0 * np.radians(1.0) ** 2 / 1.4)
+
+
+def test_a_window_that_is_too_uncertain_because_it_saw_one_scene_needs_motion() -> None:
+    assert [reason.code for reason in verdict_on(sigma=VAGUE, looks=2.0).reasons] == ["sigma_deg", "motion"]
+    assert [reason.code for reason in verdict_on(sigma=VAGUE, looks=9.0).reasons] == ["sigma_deg"]
+    assert verdict_on(looks=2.0).decision is Decision.ACCEPTED
+
+
+def test_range_edges_that_frames_have_in_common_count_once() -> None:
+    found = (Metric("range_edges", 3000.0, 1000.0, at_least=True), OUTSTANDING[0])
+    once = {metric.name: metric.value for metric in counted_once(found, 2.0, FRAMES)}
+    assert once == {"range_edges": 600.0, "edge_contrast": OUTSTANDING[0].value}
+    assert counted_once(found, float("nan"), FRAMES) == found
+
+
+def changed(gain: float = 9.0, turn_deg: float = 1.0, support: float = 8.0, likeness: float = 0.9) -> ChangePoint:
+    after = se3.perturbation(np.radians([turn_deg, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    return ChangePoint(3, np.eye(4), after, gain, support, likeness)
+
+
+def verdict_after(change: ChangePoint | None) -> Verdict:
+    return judge(
+        change_metric(change, LIMITS),
+        StopReason.TOLERANCE,
+        FRAMES,
+        FRAMES,
+        {MOVED: ", by 1.0° between 20.4 and 21.6 s"},
+    )
+
+
+def test_a_knock_within_the_window_refuses_it_and_says_when() -> None:
+    verdict = verdict_after(changed())
+    (reason,) = verdict.reasons
+    assert reason.code == "moved_within_window"
+    assert "the camera moved while the window was taken, by 1.0° between 20.4 and 21.6 s: 9, limit" in reason.text
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        changed(gain=2.0),
+        changed(turn_deg=0.2),
+        changed(support=3.0),
+        changed(likeness=0.3),
+        None,
+    ],
+    ids=["chance", "small", "nothing to see", "the scene changed", "not looked for"],
+)
+def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
+    assert verdict_after(change).decision is Decision.ACCEPTED

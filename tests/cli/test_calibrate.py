@@ -13,7 +13,7 @@ from coec.calibration.ports import DepthModel
 from coec.cli.calibrate import Options, configuration_of
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig
 from coec.errors import UsageError
-from coec.sources.windows import evenly, perturbation_of
+from coec.sources.windows import evenly, vector_of
 
 TOLERANCE_DEG = 0.35
 
@@ -131,7 +131,7 @@ def test_options_override_the_recorded_configuration_and_nothing_else() -> None:
 @pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", ""])
 def test_malformed_perturbation(text: str) -> None:
     with pytest.raises(UsageError):
-        perturbation_of(text)
+        vector_of("--perturb", text)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cli.conftest import SMALL, Coec
 from coec.calibration.commissioning import learning
@@ -20,7 +21,8 @@ from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
 from coec.evaluation import experiments
 from coec.evaluation.starts import perturbations
-from coec.schemas.evaluation import ComparisonReport, EvaluationReport
+from coec.geometry import se3
+from coec.schemas.evaluation import ClosureReport, ComparisonReport, EvaluationReport
 from coec.sources.recording import FramewiseRecording
 from drives import drawn
 
@@ -247,3 +249,77 @@ def test_a_recording_too_short_for_detection_is_refused_before_the_work(coec: Co
     outcome = coec("evaluate", SMALL, "--depth", "stereo", "--detection", "1", "--rotation-deg", "2")
     assert outcome.status != 0
     assert "needs 9 pairs" in outcome.err
+
+
+def test_normalised_errors_of_windows_and_halves(coec: Coec, tmp_path: Path) -> None:
+    outcome = coec(
+        "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--objective", "mi",
+        "--nees", "2", "--output", tmp_path / "out", "--json",
+    )  # fmt: skip
+    windows, halves = outcome.document["normalised"]
+    assert EvaluationReport.model_validate(outcome.document).model_dump(mode="json") == outcome.document
+    assert windows["judged"] + windows["refused"] == halves["judged"] + halves["refused"] == 2
+    assert (halves["against"], halves["independent"] <= 1) == ("the other half of the frames", True)
+    for found in (windows, halves):
+        assert [sum(counts) for counts in found["histogram"]][:3] == [found["judged"]] * 3
+    assert outcome.document["halves"] is None
+    assert (tmp_path / "out" / "normalised.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_simulated_drive_is_held_against_its_truth(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Known(FramewiseRecording):
+        def truth(self, stamp_ns: int) -> NDArray[np.float64]:
+            assert stamp_ns in self.camera_stamps_ns
+            return se3.perturb(self.rig.T_camera_lidar_nominal, np.radians([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    def known(query: dict[str, str]) -> FramewiseRecording:
+        recording = drawn(query)
+        return Known(recording.name, recording.rig, recording.T_camera_lidar_start, recording.frames, recording.motions)
+
+    monkeypatch.setattr("coec.simulation.source.open_sim", known)
+    arguments = (SMALL, "--depth", "stereo", "--rotation-deg", "1", "--directions", "1", "--objective", "mi")
+    found = coec("evaluate", *arguments, "--nees", "1", "--json").document["normalised"][0]
+    assert found["against"] == "the simulated truth"
+    assert (found["judged"], found["refused"]) == (1, 0)
+    assert found["rms"][0] == pytest.approx(3.0, abs=0.5)
+    assert found["within_3_sigma"][0] == 0.0
+
+
+CLOSURE = ("evaluate", "--closure", SMALL, SMALL, "--depth", "stereo", "--objective", "mi", "--rotation-deg", "1")
+
+
+def test_closure_misses_a_pose_by_what_it_is_off(coec: Coec, tmp_path: Path) -> None:
+    outcome = coec(*CLOSURE, "--directions", "1", "--relative", "1,0,0", "--output", tmp_path / "out", "--json")
+    report = outcome.document
+    assert ClosureReport.model_validate(report).model_dump(mode="json") == report
+    assert (report["from_recordings"], report["known"][0]) == (False, pytest.approx(1.0))
+    assert [group["frames"] for group in report["groups"]] == ["all frames", "the same half", "other halves"]
+    assert report["groups"][0]["errors"]["rms"][:3] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    assert report["groups"][0]["translation_m"]["median"] is None
+    assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
+    assert (tmp_path / "out" / "normalised.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_closure_in_words(coec: Coec) -> None:
+    outcome = coec(*CLOSURE, "--directions", "1", "--frames", "2")
+    assert "two cameras, one LiDAR; A in the frame of B, as the recordings tell: 0.000 deg" in outcome.out
+    assert "errors against the known pose between both" in outcome.out
+    assert not outcome.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("evaluate", "--rotation-deg", "1"), "give a SOURCE, or --closure A B"),
+        (("evaluate", SMALL, "--closure", SMALL, SMALL, "--rotation-deg", "1"), "not both"),
+        (("evaluate", SMALL, "--relative", "0,0,0", "--rotation-deg", "1"), "it needs --closure A B"),
+        ((*CLOSURE, "--relative", "1,2"), "--relative 1,2: give three numbers"),
+        ((*CLOSURE, "--nees", "2"), "an experiment of its own"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_before_the_work(
+    coec: Coec, arguments: tuple[str, ...], said: str
+) -> None:
+    outcome = coec(*arguments)
+    assert outcome.status == 2
+    assert said in outcome.err

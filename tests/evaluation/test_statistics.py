@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.types import Decision, Estimate, Optimum, StopReason, Verdict
+from coec.calibration.types import Decision, Estimate, Optimum, StopReason, Uncertainty, Verdict
 from coec.evaluation.statistics import (
     NOT_SOLVED,
     Outcome,
@@ -55,7 +55,7 @@ def _estimate(error: NDArray[np.float64], accepted: bool, sigma: float = np.nan)
         optimum,
         Verdict(decision, (), ()),
         nan,
-        np.full(6, sigma),
+        Uncertainty.independent(np.full(6, sigma)),
         np.ones(6, np.bool_),
         np.zeros(6, np.bool_),
         {},

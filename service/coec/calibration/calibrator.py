@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
+from math import degrees
 
 import numpy as np
 
+from coec.calibration.confidence.uncertainty import measure_uncertainty
 from coec.calibration.estimators import ESTIMATORS, sight_of
 from coec.calibration.frames.motion_compensation import compensation
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
+from coec.calibration.search.change_point import ChangePoint, change_point
 from coec.calibration.search.observability import unobservable, without
-from coec.calibration.types import Compensation, Estimate, Optimum, Window
-from coec.calibration.verdict import judge, shape_metrics
+from coec.calibration.types import MOVED, Compensation, Estimate, MovedWithin, Optimum, Window
+from coec.calibration.verdict import change_metric, counted_once, judge, shape_metrics
 from coec.config import CalibrationConfig, config_hash
 from coec.errors import CalibrationError
 from coec.geometry import se3
@@ -35,27 +38,39 @@ def calibrate(
     # P_i and D_i, the objective and its maximum.
     sight = sight_of(window, depth, images, config, progress)
     found = ESTIMATORS[config.objective.kind](sight, config)
-    search, curvature = found.search, measure_curvature(found.objective, found.search.T_camera_lidar, dof)
-    blind = unobservable(curvature, dof, config.verdict)
+    objective, search, every = found.objective, found.search, tuple(range(dof))
+    curvature = measure_curvature(objective, search.T_camera_lidar, dof)
+    uncertainty = measure_uncertainty(objective, search.T_camera_lidar, every, found.rivals, sight.window)
+    blind = unobservable(curvature, uncertainty.sigma, dof, config.verdict)
     if blind:
-        search = without(blind, search, found.objective, window.T_camera_lidar_start, config.search, progress)
-        curvature = measure_curvature(found.objective, search.T_camera_lidar, dof, blind)
+        search = without(blind, search, objective, window.T_camera_lidar_start, config.search, progress)
+        curvature = measure_curvature(objective, search.T_camera_lidar, dof, blind)
+        told = tuple(axis for axis in every if axis not in blind)
+        uncertainty = measure_uncertainty(objective, search.T_camera_lidar, told, found.rivals, sight.window)
     pose = search.T_camera_lidar
     # Self-diagnosis, equation (2).
-    at_optimum = found.objective.evaluate(pose)
-    metrics = (*found.metrics, *shape_metrics(at_optimum, curvature, config.verdict))
-    verdict = judge(metrics, search.stop_reason)
+    at_optimum = objective.evaluate(pose)
+    change = None if found.edges is None else change_point(found.edges, pose)
+    looks, pairs = uncertainty.looks, len(window.pairs)
+    metrics = (
+        *counted_once(found.metrics, looks, pairs),
+        *shape_metrics(at_optimum, curvature, uncertainty.sigma, config.verdict),
+        *change_metric(change, config.verdict),
+    )
+    moved = None if change is None else _moved(change, window)
+    details = {} if moved is None else {MOVED: _told(moved, window)}
+    verdict = judge(metrics, search.stop_reason, looks, pairs, details)
     progress.step("diagnosis", 1, 1)
 
     outcomes = Counter(compensation(pair, window.rig, enabled=config.motion_compensation) for pair in window.pairs)
     return Estimate(
         window_id=window.window_id,
         data_stamp_ns=window.stamp_ns,
-        pairs=len(window.pairs),
+        pairs=pairs,
         optimum=Optimum(
             T_camera_lidar=pose,
             score=at_optimum.score,
-            score_at_start=found.objective.evaluate(window.T_camera_lidar_start).score,
+            score_at_start=objective.evaluate(window.T_camera_lidar_start).score,
             mi=at_optimum.mi,
             overlap=at_optimum.overlap,
             points_in_view=at_optimum.points_in_view,
@@ -66,7 +81,7 @@ def calibrate(
         ),
         verdict=verdict,
         correction=se3.difference(pose, window.rig.T_camera_lidar_nominal),
-        sigma=curvature.sigma,
+        uncertainty=uncertainty,
         solved=(np.arange(6) < dof) & ~np.isin(np.arange(6), blind),
         unobservable=np.isin(np.arange(6), blind),
         compensation={outcome.value: outcomes[outcome] for outcome in Compensation},
@@ -74,4 +89,18 @@ def calibrate(
         config_hash=config_hash(
             config.objective, config.search, config.verdict, str(config.motion_compensation), depth.identity
         ),
+        moved=moved if any(reason.code == MOVED for reason in verdict.reasons) else None,
     )
+
+
+def _moved(change: ChangePoint, window: Window) -> MovedWithin:
+    before, after = (window.pairs[index].stamp_ns for index in (change.first_late - 1, change.first_late))
+    return MovedWithin(before, after, change.T_before, change.T_after)
+
+
+def _told(moved: MovedWithin, window: Window) -> str:
+    turn_deg = degrees(se3.rotation_angle_rad(moved.T_after @ se3.inverse(moved.T_before)))
+    before_s, after_s = (
+        (stamp_ns - window.pairs[0].stamp_ns) / 1e9 for stamp_ns in (moved.last_before_ns, moved.first_after_ns)
+    )
+    return f", by {turn_deg:.1f}° between {before_s:.1f} and {after_s:.1f} s after its first pair"

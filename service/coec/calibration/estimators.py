@@ -11,14 +11,15 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.modes import Rivals
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
-from coec.calibration.objective.edges import build_edges
+from coec.calibration.objective.edges import EdgeWitness, build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import (
+    Divisible,
     Features,
     MutualInformation,
-    Objective,
     SearchBox,
     build_mutual_information,
     distance_and_depth,
@@ -26,6 +27,7 @@ from coec.calibration.objective.mutual_information import (
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.search.global_search import at_rim, find_basins
 from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
+from coec.calibration.search.mount_prior import log_prior
 from coec.calibration.types import DepthMap, Matrix4, Metric, StopReason, Window
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, DecodeError
@@ -35,8 +37,8 @@ from coec.geometry.thinning import thinned
 
 Seen = TypeVar("Seen")
 
-POLISHED_BASINS = 6
-"""Basins that are polished on the fused objective: the true one was never below the second place."""
+POLISHED_BASINS = 5
+"""Basins that are polished on the fused objective beside the start's: the true one was never below the second place."""
 
 SETTLED_POSES = 2
 """Poses of the best basin that are settled: with six degrees of freedom, blurred edges can lead one of them astray (to
@@ -121,11 +123,14 @@ def _masked(sight: Sight) -> Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What an estimator found: its objective, the search on it, and the metrics that only this objective has."""
+    """What an estimator found: its objective, the search on it, the metrics that only this objective has, the other
+    summits that it came to within the basin, and the edges of the window where it looked at them."""
 
-    objective: Objective
+    objective: Divisible
     search: SearchResult
     metrics: tuple[Metric, ...]
+    rivals: tuple[Rivals, ...] = ()
+    edges: EdgeWitness | None = None
 
 
 Estimator = Callable[[Sight, CalibrationConfig], Found]
@@ -167,10 +172,19 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     fusion = Fusion(edges, depth, start, reach)
     ranked = sorted(((fusion.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
     to_rank = near(config.search, fusion.ranking[-1])
-    ends = [polish_in_turn(fusion.ranking, basin, to_rank, progress) for _, basin in ranked[:POLISHED_BASINS]]
+    # The neighbourhood of the start, whatever the charts say of it.
+    begun = [start, *(basin for _, basin in ranked[:POLISHED_BASINS])]
+    ends = [polish_in_turn(fusion.ranking, basin, to_rank, progress) for basin in begun]
     polished = [(fusion.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
-    # A maximum outside of the reach is a rival, but what is asked for lies inside.
-    _, pose = max(polished, key=lambda end: (not at_rim(end[1], start, reach), end[0]))
+
+    def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:
+        rank, pose = end
+        # A rank is an improbability: half its square, in nats, is what the window says against chance. A maximum
+        # outside of the reach is a rival, but what is asked for lies inside.
+        told = 0.5 * rank**2 + log_prior(pose, start, window.start_known_to_rad)
+        return not at_rim(pose, start, reach), told
+
+    _, pose = max(polished, key=preferred)
     contrast = fusion.edge_contrast(pose)
     rivals = [
         fusion.edge_contrast(other) for _, other in (*polished, *ranked[POLISHED_BASINS:]) if _differ(other, pose)
@@ -184,11 +198,16 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
     settled = [polish_in_turn(fusion.settling, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
     finest = fusion.settling[-1]
-    found = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
-    found = replace(found, evaluations=sum(end.evaluations for end in (*ends, *settled)))
+    best = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
+    found = replace(best, evaluations=sum(end.evaluations for end in (*ends, *settled)))
     if at_rim(found.T_camera_lidar, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
-    return Found(finest, found, metrics)
+    summits = (
+        # The pose before the search, too: where the window cannot tell it from what was found, it has told nothing.
+        Rivals(finest, best.T_camera_lidar, (*(e.T_camera_lidar for e in settled if e is not best), start)),
+        Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
+    )
+    return Found(finest, found, metrics, summits, edges)
 
 
 def runner_up(contrast: float, rivals: Sequence[float]) -> float:

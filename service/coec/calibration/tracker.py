@@ -3,7 +3,8 @@ step at once.
 
 The slow track is an information filter on SE(3): its state is a pose and the covariance of the perturbation on its left
 (Barfoot, Furgale, "Associating uncertainty with three-dimensional poses", 2014), its update the Kalman update of that
-perturbation, and between windows the covariance grows with time so that a mount that creeps is followed.
+perturbation, and between windows the covariance grows with time so that a mount that creeps is followed. What windows
+have in common does not average away: it is carried beside the noise, and told with it.
 
 A window is first asked whether it can come from the same mount: the squared Mahalanobis distance of its innovation is
 chi-square distributed if it does (Bar-Shalom, Li, Kirubarajan 2001, section 5.4). One that does not opens a fast track
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import Estimate, Matrix4
+from coec.calibration.types import Estimate, Matrix4, Uncertainty
 from coec.config import TrackerConfig
 from coec.geometry import se3
 from coec.geometry.linear import congruent, solved
@@ -49,41 +50,51 @@ class Measurement:
 
     Attributes:
         T_camera_lidar: (4, 4).
-        covariance: (6, 6) of the perturbation about the camera axes, radians and metres; the diagonal is NaN on axes
-            that were not solved or could not be observed.
+        uncertainty: of the perturbation about the camera axes; its noise is NaN on axes that were not solved or could
+            not be observed.
         stamp_ns: sensor time of its last pair.
     """
 
     T_camera_lidar: Matrix4
-    covariance: Matrix6
+    uncertainty: Uncertainty
     stamp_ns: int
-
-    @classmethod
-    def independent(cls, T_camera_lidar: Matrix4, sigma: NDArray[np.float64], stamp_ns: int) -> Measurement:
-        """With axes whose errors are independent; `sigma` (6,), NaN where an axis tells nothing."""
-        return cls(T_camera_lidar, np.diag(np.asarray(sigma, np.float64) ** 2), stamp_ns)
 
     @classmethod
     def of(cls, estimate: Estimate) -> Measurement:
         """What an estimate tells about the axes that it solved."""
-        sigma = np.where(estimate.solved, estimate.sigma, np.nan)
-        return cls.independent(estimate.optimum.T_camera_lidar, sigma, estimate.data_stamp_ns)
+        told, noise = estimate.solved, estimate.uncertainty.noise
+        uncertainty = replace(estimate.uncertainty, noise=np.where(told[:, None] & told, noise, np.nan))
+        return cls(estimate.optimum.T_camera_lidar, uncertainty, estimate.data_stamp_ns)
 
     def told_axes(self) -> list[int]:
         """Axes with a finite variance above zero."""
-        variances = self.covariance.diagonal()
+        variances = self.uncertainty.noise.diagonal()
         return [axis for axis in range(6) if np.isfinite(variances[axis]) and variances[axis] > 0.0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Belief:
-    """A pose (4, 4), the covariance (6, 6) of the perturbation on its left, the axes (6,) that any window told, and the
-    number of windows in it."""
+    """A pose and what is known of it.
+
+    Attributes:
+        T_camera_lidar: (4, 4).
+        covariance: (6, 6) of the perturbation on its left: noise, which averages away.
+        systematic: by its name, (6,) the shift of the pose by one standard deviation of an error that the windows in
+            it have in common, which does not.
+        observed: (6,) axes that any window told.
+        windows: number of windows in it.
+    """
 
     T_camera_lidar: Matrix4
     covariance: Matrix6
+    systematic: Mapping[str, NDArray[np.float64]]
     observed: NDArray[np.bool_]
     windows: int
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """Both together."""
+        return Uncertainty(self.covariance, self.systematic, np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +131,7 @@ class Track:
             raise ValueError("T_camera_lidar of a track must be a rigid transform (4, 4)")
         if sigma.shape != (6,) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
             raise ValueError(f"prior_sigma of a track must be six positive numbers, got {sigma.tolist()}")
-        return cls(Belief(T_camera_lidar, np.diag(sigma**2), np.zeros(6, np.bool_), 0), sigma, stamp_ns)
+        return cls(Belief(T_camera_lidar, np.diag(sigma**2), {}, np.zeros(6, np.bool_), 0), sigma, stamp_ns)
 
     @property
     def T_camera_lidar(self) -> Matrix4:
@@ -142,11 +153,10 @@ class Track:
         """Windows in the slow track since it started or started again."""
         return self.slow.windows
 
-    def sigma(self, config: TrackerConfig) -> NDArray[np.float64]:
-        """(6,) standard deviations to report, radians and metres: noise, and the error that averaging cannot remove."""
-        return np.array(
-            [sqrt(v + f * f) for v, f in zip(self.covariance.diagonal().tolist(), _floor(config), strict=True)]
-        )
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """What to report: noise, and the errors that averaging cannot remove."""
+        return self.slow.uncertainty
 
 
 def prior_sigma(config: TrackerConfig) -> NDArray[np.float64]:
@@ -161,7 +171,7 @@ def absorb(track: Track, measurement: Measurement, config: TrackerConfig) -> Tra
         return track
     elapsed_h = max(0, measurement.stamp_ns - track.stamp_ns) / NS_PER_H
     slow = _drifted(track.slow, elapsed_h, config)
-    distance, chance = _disagreement(slow, measurement, axes, config)
+    distance, chance = _disagreement(slow, measurement, axes)
     stamp_ns = max(track.stamp_ns, measurement.stamp_ns)
     heard = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
     if chance >= config.step_false_alarm:
@@ -171,7 +181,7 @@ def absorb(track: Track, measurement: Measurement, config: TrackerConfig) -> Tra
         return replace(heard, slow=alone, step=StepState.CONFIRMED, candidate=None)
     if track.candidate is not None:
         fast = _drifted(track.candidate, elapsed_h, config)
-        _, chance_of_fast = _disagreement(fast, measurement, axes, config)
+        _, chance_of_fast = _disagreement(fast, measurement, axes)
         if chance_of_fast >= config.step_false_alarm:
             return replace(heard, slow=_updated(fast, measurement, axes), step=StepState.CONFIRMED, candidate=None)
     return replace(heard, step=StepState.SUSPECTED, candidate=alone)
@@ -182,10 +192,11 @@ def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belie
     them beyond the prior."""
     away = se3.difference(measurement.T_camera_lidar, track.T_camera_lidar)
     covariance = np.diag(track.prior_sigma**2)
-    covariance[np.ix_(axes, axes)] = measurement.covariance[np.ix_(axes, axes)]
+    covariance[np.ix_(axes, axes)] = measurement.uncertainty.noise[np.ix_(axes, axes)]
     told = np.isin(np.arange(6), axes)
+    systematic = {name: np.where(told, shift, 0.0) for name, shift in measurement.uncertainty.systematic.items()}
     pose = se3.perturb(track.T_camera_lidar, np.where(told, away, 0.0))
-    return Belief(pose, covariance, told, 1)
+    return Belief(pose, covariance, systematic, told, 1)
 
 
 def _drifted(belief: Belief, elapsed_h: float, config: TrackerConfig) -> Belief:
@@ -194,15 +205,12 @@ def _drifted(belief: Belief, elapsed_h: float, config: TrackerConfig) -> Belief:
     return replace(belief, covariance=belief.covariance + np.diag([elapsed_h * q for q in walk]))
 
 
-def _disagreement(
-    belief: Belief, measurement: Measurement, axes: list[int], config: TrackerConfig
-) -> tuple[float, float]:
-    """Squared Mahalanobis distance on the axes told, and its probability. Windows of different scenes differ by what
-    windows of one scene have in common, so the floor counts as noise here."""
+def _disagreement(belief: Belief, measurement: Measurement, axes: list[int]) -> tuple[float, float]:
+    """Squared Mahalanobis distance on the axes told, and its probability. What windows of one scene have in common
+    differs between scenes, so the window's systematic errors count as noise here."""
     away = se3.difference(measurement.T_camera_lidar, belief.T_camera_lidar).tolist()
-    floor = _floor(config)
-    spread = (belief.covariance + measurement.covariance).tolist()
-    s = [[spread[i][j] + (floor[i] ** 2 if i == j else 0.0) for j in axes] for i in axes]
+    spread = (belief.covariance + measurement.uncertainty.covariance).tolist()
+    s = [[spread[i][j] for j in axes] for i in axes]
     y = [away[i] for i in axes]
     distance = fsum(a * b for a, b in zip(y, solved(s, y), strict=True))
     return distance, chi_square_tail(distance, len(axes))
@@ -212,8 +220,10 @@ def _updated(belief: Belief, measurement: Measurement, axes: list[int]) -> Belie
     """The Kalman update with the window's perturbation from the belief, on the axes that it tells.
 
     K = P Hᵀ (H P Hᵀ + R)⁻¹, ξ = K y, P ← (1 - K H) P (1 - K H)ᵀ + K R Kᵀ (Joseph's form: stays positive definite).
+    A systematic error is the same in every window and shifts the belief as it shifts the window, b ← (1 - K H) b + K s:
+    it is considered, not estimated (Schmidt 1966), for no number of windows tells it.
     """
-    p, r = belief.covariance.tolist(), measurement.covariance.tolist()
+    p, r = belief.covariance.tolist(), measurement.uncertainty.noise.tolist()
     away = se3.difference(measurement.T_camera_lidar, belief.T_camera_lidar).tolist()
     s = [[p[i][j] + r[i][j] for j in axes] for i in axes]
     gain = [solved(s, [p[row][j] for j in axes]) for row in range(6)]  # S is symmetric: K's rows solve S·k = P's
@@ -222,14 +232,23 @@ def _updated(belief: Belief, measurement: Measurement, axes: list[int]) -> Belie
     keep = [[float(i == j) - (gain[i][told[j]] if j in told else 0.0) for j in range(6)] for i in range(6)]
     noise = [[r[i][j] for j in axes] for i in axes]
     covariance = np.array(congruent(keep, p)) + np.array(congruent(gain, noise))
-    observed = belief.observed | np.isin(np.arange(6), axes)
+    before, of_window, none = belief.systematic, measurement.uncertainty.systematic, np.zeros(6)
+    systematic = {}
+    for name in sorted({*before, *of_window}):
+        old, new = before.get(name, none).tolist(), of_window.get(name, none).tolist()
+        shift = [
+            fsum(k * b for k, b in zip(keep[i], old, strict=True))
+            + fsum(k * new[j] for k, j in zip(gain[i], axes, strict=True))
+            for i in range(6)
+        ]
+        systematic[name] = np.array(shift)
     return Belief(
-        se3.perturb(belief.T_camera_lidar, xi), 0.5 * (covariance + covariance.T), observed, belief.windows + 1
+        se3.perturb(belief.T_camera_lidar, xi),
+        0.5 * (covariance + covariance.T),
+        systematic,
+        belief.observed | np.isin(np.arange(6), axes),
+        belief.windows + 1,
     )
-
-
-def _floor(config: TrackerConfig) -> list[float]:
-    return [radians(config.floor_deg)] * 3 + [config.floor_m] * 3
 
 
 def chi_square_tail(x: float, degrees_of_freedom: int) -> float:
@@ -279,7 +298,7 @@ def track_from_dict(document: Mapping[str, Any]) -> Track:
             innovation=float(document["innovation"]),
             chance=float(document["chance"]),
         )
-    except (KeyError, TypeError) as error:
+    except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"not a track: {error}") from error
 
 
@@ -287,6 +306,7 @@ def _belief_to_dict(belief: Belief) -> dict[str, Any]:
     return {
         "T_camera_lidar": belief.T_camera_lidar.tolist(),
         "covariance": belief.covariance.tolist(),
+        "systematic": {name: shift.tolist() for name, shift in belief.systematic.items()},
         "observed": belief.observed.tolist(),
         "windows": belief.windows,
     }
@@ -296,6 +316,7 @@ def _belief_from_dict(document: Mapping[str, Any]) -> Belief:
     return Belief(
         _array(document["T_camera_lidar"], (4, 4)),
         _array(document["covariance"], (6, 6)),
+        {str(name): _array(shift, (6,)) for name, shift in document["systematic"].items()},
         _array(document["observed"], (6,)).astype(np.bool_),
         int(document["windows"]),
     )

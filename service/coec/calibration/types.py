@@ -9,8 +9,10 @@ z forward). Stamps are sensor time in integer nanoseconds.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,6 +163,7 @@ class Rig:
         T_lidar_ego: (4, 4) maps ego-frame coordinates to LiDAR coordinates; carries ego-motion to the sensor.
         mask: (height, width) bool or None; False = ignore this pixel (vehicle body, outside the lens).
         sweep: azimuth timing, or None when unknown or when the clouds carry per-point time.
+        camera_residual_px: what `camera` misses of the lens that it was fitted to, at most, pixels.
     """
 
     pair: str
@@ -171,6 +174,7 @@ class Rig:
     T_lidar_ego: Matrix4
     mask: NDArray[np.bool_] | None = None
     sweep: SweepTiming | None = None
+    camera_residual_px: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,13 +182,15 @@ class Window:
     """The pairs of one slice of sensor time, in order of their stamps, and the extrinsic that was current then.
 
     `T_camera_lidar_start` (4, 4) is where the search starts: it is part of the window, so that a replay starts there
-    too.
+    too. `start_known_to_rad` is how far it usually is from
+    the truth: half a turn where it is a guess.
     """
 
     window_id: str
     rig: Rig
     T_camera_lidar_start: Matrix4
     pairs: tuple[FramePair, ...]
+    start_known_to_rad: float = pi
 
     @property
     def stamp_ns(self) -> int:
@@ -273,6 +279,13 @@ ELSEWHERE = frozenset({"newton_step_deg", "newton_step_m", *(stop.value for stop
 whether there is one. Every other reason says that the window cannot tell."""
 
 
+MOVED = "moved_within_window"
+"""Code of the reason that refuses a window within which the camera moved."""
+
+TWO_POSES = ELSEWHERE | {MOVED, "runner_up"}
+"""Codes of the reasons that a window has which holds two poses, and tells both well."""
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """Equation (2): every metric beside its limit, and the reasons when it failed (empty when accepted)."""
@@ -282,10 +295,87 @@ class Verdict:
     reasons: tuple[Reason, ...]
 
     @property
+    def tells_two_poses(self) -> bool:
+        """Of a refused window: the camera moved within it, and nothing else is wrong with it."""
+        codes = {reason.code for reason in self.reasons}
+        return MOVED in codes and codes <= TWO_POSES
+
+    @property
     def cannot_tell(self) -> bool:
         """Of a refused window: it says nothing of where the camera is; too little to see, or more than one answer."""
         codes = {reason.code for reason in self.reasons}
         return not codes or not codes <= ELSEWHERE
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """How far a pose may be off, about the camera axes, radians and metres.
+
+    Attributes:
+        noise: (6, 6) covariance of what differs from window to window; NaN on axes that were not told.
+        systematic: by its name, (6,) the shift by one standard deviation of an error that windows have in common.
+        looks: how many independent looks the frames of the window are worth; NaN where that is not known.
+    """
+
+    noise: NDArray[np.float64]
+    systematic: Mapping[str, NDArray[np.float64]]
+    looks: float
+
+    @classmethod
+    def unknown(cls) -> Uncertainty:
+        """On every axis."""
+        return cls(np.full((6, 6), np.nan), {}, np.nan)
+
+    @classmethod
+    def independent(cls, sigma: NDArray[np.float64]) -> Uncertainty:
+        """Noise alone, its axes uncorrelated: standard deviations (6,), NaN where an axis is not told."""
+        told = np.isfinite(sigma)
+        noise = np.where(told[:, None] & told, np.diag(np.where(told, sigma, 0.0) ** 2), np.nan)
+        return cls(noise, {}, np.nan)
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(6, 6) of both together."""
+        shared = np.zeros((6, 6))
+        for name in sorted(self.systematic):  # to the bit the same, in whatever order they were kept
+            shared += self.systematic[name][:, None] * self.systematic[name]
+        return self.noise + shared
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """(6,) standard deviations of both together; NaN on axes that were not told."""
+        return np.sqrt(self.covariance.diagonal())
+
+    @property
+    def pitch_height(self) -> float:
+        """Correlation of the errors of rx and ty, -1 to 1; NaN where either was not told. Only what is near tells a
+        turn from a shift."""
+        return self._correlation(0, 4)
+
+    @property
+    def yaw_side(self) -> float:
+        """The same of ry and tx."""
+        return self._correlation(1, 3)
+
+    def _correlation(self, one: int, other: int) -> float:
+        covariance, sigma = self.covariance, self.sigma
+        size = float(sigma[one] * sigma[other])
+        return float(covariance[one, other]) / size if size > 0.0 else np.nan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovedWithin:
+    """The camera moved while a window was taken: two poses, one after the other, explain it, and one does not.
+
+    Attributes:
+        last_before_ns, first_after_ns: stamps of the pairs between which it moved.
+        T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after; turned about the camera's centre.
+    """
+
+    last_before_ns: int
+    first_after_ns: int
+    T_before: Matrix4
+    T_after: Matrix4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -294,13 +384,14 @@ class Estimate:
 
     Attributes:
         correction: (6,) rotation vector (rad) and translation (m) from the nominal calibration, about the camera axes.
-        sigma: (6,) standard deviation per axis (rad, m); NaN where it was not estimated.
+        uncertainty: of the pose; unknown on axes that were not solved.
         solved: (6,) bool, the axes that were searched and found.
         unobservable: (6,) bool, the translations that were searched but that the window does not tell: along these
             axes of the camera its centre, -Rᵀ·t in LiDAR coordinates, is that of the start.
         compensation: how many pairs ended with which `Compensation`, by name.
         depth_identity: sha256 of the network, or `precomputed`.
         config_hash: of everything that decides the result.
+        moved: what the window was refused for, if the camera moved within it; None otherwise.
     """
 
     window_id: str
@@ -309,9 +400,15 @@ class Estimate:
     optimum: Optimum
     verdict: Verdict
     correction: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    uncertainty: Uncertainty
     solved: NDArray[np.bool_]
     unobservable: NDArray[np.bool_]
     compensation: dict[str, int]
     depth_identity: str
     config_hash: str
+    moved: MovedWithin | None = None
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """(6,) standard deviation per axis (rad, m); NaN where it was not estimated."""
+        return self.uncertainty.sigma

@@ -9,49 +9,85 @@ a rig is commissioned.
 
 from __future__ import annotations
 
-from math import degrees, radians
+from collections.abc import Mapping
+from dataclasses import replace
+from math import degrees, isfinite, radians
+from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
-from coec.calibration.types import Decision, Metric, Reason, StopReason, Verdict
+from coec.calibration.search.change_point import ChangePoint
+from coec.calibration.types import MOVED, Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 """Places of both in ξ = [rx ry rz tx ty tz]."""
 
+COUNTED = "range_edges"
+"""A figure that counts what the frames show, and that counts the same thing again for each that shows it."""
+
+UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
+"""Codes of reasons that more scenes would remedy."""
+
 _MEANING = {
     "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",
-    "range_edges": "too little structure: the sweeps have too few jumps in range",
+    "range_edges": "too little structure: the sweeps have too few independent jumps in range",
     "edge_contrast": "no pose stands out from the others",
     "runner_up": "ambiguous: another pose explains the window nearly as well",
     "newton_step_deg": "the objective is not at a maximum on every rotation axis",
     "newton_step_m": "the objective is not at a maximum on every translation axis",
     "peakedness_per_deg2": "the objective is too flat on at least one rotation axis",
-    "sigma_deg": "the frames disagree on a rotation, or are too few to tell",
-    "sigma_m": "the frames disagree on a translation, or are too few to tell",
+    "sigma_deg": "what was seen does not settle a rotation, or is too little to tell",
+    "sigma_m": "what was seen does not settle a translation, or is too little to tell",
     "overlap": "too few LiDAR points are in view",
+    MOVED: "the camera moved while the window was taken",
 }
 
 
-def shape_metrics(evaluation: Evaluation, curvature: Curvature, limits: VerdictConfig) -> tuple[Metric, ...]:
-    """What any objective has to show at an optimum: no slope, a peak, an uncertainty worth the name, enough in view."""
+SAME_SCENE = 0.5
+"""Share of the frames below which the independent looks of a window say that it saw one scene: on recordings in motion
+they are worth three quarters of their number and more, of a standing vehicle a quarter to half."""
+
+
+def counted_once(metrics: tuple[Metric, ...], looks: float, frames: int) -> tuple[Metric, ...]:
+    """The metrics of an objective, with what frames have in common counted once, not in each of them. Where the number
+    of independent `looks` is not known the frames are counted."""
+    share = looks / frames if isfinite(looks) else 1.0
+    return tuple(replace(m, value=m.value * share) if m.name == COUNTED else m for m in metrics)
+
+
+def shape_metrics(
+    evaluation: Evaluation, curvature: Curvature, sigma: NDArray[np.float64], limits: VerdictConfig
+) -> tuple[Metric, ...]:
+    """What any objective has to show at an optimum: no slope, a peak, standard deviations `sigma` (6,) worth the name,
+    enough in view."""
     peakedness = float(np.min(curvature.peakedness(evaluation.score))) * radians(1.0) ** 2
     metrics = [
         Metric(
             "newton_step_deg", degrees(_newton_step(curvature, ROTATION)), limits.max_newton_step_deg, at_least=False
         ),
         Metric("peakedness_per_deg2", peakedness, limits.min_peakedness_per_deg2, at_least=True),
-        Metric("sigma_deg", degrees(float(np.max(curvature.sigma[ROTATION]))), limits.max_sigma_deg, at_least=False),
+        Metric("sigma_deg", degrees(float(np.max(sigma[ROTATION]))), limits.max_sigma_deg, at_least=False),
         Metric("overlap", evaluation.overlap, limits.min_overlap, at_least=True),
     ]
     if np.isfinite(curvature.first_derivative[TRANSLATION]).any():
         step_m = _newton_step(curvature, TRANSLATION)
-        sigma_m = float(np.max(curvature.sigma[TRANSLATION][np.isfinite(curvature.first_derivative[TRANSLATION])]))
+        sigma_m = float(np.max(sigma[TRANSLATION][np.isfinite(curvature.first_derivative[TRANSLATION])]))
         metrics.append(Metric("newton_step_m", step_m, limits.max_newton_step_m, at_least=False))
         metrics.append(Metric("sigma_m", sigma_m, limits.max_sigma_m, at_least=False))
     return tuple(metrics)
+
+
+def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Metric, ...]:
+    """What the likeliest change within the window gains over no change; nothing where changes were not looked for. A
+    change of the scene gains nothing, nor does a turn below `min_change_deg`: scenes differ by that without a knock."""
+    if change is None:
+        return ()
+    gain = change.gain if change.of_camera and degrees(change.turn_rad) >= limits.min_change_deg else 0.0
+    return (Metric(MOVED, gain, limits.max_change_gain, at_least=False),)
 
 
 def _newton_step(curvature: Curvature, axes: slice) -> float:
@@ -62,13 +98,27 @@ def _newton_step(curvature: Curvature, axes: slice) -> float:
     return float(np.max(np.abs(first) / second)) if (second > 0.0).all() else float("inf")
 
 
-def judge(metrics: tuple[Metric, ...], stop: StopReason) -> Verdict:
-    """Equation (2) over the metrics of the objective and of its optimum."""
+def judge(
+    metrics: tuple[Metric, ...],
+    stop: StopReason,
+    looks: float,
+    frames: int,
+    details: Mapping[str, str] = MappingProxyType({}),
+) -> Verdict:
+    """Equation (2) over the metrics of the objective and of its optimum. A window that is too uncertain because its
+    `frames` are worth few independent `looks` is told to need motion. `details` say more of what a metric means in this
+    window, by its name."""
     reasons = [
-        Reason(metric.name, f"{_MEANING[metric.name]}: {metric.value:.3g}, limit {metric.limit:.3g}")
+        Reason(
+            metric.name,
+            f"{_MEANING[metric.name]}{details.get(metric.name, '')}: {metric.value:.3g}, limit {metric.limit:.3g}",
+        )
         for metric in metrics
         if not metric.passed
     ]
     if stop is not StopReason.TOLERANCE:
         reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
+    if looks < SAME_SCENE * frames and any(reason.code in UNCERTAIN for reason in reasons):
+        told = f"{frames} frames are worth {looks:.1f} independent ones: a window taken in motion tells more"
+        reasons.append(Reason("motion", told))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from coec.errors import CoecError
+from coec.errors import CoecError, UsageError
 
 EXIT_USAGE = 2
 EXIT_FAULT = 70
@@ -131,10 +131,26 @@ def _calibrate(
 
 @app.command("evaluate")
 def _evaluate(
-    source: Source,
     rotation_deg: Annotated[
         float, typer.Option(help="Radius of the sphere of starts, degrees.", metavar="R", min=0, show_default=False)
     ],
+    source: Annotated[str | None, typer.Argument(metavar="SOURCE", help=SOURCE_HELP, show_default=False)] = None,
+    closure: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            help="Instead of SOURCE: two cameras (or LiDARs) of one vehicle, each calibrated by itself; tells how "
+            "far their results miss the pose between them.",
+            metavar="A B",
+        ),
+    ] = None,
+    relative: Annotated[
+        str | None,
+        typer.Option(
+            help="With --closure: pose of sensor A in the frame of B, degrees and metres; without it, as the "
+            "calibrations of both recordings tell.",
+            metavar="RX,RY,RZ,TX,TY,TZ",
+        ),
+    ] = None,
     directions: Annotated[int, typer.Option(help="Number of starts.", metavar="N", min=1)] = 200,
     translation_m: Annotated[
         float, typer.Option(help="Radius of the sphere of starts, metres.", metavar="T", min=0)
@@ -168,6 +184,15 @@ def _evaluate(
             min=0,
         ),
     ] = 0,
+    nees: Annotated[
+        int,
+        typer.Option(
+            help="Also hold errors against claimed standard deviations: N windows one after the other against the "
+            "truth (of a recording: its own calibration), and N splits into halves: normalised.png.",
+            metavar="N",
+            min=0,
+        ),
+    ] = 0,
     detection: Annotated[
         int,
         typer.Option(
@@ -182,10 +207,13 @@ def _evaluate(
     as_json: Json = False,
 ) -> None:
     """Solve from starts all around the source's calibration: hit rate, bias, spread, and how good the verdicts are."""
+    from coec.cli import closure as closure_command
     from coec.cli import evaluate as command
 
+    if (source is None) == (closure is None):
+        raise UsageError("coec evaluate: give a SOURCE, or --closure A B, and not both")
     options = command.Options(
-        source=source,
+        source=source or "",
         rotation_deg=rotation_deg,
         directions=directions,
         translation_m=translation_m,
@@ -198,11 +226,21 @@ def _evaluate(
         against_frames=against_frames,
         against_slice=against_slice,
         halves=halves,
+        nees=nees,
         detection=detection,
         output=output,
         as_json=as_json,
     )
-    raise typer.Exit(command.run(options))
+    if closure is None:
+        if relative is not None:
+            raise UsageError("--relative tells the pose between two sources: it needs --closure A B")
+        raise typer.Exit(command.run(options))
+    if objective == command.ALL or against_frames or against_slice or halves or nees or detection or camera_model:
+        raise UsageError(
+            "--closure is an experiment of its own: leave out --objective all, --against-frames, --against-slice, "
+            "--halves, --nees, --detection and --camera-model"
+        )
+    raise typer.Exit(closure_command.run(closure_command.Options(*closure, options, relative)))
 
 
 @app.command("commission")
@@ -275,6 +313,24 @@ def _diagnose(
         frames=frames,
         as_json=as_json,
     )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("alarms")
+def _alarms(
+    hours: Annotated[float, typer.Option(help="Hours of driving with a right mount.", min=0.1)] = 100.0,
+    steps: Annotated[int, typer.Option(help="Drawn steps of every size.", min=1)] = 20,
+    period_s: Annotated[float, typer.Option("--period", help="Seconds between checks.")] = 5.0,
+    between_h: Annotated[float, typer.Option("--between", help="Hours between false alarms, as configured.")] = 100.0,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for alarms.json and delay.png.", metavar="DIR", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """How often the monitor accuses a mount that is right, and how soon it notices one that moved (drawn checks)."""
+    from coec.cli import alarms as command
+
+    options = command.Options(hours, steps, period_s, between_h, output, as_json)
     raise typer.Exit(command.run(options))
 
 

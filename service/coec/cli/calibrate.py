@@ -91,7 +91,7 @@ def run(options: Options) -> int:
     Raises:
         CoecError: there is no result.
     """
-    xi = None if options.perturb is None else windows.perturbation_of(options.perturb)
+    xi = None if options.perturb is None else windows.vector_of("--perturb", options.perturb)
     with console.progress() as bars:
         times = StageTimes(bars)
         loaded = windows.load(
@@ -150,7 +150,8 @@ def refitted(window: Window, model: str) -> tuple[Window, CameraFit]:
     rig: Rig = window.rig
     fit = fit_double_sphere(rig.camera)
     quality = CameraFit(FITTED, name_of(rig.camera), fit.residual_rms_px, fit.residual_max_px, fit.coverage)
-    return replace(window, rig=replace(rig, camera=fit.camera)), quality
+    fitted = replace(rig, camera=fit.camera, camera_residual_px=fit.residual_max_px)
+    return replace(window, rig=fitted), quality
 
 
 def _document(
@@ -220,8 +221,19 @@ def _show(
         )
     if offset is not None:
         console.show(f"camera after its stamp: {_offset_text(offset)}")
+    if result.independent_looks is not None:
+        console.show(
+            f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent looks{_together(result)}"
+        )
     stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in document["elapsed_s"].items())
     console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")
+
+
+def _together(result: CalibrationResult) -> str:
+    """How the errors of turns and shifts go together, where both were solved."""
+    pairs = {"pitch and height": result.correlation_pitch_height, "yaw and side": result.correlation_yaw_side}
+    told = ", ".join(f"{names} {value:+.2f}" for names, value in pairs.items() if value is not None)
+    return f"; correlation of errors: {told}" if told else ""
 
 
 def _offset_text(offset: TimeOffset) -> str:

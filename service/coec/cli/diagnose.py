@@ -77,7 +77,7 @@ def _tabulate(rigged: commission.Rigged, options: Options, times: calibrate_comm
 def _check(rigged: commission.Rigged, options: Options) -> int:
     window = rigged.windows[0]
     if options.perturb is not None:
-        moved = se3.perturb(window.T_camera_lidar_start, windows.perturbation_of(options.perturb))
+        moved = se3.perturb(window.T_camera_lidar_start, windows.vector_of("--perturb", options.perturb))
         window = replace(window, T_camera_lidar_start=moved)
     baseline = None
     if options.rig is not None:

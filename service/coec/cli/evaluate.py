@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import degrees, radians
 from pathlib import Path
@@ -13,13 +14,14 @@ from rich.progress import Progress
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.ports import DepthModel
-from coec.calibration.types import Window
+from coec.calibration.types import Matrix4, Window
 from coec.cli import calibrate as calibrate_command
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
 from coec.errors import CalibrationError, UsageError
-from coec.evaluation import experiments, statistics
+from coec.evaluation import experiments, normalised_errors, split_halves, statistics
 from coec.evaluation.detection import require_enough
 from coec.evaluation.experiments import Bench, Stages
+from coec.evaluation.normalised_errors import NormalisedErrors
 from coec.evaluation.split_halves import Halves
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
 from coec.geometry.cameras import name_of
@@ -30,6 +32,7 @@ from coec.reports.evaluation_documents import (
     frames_point_of,
     halves_of,
     in_degrees,
+    normalised_of,
     slice_point_of,
     spread_of,
     verdicts_of,
@@ -37,7 +40,8 @@ from coec.reports.evaluation_documents import (
 from coec.schemas.base import to_json
 from coec.schemas.evaluation import ComparisonReport, DetectionReport, EvaluationReport
 from coec.schemas.replies import Vector6
-from coec.sources import windows
+from coec.sources import open_source, windows
+from coec.sources.recording import KnowsTruth
 
 MARGIN_DEG, MARGIN_M = 5.0, 0.2
 REACH_MARGIN_DEG, REACH_MARGIN_M = 3.0, 0.15
@@ -47,13 +51,18 @@ may overshoot."""
 ALL = "all"
 """Objective that stands for `METHODS`, one after the other."""
 
+SIMULATED_TRUTH, OWN_CALIBRATION = "the simulated truth", "the source's own calibration"
+OTHER_HALF = "the other half of the frames"
+"""What normalised errors are counted from."""
+
 METHODS = ("fused", "mi", "intensity")
 """This project's, the paper's, and the one before it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The arguments of the command; None = not given. `halves` and `detection` are numbers of splits, 0 = none."""
+    """The arguments of the command; None = not given. `halves` and `detection` are numbers of splits, `nees` is one of
+    windows and of splits; 0 = none."""
 
     source: str
     rotation_deg: float
@@ -68,6 +77,7 @@ class Options:
     against_frames: bool = False
     against_slice: bool = False
     halves: int = 0
+    nees: int = 0
     detection: int = 0
     output: Path | None = None
     as_json: bool = False
@@ -93,6 +103,7 @@ class _Experiments:
     frames: tuple[FramesPoint, ...]
     slices: tuple[SlicePoint, ...]
     halves: Halves | None
+    normalised: dict[str, NormalisedErrors]
     detection: DetectionReport | None
 
 
@@ -228,6 +239,8 @@ def _evaluate(options: Options, subject: _Subject, stages: Stages) -> tuple[Eval
         of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
         draw = stages.begin("draw", None)
         evaluation_pictures.write(options.output, bench, of_starts, done.outcomes, done.frames, done.slices, draw)
+        if done.normalised:
+            evaluation_pictures.write_normalised(options.output, bench.window.window_id, done.normalised)
         table = evaluation_tables.csv_of(bench.reference, done.outcomes)
         output.write(options.output / "starts.csv", table.encode())
     return _report(options, bench, subject.vehicle, done, stages.elapsed_s()), done.outcomes
@@ -245,15 +258,34 @@ def _experiments(options: Options, subject: _Subject, bench: Bench, stages: Stag
     outcomes = experiments.from_starts(bench, poses, stages)
     frames = experiments.against_frames(bench, poses, stages) if options.against_frames else ()
     slices = experiments.against_slice(bench, subject.model, cut, poses, stages) if options.against_slice else ()
+    radii = (radians(options.rotation_deg), options.translation_m)
+    splits = options.halves or options.nees
+    halved = experiments.in_halves(bench, splits, *radii, stages) if splits else []
     halves = None
     if options.halves:
-        radii = (radians(options.rotation_deg), options.translation_m)
-        halves = experiments.in_halves(bench, options.halves, *radii, stages)
+        halves = split_halves.compare(halved, len(bench.window.pairs) // 2, bench.configuration.search.dof)
+    normalised = {}
+    if options.nees:
+        against, true_pose = _truth(options.source, bench)
+        starts = experiments.poses_of(bench, options.nees, options.rotation_deg, options.translation_m)
+        apart = experiments.in_windows(bench, subject.model, cut, starts, true_pose, stages)
+        normalised[against] = normalised_errors.normalise(normalised_errors.of_outcomes(apart), len(apart))
+        # Every split sees the same frames: they count as one.
+        normalised[OTHER_HALF] = normalised_errors.normalise(normalised_errors.of_differences(halved), independent=1)
     detection = None
     if options.detection:
         tried = experiments.detected(bench, options.detection, experiments.CHECKS, stages)
         detection = detection_of(tried, options.detection, len(bench.window.pairs))
-    return _Experiments(from_reference, outcomes, frames, slices, halves, detection)
+    return _Experiments(from_reference, outcomes, frames, slices, halves, normalised, detection)
+
+
+def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
+    """What the errors of windows are counted from, and its name: the truth where the source knows it, else its own
+    calibration."""
+    recording = open_source(source)
+    if isinstance(recording, KnowsTruth):
+        return SIMULATED_TRUTH, recording.truth
+    return OWN_CALIBRATION, lambda _: bench.reference
 
 
 def _report(
@@ -300,6 +332,7 @@ def _report(
         slices=tuple(slice_point_of(point) for point in done.slices),
         halves=None if done.halves is None else halves_of(done.halves),
         detection=done.detection,
+        normalised=tuple(normalised_of(against, found) for against, found in done.normalised.items()),
         depth_identity=solved.depth_identity,
         config_hash=solved.config_hash,
         elapsed_s=elapsed_s,

@@ -1,6 +1,9 @@
-"""How well a wrong extrinsic is seen: limits learned on some pairs of a recording, tried on the others.
+"""How well a wrong extrinsic is seen: limits learned on one stretch of a recording, tried on the rest, with no pair in
+both.
 
-Both classifiers are tried on the same checks: the paper's, equation (2), and the distance of the local optimum.
+Both classifiers are tried on the same checks: the distance of the local optimum, which decides, and for comparison the
+paper's, equation (2). On other pairs than those its limits were learned on, that one flagged 27 to 48 % of right poses
+of KITTI-360: mutual information tells the scene as much as the pose.
 """
 
 from __future__ import annotations
@@ -21,8 +24,11 @@ from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 
+RIGHT = "right"
+"""Name of no move."""
+
 MOVES = (
-    ("right", 0.0, 0.0),
+    (RIGHT, 0.0, 0.0),
     ("0.5 deg", radians(0.5), 0.0),
     ("1 deg", radians(1.0), 0.0),
     ("3 deg", radians(3.0), 0.0),
@@ -82,8 +88,8 @@ def try_detection(
     checks: int,
     heard: Callable[[int, int], None],
 ) -> list[Tried]:
-    """Splits the pairs in two `splits` times (seeded), learns on one half, and tries `checks` checks after every move
-    on the other; `heard(done, total)` counts the splits.
+    """Cuts the pairs, taken as a ring, in two halves `splits` times (seeded), learns on one, and tries `checks` checks
+    after every move on the other; `heard(done, total)` counts the splits.
 
     Raises:
         CalibrationError: fewer than `MIN_RECORDED` pairs.
@@ -93,7 +99,8 @@ def try_detection(
     tried = []
     for split in range(splits):
         rng = np.random.default_rng([SEED, split])
-        order = rng.permutation(count)
+        # Neighbours on the same side: the limits are tried at places where they were not learned.
+        order = (int(rng.integers(count)) + np.arange(count)) % count
         learned, kept = sorted(order[: (count + 1) // 2].tolist()), order[(count + 1) // 2 :].tolist()
         of_learned = evidence.of(learned)
         accuracies = learn_accuracy(of_learned, right, config)

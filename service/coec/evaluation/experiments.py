@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import radians
+from math import pi, radians
 
 from rich.progress import Progress
 
@@ -20,7 +20,6 @@ from coec.config import CalibrationConfig, LimitsConfig
 from coec.errors import CalibrationError, DecodeError, SourceError
 from coec.evaluation import split_halves, starts, statistics
 from coec.evaluation.detection import Tried, try_detection
-from coec.evaluation.split_halves import Halves
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint, Trial
 
 SUBSETS = 20
@@ -78,9 +77,9 @@ class Bench:
         return self.window.rig.T_camera_lidar_nominal
 
     def solve(self, start: Matrix4, frames: Sequence[int] | None = None) -> Outcome:
-        """From one start, on all frames or on those with the given indices."""
+        """From one start, as a guess, on all frames or on those with the given indices."""
         pairs = self.window.pairs if frames is None else tuple(self.window.pairs[index] for index in frames)
-        window = replace(self.window, T_camera_lidar_start=start, pairs=pairs)
+        window = replace(self.window, T_camera_lidar_start=start, start_known_to_rad=pi, pairs=pairs)
         began_s = time.perf_counter()
         try:
             estimate = calibrate(window, self.depth, self.images, self.configuration, Silence())
@@ -201,7 +200,9 @@ def against_slice(
     return tuple(points)
 
 
-def in_halves(bench: Bench, splits: int, rotation_rad: float, translation_m: float, stages: Stages) -> Halves:
+def in_halves(
+    bench: Bench, splits: int, rotation_rad: float, translation_m: float, stages: Stages
+) -> list[tuple[Outcome, Outcome]]:
     """Disjoint halves of the frames, each solved from a start of its own, this far from the reference."""
     available = len(bench.window.pairs)
     poses = starts.starts(bench.reference, 2 * splits, rotation_rad, translation_m)
@@ -211,7 +212,44 @@ def in_halves(bench: Bench, splits: int, rotation_rad: float, translation_m: flo
         one, other = split_halves.split(available, trial)
         outcomes.append((bench.solve(poses[2 * trial], one), bench.solve(poses[2 * trial + 1], other)))
         heard(trial + 1, "")
-    return split_halves.compare(outcomes, available // 2, bench.configuration.search.dof)
+    return outcomes
+
+
+def in_windows(
+    bench: Bench,
+    model: DepthModel,
+    cut: Callable[[float, float], Window],
+    poses: Sequence[Matrix4],
+    true_pose: Callable[[int], Matrix4],
+    stages: Stages,
+) -> list[Outcome]:
+    """The recording cut into as many windows as there are starts, one after the other: they share no frame. Each is
+    solved from its start and held against `true_pose` at the time of its last pair (ns); windows without a camera frame
+    are left out.
+
+    Args:
+        bench, model, cut: as for `against_slice`.
+        poses: starts, (4, 4).
+        true_pose: T_camera_lidar (4, 4) at a sensor time.
+        stages: hears of every window.
+    """
+    stamps_ns = [pair.stamp_ns for pair in bench.window.pairs]
+    # A microsecond more: the last frame belongs to the last window.
+    length_s = ((stamps_ns[-1] - stamps_ns[0]) * 1e-9 + 1e-6) / len(poses)
+    heard = stages.begin("windows", len(poses))
+    outcomes = []
+    for index, pose in enumerate(poses):
+        heard(index, "")
+        try:
+            # A nanosecond less than to the next one.
+            window = cut(index * length_s, (index + 1) * length_s - 1e-9)
+        except SourceError:
+            continue
+        depth = inferred(window, model, lambda *_: None)
+        solved = replace(bench, window=window, depth=depth, images=greys_of(window)).solve(pose)
+        outcomes.append(statistics.score(solved.trial, true_pose(window.stamp_ns), bench.configuration.search.dof))
+    heard(len(poses), "")
+    return outcomes
 
 
 def detected(bench: Bench, splits: int, checks: int, stages: Stages) -> list[Tried]:

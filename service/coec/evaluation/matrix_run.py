@@ -17,12 +17,13 @@ from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.pairing import Pairer
+from coec.calibration.frames.sampling import stands
 from coec.calibration.monitor.change_detector import Finding, MonitorState, after_observation, alarm_levels
 from coec.calibration.monitor.check import check_at, gather
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, judge_check
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Decision, FramePair, Matrix4, Window
-from coec.config import CalibrationConfig, LimitsConfig, MonitorConfig, PairingConfig
+from coec.config import CalibrationConfig, LimitsConfig, MonitorConfig, PairingConfig, WindowConfig
 from coec.errors import CoecError, SourceError
 from coec.evaluation.matrix import is_hit
 from coec.evaluation.matrix_drives import MatrixDrive
@@ -183,7 +184,8 @@ def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig
         for first in range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS):
             part = evidence.of(range(first, first + CHECK_PAIRS))
             seen = judge_check(part, check_at(part, pose, configuration), pose, None)
-            before, state = state, after_observation(state, seen, levels)
+            stood = tuple(pair.stamp_ns for pair in part.pairs if stands(pair, WindowConfig()))
+            before, state = state, after_observation(state, replace(seen, standing_stamps_ns=stood), levels)
             checks += 1
             flagged += seen.flagged and not seen.causes
             blind += bool(seen.causes)

@@ -4,9 +4,12 @@ decided or kept has to be the same to the byte."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import fsum, sqrt
+from math import copysign, fsum, hypot, sqrt
 
 Rows = Sequence[Sequence[float]]
+
+MAX_SWEEPS = 30
+"""Of rotations in `eigen`; six by six is done after five or six."""
 
 
 def solved(matrix: Rows, right: Sequence[float]) -> list[float]:
@@ -34,6 +37,39 @@ def congruent(a: Rows, m: Rows) -> list[list[float]]:
     inner = range(len(m))
     left = [[fsum(row[k] * m[k][j] for k in inner) for j in inner] for row in a]
     return [[fsum(of_left[k] * row[k] for k in inner) for row in a] for of_left in left]
+
+
+def eigen(matrix: Rows) -> list[tuple[float, list[float]]]:
+    """Eigenvalues of a symmetric matrix (n, n), the largest first, each with its unit vector (n,).
+
+    Jacobi's rotations, row by row (Golub, Van Loan 2013, section 8.5).
+    """
+    n = len(matrix)
+    a = [[float(value) for value in row] for row in matrix]
+    vectors = [[float(i == j) for j in range(n)] for i in range(n)]
+    for _ in range(MAX_SWEEPS):
+        beside = fsum(abs(a[i][j]) for i in range(n) for j in range(i))
+        if beside <= 1e-15 * fsum(abs(a[i][i]) for i in range(n)):
+            break
+        for p in range(n):
+            for q in range(p + 1, n):
+                if a[p][q] != 0.0:
+                    _rotate(a, vectors, p, q)
+    pairs = [(a[k][k], [row[k] for row in vectors]) for k in range(n)]
+    return sorted(pairs, key=lambda pair: -pair[0])
+
+
+def _rotate(a: list[list[float]], vectors: list[list[float]], p: int, q: int) -> None:
+    """Turns the plane of two axes so that they are uncorrelated."""
+    tau = (a[q][q] - a[p][p]) / (2.0 * a[p][q])
+    tangent = copysign(1.0, tau) / (abs(tau) + hypot(1.0, tau))
+    cosine = 1.0 / hypot(1.0, tangent)
+    sine = tangent * cosine
+    for row in (*a, *vectors):
+        row[p], row[q] = cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]
+    for k in range(len(a)):
+        a[p][k], a[q][k] = cosine * a[p][k] - sine * a[q][k], sine * a[p][k] + cosine * a[q][k]
+    a[p][q] = a[q][p] = 0.0
 
 
 def _cholesky(matrix: Rows) -> list[list[float]]:

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.evaluation import statistics
+from coec.evaluation.closure import Closure
 from coec.evaluation.detection import Tried, table
+from coec.evaluation.normalised_errors import BIN_EDGES, CONFIDENCES, NormalisedErrors
 from coec.evaluation.split_halves import Halves
 from coec.schemas import evaluation as wire
 from coec.schemas.replies import Maybe6
@@ -81,6 +83,45 @@ def detection_of(tried: Sequence[Tried], splits: int, pairs: int) -> wire.Detect
     """The checks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
     moves = tuple(wire.DetectionRow(**asdict(row)) for row in table(tried))
     return wire.DetectionReport(splits=splits, pairs=pairs, moves=moves)
+
+
+def normalised_of(against: str, found: NormalisedErrors) -> wire.NormalisedErrorsReport:
+    """Normalised errors, counted from what `against` names."""
+    within = [cast("Maybe6", tuple(_numbers(row))) for row in found.coverage]
+    low, high = found.nees_bounds
+    return wire.NormalisedErrorsReport(
+        against=against,
+        judged=found.judged,
+        refused=found.refused,
+        independent=found.independent,
+        rms=in_degrees(found.rms),
+        largest=in_degrees(found.largest),
+        sigma=in_degrees(found.sigma),
+        sigma_over_rms=cast("Maybe6", tuple(_numbers(found.sigma_over_rms))),
+        within_1_sigma=within[0],
+        within_2_sigma=within[1],
+        within_3_sigma=within[2],
+        bin_edges=BIN_EDGES,
+        histogram=tuple(tuple(int(count) for count in row) for row in found.histogram),
+        confidences=CONFIDENCES,
+        reliability=tuple(tuple(_numbers(column)) for column in found.reliability.T),
+        nees=number(found.nees),
+        nees_low=number(low),
+        nees_high=number(high),
+    )
+
+
+def closure_of(closure: Closure) -> wire.ClosureGroup:
+    """Closure errors on some frames."""
+    pairs_a, pairs_b = closure.pairs
+    return wire.ClosureGroup(
+        frames=closure.frames.value,
+        pairs_a=pairs_a,
+        pairs_b=pairs_b,
+        errors=normalised_of("the known pose between both", closure.normalised),
+        rotation_deg=angle_spread_of(closure.rotation_rad),
+        translation_m=spread_of(closure.translation_m),
+    )
 
 
 def in_degrees(rad_m: NDArray[np.float64]) -> Maybe6:

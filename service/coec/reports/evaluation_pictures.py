@@ -12,8 +12,9 @@ from coec.calibration.estimators import sight_of
 from coec.calibration.ports import Silence
 from coec.evaluation import profiles, starts, statistics
 from coec.evaluation.experiments import SUBSETS, Bench
+from coec.evaluation.normalised_errors import NormalisedErrors
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
-from coec.reports import curves, pictures, plots
+from coec.reports import curves, normalised_plots, pictures, plots
 from coec.reports.evaluation_tables import setting, verdict
 from coec.sources import windows
 
@@ -78,6 +79,15 @@ def write_comparison(
     title = f"{window_id}: {of_starts.directions} starts, {of_starts}"
     picture = plots.compared(outcomes, starts.directions(of_starts.directions), title)
     output.write(folder / "bullseye.png", picture)
+
+
+def write_normalised(folder: Path, name: str, found: Mapping[str, NormalisedErrors]) -> None:
+    """Errors over what was claimed for them, by what they are counted from: normalised.png.
+
+    Raises:
+        OutputError: the folder or the file cannot be written.
+    """
+    output.write(folder / "normalised.png", normalised_plots.normalised(found, name))
 
 
 def write_landscape(folder: Path, bench: Bench, title: str, heard: Callable[[int, str], None]) -> None:

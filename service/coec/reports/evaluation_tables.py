@@ -10,16 +10,19 @@ from typing import Any
 
 from coec.calibration.types import Matrix4
 from coec.evaluation import statistics
+from coec.evaluation.detection import RIGHT
 from coec.evaluation.statistics import Outcome
 from coec.geometry import se3
 from coec.reports import console
 from coec.reports.evaluation_documents import in_degrees
 from coec.schemas.evaluation import (
+    ClosureReport,
     ComparisonReport,
     DetectionReport,
     EvaluationReport,
     FramesPoint,
     HalvesReport,
+    NormalisedErrorsReport,
     SlicePoint,
     Spread,
 )
@@ -81,7 +84,7 @@ def show_comparison(report: ComparisonReport) -> None:
     for name, reason in report.not_evaluated.items():
         console.show(f"{name} was not evaluated: {reason}", "yellow")
     for name, method in report.methods.items():
-        if method.frames or method.slices or method.halves is not None or method.detection is not None:
+        if method.frames or method.slices or method.halves or method.normalised or method.detection:
             console.show(name, "bold")
             _show_experiments(method)
     console.show(_seconds(report.elapsed_s))
@@ -179,8 +182,61 @@ def _show_experiments(report: EvaluationReport) -> None:
         console.out.print(slices)
     if report.halves is not None:
         _show_halves(report.halves, report.dof)
+    for of_claims in report.normalised:
+        _show_normalised(of_claims)
     if report.detection is not None:
         show_detection(report.detection)
+
+
+def show_closure(report: ClosureReport) -> None:
+    """How two calibrations close."""
+    console.show(f"A {report.source_a}\nB {report.source_b}")
+    known = ", ".join(
+        f"{console.figure(value)} {unit}" for value, unit in zip(report.known, console.UNITS, strict=True)
+    )
+    told = "as the recordings tell" if report.from_recordings else "as given"
+    console.show(f"{report.relation}; A in the frame of B, {told}: {known}")
+    console.show(
+        f"{report.trials} starts {setting(report.start_rotation_deg, report.start_translation_m)}, objective "
+        f"{report.objective}, {report.dof} degrees of freedom"
+    )
+    for group in report.groups:
+        pairs = f"{group.pairs_a}" if group.pairs_a == group.pairs_b else f"{group.pairs_a} and {group.pairs_b}"
+        console.show(f"{group.frames}: {pairs} pairs", "bold")
+        spreads = console.table("closure error", "median", "p95", "max", "unit", right=(1, 2, 3))
+        _add(spreads, "rotation", group.rotation_deg, "deg", 3)
+        if report.dof == 6:
+            _add(spreads, "translation", group.translation_m, "m", 4)
+        console.out.print(spreads)
+        _show_normalised(group.errors)
+    console.show(_seconds(report.elapsed_s))
+
+
+def _show_normalised(found: NormalisedErrorsReport) -> None:
+    """Errors beside what was claimed for them."""
+    console.show(f"errors against {found.against}: {found.judged} accepted, {found.refused} refused")
+    columns = ("error", "rms", "largest", "σ claimed", "σ / rms", "within 1 σ", "2 σ", "3 σ")
+    table = console.table(*columns, "unit", right=range(1, len(columns)))
+    for axis, name in enumerate(console.AXIS_NAMES):
+        if found.sigma[axis] is None:
+            continue
+        coverage = [row[axis] for row in (found.within_1_sigma, found.within_2_sigma, found.within_3_sigma)]
+        table.add_row(
+            name,
+            console.figure(found.rms[axis], 4),
+            console.figure(found.largest[axis], 4),
+            console.figure(found.sigma[axis], 4),
+            console.figure(found.sigma_over_rms[axis], 2),
+            *("-" if share is None else f"{100 * share:.1f} %" for share in coverage),
+            console.UNITS[axis],
+        )
+    console.out.print(table)
+    if found.nees is not None:
+        limits = f"{console.figure(found.nees_low, 2)} to {console.figure(found.nees_high, 2)}"
+        console.show(
+            f"NEES per axis {found.nees:.2f}; of true claims {limits} in 95 % of evaluations with {found.independent} "
+            "results that share no frame"
+        )
 
 
 def show_detection(detection: DetectionReport) -> None:
@@ -190,8 +246,15 @@ def show_detection(detection: DetectionReport) -> None:
         table.add_row(row.name, str(row.checks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
     console.out.print(table)
     console.show(
-        f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other"
+        f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other; "
+        "no pair is in both"
     )
+    right = next((row for row in detection.moves if row.name == RIGHT), None)
+    if right is not None:
+        console.show(
+            "equation (2) is shown for comparison and decides nothing: it flags "
+            f"{100 * right.flagged_by_paper:.1f} % of right extrinsics"
+        )
 
 
 def _show_halves(halves: HalvesReport, dof: int) -> None:

@@ -80,15 +80,100 @@ class DetectionRow(Part):
     name: str = Field(description="`right`, or how far the extrinsic was moved")
     checks: Count
     flagged: float = Field(ge=0, le=1, description="by the distance of the local optimum")
-    flagged_by_paper: float = Field(ge=0, le=1, description="by equation (2) with learned limits")
+    flagged_by_paper: float = Field(
+        ge=0, le=1, description="by equation (2) with learned limits; for comparison, it decides nothing"
+    )
 
 
 class DetectionReport(Part):
-    """How well a wrong extrinsic is seen: limits learned on one half of the pairs, tried on the other."""
+    """How well a wrong extrinsic is seen: limits learned on one half of the pairs, tried on the other; none in both."""
 
     splits: Count
     pairs: Count = Field(description="camera-LiDAR pairs that were split in two")
     moves: tuple[DetectionRow, ...]
+
+
+class NormalisedErrorsReport(Part):
+    """Errors of accepted results over what they claim: rx ry rz (deg), tx ty tz (m); null on axes of which nothing is
+    claimed."""
+
+    against: str = Field(description="what the errors are counted from")
+    judged: Count = Field(description="results that were accepted and claim a standard deviation")
+    refused: Count = Field(description="the others, which stand in no figure")
+    independent: Count = Field(description="judged results that share no frame; the bounds are those of so many")
+    rms: Maybe6
+    largest: Maybe6 = Field(description="absolute error")
+    sigma: Maybe6 = Field(description="claimed, mean")
+    sigma_over_rms: Maybe6 = Field(description="1 for a true claim; more hides behind a wide one")
+    within_1_sigma: Maybe6 = Field(description="share of the errors; 0.683 of normal ones")
+    within_2_sigma: Maybe6 = Field(description="share of the errors; 0.954 of normal ones")
+    within_3_sigma: Maybe6 = Field(description="share of the errors; 0.997 of normal ones")
+    bin_edges: tuple[float, ...] = Field(description="of the histogram, in σ; the outermost bins are open")
+    histogram: tuple[tuple[Count, ...], ...] = Field(description="per axis, results by error over σ")
+    confidences: tuple[float, ...] = Field(description="shares that intervals should hold")
+    reliability: tuple[tuple[float | None, ...], ...] = Field(description="per axis, shares that they do hold")
+    nees: float | None = Field(description="mean normalised error squared per axis; 1 for a true claim")
+    nees_low: float | None = Field(description="a true claim stays above in 97.5 % of evaluations")
+    nees_high: float | None = Field(description="and below in 97.5 %")
+
+
+class ClosureGroup(Part):
+    """Closure errors of calibrations on some frames."""
+
+    frames: str = Field(description="all frames, the same half for both, or other halves")
+    pairs_a: Count = Field(description="camera-LiDAR pairs in a solve")
+    pairs_b: Count
+    errors: NormalisedErrorsReport
+    rotation_deg: Spread
+    translation_m: Spread = Field(description="null with 3 dof")
+
+
+class ClosureReport(Message):
+    """What `coec evaluate --closure A B --json` prints: two sensors, each calibrated by itself, against the pose
+    between them. Errors about and along the axes of B's camera."""
+
+    source_a: str
+    source_b: str
+    relation: str = Field(description="what the sources share")
+    known: Vector6 = Field(description="pose of sensor A in the frame of B: rx ry rz (deg), tx ty tz (m)")
+    from_recordings: bool = Field(description="whether the recordings told it, or the command line")
+    objective: str
+    dof: Literal[3, 6]
+    start_rotation_deg: float = Field(description="radius of the sphere of starts")
+    start_translation_m: float
+    trials: Count
+    groups: tuple[ClosureGroup, ...]
+    elapsed_s: dict[str, float] = Field(description="by stage, s")
+
+
+class FalseAlarmsRow(Part):
+    """Of a right mount: how often the evidence came to what is stated to be an alarm in so many hours."""
+
+    stated_h: float
+    driven_h: float = Field(description="drawn checks, hours of driving")
+    alarms: Count
+
+
+class DelayRow(Part):
+    """From a step of the mount to the check that notices it, s; null where it is not noticed in time."""
+
+    step_deg: float
+    steps: Count
+    suspect_s: Spread
+    confirmed_s: Spread
+
+
+class AlarmsReport(Message):
+    """What `coec alarms --json` prints: the change detector on drawn streams of checks."""
+
+    period_s: float = Field(description="between checks, s")
+    hours_between_false_alarms: float = Field(description="as configured")
+    hours_between_false_suspicions: float = Field(description="as configured")
+    false: tuple[FalseAlarmsRow, ...]
+    delays: tuple[DelayRow, ...]
+    creep_deg_per_h: float = Field(description="of a mount that turns steadily")
+    creep_suspect_h: Spread = Field(description="until it is suspected, h; null where not in time")
+    creep_confirmed_h: Spread = Field(description="until it is confirmed, h")
 
 
 class EvaluationReport(Message):
@@ -130,6 +215,9 @@ class EvaluationReport(Message):
     halves: HalvesReport | None = Field(description="agreement of disjoint halves; null if not asked for")
     detection: DetectionReport | None = Field(
         default=None, description="how well a wrong extrinsic is seen; null if not asked for"
+    )
+    normalised: tuple[NormalisedErrorsReport, ...] = Field(
+        default=(), description="errors over what is claimed for them; empty if not asked for"
     )
     depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
     config_hash: str = Field(description="of everything that decides the results, but for the start")

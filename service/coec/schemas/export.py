@@ -27,8 +27,10 @@ MESSAGES: tuple[type[Message], ...] = (
     replies.ErrorReply,
     replies.CalibrationResult,
     replies.CalibrationReport,
+    evaluation.AlarmsReport,
     evaluation.EvaluationReport,
     evaluation.ComparisonReport,
+    evaluation.ClosureReport,
     evaluation.ModelAssessment,
     matrix.MatrixReport,
 )

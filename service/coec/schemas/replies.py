@@ -17,6 +17,7 @@ Vector3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 Maybe6 = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
+Maybe6x6 = tuple[Maybe6, Maybe6, Maybe6, Maybe6, Maybe6, Maybe6]
 Flags6 = tuple[bool, bool, bool, bool, bool, bool]
 Count = Annotated[int, Field(ge=0)]
 Counts = dict[str, Count]
@@ -97,6 +98,15 @@ class Verdict(Part):
 # --- one result ---------------------------------------------------------------------------------------------
 
 
+class MovedWithin(Part):
+    """The camera moved while the window was taken."""
+
+    last_before_ns: int = Field(description="stamp of the last pair before it moved, ns")
+    first_after_ns: int = Field(description="stamp of the first pair after it, ns")
+    before: Transform = Field(description="camera_from_lidar that fits the pairs before it; turned, not shifted")
+    after: Transform = Field(description="likewise after it")
+
+
 class CalibrationResult(Message):
     """The result of calibrating one window. State, history, the window's file and `coec calibrate` carry the
     same."""
@@ -112,7 +122,19 @@ class CalibrationResult(Message):
     correction: Vector6 = Field(description="rx ry rz (deg), tx ty tz (m), from the nominal calibration")
     sigma: Maybe6 = Field(description="standard deviations (deg, m); null where not estimated")
     correction_rad_m: Vector6 = Field(description="`correction` in rad and m, exact")
-    sigma_rad_m: Maybe6 = Field(description="`sigma` in rad and m, exact")
+    noise: Maybe6x6 = Field(
+        description="covariance (rad, m), exact, of what differs from window to window; null: unknown"
+    )
+    systematic: dict[str, Vector6] = Field(
+        description="by its name, the shift (rad, m) by one standard deviation of an error that windows have in common"
+    )
+    correlation_pitch_height: float | None = Field(
+        description="of the errors of rx and ty; null where either is unknown"
+    )
+    correlation_yaw_side: float | None = Field(description="of the errors of ry and tx; null where either is unknown")
+    independent_looks: float | None = Field(
+        description="how many independent looks the pairs are worth: near 1 where the vehicle stood; null: unknown"
+    )
     solved: Flags6 = Field(description="axes that the search found")
     unobservable: Flags6 = Field(
         description="axes that were searched but that the window does not tell: kept as before"
@@ -132,6 +154,9 @@ class CalibrationResult(Message):
     compensation: Counts = Field(description="pairs by outcome of motion compensation")
     depth_identity: str = Field(description="sha256 of the depth network, or `precomputed`")
     config_hash: str = Field(description="of everything that decides the result")
+    moved: MovedWithin | None = Field(
+        default=None, description="set where the window was refused because the camera moved within it"
+    )
 
 
 class CalibrationReport(CalibrationResult):
@@ -166,6 +191,12 @@ class ExtrinsicReply(Message):
     status: Status = Field(description="of the latest attempt; not_accepted before the first")
     percent_complete: float = Field(ge=0, le=100, description="of the open window")
     axes: Axes
+    correlation_pitch_height: float | None = Field(
+        default=None, description="of the errors of rx and ty; null where either is unknown"
+    )
+    correlation_yaw_side: float | None = Field(
+        default=None, description="of the errors of ry and tx; null where either is unknown"
+    )
     valid_from_ns: int = Field(description="sensor time from which it holds, ns; 0 for nominal")
     data_stamp_ns: int | None = Field(description="last contributing pair, ns; null for nominal")
     window_id: str | None = Field(description="the window it came from; null for nominal")
@@ -193,7 +224,9 @@ class CheckReply(Part):
     pair_stamps_ns: tuple[int, ...] = Field(description="of all of them, ns, ascending")
     flagged: bool = Field(description="the pose is wrong, or the data are")
     weak: bool = Field(description="the edges are fainter than they should be: the check counts less")
-    flagged_by_paper: bool | None = Field(description="equation (2); null until the rig is commissioned")
+    flagged_by_paper: bool | None = Field(
+        description="equation (2), for comparison: it decides nothing; null until the rig is commissioned"
+    )
     causes: tuple[Reason, ...] = Field(description="what is wrong with the data; such a check says nothing of the pose")
     metrics: dict[str, MetricReply] = Field(description="by name")
     first_derivative: Maybe6 = Field(description="f' at the pose: dMI, nats per rad or m")

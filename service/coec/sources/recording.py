@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 from coec.config import CalibrationConfig
@@ -58,6 +58,15 @@ class Recording(Protocol):
             UsageError: an index out of range.
             SourceError: a file that cannot be read, names the file.
         """
+        ...
+
+
+@runtime_checkable
+class KnowsTruth(Protocol):
+    """A recording of which the extrinsic is known beyond doubt: it was simulated."""
+
+    def truth(self, stamp_ns: int) -> Matrix4:
+        """True T_camera_lidar (4, 4) at a time."""
         ...
 
 

@@ -94,18 +94,18 @@ def evenly(count: int, wanted: int) -> list[int]:
     return sorted({round(index) for index in np.linspace(0, count - 1, wanted)})
 
 
-def perturbation_of(text: str) -> NDArray[np.float64]:
-    """ξ (6,) in radians and metres from `rx,ry,rz[,tx,ty,tz]` in degrees and metres.
+def vector_of(option: str, text: str) -> NDArray[np.float64]:
+    """ξ (6,) in radians and metres from `rx,ry,rz[,tx,ty,tz]` in degrees and metres, the value of an option.
 
     Raises:
-        UsageError: it is not three or six finite numbers.
+        UsageError: it is not three or six finite numbers; names the option.
     """
     try:
         values = np.array([float(part) for part in text.split(",")])
     except ValueError as error:
-        raise UsageError(f"--perturb {text}: {error}") from error
+        raise UsageError(f"{option} {text}: {error}") from error
     if len(values) not in (3, 6) or not np.isfinite(values).all():
-        raise UsageError(f"--perturb {text}: give three numbers (degrees), or six (degrees, then metres)")
+        raise UsageError(f"{option} {text}: give three numbers (degrees), or six (degrees, then metres)")
     xi = np.zeros(6)
     xi[: len(values)] = values
     xi[:3] = np.radians(xi[:3])
@@ -113,8 +113,9 @@ def perturbation_of(text: str) -> NDArray[np.float64]:
 
 
 def started_at(window: Window, xi: NDArray[np.float64]) -> Window:
-    """The window with its start moved by ξ (6,), on the left."""
-    return replace(window, T_camera_lidar_start=se3.perturb(window.T_camera_lidar_start, xi))
+    """The window with its start moved by ξ (6,), on the left: a guess, then."""
+    start = se3.perturb(window.T_camera_lidar_start, xi)
+    return replace(window, T_camera_lidar_start=start, start_known_to_rad=math.pi)
 
 
 def rotation_error_deg(T_a: Matrix4, T_b: Matrix4) -> float:

@@ -15,10 +15,12 @@ from coec.calibration.types import (
     Decision,
     Estimate,
     Metric,
+    MovedWithin,
     Optimum,
     Reason,
     Rig,
     StopReason,
+    Uncertainty,
     Verdict,
 )
 from coec.geometry.cameras import build
@@ -64,7 +66,11 @@ def estimate(seed: int = 0, **changes: Any) -> Estimate:
         optimum=optimum,
         verdict=Verdict(Decision.FAILED, metrics, (Reason("at_bound", "The optimum lies at the bound."),)),
         correction=rng.normal(size=6) * 0.05,
-        sigma=np.array([*rng.random(3) * 1e-3, NAN, NAN, NAN]),
+        uncertainty=Uncertainty(
+            noise=np.pad(1e-6 * np.cov(rng.normal(size=(3, 9))), (0, 3), constant_values=NAN),
+            systematic={name: 1e-3 * rng.normal(size=6) for name in ("stamps", "columns")},
+            looks=float(rng.uniform(1.0, 25.0)),
+        ),
         solved=np.array([True, True, True, False, False, False]),
         unobservable=np.array([False, False, False, False, True, False]),
         compensation={"done": 24, "no_ego_motion": 1},
@@ -74,12 +80,23 @@ def estimate(seed: int = 0, **changes: Any) -> Estimate:
     return dataclasses.replace(built, **changes)
 
 
+def test_a_move_within_the_window_travels_with_the_result() -> None:
+    rng = np.random.default_rng(3)
+    moved = MovedWithin(11, 12, perturbation(rng.normal(size=6)), perturbation(rng.normal(size=6)))
+    sent = estimate(moved=moved)
+    read = from_json(CalibrationResult, to_json(result_of(sent, RIG, "truck-7")))
+    assert same(estimate_of(read).moved, moved)
+    assert estimate_of(result_of(estimate(), RIG, "truck-7")).moved is None
+
+
 def same(one: Any, other: Any) -> bool:
     """Equality down to the bits of every number, NaN included; metrics in any order."""
     if isinstance(one, np.ndarray):
         return bool(one.dtype == other.dtype and one.tobytes() == other.tobytes())
     if dataclasses.is_dataclass(one):
         return all(same(getattr(one, f.name), getattr(other, f.name)) for f in dataclasses.fields(one))
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     if isinstance(one, tuple) and one and isinstance(one[0], Metric):
         return len(one) == len(other) and all(
             same(a, b) for a, b in zip(sorted(one, key=str), sorted(other, key=str), strict=True)

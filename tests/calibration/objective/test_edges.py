@@ -84,7 +84,7 @@ def test_levels_double_and_end_at_the_same_angle_for_any_lens(street: Window, le
 def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
     rig = sharp_street.rig
     lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
-    scales = EdgeScales(lit, 0, BANDS - 1)
+    scales = EdgeScales(lit, 0, BANDS - 1, rig.T_camera_lidar_nominal[:2, 2])
     for f in (0, len(sharp_street.pairs) - 1):
         pyramid = scales.pyramid(GREY.grey(sharp_street.pairs[f].camera))
         np.testing.assert_array_equal(sharp_edges.sharp.maps[f], pyramid.sharp)
@@ -100,7 +100,8 @@ def test_points_are_the_range_edges_where_they_were_at_the_exposure(
     for f, pair in enumerate(sharp_street.pairs):
         found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
         cloud = compensate(pair, sharp_street.rig, enabled=True)
-        np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, cloud[found.index])
+        at_m = cloud[found.index] + found.shift_m
+        np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, at_m)
         np.testing.assert_array_equal(sharp_edges.sharp.weight[first[f] : first[f + 1]], found.weight)
 
 

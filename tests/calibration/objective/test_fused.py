@@ -10,6 +10,7 @@ from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.estimators import SAME_BASIN_RAD
 from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.objective.cells import COLUMNS, ROWS
 from coec.calibration.objective.edges import EdgeWitness
 from coec.calibration.objective.fused import OTHER_POSES, FusedObjective, Fusion, Scale
 from coec.calibration.objective.mutual_information import (
@@ -20,7 +21,18 @@ from coec.calibration.objective.mutual_information import (
 )
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.search.global_search import sample_reach
-from coec.calibration.types import CameraFrame, Decision, DepthMap, Estimate, FramePair, Matrix4, Window
+from coec.calibration.search.mount_prior import MOUNT_RAD
+from coec.calibration.types import (
+    CameraFrame,
+    Decision,
+    DepthMap,
+    EncodedImage,
+    Estimate,
+    FramePair,
+    ImageFormat,
+    Matrix4,
+    Window,
+)
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
@@ -145,6 +157,17 @@ def test_the_frames_average_to_the_score(sharp_street: Window, fused: FusedObjec
         assert at.frame_scores.mean() == pytest.approx(at.score)
 
 
+def test_its_cells_sum_to_the_objective_but_for_a_constant(sharp_street: Window, fused: FusedObjective) -> None:
+    truth = sharp_street.T_camera_lidar_start
+    cells = fused.cells(truth)
+    assert cells.at(truth).shape == (len(sharp_street.pairs), COLUMNS * ROWS + 1)
+    poses = [truth, *sample_reach(truth, SearchBox(np.radians(1.0), 0.0), 4)]
+    rest = [cells.at(pose).sum(axis=1).mean() - fused.evaluate(pose).score for pose in poses]
+    np.testing.assert_allclose(rest, rest[0], atol=1e-9)
+    in_front = cells.sight.p_camera[:, 2] > 0.0
+    assert in_front.mean() > 0.9
+
+
 def test_what_is_said_about_depth_is_what_the_depth_witness_says(
     sharp_street: Window, depth_witness: MutualInformation, fused: FusedObjective
 ) -> None:
@@ -204,6 +227,32 @@ def test_a_start_fifteen_degrees_and_thirty_centimetres_away_comes_back(
     assert is_accounted_for(estimate)
     # At 0.35° to a pixel the edges of this street hardly tell pitch from height.
     assert error_deg(estimate) < 0.8
+
+
+def in_noise(window: Window) -> Window:
+    """The window with images that show nothing."""
+    camera, rng = window.rig.camera, np.random.default_rng(11)
+
+    def dark(pair: FramePair) -> FramePair:
+        pixels = rng.integers(0, 256, camera.height * camera.width).astype(np.uint8).tobytes()
+        image = EncodedImage(ImageFormat.MONO8, camera.width, camera.height, pixels)
+        return replace(pair, camera=replace(pair.camera, image=image))
+
+    return replace(window, pairs=tuple(dark(pair) for pair in window.pairs))
+
+
+def test_a_window_that_shows_nothing_leaves_a_known_start_where_it_was(sharp_street: Window) -> None:
+    """Some wrong pose always fits by chance: a guess runs there, a calibration in use does not. Neither is accepted."""
+    dark = in_noise(sharp_street)
+    known = solve(replace(dark, start_known_to_rad=MOUNT_RAD), Noise())
+    guess = solve(dark, Noise())
+    assert known.verdict.decision is guess.verdict.decision is Decision.FAILED
+    assert error_deg(known) < 3.0 < error_deg(guess)
+
+
+def test_a_knock_is_found_although_the_start_was_known(sharp_street: Window, stereo: DepthModel) -> None:
+    estimate = solve(replace(from_start(sharp_street, 1, 25.0), start_known_to_rad=MOUNT_RAD), stereo)
+    assert error_deg(estimate) < 0.5
 
 
 def test_same_input_same_bits(sharp_street: Window, stereo: DepthModel) -> None:

@@ -113,7 +113,7 @@ def test_translations_without_a_maximum_or_too_wide_are_unobservable(
     second: list[float], sigma: list[float], dof: int, axes: tuple[int, ...]
 ) -> None:
     assert LIMITS.max_sigma_m == pytest.approx(0.1)
-    assert unobservable(Curvature(np.zeros(6), np.array(second), np.array(sigma)), dof, LIMITS) == axes
+    assert unobservable(Curvature(np.zeros(6), np.array(second)), np.array(sigma), dof, LIMITS) == axes
 
 
 # ----------------------------------------------------------------------------------------------- the calibration

@@ -11,6 +11,7 @@ from coec.geometry.edges.image_edges import (
     MEAN_RADIUS_PX,
     SHARP_SIGMA_PX,
     STRENGTH_STEPS,
+    UPRIGHT_SHARE,
     VOID,
     EdgePyramid,
     EdgeScales,
@@ -52,8 +53,14 @@ HALF_A_STEP = 0.5 / STRENGTH_STEPS + 5e-4
 """What rounding to whole steps may change, in standard deviations."""
 
 
-def edge_pyramid(grey: NDArray[np.uint8], lit: NDArray[np.bool_], finest: int, coarsest: int) -> EdgePyramid:
-    return EdgeScales(lit, finest, coarsest).pyramid(grey)
+SLANTED = np.array([0.28, 0.72])
+"""Of a LiDAR whose axis slants, and points at the camera somewhat."""
+
+
+def edge_pyramid(
+    grey: NDArray[np.uint8], lit: NDArray[np.bool_], finest: int, coarsest: int, upright: NDArray[np.float64] = SLANTED
+) -> EdgePyramid:
+    return EdgeScales(lit, finest, coarsest, upright).pyramid(grey)
 
 
 def strengths(level: NDArray[np.int8]) -> NDArray[np.float64]:
@@ -68,7 +75,7 @@ def halved_plainly(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def plain_edges(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Gradients, clipped, over their local mean."""
-    gradient = sobel_magnitude(grey)
+    gradient = sobel_magnitude(grey, SLANTED, UPRIGHT_SHARE)
     gradient = np.minimum(gradient, np.quantile(gradient[gradient > 0.0], CLIP_SHARE))
     mean = local_mean(gradient, MEAN_RADIUS_PX)
     return np.asarray(gradient / (mean + FLOOR_SHARE * gradient.mean()))
@@ -228,6 +235,23 @@ def shadow(level: NDArray[np.int8]) -> float:
     """How much the second row of the map falls short of the eleventh, as a share of the first row's shortfall."""
     rows = strengths(level)[:12].mean(axis=1)
     return float((rows[10] - rows[1]) / (rows[10] - rows[0]))
+
+
+def test_edges_that_cross_the_scan_lines_stand_above_those_along_them() -> None:
+    """Sides and tops of equally bright boxes. Where the camera looks along the axis, no direction is special."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    grey = np.where((y // 12 + x // 12) % 2 == 1, 170, 90).astype(np.uint8)
+
+    def strength_of(upright: NDArray[np.float64]) -> tuple[float, float]:
+        level = strengths(edge_pyramid(grey, ALL, 0, 0, upright).sharp)
+        return float(level[30, 34:38].max()), float(level[34:38, 30].max())
+
+    side, top = strength_of(np.array([0.0, -1.0]))
+    assert side > 1.15 * top > 0.0
+    lying_side, lying_top = strength_of(np.array([1.0, 0.0]))
+    assert lying_top > 1.15 * lying_side > 0.0
+    even_side, even_top = strength_of(np.zeros(2))
+    assert even_side == pytest.approx(even_top, rel=0.05)
 
 
 def test_a_uniform_picture_has_no_edges() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.geometry.edges.range_edges import MAX_WEIGHT_M, range_edges
+from coec.geometry.edges.range_edges import MAX_WEIGHT_M, SPILL_RAD, range_edges
 
 POLE_M, POLE_RADIUS_M, WALL_M = 6.0, 0.25, 15.0
 
@@ -64,9 +64,50 @@ def test_the_order_of_the_points_does_not_matter(with_ring: bool) -> None:
     shuffle = np.random.default_rng(1).permutation(len(xyz_m))
     plain = range_edges(xyz_m, ring if with_ring else None)
     shuffled = range_edges(xyz_m[shuffle], ring[shuffle] if with_ring else None)
-    assert dict(zip(plain.index, plain.weight, strict=True)) == dict(
-        zip(shuffle[shuffled.index], shuffled.weight, strict=True)
-    )
+    a, b = np.argsort(plain.index), np.argsort(shuffle[shuffled.index])
+    np.testing.assert_array_equal(plain.index[a], shuffle[shuffled.index][b])
+    np.testing.assert_array_equal(plain.shift_m[a], shuffled.shift_m[b])
+    np.testing.assert_array_equal(plain.weight[a], shuffled.weight[b])
+
+
+def edges_of_beams(columns_deg: float, spill_rad: float, phase: float) -> NDArray[np.float64]:
+    """Azimuth (n,) of the edges of a pole 0.1 rad to either side, found by beams `columns_deg` apart of which the first
+    lies `phase` of that aside, and which come back from it up to `spill_rad` beside it."""
+    azimuth = np.radians(np.arange(-30.0, 30.0, columns_deg)) + phase * np.radians(columns_deg)
+    near = np.abs(azimuth) < 0.1 + spill_rad
+    xyz_m = placed(azimuth, np.zeros(len(azimuth)), np.where(near, POLE_M, WALL_M))
+    edges = range_edges(xyz_m, np.zeros(len(azimuth), np.uint16))
+    at_m = xyz_m[edges.index] + edges.shift_m
+    assert np.linalg.norm(at_m, axis=1) == pytest.approx(POLE_M, rel=1e-6)
+    return np.asarray(np.arctan2(at_m[:, 1], at_m[:, 0]))
+
+
+@pytest.mark.parametrize("columns_deg", [0.1, 0.17, 0.2])
+def test_over_all_ways_that_beams_can_fall_an_edge_is_where_the_silhouette_is(columns_deg: float) -> None:
+    """On average; a single one is off by half a spacing at most. The last beam on the pole lies inside by that much."""
+    outside = [
+        np.abs(edges_of_beams(columns_deg, SPILL_RAD, phase)) - 0.1 for phase in np.linspace(0.0, 1.0, 40, False)
+    ]
+    assert {len(found) for found in outside} == {2}
+    assert np.degrees(np.mean(outside)) == pytest.approx(0.0, abs=0.02 * columns_deg)
+    assert np.degrees(np.max(np.abs(outside))) <= 0.51 * columns_deg
+
+
+def test_between_beams_that_are_far_apart_the_last_near_one_is_the_edge() -> None:
+    """Such a sensor measures a pole as far out as half a column beside it."""
+    half_rad = np.radians(0.35) / 2.0
+    outside = [np.abs(edges_of_beams(0.35, half_rad, phase)) - 0.1 for phase in np.linspace(0.0, 1.0, 40, False)]
+    assert np.degrees(np.mean(outside)) == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("with_ring", [True, False])
+def test_what_is_thinner_than_two_columns_is_one_edge_where_it_was_measured(with_ring: bool) -> None:
+    azimuth, elevation, ring = rays(16)
+    on_pole = np.abs(azimuth - azimuth[225]) < np.radians(0.1)
+    xyz_m = placed(azimuth, elevation, np.where(on_pole, POLE_M, WALL_M))
+    edges = range_edges(xyz_m, ring if with_ring else None)
+    assert sorted(edges.index) == np.flatnonzero(on_pole).tolist()
+    assert (edges.shift_m == 0.0).all()
 
 
 def test_the_weight_is_the_root_of_the_jump_up_to_a_cap() -> None:

@@ -18,10 +18,12 @@ from coec.calibration.types import (
     Estimate,
     Matrix4,
     Metric,
+    MovedWithin,
     Optimum,
     Reason,
     Rig,
     StopReason,
+    Uncertainty,
     Verdict,
 )
 from coec.geometry.se3 import quaternion_xyzw_from_rotation
@@ -45,7 +47,7 @@ def matrix_of(transform: replies.Transform) -> Matrix4:
 
 def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.CalibrationResult:
     """Everything of an estimate, for programs and people. NaN becomes null, infinity the largest double."""
-    optimum = estimate.optimum
+    optimum, uncertainty = estimate.optimum, estimate.uncertainty
     return replies.CalibrationResult(
         vehicle=vehicle,
         pair=rig.pair,
@@ -58,7 +60,14 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         correction=cast("replies.Vector6", tuple(float(v) for v in _in_degrees(estimate.correction))),
         sigma=degrees_or_null(estimate.sigma),
         correction_rad_m=cast("replies.Vector6", tuple(float(v) for v in estimate.correction)),
-        sigma_rad_m=_maybe6(estimate.sigma),
+        noise=cast("replies.Maybe6x6", tuple(_maybe6(row) for row in uncertainty.noise)),
+        systematic={
+            name: cast("replies.Vector6", tuple(float(v) for v in shift))
+            for name, shift in uncertainty.systematic.items()
+        },
+        correlation_pitch_height=number_or_null(uncertainty.pitch_height),
+        correlation_yaw_side=number_or_null(uncertainty.yaw_side),
+        independent_looks=number_or_null(uncertainty.looks),
         solved=cast("replies.Flags6", tuple(bool(v) for v in estimate.solved)),
         unobservable=cast("replies.Flags6", tuple(bool(v) for v in estimate.unobservable)),
         status="accepted" if estimate.verdict.decision is Decision.ACCEPTED else "failed",
@@ -67,10 +76,10 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
             reasons=tuple(replies.Reason(code=r.code, text=r.text) for r in estimate.verdict.reasons),
         ),
         metrics={metric.name: metric_of(metric) for metric in estimate.verdict.metrics},
-        score=_number(optimum.score),
-        score_at_start=_number(optimum.score_at_start),
-        mi=_number(optimum.mi),
-        overlap=_number(optimum.overlap),
+        score=number_or_null(optimum.score),
+        score_at_start=number_or_null(optimum.score_at_start),
+        mi=number_or_null(optimum.mi),
+        overlap=number_or_null(optimum.overlap),
         points_in_view=optimum.points_in_view,
         evaluations=optimum.evaluations,
         stop_reason=optimum.stop_reason.value,
@@ -79,6 +88,16 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         compensation=dict(estimate.compensation),
         depth_identity=estimate.depth_identity,
         config_hash=estimate.config_hash,
+        moved=None if estimate.moved is None else _moved_of(estimate.moved),
+    )
+
+
+def _moved_of(moved: MovedWithin) -> replies.MovedWithin:
+    return replies.MovedWithin(
+        last_before_ns=moved.last_before_ns,
+        first_after_ns=moved.first_after_ns,
+        before=transform_of(moved.T_before),
+        after=transform_of(moved.T_after),
     )
 
 
@@ -109,20 +128,29 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
             reasons=tuple(Reason(reason.code, reason.text) for reason in result.verdict.reasons),
         ),
         correction=_array(result.correction_rad_m),
-        sigma=_array(result.sigma_rad_m),
+        uncertainty=Uncertainty(
+            noise=np.array([_array(row) for row in result.noise]),
+            systematic={name: np.array(shift) for name, shift in result.systematic.items()},
+            looks=_or_nan(result.independent_looks),
+        ),
         solved=np.array(result.solved, dtype=np.bool_),
         unobservable=np.array(result.unobservable, dtype=np.bool_),
         compensation=dict(result.compensation),
         depth_identity=result.depth_identity,
         config_hash=result.config_hash,
+        moved=None if result.moved is None else _moved_within(result.moved),
     )
+
+
+def _moved_within(moved: replies.MovedWithin) -> MovedWithin:
+    return MovedWithin(moved.last_before_ns, moved.first_after_ns, matrix_of(moved.before), matrix_of(moved.after))
 
 
 def metric_of(metric: Metric) -> replies.MetricReply:
     """A figure with its limit."""
     return replies.MetricReply(
-        value=_number(metric.value),
-        limit=None if math.isinf(metric.limit) else _number(metric.limit),
+        value=number_or_null(metric.value),
+        limit=None if math.isinf(metric.limit) else number_or_null(metric.limit),
         at_least=metric.at_least,
         passed=bool(metric.passed),
     )
@@ -167,7 +195,7 @@ def _in_degrees(rad_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([np.rad2deg(rad_m[:3]), rad_m[3:]])
 
 
-def _number(value: float) -> float | None:
+def number_or_null(value: float) -> float | None:
     """JSON has neither NaN nor infinity. The largest double stands on the same side of every limit as
     infinity."""
     if math.isnan(value):
@@ -180,7 +208,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def _maybe6(values: Iterable[float]) -> replies.Maybe6:
-    return cast("replies.Maybe6", tuple(_number(float(value)) for value in values))
+    return cast("replies.Maybe6", tuple(number_or_null(float(value)) for value in values))
 
 
 def _array(values: Iterable[float | None]) -> NDArray[np.float64]:

@@ -40,6 +40,7 @@ from coec.adapters.mcap.files import (
     read_records,
 )
 from coec.adapters.ros import cdr
+from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
 from coec.errors import ConfigError, DecodeError, RecordingError, WindowError
@@ -340,7 +341,9 @@ def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
     pairs = tuple(content.pair(path, index) for index in sorted(content.parts))
     if not pairs:
         raise WindowError(f"{path} holds no camera-LiDAR pair")
-    return Window(window_id, rig, T_camera_lidar_start, pairs), content.parsed_configuration(path)
+    # The service began it at the extrinsic in use.
+    window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD)
+    return window, content.parsed_configuration(path)
 
 
 def read_result(path: Path) -> CalibrationResult | None:

@@ -88,7 +88,7 @@ class MonitorLimits:
         max_farthest2_pose: of the local optimum over six degrees of freedom, along the axis that is farthest off,
             likewise squared.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
-        min_edges_kept: see `Check`; where fewer are kept, a quarter of the distance over rotations is too far.
+        min_edges_kept: see `Check`; where fewer are kept, a quarter of the squared distances is too far.
         max_agreement_rad: between the local optima of the two witnesses.
         min_overlap: points in view over the most that any pose within reach sees.
         min_mi, max_f1, min_f2: equation (2) of Borer et al. 2023: nats, per radian, per radian².

@@ -1,8 +1,9 @@
 """From good windows to the baseline of a rig: the estimator's bias and spread on it, and every limit.
 
 Nothing is set by hand: the same windows are checked where they are right and after they were moved by known amounts,
-and each limit is put where it flags no more of the right ones than the stated rate, and as many of the moved ones as
-that leaves. Moves are seeded: the same windows give the same baseline.
+and each limit is put where it flags no more right checks of other pairs than the stated rate (a spread that few pairs
+tell is itself uncertain, so the limit is that of a prediction), and as many of the moved ones as that leaves. Moves are
+seeded: the same windows give the same baseline.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from coec.calibration.commissioning.baseline import (
     pixel_floor,
 )
 from coec.calibration.commissioning.equation_2 import PaperLimits, beyond
-from coec.calibration.commissioning.quantiles import chi2_quantile, normal_quantile
+from coec.calibration.commissioning.quantiles import distance2_quantile, normal_quantile
 from coec.calibration.commissioning.verdict_limits import verdict_limits
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import POSE_DOF, ROTATION_DOF, Check, CheckInput, check_at, gather
@@ -136,7 +137,8 @@ def commission(
     clean = checks.moved(0.0, 0.0, "right", CHECKS)
     moved = {name: checks.moved(turn_rad, shift_m, name, CHECKS) for name, turn_rad, shift_m in MOVES}
     far = checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS)
-    monitor = _monitor_limits(clean, moved, far, rotation, pose, false_alarm_rate)
+    known_by = _known_by(len(evidence.pairs))
+    monitor = _monitor_limits(clean, moved, far, rotation, pose, false_alarm_rate, known_by)
     accuracy = rotation if config.search.dof == ROTATION_DOF else pose
     expected = se3.perturb(right, accuracy.expected)
     limits = verdict_limits(whole, right, expected, depth, images, config, heard)
@@ -186,6 +188,7 @@ def learn_limits(
         rotation,
         pose,
         rate,
+        _known_by(len(evidence.pairs)),
     )
 
 
@@ -238,6 +241,11 @@ def _halves(count: int) -> list[list[int]]:
     return [[int(index) for block in sorted(half) for index in blocks[block]] for half in drawn]
 
 
+def _known_by(count: int) -> int:
+    """Degrees of freedom of the spread that so many pairs tell: what was known of other rigs, and their blocks."""
+    return PRIOR_BLOCKS + min(count, BLOCKS) - 1
+
+
 def _accuracy(
     whole: NDArray[np.float64],
     of_halves: NDArray[np.float64],
@@ -250,12 +258,12 @@ def _accuracy(
     of one pair, and what is known of other rigs: the variance of few blocks is uncertain itself (the posterior mean
     under an inverse gamma prior of `PRIOR_BLOCKS` degrees of freedom). The bias is that of the streets that were
     driven; on others it is another share of a pixel (`pixels`, (6,))."""
-    free = min(count, BLOCKS) - 1
+    known_by = _known_by(count)
     apart = np.abs(of_halves - whole)
     # One check that ended in another basin must not make the rig look blind.
     apart = np.minimum(apart, OUTLIER * np.median(apart, axis=0) + FLOOR)
     variance = (apart**2 / share[:, None]).mean(axis=0)
-    spread = np.sqrt((PRIOR_BLOCKS * prior**2 + free * variance) / (PRIOR_BLOCKS + free))
+    spread = np.sqrt((PRIOR_BLOCKS * prior**2 + (known_by - PRIOR_BLOCKS) * variance) / known_by)
     return Accuracy(bias=whole, bias_sigma=np.sqrt(spread**2 / count + pixels**2), spread=spread)
 
 
@@ -309,6 +317,7 @@ def _monitor_limits(
     rotation: Accuracy,
     pose: Accuracy,
     rate: float,
+    known_by: int,
 ) -> MonitorLimits:
     turned = [rotation.distance2(seen.offset_rotation, seen.pairs) for seen in moved["0.5 deg"]]
     shifted = [pose.farthest2(seen.offset_pose, seen.pairs) for seen in moved["10 cm"]]
@@ -318,8 +327,8 @@ def _monitor_limits(
     of_paper = PaperLimits.learned(clean, rate)
     agreement = beyond([seen.agreement_rad for seen in clean], normal_quantile(1.0 - rate / 3.0))
     return MonitorLimits(
-        max_distance2_rotation=_between(chi2_quantile(1.0 - rate / 2.0, ROTATION_DOF), min(turned)),
-        max_farthest2_pose=_between(chi2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1), min(shifted)),
+        max_distance2_rotation=_between(distance2_quantile(1.0 - rate / 2.0, ROTATION_DOF, known_by), min(turned)),
+        max_farthest2_pose=_between(distance2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1, known_by), min(shifted)),
         min_edges_per_pair=min(sqrt(edges * max(lost, LAYOUT_SHARE * edges)), POOREST_SHARE * edges),
         min_edges_kept=min(1.0 - LOSS_ALLOWED * (1.0 - kept), MOST_KEPT),
         max_agreement_rad=max(agreement, AGREEMENT_RAD),

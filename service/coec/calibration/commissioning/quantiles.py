@@ -17,6 +17,24 @@ def chi2_quantile(probability: float, dof: int) -> float:
     return dof * (1.0 - h + normal_quantile(probability) * sqrt(h)) ** 3
 
 
+def distance2_quantile(probability: float, dof: int, known_by: int) -> float:
+    """Of the squared distance of one more draw in `dof` axes from a mean, in standard deviations that were estimated
+    themselves, with so many degrees of freedom: `dof` times the F distribution, by the approximation of Paulson (1942).
+    Where the estimate is of few draws, one more lies farther out than χ² has it.
+
+    Raises:
+        ValueError: the probability is not between 0 and 1, or the estimate is of too few for so rare a quantile.
+    """
+    z = normal_quantile(probability)
+    g, h = 2.0 / (9.0 * dof), 2.0 / (9.0 * known_by)
+    a, b = 1.0 - h, 1.0 - g
+    left = a * a - z * z * h
+    if left <= 0.0:
+        raise ValueError(f"{known_by} degrees of freedom tell no quantile of {probability}")
+    root = (a * b + sqrt(a * a * b * b - left * (b * b - z * z * g))) / left
+    return dof * root**3
+
+
 def normal_quantile(probability: float) -> float:
     """Of the standard normal distribution.
 

@@ -85,9 +85,10 @@ def _hypotheses(edges: Sequence[FramePair]) -> Iterator[tuple[list[FramePair], C
 
 def _edges_only(pair: FramePair) -> FramePair:
     """The pair with nothing of the sweep but its range edges."""
-    lidar, index = pair.lidar, range_edges(pair.lidar.xyz_m, pair.lidar.ring).index
-    offsets_s = None if lidar.time_offset_s is None else lidar.time_offset_s[index]
-    sweep = LidarFrame(lidar.stamp_ns, lidar.frame_id, lidar.xyz_m[index], time_offset_s=offsets_s)
+    lidar, edges = pair.lidar, range_edges(pair.lidar.xyz_m, pair.lidar.ring)
+    offsets_s = None if lidar.time_offset_s is None else lidar.time_offset_s[edges.index]
+    xyz_m = lidar.xyz_m[edges.index] + edges.shift_m
+    sweep = LidarFrame(lidar.stamp_ns, lidar.frame_id, xyz_m, time_offset_s=offsets_s)
     return replace(pair, lidar=sweep)
 
 

@@ -29,6 +29,7 @@ from coec.calibration.lifecycle.pair_state import (
     restored,
     rolled_back,
     time_stepped_back,
+    window_wanted_since,
 )
 from coec.calibration.lifecycle.policy import Change
 from coec.calibration.lifecycle.states import MEANING, TRANSITIONS, Event, HealthState, markdown
@@ -64,4 +65,5 @@ __all__ = [
     "restored",
     "rolled_back",
     "time_stepped_back",
+    "window_wanted_since",
 ]

@@ -27,7 +27,7 @@ from coec.calibration.monitor.change_detector import (
 from coec.calibration.monitor.change_detector import after_observation as check_taken
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
-from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
+from coec.calibration.types import Decision, Estimate, Matrix4, MovedWithin, Reason, Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import CoecError
 from coec.geometry import se3
@@ -192,8 +192,12 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     state = replace(state, latest=estimate, failures=())
     if estimate.verdict.decision is Decision.FAILED:
         state = replace(state, status=Status.FAILED)
-        elsewhere = not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
-        if estimate.verdict.cannot_tell or not elsewhere:
+        moved = _well_told_move(estimate)
+        if moved is None and estimate.verdict.cannot_tell:
+            return state
+        # Where the camera moved within the window, its end tells where it is now.
+        latest = estimate.optimum.T_camera_lidar if moved is None else moved.T_after
+        if agrees(state.T_camera_lidar, latest, rules.policy):
             return state
         return _unless_red(state, Event.REFUSED_ELSEWHERE, *estimate.verdict.reasons)
     state = replace(state, status=Status.ACCEPTED)
@@ -209,6 +213,21 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     # A track of one window is that window, to the last bit.
     pose = estimate.optimum.T_camera_lidar if track.windows <= 1 else track.T_camera_lidar
     return _applied_or_waiting(state, pose, estimate, rules.policy)
+
+
+def _well_told_move(estimate: Estimate) -> MovedWithin | None:
+    """What a window says of a move within it; nothing where it may not be believed for another reason, too."""
+    return estimate.moved if estimate.verdict.tells_two_poses else None
+
+
+def window_wanted_since(state: PairState) -> int | None:
+    """Since when (sensor time) pairs are wanted for a window that has to come soon; None where none has to: what is
+    served is suspected by the monitor, or by the latest window, within which the camera moved."""
+    if state.monitor.outcome in ACCUSING and state.flagged_since_ns is not None:
+        return state.flagged_since_ns
+    moved = None if state.latest is None else _well_told_move(state.latest)
+    suspected = state.health in (HealthState.SUSPECT, HealthState.MISCALIBRATED)
+    return moved.first_after_ns if moved is not None and suspected else None
 
 
 def after_failure(state: PairState, reason: Reason) -> PairState:

@@ -58,7 +58,7 @@ MEANING: Mapping[Event, str] = MappingProxyType(
         Event.CONFIRMED_BY_WINDOW: "an accepted window is served, or agrees with what is served",
         Event.CONTRADICTED: "an accepted window contradicts what is served, and may not be applied",
         Event.STEP_SUSPECTED: "an accepted window differs from the windows before it; the next one decides",
-        Event.REFUSED_ELSEWHERE: "a window was refused, yet the pose that stands out in it is not what is served",
+        Event.REFUSED_ELSEWHERE: "a window was refused, yet the pose that it or its end shows is not what is served",
         Event.CLEAR: "the monitor sees nothing wrong with an extrinsic that a window has confirmed",
         Event.NO_OBJECTION: "the monitor sees nothing wrong with an extrinsic that no window has confirmed",
         Event.SUSPECTED: "the monitor suspects that the mount has moved",

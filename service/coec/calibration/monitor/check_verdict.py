@@ -39,7 +39,7 @@ MIN_PAIRS = 4
 """With fewer, a lamp post decides."""
 
 LOST_EDGES_SHARE = 0.25
-"""Of the limit of the squared distance over rotations, where the edges are lost at the pose. Standard deviations are
+"""Of the limits of the squared distances, where the edges are lost at the pose. Standard deviations are
 those of a rig's checks at large; how sharply this scene tells the pose, its edges know."""
 
 UNCOMMISSIONED = MonitorLimits(
@@ -111,10 +111,10 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
 def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> tuple[float, float]:
     """Squared distances of the local optima over three and six degrees of freedom, over their limits: a check is
     flagged above 1."""
-    within = limits.max_distance2_rotation * (LOST_EDGES_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0)
+    within = LOST_EDGES_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0
     return (
-        rotation.distance2(seen.offset_rotation, seen.pairs) / within,
-        pose.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose,
+        rotation.distance2(seen.offset_rotation, seen.pairs) / (within * limits.max_distance2_rotation),
+        pose.farthest2(seen.offset_pose, seen.pairs) / (within * limits.max_farthest2_pose),
     )
 
 

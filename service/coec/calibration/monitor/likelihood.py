@@ -15,21 +15,24 @@ from dataclasses import dataclass
 from math import exp, fsum, lgamma, log, pi
 
 FREEDOM = 4.0
-"""Degrees of freedom of the Student distribution of good checks: of those of simulated drives one in 60 is farther than
-four standard deviations, as of this one."""
+"""Degrees of freedom of the Student distribution of good checks: heavier tails than the normal one. Chosen; of 261
+coordinates of good checks on three simulated drives one was farther than four standard deviations, here 4 would be."""
 
 BAD_SHARE, BAD_AFTER_BAD, BAD_SHARE_WEAK = 0.01, 0.5, 0.8
-"""Share of checks that are bad though nothing is wrong with their data: after a good one, after a bad one, and of those
-with faint edges."""
+"""Share of checks that are bad though no cause was found in their data: after a good one, after a bad one, and of those
+with faint edges. Chosen to be on the safe side of a drive: none of 87 checks of simulated drives without poor stretches
+was bad; within tunnels, open roads and nights 14 of 56 with clear edges and some 57 of 63 with faint ones."""
 
 SAME_AGAIN, SAME_AGAIN_WEAK = 0.03, 0.2
-"""Share of bad checks that lie where the one before lay."""
+"""Share of bad checks that lie where the one before lay, with clear and with faint edges. Chosen: with clear edges none
+was seen to. Less makes three checks certain sooner, more lets a scene that stays the same accuse later."""
 
 FARTHER = 0.03
 """Of its offset, by which a check is less certain: far from the pose the local optimum is found less exactly."""
 
-WEAK_TIMES = 3.0
-"""Times the standard deviation of others that a check with faint edges has."""
+WEAK_TIMES = 10.0
+"""Times the standard deviation of others that a check with faint edges has: by night on simulated drives the best of
+them, 6 of 63, lie 0.3 to 0.7° off the mount."""
 
 AXES = 3
 """Of rotation, and of translation."""

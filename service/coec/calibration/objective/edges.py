@@ -104,12 +104,15 @@ def build_edges(
     first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in found])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError("no sweep has a jump in range: there is nothing to lay onto the edges of the images")
-    xyz_m = np.concatenate([points(frame, edges.index) for frame, edges in enumerate(found)])
+    # Motion compensation turns a shift of a tenth of a degree by two degrees at most: no need to.
+    xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(found)])
     lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
     weight = np.concatenate([edges.weight for edges in found])
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
     finest = min(finest, coarsest + 1 - BANDS)
-    sharp, whole, *of_bands = _maps(EdgeScales(lit, finest, coarsest), greys, len(pairs))
+    # The third column of a rotation is where it takes the third axis.
+    scales = EdgeScales(lit, finest, coarsest, upright=rig.T_camera_lidar_nominal[:2, 2])
+    sharp, whole, *of_bands = _maps(scales, greys, len(pairs))
     points_m = np.ascontiguousarray(xyz_m.T)
 
     def frames(level: int, maps: NDArray[np.int8], chosen: NDArray[np.int64]) -> EdgeFrames:

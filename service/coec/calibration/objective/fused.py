@@ -7,17 +7,20 @@ network that tells nothing adds noise of one unit, a scene without edges likewis
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import hypot, radians
+from math import hypot, radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.objective.cells import COLUMNS, ROWS, Cells, SightLines, sectors
 from coec.calibration.objective.edges import EdgeWitness
 from coec.calibration.objective.mutual_information import Evaluation, MutualInformation, SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.cameras import in_image
+from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, frame_alignment, significances
 from coec.geometry.edges.charts import charted_significances
+from coec.geometry.projection import project
 
 OTHER_POSES = 64
 """Poses within reach from which the mean and the standard deviation of a score are taken: known to an eighth."""
@@ -25,6 +28,12 @@ OTHER_POSES = 64
 OTHER_POSES_RAD = radians(28.0)
 """The reach from which those of the edges are taken at least, whatever the search may reach: nearer to the truth, poses
 share too much of the layout of the scene with it to stand for wrong ones."""
+
+
+CELL_STEP = 0.25
+"""Difference step of the cells, in blurs of the edges: half a pixel on the sharpest. At a whole blur the differences
+reach over the rim of the hill: the standard deviations of rotations were a third smaller than that, and the errors of
+16 windows of two simulated drives 2.2 of them (pitch) instead of 1.4."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +78,40 @@ class FusedObjective:
             overlap=depth.overlap,
             points_in_view=depth.points_in_view,
         )
+
+    def cells(self, T_camera_lidar: Matrix4) -> Cells:
+        """The edges by sectors of the image, and depth, which has no parts, as one more."""
+        edges = self._edges
+        p_camera = (
+            np.einsum("ij,jn->ni", T_camera_lidar[:3, :3], edges.xyz_m.astype(np.float64)) + T_camera_lidar[:3, 3]
+        )
+        uv_px, valid = project(edges.camera, p_camera)
+        seen = valid & in_image(edges.camera, uv_px)
+        frame = np.repeat(np.arange(len(edges.maps)), np.diff(edges.first_point))
+        # What lies outside counts with the first sector, should a step bring it into view.
+        sector = np.zeros(len(p_camera), np.int64)
+        sector[seen] = sectors(uv_px[seen])
+        parts = [_chosen(edges, np.flatnonzero(sector == number)) for number in range(COLUMNS * ROWS)]
+
+        def at(pose: Matrix4) -> NDArray[np.float64]:
+            of_parts = [frame_alignment(part, pose) for part in parts]
+            square = float(np.sum([part.square for part in of_parts]))
+            scale = len(edges.maps) / sqrt(max(square, LEAST_SQUARE)) / self._of_edges.deviation
+            of_edges = [part.strength * scale for part in of_parts]
+            return np.stack([*of_edges, self._depth.evaluate(pose).frame_scores / self._of_depth.deviation], axis=1)
+
+        sight = SightLines(p_camera[seen], edges.weight[seen].astype(np.float64), frame[seen])
+        return Cells(at, CELL_STEP * self._step_rad, sight)
+
+
+def _chosen(edges: EdgeFrames, index: NDArray[np.int64]) -> EdgeFrames:
+    """Some of the range edges (ascending), on the same maps."""
+    return replace(
+        edges,
+        xyz_m=np.ascontiguousarray(edges.xyz_m[:, index]),
+        weight=edges.weight[index],
+        first_point=np.searchsorted(index, edges.first_point),
+    )
 
 
 class Fusion:

@@ -17,14 +17,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.objective.cells import Cells, SightLines
 from coec.calibration.types import DepthMap, Matrix4, Rig
 from coec.config import ObjectiveConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
-from coec.geometry.cameras import Camera, domain_angle_rad, scaled
+from coec.geometry.cameras import Camera, domain_angle_rad, in_image, scaled
 from coec.geometry.culling import azimuth_order, bundle
 from coec.geometry.mutual_information import BinnedFrames, mutual_information
-from coec.geometry.projection import unproject
+from coec.geometry.projection import project, unproject
 from coec.geometry.thinning import thinned
 from coec.geometry.vectors import lengths
 
@@ -40,6 +41,10 @@ deviation of the median), far inside a bin of 1/32."""
 
 FIELD_OF_VIEW_PX = 8
 """Side of the squares of pixels over which the field of view is measured: a few thousand rays instead of a million."""
+
+
+SIGHT_POINTS = 20_000
+"""Points that stand for the geometry of a window where every point weighs the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,14 @@ class Objective(Protocol):
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
         """The objective at `T_camera_lidar` (4, 4)."""
+        ...
+
+
+class Divisible(Objective, Protocol):
+    """An objective that can be taken apart."""
+
+    def cells(self, T_camera_lidar: Matrix4) -> Cells:
+        """Its cells, cut at `T_camera_lidar` (4, 4)."""
         ...
 
 
@@ -125,6 +138,21 @@ class MutualInformation:
             mi=float(at.mi.mean()),
             overlap=float(at.points.sum() / self._reference.sum()),
             points_in_view=int(at.points.sum()),
+        )
+
+    def cells(self, T_camera_lidar: Matrix4) -> Cells:
+        """Frames alone: a histogram has no parts."""
+        frames = self._frames
+        chosen = thinned(frames.xyz_m.shape[1], SIGHT_POINTS)
+        xyz_m = frames.xyz_m[:, chosen].astype(np.float64)
+        p_camera = np.einsum("ij,jn->ni", T_camera_lidar[:3, :3], xyz_m) + T_camera_lidar[:3, 3]
+        uv_px, valid = project(frames.camera, p_camera)
+        seen = valid & in_image(frames.camera, uv_px)
+        frame = np.searchsorted(frames.first_point, chosen, side="right") - 1
+        return Cells(
+            lambda pose: self.evaluate(pose).frame_scores[:, None],
+            self.step_rad,
+            SightLines(p_camera[seen], np.ones(int(seen.sum())), frame[seen]),
         )
 
     def mi_of_unrelated(self, T_camera_lidar: Matrix4) -> float:

@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Objective
@@ -52,15 +53,16 @@ class CentreKept:
         return pose
 
 
-def unobservable(curvature: Curvature, dof: int, limits: VerdictConfig) -> tuple[int, ...]:
-    """The translation axes, of those searched, whose maximum is no maximum or wider than `max_sigma_m`.
+def unobservable(curvature: Curvature, sigma: NDArray[np.float64], dof: int, limits: VerdictConfig) -> tuple[int, ...]:
+    """The translation axes, of those searched, whose maximum is no maximum or wider than `max_sigma_m`; `sigma` (6,)
+    says how wide.
 
     Without a covariance at all (too few frames, or no maximum on a rotation) nothing can be said, and nothing is.
     """
     if dof <= TRANSLATIONS.start or not np.isfinite(curvature.second_derivative[: TRANSLATIONS.start]).all():
         return ()
     flat = [axis for axis in TRANSLATIONS if not curvature.second_derivative[axis] > 0.0]
-    wide = [axis for axis in TRANSLATIONS if curvature.sigma[axis] > limits.max_sigma_m]
+    wide = [axis for axis in TRANSLATIONS if sigma[axis] > limits.max_sigma_m]
     return tuple(sorted({*flat, *wide}))
 
 

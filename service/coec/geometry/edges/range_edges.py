@@ -4,6 +4,12 @@ Every point is compared with its two neighbours along the scan line, which are f
 are sorted by row (the ring where the cloud has one, else a band of elevation) and azimuth, and within a band only
 points of nearly the same elevation are neighbours. So organised, unorganised, 16- and 128-beam clouds are all treated
 alike.
+
+The silhouette passes between the last beam that came back from the near surface and the first that went by: half a
+spacing outside of the last near point, wherever that happened to lie. A beam is a cone, though, and comes back from the
+near surface as soon as some of it falls there: that half is less by what spills over (`SPILL_RAD`). Where beams lie too
+far apart for that (`WIDE_RAD`), the last near point stands for the edge. What both neighbours of a point lie behind is
+thinner than two spacings: one edge, a ridge, at the point itself.
 """
 
 from __future__ import annotations
@@ -42,17 +48,34 @@ MAX_WEIGHT_M = 3.0
 MIN_RANGE_M = 2.0
 """Nearer points are the vehicle itself."""
 
+SPILL_RAD = math.radians(0.06)
+"""How far the axis of a beam passes a near surface that it still measures: the half angle of a beam of 2 mrad (data
+sheets of spinning sensors: 2 to 3 mrad in all). Of two echoes the stronger one counts, and that of the nearer surface
+is the stronger one with little of the beam."""
+
+WIDE_RAD = math.radians(0.25)
+"""Beams farther apart than this tell nothing of where between them a silhouette passes: either a return is missing, or
+the sensor has few columns and gathers light over all of each, so that near surfaces grow by half a column (an OS1 of
+1024 columns, 0.35° apart: half a column farther out, other poses fit its garage nearly as well as the true one)."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeEdges:
-    """Points on the near side of a jump: `index` (E,) into the cloud, `weight` (E,) √(jump in metres), capped."""
+    """Where the silhouettes of near surfaces pass.
+
+    Attributes:
+        index: (E,) into the cloud, the point on the near side: when the edge was measured.
+        shift_m: (E, 3) float32, from that point to the edge, at the point's range.
+        weight: (E,) float32, √(jump in metres), capped.
+    """
 
     index: NDArray[np.int64]
+    shift_m: NDArray[np.float32]
     weight: NDArray[np.float32]
 
 
 def range_edges(xyz_m: NDArray[np.float32], ring: NDArray[np.uint16] | None) -> RangeEdges:
-    """The near sides of the range jumps of a sweep (METHOD, section 3, "Edge alignment").
+    """The silhouettes that the range jumps of a sweep tell (METHOD, section 3, "Edge alignment").
 
     Args:
         xyz_m: (N, 3) float32, sensor frame, as measured (motion compensation would tear scan lines apart).
@@ -60,16 +83,17 @@ def range_edges(xyz_m: NDArray[np.float32], ring: NDArray[np.uint16] | None) -> 
     """
     range_m = lengths(xyz_m)
     far = np.flatnonzero(range_m >= MIN_RANGE_M)
-    xyz_m, range_m = xyz_m[far], range_m[far]
-    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
-    elevation = np.arcsin(np.clip(xyz_m[:, 2] / np.maximum(range_m, MIN_RANGE_M), -1.0, 1.0))
+    kept_m, range_m = xyz_m[far], range_m[far]
+    azimuth = np.arctan2(kept_m[:, 1], kept_m[:, 0])
+    elevation = np.arcsin(np.clip(kept_m[:, 2] / np.maximum(range_m, MIN_RANGE_M), -1.0, 1.0))
     if ring is None:
         row, same_line = np.floor(elevation / BAND_RAD).astype(np.int64), SAME_LINE_RAD
     else:
         row, same_line = ring[far].astype(np.int64), math.pi
     order = np.lexsort((azimuth, row))
-    index, weight = _jumps(row[order], azimuth[order], elevation[order], range_m[order], same_line)
-    return RangeEdges(far[order[index]], weight)
+    index, turn_rad, weight = _jumps(row[order], azimuth[order], elevation[order], range_m[order], same_line)
+    near = far[order[index]]
+    return RangeEdges(near, _about_the_axis(kept_m[order[index]], turn_rad), weight)
 
 
 @njit(cache=True)
@@ -79,24 +103,43 @@ def _jumps(
     elevation: NDArray[np.float32],
     range_m: NDArray[np.float32],
     same_line: float,
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Indices and weights of the near sides, over points sorted by row and azimuth."""
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
+    """Indices of the near sides, the azimuth from there to the edge, and weights; over points sorted by row and
+    azimuth."""
     count = row.shape[0]
     index = np.empty(count, np.int64)
+    turn_rad = np.empty(count, np.float64)
     weight = np.empty(count, np.float32)
     found = 0
     for k in range(count):
-        jump = 0.0
+        least = max(MIN_JUMP_M, MIN_JUMP_SHARE * range_m[k])
+        highest, sides, turn = 0.0, 0, 0.0
         for step in (-1, 1):
             for ahead in range(1, LOOK_AHEAD + 1):
                 j = k + step * ahead
                 if j < 0 or j >= count or row[j] != row[k] or abs(azimuth[j] - azimuth[k]) > NEIGHBOUR_RAD:
                     break
                 if abs(elevation[j] - elevation[k]) < same_line:
-                    jump = max(jump, range_m[j] - range_m[k])
+                    jump = range_m[j] - range_m[k]
+                    if jump > least:
+                        highest = max(highest, jump)
+                        sides += 1
+                        gap = abs(azimuth[j] - azimuth[k])
+                        turn = step * (0.5 * gap - SPILL_RAD) if gap <= WIDE_RAD else 0.0
                     break
-        if jump > MIN_JUMP_M and jump > MIN_JUMP_SHARE * range_m[k]:
+        if sides > 0:
             index[found] = k
-            weight[found] = math.sqrt(min(jump, MAX_WEIGHT_M))
+            turn_rad[found] = turn if sides == 1 else 0.0
+            weight[found] = math.sqrt(min(highest, MAX_WEIGHT_M))
             found += 1
-    return index[:found].copy(), weight[:found].copy()
+    return index[:found].copy(), turn_rad[:found].copy(), weight[:found].copy()
+
+
+def _about_the_axis(xyz_m: NDArray[np.float32], turn_rad: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(E, 3) by how much points (E, 3) move when they are turned about the sensor's axis, each by its own angle."""
+    sine, less = np.sin(turn_rad), 1.0 - np.cos(turn_rad)
+    x_m, y_m = xyz_m[:, 0].astype(np.float64), xyz_m[:, 1].astype(np.float64)
+    shift_m = np.zeros(xyz_m.shape, np.float32)
+    shift_m[:, 0] = -x_m * less - y_m * sine
+    shift_m[:, 1] = x_m * sine - y_m * less
+    return shift_m

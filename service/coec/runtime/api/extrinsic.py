@@ -8,11 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.conversions import transform_of
+from coec.adapters.files.conversions import number_or_null, transform_of
 from coec.calibration.lifecycle import PairState, Status
 from coec.calibration.lifecycle.policy import step_between
-from coec.calibration.types import Rig
-from coec.config import TrackerConfig
+from coec.calibration.types import Rig, Uncertainty
 from coec.schemas import replies
 from coec.schemas.replies import CalibrationResult
 
@@ -49,9 +48,9 @@ def extrinsic_of(
     accepted: CalibrationResult | None,
     percent_complete: float,
     config_hash: str,
-    tracker: TrackerConfig,
 ) -> replies.ExtrinsicReply:
     """What to use now. `accepted` is `state.accepted` in its wire form; `config_hash` is said while there is none."""
+    of = uncertainty_of_served(state)
     return replies.ExtrinsicReply(
         vehicle=vehicle,
         pair=rig.pair,
@@ -61,7 +60,9 @@ def extrinsic_of(
         provenance=state.provenance.value,
         status=state.status.value,
         percent_complete=percent_complete,
-        axes=axes_of_served(state, rig, accepted, tracker),
+        axes=axes_of_served(state, rig, accepted),
+        correlation_pitch_height=None if of is None else number_or_null(of.pitch_height),
+        correlation_yaw_side=None if of is None else number_or_null(of.yaw_side),
         valid_from_ns=state.valid_from_ns,
         data_stamp_ns=accepted.data_stamp_ns if accepted else None,
         window_id=accepted.window_id if accepted else None,
@@ -91,15 +92,21 @@ def degrees_and_metres(rad_m: NDArray[np.float64]) -> replies.Vector6:
     return degrees(a), degrees(b), degrees(c), x, y, z
 
 
-def axes_of_served(
-    state: PairState, rig: Rig, accepted: CalibrationResult | None, tracker: TrackerConfig
-) -> replies.Axes:
+def uncertainty_of_served(state: PairState) -> Uncertainty | None:
+    """Of what is served: the track's where it holds more than one window, else that of the accepted window; None while
+    nothing was accepted."""
+    if state.accepted is None:
+        return None
+    return state.accepted.uncertainty if state.track is None or state.track.windows <= 1 else state.track.uncertainty
+
+
+def axes_of_served(state: PairState, rig: Rig, accepted: CalibrationResult | None) -> replies.Axes:
     """Correction and spread per axis of what is served: the track's where it holds more than one window."""
     axes = axes_of(accepted, Status.ACCEPTED)
     if accepted is None or state.track is None or state.track.windows <= 1:
         return axes
     correction = degrees_and_metres(step_between(rig.T_camera_lidar_nominal, state.T_camera_lidar))
-    sigma = degrees_and_metres(state.track.sigma(tracker))
+    sigma = degrees_and_metres(state.track.uncertainty.sigma)
     told = {
         name: getattr(axes, name).model_copy(
             update={"correction": correction[index], "sigma": sigma[index] if accepted.solved[index] else None}

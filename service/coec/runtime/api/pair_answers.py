@@ -69,9 +69,7 @@ class PairAnswers:
         """Serialise what is served anew, and publish what changed."""
         report, rig = self._stream.report, self._rig
         accepted = None if known.state.accepted is None else result_of(known.state.accepted, rig, self._vehicle)
-        extrinsic = extrinsic_of(
-            self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash, self._pair.tracker
-        )
+        extrinsic = extrinsic_of(self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash)
         own = () if self._recorder.trouble is None else (self._recorder.trouble,)
         troubles = (*own, *self._outside.vehicle_troubles())
         health = health_of(known, report, self._losses.snapshot(), troubles, self._pair, rig, self._vehicle)

@@ -22,7 +22,6 @@ from coec.adapters.system.threads import ServiceThread
 from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Drift
 from coec.calibration.lifecycle import HealthState, PairState, Rules
-from coec.calibration.monitor.change_detector import ACCUSING
 from coec.calibration.types import Decision, Reason
 from coec.config import CalibrationConfig, PairConfig
 from coec.runtime.decisions.incident_pictures import IncidentPictures
@@ -397,15 +396,16 @@ class Decider:
 
     def _go_on_with(self, taken: Taken, by_check: bool) -> None:
         """What a step changes for the pairs to come: the extrinsic at which they are looked at, and how soon a window
-        is wanted: soon when the monitor's word has become worse, or a window did not settle it."""
+        is wanted: soon when the monitor's word has become worse, or a window did not settle it, or saw a knock."""
         self._stream.adopt(taken.served)
         before, after = taken.before, taken.after
-        if after.monitor.outcome not in ACCUSING or after.flagged_since_ns is None:
+        since_ns = lifecycle.window_wanted_since(after)
+        if since_ns is None:
             self._stream.calm()
             return
         waiting = after.pending is not None and after.pending.contradicts
         if not waiting and not (by_check and before.monitor.outcome is after.monitor.outcome):
-            self._stream.alarm(after.flagged_since_ns)
+            self._stream.alarm(since_ns)
 
     # --- what ails --------------------------------------------------------------------------------------------------
 

@@ -36,6 +36,7 @@ from coec.calibration.types import (
 from coec.config import Config, DepthConfig
 from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.cameras import scaled
+from coec.geometry.projection import project
 from coec.reports.overlay import draw
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Solved, WrittenFile
 from coec.runtime.worker.messages import unpack_pairs
@@ -84,7 +85,9 @@ class Solver:
             search = pair.calibration.search.model_copy(update={"max_evaluations": WARM_UP_EVALUATIONS})
             configuration = pair.calibration.model_copy(update={"search": search})
             rig = _small(self._rigs[pair.name])
-            # A check runs every kernel that a calibration runs. An invented one need not lead anywhere.
+            # A check runs every kernel that a calibration runs but one, which its uncertainty takes. An invented one
+            # need not lead anywhere.
+            project(rig.camera, np.ones((1, 3)))
             with contextlib.suppress(CalibrationError, DecodeError):
                 observe(_invented_window(rig), _Ramp(), self._images, configuration, None)
 

@@ -1,0 +1,53 @@
+"""Other poses that the search came to, or from, and that the window cannot tell from the best one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, fsum
+
+from coec.calibration.confidence.landscape import Landscape
+from coec.calibration.objective.mutual_information import Divisible
+from coec.calibration.types import Matrix4
+from coec.geometry import se3
+from coec.geometry.linear import solved
+
+SAME_HILL = 3.0
+"""Standard deviations within which a pose belongs to the hill of the optimum, whose width is counted already."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rivals:
+    """Poses under one objective: the best (4, 4) and `others` (4, 4) that might have been it."""
+
+    objective: Divisible
+    best: Matrix4
+    others: tuple[Matrix4, ...]
+
+
+def with_modes(rivals: Rivals, moved: Sequence[int], covariance: list[list[float]]) -> list[list[float]]:
+    """The covariance (n, n) of the axes `moved`, about the best summit of a mixture with the others.
+
+    A summit counts exp(-2·c²) for the certainty c by which the best one stands above it: the likelihood of a pose on a
+    paraboloid, exp(-d²/2), that is as far down. One that stands above the best counts as much as that.
+    """
+    axes = tuple(moved)
+    aways = [se3.difference(other, rivals.best)[list(axes)].tolist() for other in rivals.others]
+    aways_and_poses = [
+        (away, other) for away, other in zip(aways, rivals.others, strict=True) if _beside(away, covariance)
+    ]
+    if not aways_and_poses:
+        return covariance
+    landscape = Landscape.about(rivals.objective.cells(rivals.best), rivals.best, axes)
+    found = [
+        (exp(-2.0 * max(landscape.certainty(landscape.cells.at(other)), 0.0) ** 2), away)
+        for away, other in aways_and_poses
+    ]
+    whole = 1.0 + fsum(weight for weight, _ in found)
+    n = range(len(axes))
+    return [[covariance[i][j] + fsum(w * away[i] * away[j] for w, away in found) / whole for j in n] for i in n]
+
+
+def _beside(away: list[float], covariance: list[list[float]]) -> bool:
+    """Whether a summit so far away (n,) is another hill than the best one's."""
+    return fsum(a * b for a, b in zip(away, solved(covariance, away), strict=True)) > SAME_HILL**2

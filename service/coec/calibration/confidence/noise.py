@@ -1,0 +1,88 @@
+"""What chance leaves to an optimum: other frames, or other things in them, would have put it elsewhere.
+
+The sandwich of maximum-likelihood theory (Huber 1967), J⁻¹·V·J⁻¹, with V from the scatter of the score between frames
+and between sectors of the image. A standing vehicle sees the same in all frames, which then agree on anything; the
+sectors, each with things of its own, still do not. And what a wrong lens does in a sector it does in every frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from math import fsum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.confidence.landscape import Landscape, scatter
+from coec.calibration.objective.differences import across, along
+from coec.calibration.steps import of_both
+from coec.geometry.linear import congruent, inverted
+
+WIDER = (1.0, 2.0, 4.0)
+"""Difference steps that are tried until the objective has a maximum, in those of the cells: a ripple may dent the top
+of a hill."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """The spread of an optimum by chance.
+
+    Attributes:
+        covariance: (n, n) of the axes that were searched, radians and metres.
+        information: (n, n) negative Hessian of the objective, likewise.
+        looks: how many independent looks the frames are worth: their number, if what one frame says of a sector tells
+            nothing of what the next one says there; one, if it says the same again.
+    """
+
+    covariance: list[list[float]]
+    information: list[list[float]]
+    looks: float
+
+
+def measure_noise(landscape: Landscape) -> Noise | None:
+    """By central differences; None where the objective has no maximum or the frames are too few to tell."""
+    fitted = len(landscape.moved)
+    if landscape.frames <= fitted:
+        return None
+    for wider in WIDER:
+        gradients, information = _derivatives(landscape, wider * landscape.cells.step_rad)
+        try:
+            inverse = inverted(information)
+        except ValueError:
+            continue
+        covariance = congruent(inverse, scatter(gradients, fitted))
+        return Noise(covariance, information, independent_looks(gradients, inverse))
+    return None
+
+
+def _derivatives(landscape: Landscape, step_rad: float) -> tuple[NDArray[np.float64], list[list[float]]]:
+    """The gradient (n, F, B) of each cell, and the negative Hessian (n, n) of their sum."""
+    shape, count = landscape.centre.shape, len(landscape.moved)
+    steps = of_both(step_rad)[list(landscape.moved)]
+
+    def at(offset: NDArray[np.float64]) -> NDArray[np.float64]:
+        return landscape.at(offset).ravel()
+
+    gradients, second = along(at, steps, range(count))
+    information = [[0.0] * count for _ in range(count)]
+    for i in range(count):
+        information[i][i] = -fsum(second[i].tolist())
+    for i, j in combinations(range(count), 2):
+        information[i][j] = information[j][i] = -fsum(across(at, steps, i, j).tolist())
+    return gradients.reshape(count, *shape), information
+
+
+def independent_looks(gradients: NDArray[np.float64], inverse: list[list[float]]) -> float:
+    """Of F frames, from the gradients (n, F, B) of their cells and the inverse (n, n) of the information: F over the
+    design effect (Kish 1965), which is how much more the sectors scatter than their cells would, were each frame's
+    independent of the others'."""
+    n, frames, _ = gradients.shape
+
+    def size(groups: NDArray[np.float64]) -> float:
+        rows = groups.reshape(n, -1).tolist()
+        squares = [[fsum(a * b for a, b in zip(one, other, strict=True)) for other in rows] for one in rows]
+        return fsum(inverse[i][j] * squares[j][i] for i in range(n) for j in range(n))
+
+    together = size(gradients.sum(axis=1))
+    return min(max(frames * size(gradients) / together, 1.0), float(frames)) if together > 0.0 else float(frames)

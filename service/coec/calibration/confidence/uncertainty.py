@@ -1,0 +1,37 @@
+"""How far an optimum may be off, all in all: chance, the shape of the hill, other summits, and what all frames
+share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from coec.calibration.confidence.budget import systematic
+from coec.calibration.confidence.grain import grain_of
+from coec.calibration.confidence.landscape import Landscape
+from coec.calibration.confidence.modes import Rivals, with_modes
+from coec.calibration.confidence.noise import measure_noise
+from coec.calibration.confidence.ridges import widened
+from coec.calibration.objective.mutual_information import Divisible
+from coec.calibration.types import Matrix4, Uncertainty, Window
+
+
+def measure_uncertainty(
+    objective: Divisible, pose: Matrix4, moved: Sequence[int], rivals: Sequence[Rivals], window: Window
+) -> Uncertainty:
+    """Of the optimum at `pose` (4, 4), searched along the axes `moved` of ξ; `rivals` are summits that the search came
+    to as well. Unknown where the objective has no maximum there or the frames are too few."""
+    axes = tuple(moved)
+    landscape = Landscape.about(objective.cells(pose), pose, axes)
+    noise = measure_noise(landscape)
+    if noise is None:
+        return Uncertainty.unknown()
+    covariance = widened(landscape, noise)
+    for summits in rivals:
+        covariance = with_modes(summits, axes, covariance)
+    whole = np.full((6, 6), np.nan)
+    whole[np.ix_(axes, axes)] = covariance
+    axis_of_sweep = pose[:3, 2]  # the third axis of the LiDAR
+    shared = systematic(landscape.cells.sight, grain_of(window, pose), axes, axis_of_sweep)
+    return Uncertainty(whole, shared, noise.looks)

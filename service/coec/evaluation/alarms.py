@@ -1,0 +1,225 @@
+"""What the change detector does with streams of checks whose truth is known: how often it accuses a right mount, how
+soon it notices a step of any size, and a creep.
+
+The streams are drawn, not rendered: 100 hours of driving are 72 000 checks. They are worse than what the detector
+assumes: bad checks come in bursts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.commissioning.baseline import PRIOR_SPREAD_POSE as SPREAD_POSE
+from coec.calibration.commissioning.baseline import PRIOR_SPREAD_ROTATION as SPREAD_ROTATION
+from coec.calibration.commissioning.baseline import STREET, UNCOMMISSIONED_BIAS, Accuracy
+from coec.calibration.monitor.change_detector import (
+    S_PER_H,
+    AlarmLevels,
+    MonitorState,
+    Observation,
+    after_observation,
+    alarm_level,
+    alarm_levels,
+)
+from coec.calibration.monitor.likelihood import FREEDOM
+from coec.config import MonitorConfig
+from coec.geometry.vectors import random_direction
+
+STREET_CHECKS = 24
+"""Checks in one street, on average: two minutes at one every five seconds."""
+
+BURST_EVERY, BURST_CHECKS = 100, 3
+"""Checks between two poor stretches, and in one, on average."""
+
+BAD = np.array([radians(2.5)] * 3 + [0.1] * 3)
+"""Standard deviations of what checks of poor stretches say (rad, m)."""
+
+SETTLED_CHECKS = 60
+"""Checks of a right mount before a step."""
+
+PATIENCE_CHECKS = 240
+"""Checks after a step in which it has to be noticed: twenty minutes at one every five seconds."""
+
+STATED_H = (1.0, 3.0, 10.0, 30.0, 100.0)
+"""Hours between false alarms for which it is counted how many there were."""
+
+STEPS_DEG = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 2.0, 3.0, 4.5, 7.0)
+"""Sizes of the steps."""
+
+CREEP_DEG_PER_H, CREEP_H, CREEPS = 0.1, 12.0, 3
+"""How fast a mount creeps, for how long at most, and how many of them."""
+
+FLAGGED_AT = 4.0
+"""Standard deviations on any axis at which a check of a stream is flagged by itself."""
+
+SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
+
+Heard = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class FalseAlarms:
+    """Of a right mount in so many hours: how often its evidence came to the level of a stated time between them."""
+
+    stated_h: float
+    driven_h: float
+    alarms: int
+
+
+@dataclass(frozen=True, slots=True)
+class Delay:
+    """From a step to the first check that makes it suspect, and confirms it, per drawn step, s; infinite where it was
+    not within `PATIENCE_CHECKS`."""
+
+    step_deg: float
+    suspect_s: tuple[float, ...]
+    confirmed_s: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Creep:
+    """Until a steady creep was suspected and confirmed, per drawn creep, h; infinite where it was not in time."""
+
+    deg_per_h: float
+    suspect_h: tuple[float, ...]
+    confirmed_h: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Alarms:
+    """All three experiments at one configuration."""
+
+    config: MonitorConfig
+    false: tuple[FalseAlarms, ...]
+    delays: tuple[Delay, ...]
+    creep: Creep
+
+
+def measured(config: MonitorConfig, hours: float, steps: int, heard: Heard) -> Alarms:
+    """The experiments: so many hours of a right mount, so many steps of every size (seeded)."""
+    total = 2 + len(STEPS_DEG)
+    false = false_alarms(config, hours)
+    heard(1, total)
+    delays = []
+    for place, step_deg in enumerate(STEPS_DEG):
+        delays.append(delay(config, step_deg, steps))
+        heard(2 + place, total)
+    crept = creep(config)
+    heard(total, total)
+    return Alarms(config, false, tuple(delays), crept)
+
+
+def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarms, ...]:
+    """Counts rises of the evidence of a right mount to the level of every stated time. A rise is counted once, until
+    the suspicion is over."""
+    levels = alarm_levels(config)
+    at = [alarm_level(config, stated) for stated in STATED_H]
+    above, alarms = [False] * len(at), [0] * len(at)
+    checks = round(hours * S_PER_H / config.period_s)
+    for state in _states(_stream(np.random.default_rng(SEED), np.zeros((checks, 6)), config), levels):
+        for place, level in enumerate(at):
+            if state.evidence >= level and not above[place]:
+                above[place], alarms[place] = True, alarms[place] + 1
+            elif state.evidence < levels.clear:
+                above[place] = False
+    return tuple(FalseAlarms(stated, hours, count) for stated, count in zip(STATED_H, alarms, strict=True))
+
+
+def delay(config: MonitorConfig, step_deg: float, steps: int) -> Delay:
+    """Steps about drawn axes, each after `SETTLED_CHECKS` of a right mount."""
+    suspect, confirmed = [], []
+    for number in range(steps):
+        rng = np.random.default_rng([SEED, round(step_deg * 1000), number])
+        truth = np.zeros((SETTLED_CHECKS + PATIENCE_CHECKS, 6))
+        truth[SETTLED_CHECKS:, :3] = radians(step_deg) * random_direction(rng)
+        first = _first(config, _stream(rng, truth, config), SETTLED_CHECKS)
+        suspect.append(first[0] * config.period_s)
+        confirmed.append(first[1] * config.period_s)
+    return Delay(step_deg, tuple(suspect), tuple(confirmed))
+
+
+def creep(config: MonitorConfig) -> Creep:
+    """A mount that turns steadily about a drawn axis from the first check on."""
+    checks = round(CREEP_H * S_PER_H / config.period_s)
+    hours = np.arange(checks) * config.period_s / S_PER_H
+    suspect, confirmed = [], []
+    for number in range(CREEPS):
+        rng = np.random.default_rng([SEED, number])
+        truth = np.zeros((checks, 6))
+        truth[:, :3] = np.radians(CREEP_DEG_PER_H * hours)[:, None] * random_direction(rng)
+        first = _first(config, _stream(rng, truth, config), 0)
+        suspect.append(first[0] * config.period_s / S_PER_H)
+        confirmed.append(first[1] * config.period_s / S_PER_H)
+    return Creep(CREEP_DEG_PER_H, tuple(suspect), tuple(confirmed))
+
+
+def _first(config: MonitorConfig, stream: Iterator[Observation], after: int) -> tuple[float, float]:
+    """Checks after so many until the evidence came to both levels."""
+    levels = alarm_levels(config)
+    suspect = float("inf")
+    for number, state in enumerate(_states(stream, levels)):
+        if number < after:
+            continue
+        if state.evidence >= levels.suspect:
+            suspect = min(suspect, float(number - after + 1))
+        if state.evidence >= levels.confirmed:
+            return suspect, float(number - after + 1)
+    return suspect, float("inf")
+
+
+def _states(stream: Iterator[Observation], levels: AlarmLevels) -> Iterator[MonitorState]:
+    state = MonitorState()
+    for observation in stream:
+        state = after_observation(state, observation, levels)
+        yield state
+
+
+def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: MonitorConfig) -> Iterator[Observation]:
+    """Checks of a mount that is at `truth` (n, 6), rad and m from what is served."""
+    turns = Accuracy(np.zeros(6), UNCOMMISSIONED_BIAS, SPREAD_ROTATION)
+    shifts = Accuracy(np.zeros(6), UNCOMMISSIONED_BIAS, SPREAD_POSE)
+    noise, sigma = (
+        np.concatenate([of_turns[:3], of_shifts[3:]])
+        for of_turns, of_shifts in (
+            (turns.noise(config.pairs), shifts.noise(config.pairs)),
+            (turns.sigma(config.pairs), shifts.sigma(config.pairs)),
+        )
+    )
+    checks = len(truth)
+    rig = rng.normal(0.0, 0.5, 6) * UNCOMMISSIONED_BIAS
+    streets = rng.normal(0.0, 1.0, (checks, 6)) * STREET
+    street = np.cumsum(rng.random(checks) < 1.0 / STREET_CHECKS)
+    offset = truth + rig + streets[street] + rng.standard_t(FREEDOM, (checks, 6)) * noise
+    offset = np.where(np.array(_bad(rng, checks))[:, None], rng.standard_t(FREEDOM, (checks, 6)) * BAD, offset)
+    period_ns = round(config.period_s * 1e9)
+    for number in range(checks):
+        begin_ns = number * period_ns
+        yield Observation(
+            stamp_ns=begin_ns + period_ns - 1,
+            pair_stamps_ns=tuple(begin_ns + pair for pair in range(config.pairs)),
+            metrics=(),
+            offset=offset[number],
+            sigma=sigma,
+            noise=noise,
+            place=STREET,
+            distance2=float(np.max((offset[number] / sigma / FLAGGED_AT) ** 2)),
+            flagged=bool(np.any(np.abs(offset[number]) > FLAGGED_AT * sigma)),
+            weak=False,
+            flagged_by_paper=None,
+            causes=(),
+        )
+
+
+def _bad(rng: np.random.Generator, checks: int) -> list[bool]:
+    """(n,) which checks are those of poor stretches."""
+    bad, within = [], False
+    for draw in rng.random(checks):
+        within = draw >= 1.0 / BURST_CHECKS if within else draw < 1.0 / BURST_EVERY
+        bad.append(bool(within))
+    return bad

@@ -1,0 +1,207 @@
+"""Does a claimed standard deviation hold? Errors over what was claimed for them: the calibration of the calibrator.
+
+An error e with the claimed covariance C is told by two figures: per axis e_i / √C_ii, of which 68, 95 and 99.7 % lie
+within 1, 2 and 3 if the claim holds and errors are normal; and over all axes the normalised error squared eᵀ·C⁻¹·e
+(NEES), whose mean per axis is 1 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and
+navigation", 2001, section 5.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.commissioning.quantiles import chi2_quantile
+from coec.calibration.types import Estimate
+from coec.evaluation.statistics import Outcome
+from coec.geometry import se3
+
+SIGMAS = (1.0, 2.0, 3.0)
+"""Within so many claimed standard deviations coverage is told."""
+
+BIN_EDGES = tuple(0.5 * step for step in range(-10, 11))
+"""Of the histogram of e / σ; the first and the last bin also hold what lies beyond."""
+
+CONFIDENCES = tuple(0.1 * step for step in range(1, 10))
+"""Levels of the reliability plot: the share of errors that a normal distribution puts within √2·erf⁻¹ of them."""
+
+BOUNDS = 0.95
+"""Share of evaluations whose mean NEES lies within the bounds, if every claim holds."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Claims:
+    """Errors and what was claimed for them, of n results.
+
+    Attributes:
+        errors: (n, 6) ξ, rx ry rz (rad) tx ty tz (m).
+        covariances: (n, 6, 6) in the same units; rows and columns of axes of which nothing is claimed are NaN.
+        refused: results that were not accepted, or claim nothing: they stand in no figure.
+    """
+
+    errors: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    refused: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalisedErrors:
+    """Figures of `Claims`; per axis rx ry rz tx ty tz, NaN where nothing is claimed.
+
+    Attributes:
+        judged, refused: results with and without a claim.
+        independent: of them, how many share no frame: the bounds are those of so many.
+        rms, largest: (6,) root mean square and largest absolute error, rad and m.
+        sigma: (6,) mean claimed standard deviation.
+        sigma_over_rms: (6,) their ratio: above 1 the claims are wider than the errors.
+        coverage: (3, 6) share of the errors within `SIGMAS`.
+        histogram: (6, len(BIN_EDGES) - 1) counts of e / σ.
+        reliability: (len(CONFIDENCES), 6) share of the errors within the interval that should hold that share.
+        nees: mean of eᵀ·C⁻¹·e per axis, 1 if the claims hold.
+        nees_bounds: between which it lies in `BOUNDS` of all evaluations, if they do.
+    """
+
+    judged: int
+    refused: int
+    independent: int
+    rms: NDArray[np.float64]
+    largest: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    sigma_over_rms: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+    histogram: NDArray[np.int64]
+    reliability: NDArray[np.float64]
+    nees: float
+    nees_bounds: tuple[float, float]
+
+
+def normalise(claims: Claims, independent: int) -> NormalisedErrors:
+    """The figures of some claims, of which `independent` share no frame (at most all of them count)."""
+    errors, covariances = claims.errors, claims.covariances
+    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    known = np.isfinite(sigma)
+    some = np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+    z = np.where(known, errors / np.where(known, sigma, 1.0), np.nan)
+    told = np.where(known, errors, 0.0)
+    rms = np.sqrt((told**2).sum(axis=0) / some)
+    mean_sigma = np.where(known, sigma, 0.0).sum(axis=0) / some
+    nees, axes = _nees(errors, covariances, known)
+    used = min(independent, len(errors))
+    return NormalisedErrors(
+        judged=len(errors),
+        refused=claims.refused,
+        independent=used,
+        rms=rms,
+        largest=np.where(np.isfinite(some), np.abs(told).max(axis=0, initial=0.0), np.nan),
+        sigma=mean_sigma,
+        sigma_over_rms=mean_sigma / np.where(rms > 0.0, rms, np.nan),
+        coverage=np.array([(np.abs(z) <= limit).sum(axis=0) / some for limit in SIGMAS]),
+        histogram=np.array([_histogram(column[np.isfinite(column)]) for column in z.T]),
+        reliability=np.array([(np.abs(z) <= within(share)).sum(axis=0) / some for share in CONFIDENCES]),
+        nees=nees,
+        nees_bounds=_bounds(axes * used // max(len(errors), 1)),
+    )
+
+
+def within(share: float) -> float:
+    """So many standard deviations about the mean hold this share of a normal distribution."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * share)
+
+
+def of_outcomes(outcomes: Sequence[Outcome]) -> Claims:
+    """Errors of accepted outcomes against their reference."""
+    judged = [(outcome.error, claimed(outcome)) for outcome in outcomes]
+    return gathered([None if claim is None else (error, claim) for error, claim in judged])
+
+
+def of_differences(outcomes: Sequence[tuple[Outcome, Outcome]]) -> Claims:
+    """Differences of results that share no frame: the variances add up."""
+    differences: list[tuple[NDArray[np.float64], NDArray[np.float64]] | None] = []
+    for a, b in outcomes:
+        first, second = claimed(a), claimed(b)
+        if first is None or second is None:
+            differences.append(None)
+            continue
+        differences.append((se3.difference(a.T_camera_lidar, b.T_camera_lidar), first + second))
+    return gathered(differences)
+
+
+def gathered(results: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]] | None]) -> Claims:
+    """Claims from error (6,) and covariance (6, 6) of each result; None was refused."""
+    told = [result for result in results if result is not None]
+    return Claims(
+        errors=np.array([error for error, _ in told]).reshape(-1, 6),
+        covariances=np.array([covariance for _, covariance in told]).reshape(-1, 6, 6),
+        refused=len(results) - len(told),
+    )
+
+
+def claimed(outcome: Outcome) -> NDArray[np.float64] | None:
+    """(6, 6) what an accepted outcome claims; None of any other, or where it claims nothing at all."""
+    estimate = outcome.trial.estimate
+    if estimate is None or not outcome.accepted:
+        return None
+    covariance = covariance_of(estimate)
+    return covariance if np.isfinite(np.diagonal(covariance)).any() else None
+
+
+def covariance_of(estimate: Estimate) -> NDArray[np.float64]:
+    """(6, 6) from the standard deviations of an estimate, whose axes count as independent; NaN on axes that were not
+    solved."""
+    sigma = np.where(estimate.solved, estimate.sigma, np.nan)
+    known = np.isfinite(sigma)
+    covariance = np.diag(sigma**2)
+    covariance[~known, :] = covariance[:, ~known] = np.nan
+    return covariance
+
+
+def _nees(errors: NDArray[np.float64], covariances: NDArray[np.float64], known: NDArray[np.bool_]) -> tuple[float, int]:
+    """Mean NEES per axis, NaN of none, and the number of axes of all results together."""
+    total, axes = 0.0, 0
+    for error, covariance, of in zip(errors, covariances, known, strict=True):
+        if of.any():
+            total += float(error[of] @ np.linalg.solve(covariance[np.ix_(of, of)], error[of]))
+            axes += int(of.sum())
+    return (total / axes if axes else float("nan")), axes
+
+
+def _bounds(dof: int) -> tuple[float, float]:
+    """Of a mean of χ² per degree of freedom."""
+    if dof < 1:
+        return (float("nan"), float("nan"))
+    outside = 0.5 * (1.0 - BOUNDS)
+    # The approximation of the quantile falls below zero in the lower tail of one degree of freedom.
+    return max(chi2_quantile(outside, dof), 0.0) / dof, chi2_quantile(1.0 - outside, dof) / dof
+
+
+def _histogram(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    inner = np.asarray(BIN_EDGES)[1:-1]
+    return np.bincount(np.searchsorted(inner, values, side="right"), minlength=len(inner) + 1)
+
+
+def jacobian_of(T_b_a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6, 6) how a perturbation about the axes of frame a reads about those of frame b, T_b_a (4, 4): rotations turn,
+    and shift the origin of b by their lever."""
+    rotation, lever = T_b_a[:3, :3], T_b_a[:3, 3]
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = jacobian[3:, 3:] = rotation
+    jacobian[3:, :3] = np.cross(lever, rotation.T).T
+    return jacobian
+
+
+UNKNOWN_SHARE = 0.1
+"""An axis that takes more than this share of its length from an axis of which nothing is claimed claims nothing, too:
+less is a lever of parallel cameras, whose axes differ by rounding."""
+
+
+def carried(covariance: NDArray[np.float64], jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6, 6) J·C·Jᵀ, with NaN on the axes that rest upon one of which nothing is claimed."""
+    unknown = ~np.isfinite(np.diagonal(covariance))
+    moved = jacobian @ np.where(np.isfinite(covariance), covariance, 0.0) @ jacobian.T
+    spoiled = np.sqrt((jacobian**2 * unknown).sum(axis=1)) > UNKNOWN_SHARE
+    moved[spoiled, :] = moved[:, spoiled] = np.nan
+    return np.asarray(moved)

@@ -1,0 +1,109 @@
+"""What sensors are off by, and what a pose makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coec.calibration.confidence.budget import COLUMN_SHARE, EDGE_PX, STAMP_S, TERMS, systematic
+from coec.calibration.confidence.grain import LENS_PX, Grain, column_rad, grain_of
+from coec.calibration.objective.cells import SightLines
+from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Window
+from estimates import RIG
+from landscapes import Array
+
+FRAMES = 4
+UP_OF_LIDAR = np.array([0.0, -1.0, 0.0])
+GRAIN = Grain(
+    pixel_rad=1e-3,
+    lens_px=0.05,
+    column_rad=3e-3,
+    velocity_mps=np.tile([0.0, 0.0, 10.0], (FRAMES, 1)),
+    turn_radps=np.zeros((FRAMES, 3)),
+)
+
+
+def street(rng: np.random.Generator, farthest_m: float = 40.0) -> SightLines:
+    """Points ahead, as many to the left as to the right, at many ranges."""
+    direction = np.column_stack([rng.uniform(-0.8, 0.8, 3000), rng.uniform(-0.3, 0.3, 3000), np.ones(3000)])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    range_m = rng.uniform(5.0, farthest_m, 3000)
+    return SightLines(direction * range_m[:, None], np.ones(3000), rng.integers(0, FRAMES, 3000))
+
+
+def shifts(sight: SightLines, dof: int, grain: Grain = GRAIN) -> dict[str, Array]:
+    return systematic(sight, grain, tuple(range(dof)), UP_OF_LIDAR)
+
+
+def test_every_term_answers_on_the_axes_that_were_searched_and_on_no_other(rng: np.random.Generator) -> None:
+    found = shifts(street(rng), 3)
+    assert list(found) == list(TERMS)
+    for shift in found.values():
+        assert np.isfinite(shift).all()
+        np.testing.assert_array_equal(shift[3:], 0.0)
+
+
+def test_a_principal_point_aside_is_a_turn_of_the_camera(rng: np.random.Generator) -> None:
+    off = GRAIN.lens_px * GRAIN.pixel_rad
+    found = shifts(street(rng), 3)
+    assert found["lens_across"][1] == pytest.approx(off, rel=0.15)
+    assert found["lens_down"][0] == pytest.approx(-off, rel=0.15)
+    assert np.abs(found["lens_across"][[0, 2]]).max() < 0.1 * off
+
+
+def test_a_stamp_that_is_late_is_a_shift_along_the_way(rng: np.random.Generator) -> None:
+    found = shifts(street(rng), 6)["stamps"]
+    assert abs(found[5]) == pytest.approx(10.0 * STAMP_S, rel=1e-6)
+    np.testing.assert_allclose(found[:5], 0.0, atol=1e-9)
+    still = replace(GRAIN, velocity_mps=np.zeros((FRAMES, 3)))
+    np.testing.assert_allclose(shifts(street(rng), 6, still)["stamps"], 0.0, atol=1e-12)
+
+
+def test_what_moves_near_edges_alone_is_a_shift_to_the_side(rng: np.random.Generator) -> None:
+    """With six degrees of freedom far edges hold the turn, and near ones the place."""
+    found = shifts(street(rng), 6)
+    for name, size_rad in (
+        ("near_edges_across", EDGE_PX * GRAIN.pixel_rad),
+        ("columns", COLUMN_SHARE * GRAIN.column_rad),
+    ):
+        assert 5.0 * size_rad < abs(found[name][3]) < 40.0 * size_rad
+        assert abs(found[name][1]) < size_rad
+
+
+def test_a_lens_that_misses_its_camera_is_told_in_proportion(rng: np.random.Generator) -> None:
+    sight = street(rng)
+    good, poor = shifts(sight, 3), shifts(sight, 3, replace(GRAIN, lens_px=10.0))
+    np.testing.assert_allclose(poor["lens_across"], 200.0 * good["lens_across"], rtol=1e-9)
+
+
+def test_what_a_fitted_camera_misses_is_in_the_budget() -> None:
+    sweep = LidarFrame(0, "lidar", np.zeros((0, 3), np.float32))
+    image = EncodedImage(ImageFormat.MONO8, 4, 3, bytes(12))
+    pair = FramePair(CameraFrame(0, "camera", image), sweep)
+    window = Window("w", RIG, RIG.T_camera_lidar_nominal, (pair,))
+    missing = replace(window, rig=replace(RIG, camera_residual_px=33.7))
+    good, poor = (grain_of(one, RIG.T_camera_lidar_nominal) for one in (window, missing))
+    assert good.lens_px == LENS_PX
+    assert poor.lens_px == pytest.approx(33.7 / np.sqrt(3.0), rel=1e-3)
+    np.testing.assert_array_equal(good.velocity_mps, np.zeros((1, 3)))
+
+
+def test_nothing_in_view_determines_nothing() -> None:
+    nothing = SightLines(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+    assert shifts(nothing, 6) == {}
+
+
+@pytest.mark.parametrize("with_rings", [True, False])
+def test_the_columns_of_a_sweep_are_measured(with_rings: bool, rng: np.random.Generator) -> None:
+    azimuth, beam = (grid.ravel() for grid in np.meshgrid(np.radians(np.arange(0.0, 360.0, 0.4)), np.arange(16)))
+    elevation = np.radians(2.0 * beam - 15.0)
+    range_m = rng.uniform(5.0, 30.0, len(azimuth))
+    xyz_m = range_m[:, None] * np.column_stack(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
+    order = rng.permutation(len(xyz_m))
+    ring = beam[order].astype(np.uint16) if with_rings else None
+    sweep = LidarFrame(0, "lidar", xyz_m[order].astype(np.float32), ring=ring)
+    assert column_rad(sweep) == pytest.approx(np.radians(0.4), rel=1e-3)

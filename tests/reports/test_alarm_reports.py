@@ -1,0 +1,36 @@
+"""Tables and pictures of the change detector, whatever was noticed."""
+
+from __future__ import annotations
+
+from math import inf
+
+import pytest
+
+from coec.config import MonitorConfig
+from coec.evaluation.alarms import Alarms, Creep, Delay, FalseAlarms
+from coec.reports import alarm_reports
+
+ALARMS = Alarms(
+    MonitorConfig(),
+    (FalseAlarms(10.0, 5.0, 1),),
+    (Delay(0.1, (inf, 5.0), (inf, inf)), Delay(1.0, (5.0, 10.0, 10.0), (10.0, 15.0, 20.0))),
+    Creep(0.1, (2.0, 3.0, 4.0), (3.0, 4.0, inf)),
+)
+
+
+def test_what_was_not_noticed_in_time_has_no_figure() -> None:
+    report = alarm_reports.document_of(ALARMS)
+    assert report.delays[0].confirmed_s.median is None
+    assert (report.delays[1].confirmed_s.median, report.delays[1].confirmed_s.p95) == (15.0, 20.0)
+    assert (report.creep_confirmed_h.median, report.creep_confirmed_h.max) == (4.0, None)
+
+
+def test_the_curve_is_drawn() -> None:
+    assert alarm_reports.delay_curve(alarm_reports.document_of(ALARMS)).startswith(b"\x89PNG")
+
+
+def test_the_tables_say_what_is_stated_and_what_was(capsys: pytest.CaptureFixture[str]) -> None:
+    alarm_reports.show(alarm_reports.document_of(ALARMS))
+    told = capsys.readouterr().out
+    assert "10 h" in told
+    assert "0.1°/h is suspected after 3.0 h and confirmed after 4.0 h" in " ".join(told.split())

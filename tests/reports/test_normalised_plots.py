@@ -1,0 +1,22 @@
+"""Figures of normalised errors: that they are drawn whatever was claimed, and always the same."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coec.evaluation.normalised_errors import Claims, gathered, normalise
+from coec.reports.normalised_plots import normalised
+from reports.test_plots import _size
+
+ERRORS = np.random.default_rng(1).normal(size=(40, 6))
+FOUND = normalise(Claims(ERRORS, np.tile(np.eye(6), (40, 1, 1)), refused=2), 40)
+NOTHING = normalise(gathered([None]), 1)
+
+
+def test_every_reference_has_its_row() -> None:
+    one, two = normalised({"truth": FOUND}, "title"), normalised({"truth": FOUND, "halves": NOTHING}, "title")
+    assert _size(two)[1] > 1.8 * _size(one)[1]
+
+
+def test_equal_figures_are_equal_bytes() -> None:
+    assert normalised({"truth": FOUND}, "title") == normalised({"truth": FOUND}, "title")
