@@ -31,7 +31,7 @@ from coec.calibration.lifecycle import (
     time_stepped_back,
     window_wanted_since,
 )
-from coec.calibration.monitor.change_detector import Finding, Observation
+from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import (
     Decision,
@@ -192,12 +192,22 @@ def moved_within(before_deg: float, after_deg: float, stamp_s: int = 300) -> Est
     return replace(refused, verdict=Verdict(Decision.FAILED, (), (KNOCK,)), moved=moved)
 
 
+OBJECTED = replace(HEALTHY, flagged_since_ns=290 * S)
+"""A check has something against the mount, which is no suspicion yet."""
+
+
 def test_a_window_that_saw_a_knock_speaks_against_what_is_served_and_wants_the_next_one_soon() -> None:
-    state = solved(HEALTHY, moved_within(0.5, 3.0))
+    state = solved(OBJECTED, moved_within(0.5, 3.0))
     assert state.health is HealthState.SUSPECT
     assert state.reasons == (KNOCK,)
     assert np.array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
     assert window_wanted_since(state) == (300 - 18) * S
+
+
+def test_without_a_check_that_objects_a_knock_within_a_window_is_no_witness() -> None:
+    assert solved(HEALTHY, moved_within(0.5, 3.0)).health is HealthState.HEALTHY
+    dazzled = replace(OBJECTED, monitor=MonitorState(blind={"open_field": 2.0}))
+    assert solved(dazzled, moved_within(0.5, 3.0)).health is HealthState.HEALTHY
 
 
 def test_a_window_at_whose_end_the_camera_is_where_it_is_served_speaks_against_nothing() -> None:
@@ -215,7 +225,7 @@ def test_a_window_that_cannot_tell_for_another_reason_is_no_witness_of_a_knock()
 
 
 def test_a_window_is_wanted_no_longer_once_one_was_accepted_or_the_monitor_is_clear() -> None:
-    knocked = solved(HEALTHY, moved_within(0.5, 3.0))
+    knocked = solved(OBJECTED, moved_within(0.5, 3.0))
     assert window_wanted_since(solved(knocked, estimate(0.5, 400))) is None
     assert window_wanted_since(watched(knocked, *clear_from(310, 3))) is None
 
@@ -224,6 +234,17 @@ def test_the_monitor_says_since_when_a_window_is_wanted() -> None:
     state = watched(HEALTHY, *clear_from(200, 2), *flagged_from(300, 6))
     assert state.flagged_since_ns is not None
     assert window_wanted_since(state) == state.flagged_since_ns
+
+
+def test_one_poor_stretch_after_another_is_one() -> None:
+    poor = MonitorState(outcome=Finding.CLEAR, blind={"open_field": 3.0})
+    state = watched(replace(HEALTHY, monitor=poor), *clear_from(300, 1))
+    assert (state.health, state.poor_since_ns) == (HealthState.DEGRADED, 300 * S)
+    early = watched(state, *clear_from(310, 4))
+    assert (early.health, [reason.code for reason in early.reasons]) == (HealthState.DEGRADED, ["settling"])
+    assert solved(early, estimate(0.5, 340)).health is HealthState.DEGRADED, "a window settles the mount, not the data"
+    late = watched(early, *clear_from(361, 1))
+    assert (late.health, late.poor_since_ns) == (HealthState.HEALTHY, None)
 
 
 def test_a_refused_window_in_which_another_pose_stands_out_is_a_suspicion() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from coec.calibration.lifecycle.pair_state import SETTLING_NS
 from coec.calibration.lifecycle.states import MEANING, STATES, HealthState, markdown
 from coec.calibration.monitor import change_detector, hypotheses, sensor_faults
 from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, Cause
@@ -42,7 +43,9 @@ def page() -> str:
         f"{change_detector.WEAK_SHARE:g}) that do not\n"
         "add up to that, as they put the mount elsewhere every time, the monitor is at odds with itself.\n"
         f"A cause in the data is believed from {change_detector.BLIND_AT:g} on; dirt is one after the same blocks\n"
-        f"of the image have shown no contrast for {sensor_faults.DIRTY_CHECKS:g} checks.\n\n"
+        f"of the image have shown no contrast for {sensor_faults.DIRTY_CHECKS:g} checks.\n"
+        f"Once its data could not be judged a pair stays `degraded` for {SETTLING_NS / 1e9:g} s of sensor time\n"
+        "(`settling`): one poor stretch after another is one.\n\n"
         f"## Causes\n\n{told}"
     )
 

@@ -40,6 +40,12 @@ LAST_KNOWN = "last_known"
 
 RESTARTED = Reason("restarted", "The service was started again; nothing has been looked at since.")
 
+SETTLING_NS = 60_000_000_000
+"""Sensor time, a minute, that a pair stays degraded, at least, once its data could not be judged: one poor stretch
+after another is one, and who reads health is told of no change twice a minute."""
+
+SETTLING = Reason("settling", "The data can be judged again, after a stretch where they could not.")
+
 NOT_EVALUATED = Reason("not_evaluated", "No window has been evaluated yet.")
 
 
@@ -125,6 +131,7 @@ class PairState:
         monitor: what the checks since then add up to.
         flagged_since_ns: sensor time since which the monitor has something against the pairs, None while it has not. A
             window that began earlier mixes two mounts: it neither corrects nor acquits.
+        poor_since_ns: sensor time at which the data began not to tell, None once health has left that behind.
         changes: steps of the last day that nobody ordered.
     """
 
@@ -143,6 +150,7 @@ class PairState:
     track: Track | None = None
     monitor: MonitorState = field(default_factory=MonitorState)
     flagged_since_ns: int | None = None
+    poor_since_ns: int | None = None
     changes: tuple[policy.Change, ...] = ()
 
 
@@ -193,7 +201,9 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     if estimate.verdict.decision is Decision.FAILED:
         state = replace(state, status=Status.FAILED)
         moved = _well_told_move(estimate)
-        if moved is None and estimate.verdict.cannot_tell:
+        # Along a tunnel two poses fit as well as in front of and behind a knock: without a check that has something
+        # against the pairs that is no witness.
+        if (moved is None and estimate.verdict.cannot_tell) or (moved is not None and not _objected(state)):
             return state
         # Where the camera moved within the window, its end tells where it is now.
         latest = estimate.optimum.T_camera_lidar if moved is None else moved.T_after
@@ -213,6 +223,12 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     # A track of one window is that window, to the last bit.
     pose = estimate.optimum.T_camera_lidar if track.windows <= 1 else track.T_camera_lidar
     return _applied_or_waiting(state, pose, estimate, rules.policy)
+
+
+def _objected(state: PairState) -> bool:
+    """Whether the monitor has something against the mount, and nothing against the data."""
+    cause = diagnose(state.monitor)
+    return state.flagged_since_ns is not None and (cause is None or cause.code == BENT_MOUNT)
 
 
 def _well_told_move(estimate: Estimate) -> MovedWithin | None:
@@ -267,7 +283,7 @@ def _applied_or_waiting(state: PairState, pose: Matrix4, estimate: Estimate, rul
     close = policy.agrees(step, rules)
     state = replace(state, pending=Candidate(pose, estimate, waits, contradicts=not close))
     if close:
-        return _confirmed(state)
+        return _confirmed(state, estimate.data_stamp_ns)
     why = Reason("candidate_waits", f"An accepted window differs by {_told(step)} from what is served.")
     return happened(state, Event.CONTRADICTED, why, waits)
 
@@ -281,16 +297,19 @@ def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
         accepted=estimate,
         pending=None,
     )
-    return _confirmed(state)
+    return _confirmed(state, estimate.data_stamp_ns)
 
 
-def _confirmed(state: PairState) -> PairState:
+def _confirmed(state: PairState, stamp_ns: int) -> PairState:
     """A window vouches for what is served: whatever the monitor had against it is settled. What is wrong with the data
     is not."""
     fresh = MonitorState(blind=state.monitor.blind, dirt=state.monitor.dirt)
     cause = diagnose(fresh)
-    state = happened(replace(state, proven=True, monitor=fresh, flagged_since_ns=None), Event.CONFIRMED_BY_WINDOW)
-    return state if cause is None else happened(state, Event.DATA_CAUSE, cause.as_reason())
+    state = replace(state, proven=True, monitor=fresh, flagged_since_ns=None)
+    if cause is None:
+        return _well_again(state, Event.CONFIRMED_BY_WINDOW, stamp_ns)
+    after = happened(happened(state, Event.CONFIRMED_BY_WINDOW), Event.DATA_CAUSE, cause.as_reason())
+    return after if state.health is HealthState.DEGRADED else replace(after, poor_since_ns=stamp_ns)
 
 
 # --- the monitor, and time ------------------------------------------------------------------------------------------
@@ -310,7 +329,7 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
     state = replace(state, monitor=monitor, flagged_since_ns=since_ns)
     cause = diagnose(monitor)
     if cause is not None and cause.code != BENT_MOUNT:
-        return _unless_red(state, Event.DATA_CAUSE, cause.as_reason())
+        return _poor(state, Event.DATA_CAUSE, observation.stamp_ns, cause.as_reason())
     if monitor.outcome is Finding.CONFIRMED:
         why = () if cause is None else (cause.as_reason(),)
         return happened(state, Event.MOUNT_MOVED, *(why or (Reason(BENT_MOUNT, "The mount has moved."),)))
@@ -319,14 +338,30 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
         return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
     if monitor.outcome is Finding.AT_ODDS:
         text = "The latest checks accuse the mount, but do not add up to a move; a window is being taken to tell."
-        return _unless_red(state, Event.AT_ODDS, Reason("checks_at_odds", text))
+        return _poor(state, Event.AT_ODDS, observation.stamp_ns, Reason("checks_at_odds", text))
     # Against an accepted window that contradicts what is served the word of the monitor is not enough.
     if monitor.outcome is Finding.CLEAR and (state.pending is None or not state.pending.contradicts):
         if state.proven:
-            return happened(state, Event.CLEAR)
-        after = happened(state, Event.NO_OBJECTION, NOT_EVALUATED)
-        return state if after.health is state.health else after
+            return _well_again(state, Event.CLEAR, observation.stamp_ns)
+        after = _well_again(state, Event.NO_OBJECTION, observation.stamp_ns, NOT_EVALUATED)
+        return after if after.health is not state.health or after.reasons == (SETTLING,) else state
     return state
+
+
+def _poor(state: PairState, event: Event, stamp_ns: int, why: Reason) -> PairState:
+    """The data do not tell, at this sensor time."""
+    after = _unless_red(state, event, why)
+    goes_on = state.health is HealthState.DEGRADED and state.poor_since_ns is not None
+    return after if goes_on else replace(after, poor_since_ns=stamp_ns)
+
+
+def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason) -> PairState:
+    """The event, at this sensor time, which makes a pair healthy, unless its data began not to tell less than
+    `SETTLING_NS` before."""
+    since_ns = state.poor_since_ns
+    if state.health is HealthState.DEGRADED and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
+        return replace(state, reasons=(SETTLING,))
+    return replace(happened(state, event, *reasons), poor_since_ns=None)
 
 
 def overdue(state: PairState, why: Reason) -> PairState:
@@ -355,7 +390,9 @@ def time_stepped_back(state: PairState, stamp_ns: int) -> PairState:
     """The clock of the sensors stepped back, to this time. What was suspected of pairs since some time of the old clock
     is suspected of every pair of the new one."""
     since_ns = None if state.flagged_since_ns is None else stamp_ns
-    state = replace(state, flagged_since_ns=since_ns, monitor=replace(state.monitor, last_stamps_ns=()))
+    state = replace(
+        state, flagged_since_ns=since_ns, poor_since_ns=None, monitor=replace(state.monitor, last_stamps_ns=())
+    )
     why = Reason("time_stepped_back", "The clock of the sensors stepped back; nothing has been looked at since.")
     return _unseen(state, Event.TIME_STEPPED_BACK, why)
 
@@ -427,6 +464,7 @@ def after_commissioning(state: PairState, T_commissioned: Matrix4) -> PairState:
 
 def _replaced(state: PairState, pose: Matrix4, text: str) -> PairState:
     state = replace(state, T_camera_lidar=pose, pending=None, monitor=MonitorState(), flagged_since_ns=None, changes=())
+    state = replace(state, poor_since_ns=None)
     return happened(state, Event.REPLACED, Reason("replaced", text))
 
 

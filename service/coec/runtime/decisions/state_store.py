@@ -69,6 +69,7 @@ class StoredPair(Part):
     track: dict[str, Any] | None = None
     monitor: MonitorState = MonitorState()
     flagged_since_ns: int | None = None
+    poor_since_ns: int | None = None
     changes: tuple[StoredChange, ...] = ()
     since_wall_ns: int | None = None
     completed_stamp_ns: int | None = None
@@ -156,6 +157,7 @@ class StateStore:
             track=track_to_dict(state.track) if state.track else None,
             monitor=state.monitor,
             flagged_since_ns=state.flagged_since_ns,
+            poor_since_ns=state.poor_since_ns,
             changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
             since_wall_ns=clocks.since_wall_ns,
             completed_stamp_ns=clocks.completed_stamp_ns,
@@ -216,5 +218,6 @@ def _state_of(stored: StoredPair) -> PairState:
         track=track_from_dict(stored.track) if stored.track else None,
         monitor=stored.monitor,
         flagged_since_ns=stored.flagged_since_ns,
+        poor_since_ns=stored.poor_since_ns,
         changes=tuple(Change(change.stamp_ns, change.step) for change in stored.changes),
     )
