@@ -202,9 +202,12 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     found = replace(best, evaluations=sum(end.evaluations for end in (*ends, *settled)))
     if at_rim(found.T_camera_lidar, start, reach):
         found = replace(found, stop_reason=StopReason.AT_BOUND)
+    others = [end.T_camera_lidar for end in settled if end is not best]
+    if not _differ(start, best.T_camera_lidar):
+        # Where the window cannot tell the pose before the search from what was found, it has told nothing.
+        others.append(start)
     summits = (
-        # The pose before the search, too: where the window cannot tell it from what was found, it has told nothing.
-        Rivals(finest, best.T_camera_lidar, (*(e.T_camera_lidar for e in settled if e is not best), start)),
+        Rivals(finest, best.T_camera_lidar, tuple(others)),
         Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
     )
     return Found(finest, found, metrics, summits, edges)
