@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from coec.adapters.files.conversions import result_of
+from coec.adapters.files.state_file import StateFile
 from coec.calibration.lifecycle import (
     Change,
     HealthState,
@@ -99,4 +100,59 @@ def test_an_intact_file_of_another_form_is_an_error(tmp_path: Path) -> None:
     store = StateStore(tmp_path, "test")
     store._file.save({"pairs": {"front": {"matrix": 1}}})
     with pytest.raises(StateError, match="another form"):
+        StateStore(tmp_path, "test").recall(RIG)
+
+
+ZERO = [[0.0] * 4] * 4
+SHEARED = [[1.0, 0.1, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize("rows", [ZERO, SHEARED], ids=["zero", "sheared"])
+@pytest.mark.parametrize("where", ["T_camera_lidar", "pending", "accepted", "track"])
+def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: str, rows: list[list[float]]) -> None:
+    served = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
+    waiting = after_estimate(initial_state(RIG), estimate(1), 0, NEVER)
+    StateStore(tmp_path, "test").remember(RIG, waiting if where == "pending" else served, CLOCKS)
+    file = StateFile(tmp_path / "state.json")
+    body = file.load().body
+    assert body is not None
+    stored = body["pairs"][RIG.pair]
+    match where:
+        case "T_camera_lidar":
+            stored["T_camera_lidar"] = rows
+        case "pending":
+            stored["pending"]["T_camera_lidar"] = rows
+        case "accepted":
+            stored["accepted"]["camera_from_lidar"]["matrix"] = rows
+        case _:
+            stored["track"]["slow"]["T_camera_lidar"] = rows
+    file.save(body)
+    forged = (tmp_path / "state.json").read_bytes()
+    store = StateStore(tmp_path, "test")
+    with pytest.raises(StateError, match="no rigid transform"):
+        store.recall(RIG)
+    store.remember(RIG, initial_state(RIG), CLOCKS)
+    assert (tmp_path / "state.json.broken").read_bytes() == forged
+    assert restarted(tmp_path) is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("completed_wall_ns", -(10**4000)),
+        ("since_wall_ns", 10**400),
+        ("T_camera_lidar", [[10**400] * 4] * 4),
+        ("track", {"slow": []}),
+        ("monitor", 3),
+        ("changes", [{"stamp_ns": 1, "step": "x"}]),
+    ],
+)
+def test_numbers_and_shapes_that_nobody_wrote_are_an_error_of_ours(tmp_path: Path, name: str, value: object) -> None:
+    StateStore(tmp_path, "test").remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS)
+    file = StateFile(tmp_path / "state.json")
+    body = file.load().body
+    assert body is not None
+    body["pairs"][RIG.pair][name] = value
+    file.save(body)
+    with pytest.raises(StateError):
         StateStore(tmp_path, "test").recall(RIG)

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from coec.adapters.files import durable
 from coec.adapters.files.durable import Log
+from coec.adapters.files.state_file import BROKEN
 from coec.errors import DecodeError, StateError
 from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import CalibrationResult, ChainedEntry, HistoryEntry
@@ -148,12 +149,7 @@ class History:
             return []
 
     def _keep_aside(self) -> None:
-        aside, number = self._path.with_name(f"{self._path.name}.broken"), 0
-        while aside.exists():
-            number += 1
-            aside = self._path.with_name(f"{self._path.name}.broken-{number}")
-        with contextlib.suppress(FileNotFoundError):
-            durable.keep_under(self._path, aside)
+        durable.set_aside(self._path, BROKEN)
         self._to_keep_aside = False
 
 

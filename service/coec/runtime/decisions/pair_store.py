@@ -97,6 +97,8 @@ class PairStore:
             self.damage = self.damage or Reason("history_damaged", text)
             self._write(_entry("chain", "broken", text))
             self.save()
+        elif self.damage is not None:
+            self.save()
         if self._state.health is not remembered.health:
             self._since_ns = time.time_ns()
             self._note_health(remembered, self._state, None)
@@ -258,7 +260,8 @@ class PairStore:
             damage, remembered = (*damage, str(error)), None
         if damage:
             source = "the previous copy" if remembered else "the nominal calibration"
-            self.damage = Reason("state_damaged", f"The state on the disk was damaged; {source} is served.")
+            text = f"The state on the disk cannot be used: {'; '.join(damage)}. It is kept aside; {source} is served."
+            self.damage = Reason("state_damaged", text)
             self._losses.add("storage", "state_damaged", len(damage), detail="; ".join(damage))
         if remembered is None:
             return initial_state(self._rig), None
