@@ -367,7 +367,7 @@ class StateConfig(Stage):
     min_free_bytes: int = Field(
         default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
     )
-    history: int = Field(default=500, ge=1, le=10_000, description="entries kept per pair")
+    history: int = Field(default=500, ge=1, le=10_000, description="kept per pair: results, states, commands, each")
     checks: int = Field(default=2000, ge=1, le=100_000, description="checks of the monitor kept per pair, 2 kB each")
     evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -53,7 +54,7 @@ class StoredChange(Part):
 
 class StoredPair(Part):
     """`PairState` on the disk; when (wall clock) a check was last completed and since when it is in its state of
-    health; and the head of its history on the disk. What is not in a file of an earlier version is as at the first
+    health; and the heads of its history on the disk. What is not in a file of an earlier version is as at the first
     start."""
 
     rig_sha256: str
@@ -76,7 +77,7 @@ class StoredPair(Part):
     changes: tuple[StoredChange, ...] = ()
     since_wall_ns: WallNs | None = None
     completed_stamp_ns: int | None = None
-    history_head: str | None = None
+    history_heads: dict[str, str] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ class Remembered:
 
     state: PairState
     clocks: Clocks
-    history_head: str | None
+    history_heads: Mapping[str, str]
 
 
 class StateStore:
@@ -133,13 +134,13 @@ class StateStore:
                 )
                 return None
             clocks = Clocks(stored.completed_wall_ns, stored.completed_stamp_ns, stored.since_wall_ns)
-            return Remembered(_state_of(stored), clocks, stored.history_head)
+            return Remembered(_state_of(stored), clocks, stored.history_heads)
         except (ValidationError, CoecError, ArithmeticError, LookupError, ValueError, TypeError) as error:
             self._file.distrust()
             why = "a pose in it is no rigid transform" if isinstance(error, _NoPoseError) else "it has another form"
             raise StateError(f"the state of pair {rig.pair} cannot be used: {why}") from error
 
-    def remember(self, rig: Rig, state: PairState, clocks: Clocks, history_head: str | None = None) -> None:
+    def remember(self, rig: Rig, state: PairState, clocks: Clocks, history_heads: Mapping[str, str]) -> None:
         """Put the pair's state on the disk.
 
         Raises:
@@ -166,7 +167,7 @@ class StateStore:
             changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
             since_wall_ns=clocks.since_wall_ns,
             completed_stamp_ns=clocks.completed_stamp_ns,
-            history_head=history_head,
+            history_heads=dict(history_heads),
         )
         with self._lock:
             self._pairs[rig.pair] = stored.model_dump(mode="json")
