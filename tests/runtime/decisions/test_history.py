@@ -68,7 +68,7 @@ def test_a_window_that_is_solved_again_and_again_displaces_no_other(tmp_path: Pa
             entry("extrinsic", "estimated", window_id=again.window_id, camera_from_lidar=again.camera_from_lidar)
         )
     assert history.results()[0] == result
-    assert [kept.entry.window_id for kept in history.entries() if kept.entry.kind == "extrinsic"][0] == result.window_id
+    assert next(one.entry.window_id for one in history.entries() if one.entry.kind == "extrinsic") == result.window_id
 
 
 def test_entries_are_numbered_together_in_the_order_in_which_they_came(tmp_path: Path) -> None:
