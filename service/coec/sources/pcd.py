@@ -20,7 +20,7 @@ MAX_TABLE_BYTES = 128 * 2**20
 """Of all rows as they are packed: 32 bytes for each of `MAX_POINTS`. With the columns made of it, and the file, it is
 what a hostile header can make us allocate, some 400 MB."""
 
-MAX_UNPACKED_BYTES = 32 * 2**20
+MAX_UNPACKED_BYTES = 20 * 2**20
 """The same for compressed points. They are unpacked in plain Python, and nobody waits for more; a sweep of 0.3 million
 points with 10 columns has 12 MB."""
 
