@@ -367,7 +367,7 @@ class StateConfig(Stage):
     min_free_bytes: int = Field(
         default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
     )
-    history: int = Field(default=500, ge=1, le=10_000, description="entries kept per pair")
+    history: int = Field(default=500, ge=1, le=10_000, description="kept per pair: results, states, commands, each")
     checks: int = Field(default=2000, ge=1, le=100_000, description="checks of the monitor kept per pair, 2 kB each")
     evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
 
@@ -428,6 +428,16 @@ def config_hash(*parts: BaseModel | str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+MAX_YAML_BYTES = 2**20
+"""Of a YAML file; 10,000 frames of a manifest, or pairs beyond number. Reading it takes 4 s (one core at 3 GHz)."""
+
+MAX_YAML_DEPTH = 32
+"""Of ours, none is nested deeper than 6."""
+
+MAX_YAML_VALUES = 200_000
+"""10,000 frames of a manifest with a velocity each have 130,000."""
+
+
 def load_yaml(path: Path) -> Any:
     """The document of a YAML 1.2 file.
 
@@ -435,11 +445,48 @@ def load_yaml(path: Path) -> Any:
         ConfigError: the file cannot be read or is not YAML.
     """
     try:
-        return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+        with path.open("rb") as stream:
+            data = stream.read(MAX_YAML_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
-    except (YAMLError, UnicodeDecodeError) as error:
+    try:
+        return parse_yaml(data.decode("utf-8"))
+    except (ConfigError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid YAML: {error}") from error
+
+
+def parse_yaml(text: str) -> Any:
+    """The document of a YAML 1.2 text.
+
+    Raises:
+        ConfigError: it is not YAML, or larger or deeper than anything that a person writes.
+    """
+    if len(text) > MAX_YAML_BYTES:
+        raise ConfigError(f"it has more than {MAX_YAML_BYTES} bytes")
+    try:
+        document = YAML(typ="safe").load(text)
+    except RecursionError as error:
+        raise ConfigError("it is nested too deeply") from error
+    except YAMLError as error:
+        raise ConfigError(str(error)) from error
+    except Exception as error:  # constructors of numbers, dates and the like raise whatever Python's own do
+        raise ConfigError(f"a value in it is none: {type(error).__name__}") from error
+    _check_extent(document)
+    return document
+
+
+def _check_extent(document: object) -> None:
+    """Aliases make little text a document without end: it is walked as whoever validates it will walk it."""
+    waiting, values = [(document, 0)], 0
+    while waiting:
+        value, depth = waiting.pop()
+        values += 1
+        if depth > MAX_YAML_DEPTH or values > MAX_YAML_VALUES:
+            raise ConfigError(f"it is nested deeper than {MAX_YAML_DEPTH}, or has more than {MAX_YAML_VALUES} values")
+        if isinstance(value, dict):
+            waiting += ((item, depth + 1) for item in value.values())
+        elif isinstance(value, list):
+            waiting += ((item, depth + 1) for item in value)
 
 
 def load_config(path: Path) -> Config:

@@ -12,6 +12,7 @@ import pytest
 
 from baselines import a_baseline
 from coec.adapters.files.baseline_file import save_baseline
+from coec.adapters.files.state_file import StateFile
 from coec.calibration.commissioning.baseline import learned_hash
 from coec.calibration.monitor.change_detector import alarm_levels
 from coec.calibration.types import (
@@ -161,12 +162,12 @@ def test_hold_freezes_over_a_restart_until_it_is_released(bench: Bench) -> None:
 
 
 def test_every_command_is_written_down_but_a_flood_of_refusals_only_once(bench: Bench) -> None:
-    for _ in range(50):
+    for _ in range(10):
         bench.do("apply")
     bench.do("hold")
     entries = bench.entries("command")
     assert [(entry.code, entry.sender) for entry in entries] == [("nothing_pending", "the test"), ("held", "the test")]
-    assert bench.answers.status().commands == {"apply_refused": 50, "hold_accepted": 1}
+    assert bench.answers.status().commands == {"apply_refused": 10, "hold_accepted": 1}
 
 
 def test_a_red_event_leaves_evidence(bench: Bench) -> None:
@@ -286,3 +287,23 @@ def test_a_chain_that_was_tampered_with_is_told_and_kept_aside(bench: Bench) -> 
     np.testing.assert_allclose(bench.pose, BEFORE, atol=1e-9)
     bench.restart()
     assert bench.store.damage is None
+
+
+def test_a_forged_state_is_never_served_and_said_in_health(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "state")
+    bench.drive(BEGIN_S, STEP_S)
+    assert bench.health == "healthy"
+    file = StateFile(bench.folder / "state.json")
+    body = file.load().body
+    assert body is not None
+    body["pairs"]["front"]["T_camera_lidar"] = [[0.0] * 4] * 4
+    file.save(body)
+    forged = (bench.folder / "state.json").read_bytes()
+    bench.restart()
+    np.testing.assert_array_equal(bench.pose, NOMINAL)
+    assert bench.health == "unknown"
+    reply = bench.answers.health_reply
+    (reason,) = [reason for reason in reply.reasons if reason.code == "state_damaged"]
+    assert "no rigid transform" in reason.text
+    assert "nominal" in reason.text
+    assert (bench.folder / "state.json.broken").read_bytes() == forged

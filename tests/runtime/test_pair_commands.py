@@ -13,7 +13,7 @@ from baselines import a_baseline
 from coec.adapters.files.baseline_file import save_baseline
 from coec.calibration.commissioning.baseline import learned_hash
 from coec.geometry import se3
-from coec.runtime.api import commands
+from coec.runtime.api import commands, rate_limit
 from pair_bench import BEGIN_S, END_S, STEP_S, Bench
 
 
@@ -111,3 +111,37 @@ def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, mon
     bench.settle()
     assert (bench.pair.stream.report.chosen.selected, bench.recorder.recorded) == (selected, 0)
     assert bench.answers.status().commands == {"calibrate_refused": 1}
+
+
+def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rate_limit, "BURST", 10_000)
+    bench = Bench(tmp_path / "state")
+    bench.config = bench.config.model_copy(update={"state": bench.config.state.model_copy(update={"history": 12})})
+    bench.restart()
+    bench.drive(BEGIN_S, END_S)
+    results, first = bench.store.history.results(), bench.entries("extrinsic")[0]
+    corrected = bench.pose.copy()
+    for _ in range(10):
+        codes = [bench.do("hold"), bench.do("hold", release=True), bench.do("reset"), bench.do("calibrate")]
+        assert codes[:3] == ["held", "released", "reset"]
+    kept = bench.store.history.results()
+    assert all(result in kept for result in results)
+    bench.restart()
+    assert bench.do("rollback", to=first.window_id) == "rolled_back"
+    assert first.camera_from_lidar is not None
+    assert bench.pose.tolist() == [list(row) for row in first.camera_from_lidar.matrix]
+    assert bench.do("rollback", to=results[-1].window_id) == "rolled_back"
+    assert bench.pose.tobytes() == corrected.tobytes()
+    assert bench.do("commission") == "commissioning"
+
+
+def test_commands_that_come_too_fast_are_answered_and_do_nothing(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "state")
+    codes = [bench.do("hold") for _ in range(rate_limit.BURST)]
+    assert set(codes) == {"held"}
+    before = bench.store.history.entries()
+    told = [bench.pair.commands.carry_out("hold", {"release": True}, "the test") for _ in range(5)]
+    assert {(one.accepted, one.code) for one in told} == {(False, "too_many")}
+    assert bench.store.state.frozen
+    assert bench.store.history.entries() == before
+    assert bench.answers.status().commands == {"hold_accepted": rate_limit.BURST, "hold_refused": 5}

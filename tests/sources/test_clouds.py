@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coec.errors import SourceError
-from coec.sources import clouds
+from coec.sources import reading
 from coec.sources.clouds import load_cloud
 from coec.sources.pcd import PcdError, parse_pcd
 
@@ -208,7 +208,7 @@ def test_numpy_files_that_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(SourceError, match="is not an"):
         load_cloud(0, "lidar", packed)
     np.savez_compressed(packed, xyz=np.zeros((6_000, 3)))
-    monkeypatch.setattr(clouds, "MAX_POINTS", 1_000)
+    monkeypatch.setattr(reading, "MAX_FILE_BYTES", 100_000)
     with pytest.raises(SourceError, match="would unpack"):
         load_cloud(0, "lidar", packed)
 

@@ -273,12 +273,17 @@ class HealthReply(Message):
     age_s: float | None = Field(description="of the last evaluated window; null before the first")
 
 
-class HistoryEntry(Message):
-    """A line of the append-only history. Its sha256 is that of its own canonical JSON; the next entry holds it as
-    `previous_sha256`, so that no entry can be changed, taken out or put in unseen."""
+Book = Literal["results", "states", "commands"]
+"""Part of a history with a quota of its own."""
 
-    sequence: Count = Field(description="counts the entries of a pair from 0")
-    previous_sha256: str = Field(description="of the entry before, hexadecimal; 64 zeros for the first")
+
+class HistoryEntry(Message):
+    """A line of a book of the append-only history. Its sha256 is that of its own canonical JSON; the next entry of the
+    book holds it as `previous_sha256`, so that no entry can be changed, taken out or put in unseen."""
+
+    sequence: Count = Field(description="counts the entries of a pair, over all books, from 0")
+    book: Book = Field(default="results", description="chain that the entry belongs to; each keeps a quota of its own")
+    previous_sha256: str = Field(description="of the entry before in its book, hexadecimal; 64 zeros for the first")
     kind: Literal["estimate", "extrinsic", "state", "command", "commissioned", "chain"]
     code: str = Field(description="machine-readable: decision, provenance, state, outcome of the command")
     text: str = Field(description="one sentence")
@@ -304,7 +309,7 @@ class HistoryReply(Message):
     pair: str
     total: Count = Field(description="results kept, before the selector")
     results: tuple[CalibrationResult, ...]
-    entries: tuple[ChainedEntry, ...] = Field(default=(), description="of the hash chain, results without their bodies")
+    entries: tuple[ChainedEntry, ...] = Field(default=(), description="of all books, results without their bodies")
     checks: tuple[CheckReply, ...] = Field(default=(), description="of the monitor, as far as they are kept")
 
 

@@ -5,7 +5,6 @@ Rows with a non-finite coordinate are dropped together with their intensity, rin
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from coec.calibration.types import LidarFrame
 from coec.errors import SourceError
 from coec.sources.pcd import MAX_POINTS, Columns, PcdError, parse_pcd
+from coec.sources.reading import read_bytes, read_npy, read_npz
 
 VELODYNE_POINT_BYTES = 16
 """x, y, z, reflectance as little-endian float32 (KITTI development kit)."""
@@ -30,13 +30,12 @@ def load_cloud(stamp_ns: int, frame_id: str, path: Path) -> LidarFrame:
     loader = {".pcd": _load_pcd, ".bin": _load_bin, ".npy": _load_npy, ".npz": _load_npz}.get(path.suffix.lower())
     if loader is None:
         raise SourceError(f"{path}: clouds are .pcd, .bin, .npy or .npz files")
-    try:
-        columns = loader(path)
-    except FileNotFoundError as error:
-        raise SourceError(f"{path} does not exist") from error
-    except (OSError, EOFError) as error:
-        raise SourceError(f"cannot read {path}: {error}") from error
-    return _frame(stamp_ns, frame_id, path, columns)
+    columns = loader(path)
+    if len(columns["xyz"]) > MAX_POINTS:
+        raise SourceError(f"{path} has {len(columns['xyz'])} points; no sweep has more than {MAX_POINTS}")
+    # A double that no float holds becomes infinite, and its point is dropped.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _frame(stamp_ns, frame_id, path, columns)
 
 
 def _frame(stamp_ns: int, frame_id: str, path: Path, columns: Columns) -> LidarFrame:
@@ -60,7 +59,7 @@ def _frame(stamp_ns: int, frame_id: str, path: Path, columns: Columns) -> LidarF
 
 
 def _load_bin(path: Path) -> Columns:
-    data = path.read_bytes()
+    data = read_bytes(path)
     if len(data) % VELODYNE_POINT_BYTES:
         whole = len(data) - len(data) % VELODYNE_POINT_BYTES
         raise SourceError(f"{path} is truncated: a point of 16 bytes (float32 x y z i) is cut at byte {whole}")
@@ -69,17 +68,8 @@ def _load_bin(path: Path) -> Columns:
 
 
 def _load_npy(path: Path) -> Columns:
-    try:
-        # A memory map checks the promised shape against the file before anything is allocated.
-        points = np.load(path, mmap_mode="r", allow_pickle=False)
-    except ValueError as error:
-        raise SourceError(f"{path} is not a NumPy array, or is truncated: {error}") from error
-    if (
-        not isinstance(points, np.ndarray)
-        or points.ndim != 2
-        or points.shape[1] not in (3, 4)
-        or points.dtype.kind != "f"
-    ):
+    points = read_npy(path)
+    if points.ndim != 2 or points.shape[1] not in (3, 4) or points.dtype.kind != "f":
         raise SourceError(f"{path}: expected float (N, 3) or (N, 4), x y z [intensity]")
     columns: Columns = {"xyz": np.asarray(points[:, :3])}
     if points.shape[1] == 4:
@@ -91,15 +81,7 @@ _NPZ_KINDS = {"xyz": "f", "intensity": "fiu", "ring": "iu", "time_offset_s": "f"
 
 
 def _load_npz(path: Path) -> Columns:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(item.file_size for item in archive.infolist())
-        if unpacked > MAX_POINTS * 64:
-            raise SourceError(f"{path} would unpack to {unpacked} bytes: refused")
-        with np.load(path, allow_pickle=False) as arrays:
-            columns = {name: arrays[name] for name in _NPZ_KINDS if name in arrays.files}
-    except (ValueError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise SourceError(f"{path} is not an .npz file, or is damaged: {error}") from error
+    columns = read_npz(path, _NPZ_KINDS)
     xyz = columns.get("xyz")
     if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3:
         raise SourceError(f"{path}: expected an array `xyz` of shape (N, 3)")
@@ -111,6 +93,6 @@ def _load_npz(path: Path) -> Columns:
 
 def _load_pcd(path: Path) -> Columns:
     try:
-        return parse_pcd(path.read_bytes())
+        return parse_pcd(read_bytes(path))
     except PcdError as error:
         raise SourceError(f"{path}, {error}") from error

@@ -20,11 +20,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from coec.calibration.types import EgoMotion, Matrix4, Rig, SweepTiming
-from coec.errors import SourceError
+from coec.config import parse_yaml
+from coec.errors import ConfigError, SourceError
 from coec.geometry import cameras, se3
 from coec.sources.clouds import load_cloud
 from coec.sources.kitti_files import (
@@ -172,7 +171,7 @@ def _fisheye(path: Path) -> cameras.Camera:
     if text.startswith("%YAML"):
         text = text.partition("\n")[2]
     try:
-        document = YAML(typ="safe").load(text)
+        document = parse_yaml(text)
         mirror, distortion = document["mirror_parameters"], document["distortion_parameters"]
         projection = document["projection_parameters"]
         return cameras.build(
@@ -186,7 +185,7 @@ def _fisheye(path: Path) -> cameras.Camera:
             xi=float(mirror["xi"]),
             **{name: float(distortion[name]) for name in ("k1", "k2", "p1", "p2")},
         )
-    except (YAMLError, KeyError, TypeError, ValueError) as error:
+    except (ConfigError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise SourceError(f"{path} does not hold MEI intrinsics: {error}") from error
 
 

@@ -13,8 +13,12 @@ from coec.adapters.images.codec import probe
 from coec.calibration.types import CameraFrame, EncodedImage
 from coec.config import LimitsConfig
 from coec.errors import DecodeError, SourceError
+from coec.sources.reading import read_bytes
 
 NS_PER_S = 1_000_000_000
+
+MAX_TEXT_BYTES = 32 * 2**20
+"""Of a text file. The poses of the longest drive of KITTI-360, 19,240 frames, have 4 MB."""
 
 _STAMP = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(?:\.(\d{1,9}))?")
 
@@ -26,9 +30,7 @@ def read_text(path: Path) -> str:
         SourceError: it is absent or not text.
     """
     try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise SourceError(f"cannot read {path}: {error.strerror}") from error
+        return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8")
     except UnicodeDecodeError as error:
         raise SourceError(f"{path} is not a text file (byte {error.start})") from error
 
@@ -157,9 +159,7 @@ def load_image(path: Path) -> EncodedImage:
         SourceError: absent, or not an image; names the file.
     """
     try:
-        return probe(path.read_bytes(), LimitsConfig())
-    except OSError as error:
-        raise SourceError(f"cannot read {path}: {error.strerror}") from error
+        return probe(read_bytes(path), LimitsConfig())
     except DecodeError as error:
         raise SourceError(f"{path}: {error}") from error
 

@@ -22,6 +22,7 @@ from coec.config import CameraIntrinsics, LimitsConfig, Matrix4x4, Name, describ
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.sources.clouds import load_cloud
 from coec.sources.kitti_files import load_image
+from coec.sources.reading import read_bytes, read_npy
 from coec.sources.recording import FramewiseRecording, RecordedFrame
 from coec.sources.spec import SourceSpec
 
@@ -151,16 +152,16 @@ def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> Came
 
 def _load_any_image(path: Path) -> EncodedImage:
     """JPEG and PNG as they are, anything else that OpenCV reads as raw 8-bit pixels."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SourceError(f"cannot read {path}: {error.strerror}") from error
+    data = read_bytes(path)
     try:
         return probe(data, LimitsConfig())
     except DecodeError as error:
         if error.reason != "image_unknown_format":
             raise SourceError(f"{path}: {error}") from error
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:  # an empty file, or a size that it refuses
+        pixels = None
     if pixels is None:
         raise SourceError(f"{path} is not an image that OpenCV reads")
     height, width = pixels.shape[:2]
@@ -201,11 +202,8 @@ def _has_value(values: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def _load_float_map(path: Path) -> NDArray[np.floating]:
-    try:
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise SourceError(f"{path} is not a NumPy array, or is truncated: {error}") from error
-    if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f" or not values.size:
+    values = read_npy(path)
+    if values.ndim != 2 or values.dtype.kind != "f" or not values.size:
         raise SourceError(f"{path}: a depth map must be a float array of shape (height, width)")
     if values.size > LimitsConfig().max_image_pixels:
         raise SourceError(f"{path}: {values.shape} is larger than any depth map")

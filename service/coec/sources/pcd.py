@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +13,25 @@ from numpy.typing import NDArray
 Columns = dict[str, NDArray[np.generic]]
 """`xyz` (N, 3), and where there are: `intensity`, `ring`, `time_offset_s`, each (N,). Not filtered."""
 
-MAX_POINTS = 20_000_000
-"""No sweep is larger; bounds what a hostile header can make us allocate (a 128-beam LiDAR gives 0.3 million)."""
+MAX_POINTS = 4_000_000
+"""No sweep is larger (a 128-beam LiDAR gives 0.3 million)."""
+
+MAX_TABLE_BYTES = 128 * 2**20
+"""Of all rows as they are packed: 32 bytes for each of `MAX_POINTS`. With the columns made of it, and the file, it is
+what a hostile header can make us allocate, some 400 MB."""
+
+MAX_UNPACKED_BYTES = 20 * 2**20
+"""The same for compressed points. They are unpacked in plain Python, and nobody waits for more; a sweep of 0.3 million
+points with 10 columns has 12 MB."""
+
+MAX_FIELDS = 256
+"""Drivers give about ten."""
+
+MAX_LINE_BYTES = 65_536
+"""Of a row in ascii."""
+
+ASCII_BLOCK_BYTES = 2**20
+"""Rows in ascii are parsed in blocks of this size: as Python objects they take thirty times as much."""
 
 MAX_HEADER_BYTES = 65_536
 """PCL's headers have some 300 bytes."""
@@ -77,7 +97,7 @@ def _parse_header(data: bytes) -> _Header:
             numbers = [int(value) for value in values[key]]
         except (KeyError, ValueError) as error:
             raise PcdError(f"line {line_number}: the header has no valid {key}") from error
-        if (count is not None and len(numbers) != count) or any(number < 0 for number in numbers):
+        if (count is not None and len(numbers) != count) or any(not 0 <= number < 2**63 for number in numbers):
             raise PcdError(f"line {line_number}: the header has no valid {key}")
         return numbers
 
@@ -88,24 +108,34 @@ def _parse_header(data: bytes) -> _Header:
     points = integers("POINTS", 1)[0] if "POINTS" in values else width * height
     if points != width * height or points > MAX_POINTS:
         raise PcdError(f"line {line_number}: {points} POINTS do not agree with {width} x {height}, or are too many")
+    if len(names) > MAX_FIELDS:
+        raise PcdError(f"line {line_number}: {len(names)} FIELDS; more than {MAX_FIELDS} are none of a LiDAR")
     encoding = (values["DATA"] or [""])[0]
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise PcdError(f"line {line_number}: DATA must be ascii, binary or binary_compressed")
-    return _Header(_point_type(names, sizes, types, counts, line_number), points, encoding, start, line_number)
+    point = _point_type(names, sizes, types, counts, line_number)
+    most = MAX_UNPACKED_BYTES if encoding == "binary_compressed" else MAX_TABLE_BYTES
+    if points * point.itemsize > most:
+        raise PcdError(
+            f"line {line_number}: {points} points of {point.itemsize} bytes are more than the {most} bytes that "
+            f"are read as {encoding}"
+        )
+    return _Header(point, points, encoding, start, line_number)
 
 
 def _point_type(
     names: list[str], sizes: list[int], types: list[str], counts: list[int], line: int
 ) -> np.dtype[np.void]:
     """The packed row of one point. Padding fields (`_`) and repeated names get a name of their own."""
-    if len(types) != len(names) or any(not 1 <= count <= 4096 for count in counts):
+    if len(types) != len(names) or any(not 1 <= repeats <= 4096 for repeats in counts):
         raise PcdError(f"line {line}: FIELDS, SIZE, TYPE and COUNT do not agree")
     fields: list[tuple[str, str, tuple[int, ...]]] = []
-    for place, (name, size, kind, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
+    free = (f"_{number}" for number in itertools.count() if f"_{number}" not in names)
+    for place, (name, size, kind, repeats) in enumerate(zip(names, sizes, types, counts, strict=True)):
         if (kind, size) not in {("F", 4), ("F", 8), *((k, s) for k in "IU" for s in (1, 2, 4, 8))}:
             raise PcdError(f"line {line}: field {name} has unknown type {kind}{size}")
-        unique = name if name != "_" and name not in names[:place] else f"_{place}"
-        fields.append((unique, f"<{kind.lower()}{size}", (count,) if count > 1 else ()))
+        unique = name if name != "_" and name not in names[:place] else next(free)
+        fields.append((unique, f"<{kind.lower()}{size}", (repeats,) if repeats > 1 else ()))
     missing = [axis for axis in "xyz" if axis not in names or counts[names.index(axis)] != 1]
     if missing:
         raise PcdError(f"line {line}: FIELDS lacks {' '.join(missing)}")
@@ -113,33 +143,60 @@ def _point_type(
 
 
 def _ascii_table(data: bytes, header: _Header) -> NDArray[np.void]:
-    """Rows of numbers. NumPy reads them in one go; only when it fails are the lines looked at one by one."""
-    width = sum(int(np.prod(header.point[name].shape)) for name in header.point.names or ())
-    lines = data[header.body :].decode("ascii", errors="replace").splitlines()
+    """Rows of numbers, block by block. NumPy reads one in one go; only when it fails are its lines looked at one by
+    one."""
+    table = np.zeros(header.points, header.point)
+    begin = 0
+    for lines in _blocks(data, header):
+        first_line = header.body_line + 1 + begin
+        table[begin : begin + len(lines)] = _ascii_rows(lines, header.point, first_line)
+        begin += len(lines)
+    if begin < header.points:
+        raise PcdError(f"line {header.body_line + begin}: the file ends after {begin} of {header.points} points")
+    return table
+
+
+def _blocks(data: bytes, header: _Header) -> Iterator[list[str]]:
+    """The lines of the points, those of one block after the other; empty ones at the end of the file are none."""
+    stream = BytesIO(data)
+    stream.seek(header.body)
+    lines: list[str] = []
+    held = 0
+    left = header.points
+    while left and (line := stream.readline(MAX_LINE_BYTES + 1)):
+        if len(line) > MAX_LINE_BYTES:
+            raise PcdError(f"line {header.body_line + 1 + header.points - left}: longer than {MAX_LINE_BYTES} bytes")
+        lines.append(line.decode("ascii", errors="replace"))
+        held += len(line)
+        left -= 1
+        if held >= ASCII_BLOCK_BYTES:
+            yield lines
+            lines, held = [], 0
     while lines and not lines[-1].strip():
         lines.pop()
-    if len(lines) < header.points:
-        raise PcdError(
-            f"line {header.body_line + len(lines)}: the file ends after {len(lines)} of {header.points} points"
-        )
-    lines = lines[: header.points]
+    yield lines
+
+
+def _ascii_rows(lines: list[str], point: np.dtype[np.void], first_line: int) -> NDArray[np.void]:
+    width = sum(int(np.prod(point[name].shape)) for name in point.names or ())
     try:
         values = np.array(" ".join(lines).split(), dtype=np.float64)
     except ValueError:
         values = np.empty(0)
     if values.size != len(lines) * width:
-        for number, line in enumerate(lines, start=header.body_line + 1):
+        for number, line in enumerate(lines, start=first_line):
             _check_row(line.split(), width, number)
     rows = values.reshape(len(lines), width)
-    table = np.zeros(len(lines), header.point)
+    table = np.zeros(len(lines), point)
     column = 0
-    for name in header.point.names or ():
-        shape = header.point[name].shape
+    for name in point.names or ():
+        shape = point[name].shape
         span = int(np.prod(shape))
         block = rows[:, column : column + span].reshape(len(lines), *shape)
-        if header.point[name].base.kind in "iu":
-            block = _bounded(block, header.point[name].base, header.body_line)
-        table[name] = block
+        if point[name].base.kind in "iu":
+            block = _bounded(block, point[name].base, first_line)
+        with np.errstate(over="ignore"):
+            table[name] = block
         column += span
     return table
 
@@ -154,12 +211,14 @@ def _check_row(words: list[str], width: int, number: int) -> None:
             raise PcdError(f"line {number}: not a number") from error
 
 
-def _bounded(values: NDArray[np.float64], dtype: np.dtype[np.generic], body_line: int) -> NDArray[np.float64]:
+def _bounded(values: NDArray[np.float64], dtype: np.dtype[np.generic], first_line: int) -> NDArray[np.float64]:
     """Integer columns written as text may be out of their type's range; a cast would be undefined."""
     limits = np.iinfo(dtype.type)  # type: ignore[type-var]
-    bad = ~((values >= limits.min) & (values <= limits.max))
+    # The largest integer of 64 bits is no double, and rounds to one that is out of range.
+    fits = (values >= limits.min) & (values <= limits.max) & (values < float(limits.max) + 1.0)
+    bad = ~fits
     if bad.any():
-        raise PcdError(f"line {body_line + 1 + int(np.argwhere(bad)[0, 0])}: a value does not fit its type {dtype}")
+        raise PcdError(f"line {first_line + int(np.argwhere(bad)[0, 0])}: a value does not fit its type {dtype}")
     return values
 
 
@@ -171,6 +230,8 @@ def _decompressed_table(data: bytes, header: _Header) -> NDArray[np.void]:
     packed, unpacked = np.frombuffer(data, "<u4", 2, header.body).tolist()
     if unpacked != header.points * header.point.itemsize:
         raise PcdError(f"byte {header.body}: {unpacked} bytes are promised, the header needs {header.points} points")
+    if packed > unpacked + unpacked // 25 + 64:  # liblzf's own worst case is 104 %
+        raise PcdError(f"byte {header.body}: {packed} compressed bytes for {unpacked}: no compression makes them more")
     if len(data) < start + packed:
         raise PcdError(f"byte {len(data)}: the file ends after {len(data) - start} of {packed} compressed bytes")
     columns = _lzf_decompress(data, start, start + packed, unpacked)
@@ -223,6 +284,11 @@ def _lzf_decompress(data: bytes, start: int, end: int, size: int) -> bytes:
 
 def _columns(table: NDArray[np.void]) -> Columns:
     names = table.dtype.names or ()
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _picked(table, names)
+
+
+def _picked(table: NDArray[np.void], names: tuple[str, ...]) -> Columns:
     columns: Columns = {"xyz": np.stack([table[axis].astype(np.float32) for axis in "xyz"], axis=1)}
     if "intensity" in names and table["intensity"].ndim == 1:
         columns["intensity"] = table["intensity"].astype(np.float32)

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from coec.adapters.files.state_file import StateFile
+from coec.adapters.files.durable import MAX_ASIDE
+from coec.adapters.files.state_file import MAX_BYTES, StateFile
 from coec.errors import StateError
-from disks import Disk
+from disks import EVERYTHING, Disk
 
 FIRST: dict[str, object] = {"pairs": {"front": {"matrix": [[1.0, 0.1], [1e-17, -0.0]], "name": "Ä"}}}
 SECOND: dict[str, object] = {"pairs": {"front": {"matrix": [[2.0, 0.30000000000000004], [3, None]]}}}
@@ -79,8 +80,66 @@ def test_another_schema_version_is_named(tmp_path: Path) -> None:
     assert "schema version" in loaded.damage[0]
 
 
+def test_a_state_of_a_newer_service_is_kept_aside_and_not_overwritten(tmp_path: Path) -> None:
+    path = saved(tmp_path, FIRST)
+    newer = path.read_bytes().replace(b'"schema_version":1', b'"schema_version":2')
+    path.write_bytes(newer)
+    file = StateFile(path)
+    assert "newer schema version" in file.load().damage[0]
+    for body in (FIRST, SECOND, FIRST):
+        file.save(body)
+    assert (tmp_path / "state.json.newer").read_bytes() == newer
+    assert StateFile(path).load().body == FIRST
+
+
+def test_what_is_kept_aside_is_bounded_and_the_first_ones_stay(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    for number in range(2 * MAX_ASIDE):
+        path.write_bytes(b"junk %d" % number)
+        file = StateFile(path)
+        assert file.load().damage
+        file.save(FIRST)
+    aside = {entry.name: entry.read_bytes() for entry in tmp_path.glob("*.broken*")}
+    assert len(aside) == MAX_ASIDE + 1
+    assert aside["state.json.broken"] == b"junk 0"
+    assert b"junk %d" % (2 * MAX_ASIDE - 1) in aside.values()
+
+
+def test_a_save_waits_until_what_cannot_be_used_is_kept_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(tmp_path, monkeypatch)
+    path = saved(tmp_path, FIRST)
+    path.write_bytes(b"junk")
+    file = StateFile(path)
+    file.load()
+    disk.refuses = EVERYTHING
+    with pytest.raises(StateError):
+        file.save(FIRST)
+    assert path.read_bytes() == b"junk"
+    disk.refuses = ()
+    file.save(FIRST)
+    assert (tmp_path / "state.json.broken").read_bytes() == b"junk"
+
+
+def test_a_file_larger_than_any_state_is_not_read_whole(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    with path.open("wb") as stream:
+        stream.truncate(MAX_BYTES + 1)
+    assert "more than" in StateFile(path).load().damage[0]
+
+
 @pytest.mark.parametrize(
-    "text", [b"", b"null", b"[]", b'{"body":3}', b"[" * 100_000, b'{"body":{"a":NaN},"schema_version":1}']
+    "text",
+    [
+        b"",
+        b"null",
+        b"[]",
+        b'{"body":3}',
+        b"[" * 100_000,
+        b'{"body":{"a":NaN},"schema_version":1}',
+        b'{"body":{},"schema_version":%s}' % (b"9" * 4000),
+        b'{"body":{"a":%s},"schema_version":1}' % (b"9" * 5000),
+    ],
+    ids=range(8),
 )
 def test_foreign_files_are_damage_not_exceptions(tmp_path: Path, text: bytes) -> None:
     path = tmp_path / "state.json"

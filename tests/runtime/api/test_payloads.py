@@ -1,7 +1,12 @@
 """What a command may say, and what is written down of who said it."""
 
+import json
+from contextlib import suppress
+
 import msgpack
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from coec.errors import UsageError
 from coec.runtime.api.payloads import MAX_SENDER, NAMES, parse, sender_of
@@ -32,6 +37,14 @@ def test_arguments_in_either_encoding(pack: object) -> None:
         ("reset", b"\xc1"),
         ("reset", b"\x81\x01\x02"),
         ("reset", b"{" * 100_000),
+        ("reset", b'{"a":' * 800),
+        ("hold", b'{"release":%s}' % (b"9" * 4050)),
+        ("hold", b'{"release":%s}' % (b"9" * 5000)),
+        ("hold", b'{"release":true,"a":[%s0]}' % (b"[]," * 1_000_000)),
+        ("hold", b"\x81\xa7release" + b"\x91" * 2000),
+        ("hold", b"\x81\xa7release\xd6\xff\xff\xff\xff\xff"),
+        ("hold", b"\x81\x90\x01"),
+        ("rollback", b"\x81\xa2to\xc7\x0c\xff" + b"\xff" * 12),
         ("hold", msgpack.packb({str(i): i for i in range(1000)})),
     ],
 )
@@ -60,3 +73,20 @@ def test_long_and_binary_senders_are_bounded() -> None:
     binary = sender_of(bytes(range(128, 256)) * 1000)
     assert binary.startswith("128000 bytes, sha256 ")
     assert len(binary) < MAX_SENDER
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.sampled_from(NAMES),
+    st.one_of(
+        st.binary(max_size=64),
+        st.binary(max_size=16).map(lambda rest: b"{" + rest),
+        st.binary(max_size=24).map(lambda rest: b"\x81\xa2to" + rest),
+        st.dictionaries(st.text(max_size=3), st.integers() | st.text(max_size=3) | st.none(), max_size=3).map(
+            lambda told: json.dumps(told).encode()
+        ),
+    ),
+)
+def test_any_bytes_are_a_command_or_an_error_of_ours(name: str, payload: bytes) -> None:
+    with suppress(UsageError):
+        parse(name, payload)

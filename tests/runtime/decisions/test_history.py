@@ -1,260 +1,121 @@
-"""The hash chain: what it keeps over a restart, and that no change of it goes unseen."""
+"""The books of a pair: what one holds, no other can push out."""
 
 from __future__ import annotations
 
-import hashlib
-from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from coec.adapters.files.conversions import result_of
+from coec.adapters.files.conversions import result_of, transform_of
 from coec.adapters.files.state_file import StateFile
-from coec.errors import StateError
-from coec.runtime.decisions.history import GENESIS, History
-from coec.schemas.base import to_json
+from coec.runtime.decisions.history import History
 from coec.schemas.replies import CalibrationResult, HistoryEntry
 from disks import EVERYTHING, Disk
 from estimates import RIG, estimate
 
-
-def result(window: int) -> CalibrationResult:
-    return result_of(estimate(window), RIG, "test")
+LIMIT = 4
 
 
-def entry(text: str = "something") -> HistoryEntry:
-    return HistoryEntry(sequence=0, previous_sha256="", kind="command", code="hold", text=text, wall_ns=1)
+def entry(kind: str, code: str = "", **fields: Any) -> HistoryEntry:
+    return HistoryEntry.model_validate(
+        {"sequence": 0, "previous_sha256": "", "kind": kind, "code": code, "text": "", "wall_ns": 1, **fields}
+    )
 
 
-def written(path: Path, count: int, limit: int = 100) -> History:
-    history = History(path, limit)
-    for window in range(count):
-        history.append(entry(str(window)), result(window) if window % 2 else None)
-    return history
+def solved(history: History, window: int) -> CalibrationResult:
+    result = result_of(estimate(window), RIG, "test")
+    history.append(entry("estimate", "accepted", window_id=result.window_id), result)
+    return result
 
 
-def test_every_entry_holds_the_hash_of_the_one_before(tmp_path: Path) -> None:
-    kept = written(tmp_path / "h", 4).entries()
-    previous = GENESIS
-    for number, item in enumerate(kept):
-        assert (item.entry.sequence, item.entry.previous_sha256) == (number, previous)
-        assert item.sha256 == hashlib.sha256(to_json(item.entry)).hexdigest()
-        if item.result is not None:
-            assert item.entry.result_sha256 == hashlib.sha256(to_json(item.result)).hexdigest()
-        previous = item.sha256
+def filled(folder: Path) -> tuple[History, CalibrationResult]:
+    history = History(folder, "front", LIMIT, {})
+    result = solved(history, 1)
+    history.append(
+        entry("extrinsic", "estimated", window_id=result.window_id, camera_from_lidar=result.camera_from_lidar)
+    )
+    return history, result
 
 
-def test_a_restart_finds_the_same_chain_and_goes_on(tmp_path: Path) -> None:
-    before = written(tmp_path / "h", 4)
-    again = History(tmp_path / "h", 100, before.durable_head)
-    assert again.damage is None
-    assert again.entries() == before.entries()
-    assert again.results() == (result(1), result(3))
-    assert again.append(entry()).entry.previous_sha256 == before.entries()[-1].sha256
+@pytest.mark.parametrize(
+    "flood",
+    [
+        entry("command", "held"),
+        entry("state", "suspect"),
+        entry("extrinsic", "nominal", camera_from_lidar=transform_of(np.eye(4))),
+        entry("extrinsic", "restored", camera_from_lidar=transform_of(np.eye(4)), window_id="1"),
+        entry("commissioned", "commissioned"),
+    ],
+    ids=lambda one: f"{one.kind}-{one.code}",
+)
+def test_no_flood_pushes_a_result_or_what_it_put_in_place_out(tmp_path: Path, flood: HistoryEntry) -> None:
+    history, result = filled(tmp_path)
+    for _ in range(5 * LIMIT):
+        history.append(flood)
+    for one in (history, History(tmp_path, "front", LIMIT, history.durable_heads)):
+        assert one.damage is None
+        assert one.results() == (result,)
+        assert [kept.entry.code for kept in one.entries()] == ["accepted", "estimated", *[flood.code] * LIMIT]
 
 
-def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
-    history = written(tmp_path / "h", 20, limit=3)
-    assert [item.entry.sequence for item in history.entries()] == [17, 18, 19]
-    assert len((tmp_path / "h").read_bytes().splitlines()) <= 6
-    again = History(tmp_path / "h", 3, history.durable_head)
-    assert again.damage is None
-    assert again.entries() == history.entries()
+def test_a_window_that_is_solved_again_and_again_displaces_no_other(tmp_path: Path) -> None:
+    history, result = filled(tmp_path)
+    for _ in range(5 * LIMIT):
+        again = solved(history, 2)
+        history.append(
+            entry("extrinsic", "estimated", window_id=again.window_id, camera_from_lidar=again.camera_from_lidar)
+        )
+    assert history.results()[0] == result
+    assert next(one.entry.window_id for one in history.entries() if one.entry.kind == "extrinsic") == result.window_id
 
 
-@pytest.mark.parametrize("what", ["text", "result", "removed", "swapped", "inserted"])
-def test_any_change_is_noticed_and_the_file_kept_aside(tmp_path: Path, what: str) -> None:
-    path = tmp_path / "h"
-    head = written(path, 5).durable_head
-    original = path.read_bytes()
-    lines = original.splitlines(keepends=True)
-    changed = {
-        "text": [*lines[:2], lines[2].replace(b'"text":"2"', b'"text":"9"'), *lines[3:]],
-        "result": [*lines[:3], lines[3].replace(b'"pairs":3', b'"pairs":4'), lines[4]],
-        "removed": [*lines[:2], *lines[3:]],
-        "swapped": [*lines[:2], lines[3], lines[2], lines[4]],
-        "inserted": [*lines[:2], lines[1], *lines[2:]],
-    }[what]
-    path.write_bytes(b"".join(changed))
-    again = History(path, 100, head)
+def test_entries_are_numbered_together_in_the_order_in_which_they_came(tmp_path: Path) -> None:
+    kinds = ["command", "state", "command", "commissioned", "state"]
+    history, _ = filled(tmp_path)
+    for kind in kinds[:3]:
+        history.append(entry(kind))
+    history = History(tmp_path, "front", LIMIT, history.durable_heads)
+    for kind in kinds[3:]:
+        history.append(entry(kind))
+    told = [(kept.entry.sequence, kept.entry.kind) for kept in history.entries()]
+    assert told == list(enumerate(["estimate", "extrinsic", *kinds]))
+
+
+@pytest.mark.parametrize("book", ["history", "commands", "states"])
+def test_a_book_that_was_cut_or_removed_is_noticed(tmp_path: Path, book: str) -> None:
+    history, _ = filled(tmp_path)
+    for kind in ("state", "command"):
+        history.append(entry(kind))
+    (tmp_path / f"{book}-front.jsonl").unlink()
+    assert "cut off" in str(History(tmp_path, "front", LIMIT, history.durable_heads).damage)
+
+
+def test_a_forged_pose_in_a_book_is_damage_whatever_its_hash(tmp_path: Path) -> None:
+    history, result = filled(tmp_path)
+    zero = transform_of(np.eye(4)).model_copy(update={"matrix": ((0.0,) * 4,) * 4})
+    history.append(entry("extrinsic", "estimated", window_id=result.window_id, camera_from_lidar=zero))
+    again = History(tmp_path, "front", LIMIT, {})
     assert again.damage is not None
-    good = 3 if what == "result" else 2
-    assert [item.entry.text for item in again.entries()] == [str(i) for i in range(good)]
-    assert (tmp_path / "h.broken").read_bytes() == b"".join(changed)
-    assert History(path, 100).damage is None, "what is left is sound"
+    assert [kept.entry.code for kept in again.entries()] == ["accepted", "estimated"]
 
 
-def test_an_end_that_was_cut_off_is_noticed(tmp_path: Path) -> None:
-    path = tmp_path / "h"
-    head = written(path, 5).durable_head
-    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:3]))
-    assert History(path, 100).damage is None, "the chain alone cannot tell"
-    path.write_bytes(path.read_bytes())
-    cut = History(path, 100, head)
-    assert cut.damage is not None
-    assert "cut off" in cut.damage
-    assert len(cut.entries()) == 3
-
-
-def test_a_torn_last_line_of_a_power_cut_is_no_tampering(tmp_path: Path) -> None:
-    path = tmp_path / "h"
-    before = written(path, 3)
-    path.write_bytes(path.read_bytes() + b"0123 half a li")
-    again = History(path, 100, before.durable_head)
-    assert again.damage is None
-    assert again.entries() == before.entries()
-    again.append(entry())
-    assert History(path, 100).damage is None
-
-
-def test_two_broken_chains_do_not_overwrite_each_other(tmp_path: Path) -> None:
-    path = tmp_path / "h"
-    for _ in range(2):
-        path.write_bytes(b"junk\n")
-        assert History(path, 100).damage is not None
-    assert {item.name for item in tmp_path.iterdir()} >= {"h.broken", "h.broken-1"}
-
-
-def test_a_head_that_was_dropped_for_its_age_is_no_tampering(tmp_path: Path) -> None:
-    path = tmp_path / "h"
-    head = written(path, 1, limit=2).durable_head
-    history = History(path, 2, head)
-    for number in range(1, 9):
-        history.append(entry(str(number)))
-    assert History(path, 2, head).damage is None
-
-
-def test_another_entry_at_the_place_of_the_head_is_noticed(tmp_path: Path) -> None:
-    (tmp_path / "other").mkdir()
-    head = written(tmp_path / "other" / "h", 3).durable_head
-    history = History(tmp_path / "h", 100)
-    for number in range(5):
-        history.append(entry(f"forged {number}"))
-    assert History(tmp_path / "h", 100, head).damage is not None
-
-
-# --- disks ----------------------------------------------------------------------------------------------------------
-
-LIMIT = 3
-
-
-class Life:
-    """A history and the state file that knows its head, as the service writes them."""
-
-    def __init__(self, root: Path) -> None:
-        self.history = History(root / "h", LIMIT)
-        self.state = StateFile(root / "state.json")
-        self.said = 0
-
-    def append(self) -> int | None:
-        """One entry more, then the state: the number of the entry if both say that it is safe."""
-        number, self.said = self.said, self.said + 1
-        try:
-            self.history.append(entry(str(number)))
-        except StateError:
-            return None
-        finally:
-            with suppress(StateError):
-                self.state.save({"head": self.history.durable_head})
-        return number
-
-
-def assert_restarts(root: Path, safe: int) -> None:
-    """Nothing is called tampered with, and entry `safe` (-1: none) and those kept before it are there."""
-    body = StateFile(root / "state.json").load().body
-    again = History(root / "h", LIMIT, body["head"] if body else None)
-    assert again.damage is None
-    found = [int(kept.entry.text) for kept in again.entries()]
-    assert found == list(range(found[0], found[-1] + 1)) if found else safe == -1
-    if found:
-        assert found[-1] >= safe
-        assert found[0] <= max(0, found[-1] - LIMIT + 1)
-
-
-@pytest.mark.parametrize("length", [1, 2, 4, 30])
-def test_a_disk_that_refuses_for_a_while_loses_nothing_and_is_no_tampering(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int
-) -> None:
-    """Each write, fsync, rename and the like of a life fails once, with `length` - 1 after it."""
-    first, refused = 0, True
-    while refused:
-        root = tmp_path / str(first)
-        root.mkdir()
-        with monkeypatch.context() as patch:
-            disk = Disk(root, patch)
-            disk.refuses = range(first, first + length)
-            life, safe = Life(root), -1
-            for _ in range(8):
-                number = life.append()
-                safe = safe if number is None else number
-                assert_restarts(root, safe)
-            refused = disk.operations > first
-            disk.refuses = ()
-            assert life.append() == 8
-            assert_restarts(root, 8)
-        first += 1
-    assert first > 40
-
-
-def test_what_waits_is_written_without_another_entry_and_the_head_follows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_book_waits_for_a_full_disk_and_is_written_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(tmp_path, monkeypatch)
-    history = written(tmp_path / "h", 2)
-    before = history.durable_head
+    history, _ = filled(tmp_path)
     disk.refuses = EVERYTHING
-    with pytest.raises(StateError, match="No space"):
-        history.append(entry("third"))
-    with pytest.raises(StateError, match="No space"):
+    for kind in ("state", "command"):
+        with pytest.raises(Exception, match="No space"):
+            history.append(entry(kind))
+    with pytest.raises(Exception, match=r"commands-front\.jsonl"):
         history.flush()
-    assert [kept.entry.text for kept in history.entries()] == ["0", "1", "third"]
-    assert history.durable_head == before
     disk.refuses = ()
     history.flush()
-    assert history.durable_head != before
-    again = History(tmp_path / "h", 100, history.durable_head)
+    state = StateFile(tmp_path / "state.json")
+    state.save({"heads": history.durable_heads})
+    body = StateFile(tmp_path / "state.json").load().body
+    assert body is not None
+    again = History(tmp_path, "front", LIMIT, body["heads"])
     assert again.damage is None
     assert again.entries() == history.entries()
-
-
-def test_a_broken_chain_is_kept_aside_once_the_disk_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    disk = Disk(tmp_path, monkeypatch)
-    path = tmp_path / "h"
-    written(path, 3)
-    broken = path.read_bytes().replace(b'"text":"1"', b'"text":"9"')
-    path.write_bytes(broken)
-    disk.refuses = EVERYTHING
-    history = History(path, 100)
-    assert history.damage is not None
-    assert path.read_bytes() == broken
-    disk.refuses = ()
-    history.append(entry("on"))
-    assert (tmp_path / "h.broken").read_bytes() == broken
-    assert [kept.entry.text for kept in History(path, 100, history.durable_head).entries()] == ["0", "on"]
-
-
-def test_a_history_that_cannot_be_read_is_damage(tmp_path: Path) -> None:
-    (tmp_path / "h").mkdir()
-    history = History(tmp_path / "h", 100)
-    assert history.damage is not None
-    assert "cannot be read" in history.damage
-    with pytest.raises(StateError):
-        history.append(entry())
-
-
-def test_a_power_cut_at_any_byte_loses_nothing_and_is_no_tampering(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "disk").mkdir()
-    with monkeypatch.context() as patch:
-        disk = Disk(tmp_path / "disk", patch)
-        life = Life(tmp_path / "disk")
-        for attempt in range(8):
-            disk.refuses = [number for number in range(1000) if number % 5] if attempt in (2, 3) else ()
-            number = life.append()
-            if number is not None:
-                disk.acknowledge(number)
-    count = 0
-    for count, cut in enumerate(disk.power_cuts()):
-        assert_restarts(cut.put(tmp_path / str(count)), max(cut.acknowledged, default=-1))
-    assert count > 3000

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from coec.adapters.files.conversions import result_of
+from coec.adapters.files.state_file import StateFile
 from coec.calibration.lifecycle import (
     Change,
     HealthState,
@@ -33,6 +34,7 @@ from estimates import RIG, estimate
 RULES = Rules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
 NEVER = Rules(PolicyConfig(apply="never"), TrackerConfig(), MonitorConfig())
 CLOCKS = Clocks(77, 88, 99)
+HEADS = {"results": "3 abc", "commands": "4 def"}
 
 
 def restarted(folder: Path, rig: Rig = RIG) -> PairState | None:
@@ -43,10 +45,10 @@ def restarted(folder: Path, rig: Rig = RIG) -> PairState | None:
 def test_a_state_comes_back_bit_for_bit(tmp_path: Path) -> None:
     state = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
     state = after_estimate(state, estimate(2, Decision.FAILED), 0, RULES)
-    StateStore(tmp_path, "test").remember(RIG, after_failure(state, Reason("worker_failed", "crash")), CLOCKS, "head")
+    StateStore(tmp_path, "test").remember(RIG, after_failure(state, Reason("worker_failed", "crash")), CLOCKS, HEADS)
     remembered = StateStore(tmp_path, "test").recall(RIG)
     assert remembered is not None
-    assert (remembered.clocks, remembered.history_head) == (CLOCKS, "head")
+    assert (remembered.clocks, remembered.history_heads) == (CLOCKS, HEADS)
     back = remembered.state
     assert np.array_equal(back.T_camera_lidar, estimate(1).optimum.T_camera_lidar)
     assert (back.provenance, back.status, back.valid_from_ns) == (Provenance.ESTIMATED, Status.FAILED, 1)
@@ -65,7 +67,7 @@ def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> N
     tests = Hypotheses(belief, (Hypothesis(1, 2.5, 1 / 7, belief, belief),), (0.1, 0.2, 0.3))
     monitor = MonitorState(Finding.SUSPECT, tests, Hypotheses(), {"dark": 0.1}, {"40": 2.5}, 0.5, (5, 6), stood=True)
     state = replace(state, monitor=monitor, flagged_since_ns=4, changes=(Change(3, (0.1,) * 6),))
-    StateStore(tmp_path, "test").remember(RIG, state, CLOCKS)
+    StateStore(tmp_path, "test").remember(RIG, state, CLOCKS, {})
     first = (tmp_path / "state.json").read_bytes()
     back = restarted(tmp_path)
     assert back is not None
@@ -73,15 +75,15 @@ def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> N
     assert back.pending is not None
     assert back.pending.contradicts
     assert np.array_equal(back.pending.T_camera_lidar, estimate(1).optimum.T_camera_lidar)
-    StateStore(tmp_path, "test").remember(RIG, back, CLOCKS)
+    StateStore(tmp_path, "test").remember(RIG, back, CLOCKS, {})
     assert (tmp_path / "state.json").read_bytes() == first
 
 
 def test_pairs_do_not_touch_each_other(tmp_path: Path) -> None:
     rear = replace(RIG, pair="rear")
     store = StateStore(tmp_path, "test")
-    store.remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS)
-    store.remember(rear, initial_state(rear), CLOCKS)
+    store.remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS, {})
+    store.remember(rear, initial_state(rear), CLOCKS, {})
     front, back = restarted(tmp_path), restarted(tmp_path, rear)
     assert front is not None
     assert front.status is Status.ACCEPTED
@@ -90,7 +92,7 @@ def test_pairs_do_not_touch_each_other(tmp_path: Path) -> None:
 
 
 def test_the_state_of_another_rig_is_not_used(tmp_path: Path) -> None:
-    StateStore(tmp_path, "test").remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS)
+    StateStore(tmp_path, "test").remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS, {})
     assert restarted(tmp_path, replace(RIG, T_camera_lidar_nominal=np.eye(4))) is None
     assert restarted(tmp_path, replace(RIG, pair="other")) is None
 
@@ -99,4 +101,59 @@ def test_an_intact_file_of_another_form_is_an_error(tmp_path: Path) -> None:
     store = StateStore(tmp_path, "test")
     store._file.save({"pairs": {"front": {"matrix": 1}}})
     with pytest.raises(StateError, match="another form"):
+        StateStore(tmp_path, "test").recall(RIG)
+
+
+ZERO = [[0.0] * 4] * 4
+SHEARED = [[1.0, 0.1, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize("rows", [ZERO, SHEARED], ids=["zero", "sheared"])
+@pytest.mark.parametrize("where", ["T_camera_lidar", "pending", "accepted", "track"])
+def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: str, rows: list[list[float]]) -> None:
+    served = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
+    waiting = after_estimate(initial_state(RIG), estimate(1), 0, NEVER)
+    StateStore(tmp_path, "test").remember(RIG, waiting if where == "pending" else served, CLOCKS, {})
+    file = StateFile(tmp_path / "state.json")
+    body = file.load().body
+    assert body is not None
+    stored = body["pairs"][RIG.pair]
+    match where:
+        case "T_camera_lidar":
+            stored["T_camera_lidar"] = rows
+        case "pending":
+            stored["pending"]["T_camera_lidar"] = rows
+        case "accepted":
+            stored["accepted"]["camera_from_lidar"]["matrix"] = rows
+        case _:
+            stored["track"]["slow"]["T_camera_lidar"] = rows
+    file.save(body)
+    forged = (tmp_path / "state.json").read_bytes()
+    store = StateStore(tmp_path, "test")
+    with pytest.raises(StateError, match="no rigid transform"):
+        store.recall(RIG)
+    store.remember(RIG, initial_state(RIG), CLOCKS, {})
+    assert (tmp_path / "state.json.broken").read_bytes() == forged
+    assert restarted(tmp_path) is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("completed_wall_ns", -(10**4000)),
+        ("since_wall_ns", 10**400),
+        ("T_camera_lidar", [[10**400] * 4] * 4),
+        ("track", {"slow": []}),
+        ("monitor", 3),
+        ("changes", [{"stamp_ns": 1, "step": "x"}]),
+    ],
+)
+def test_numbers_and_shapes_that_nobody_wrote_are_an_error_of_ours(tmp_path: Path, name: str, value: object) -> None:
+    StateStore(tmp_path, "test").remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS, {})
+    file = StateFile(tmp_path / "state.json")
+    body = file.load().body
+    assert body is not None
+    body["pairs"][RIG.pair][name] = value
+    file.save(body)
+    with pytest.raises(StateError):
         StateStore(tmp_path, "test").recall(RIG)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,18 @@ import pytest
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import cdr
 from coec.adapters.system.logs import LossCounter
+from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
-from coec.config import IDENTITY, CameraConfig, CameraIntrinsics, EgoConfig, LidarConfig, LimitsConfig, PairConfig
+from coec.config import (
+    IDENTITY,
+    CameraConfig,
+    CameraIntrinsics,
+    EgoConfig,
+    LidarConfig,
+    LimitsConfig,
+    PairConfig,
+    PairingConfig,
+)
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
 from coec.runtime.ingest.inbox import Call, Inbox, Parcel
 
@@ -109,6 +120,18 @@ def test_gaps_in_the_numbers_are_loss_but_a_new_count_is_not(desk: Desk) -> None
     for sequence in (7, 8, 11, 11, 0, 1, 2_000_000):
         assert desk.take(CAMERA, msgpack_frames.encode_camera(camera(sequence)), MSGPACK) is not None
     assert desk.losses.snapshot() == {(CAMERA, "sequence_gap"): 2}
+
+
+def test_a_frame_that_was_overtaken_is_counted_once(desk: Desk) -> None:
+    """As out of order by the pairer, and not as missing by the decoder as well."""
+    pairer = Pairer(PairingConfig(), expects_motion=False)
+    for sequence in (1, 3, 2, *range(4, 40)):
+        frame = replace(camera(sequence), stamp_ns=sequence * 10**8)
+        taken = desk.take(CAMERA, msgpack_frames.encode_camera(frame), MSGPACK)
+        assert isinstance(taken, CameraFrame)
+        pairer.push(taken)
+    assert desk.losses.snapshot() == {}
+    assert pairer.losses["camera_stamp_back"] == 1
 
 
 def test_losses_are_logged_first_and_then_ever_more_rarely(caplog: pytest.LogCaptureFixture) -> None:

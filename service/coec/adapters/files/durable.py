@@ -20,6 +20,10 @@ FRESH_SUFFIX = ".new"
 _MODE = 0o666
 """Permissions of a new file, less what the umask of the process takes off: those that `open` gives."""
 
+MAX_ASIDE = 8
+"""Files of one name that are kept aside: those that came first tell most, and a disk that damages every file must not
+be filled by them."""
+
 _LINK_SUFFIX = ".link"
 """Of the second name of a file that is about to become the previous copy."""
 
@@ -60,6 +64,16 @@ def keep_under(path: Path, other: Path) -> None:
     """Give a file a second name, which must be free."""
     other.hardlink_to(path)
     sync_folder(other.parent)
+
+
+def set_aside(path: Path, suffix: str) -> None:
+    """Give a file that is about to be replaced a second name beside it: its own and `suffix`, and -1, -2 and so on. One
+    that is not there needs none. The first `MAX_ASIDE` are kept, and the newest of the later ones."""
+    names = [_beside(path, suffix), *(_beside(path, f"{suffix}-{number}") for number in range(1, MAX_ASIDE + 1))]
+    other = next((name for name in names if not name.exists()), names[-1])
+    other.unlink(missing_ok=True)
+    with suppress(FileNotFoundError):
+        keep_under(path, other)
 
 
 def remove(path: Path) -> None:

@@ -2,7 +2,8 @@
 
 The file is the canonical JSON (sorted keys, no spaces) of `{"body": …, "checksum": sha256 of the canonical body,
 "schema_version": 1}`. A file that is not byte for byte what this module would write for its own body is damaged: no
-flipped bit can be read as a calibration.
+flipped bit can be read as a calibration. What cannot be used is kept beside the file that takes its place, as
+`.broken`, or as `.newer` where a later version of the service wrote it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,12 @@ from coec.errors import StateError
 
 SCHEMA_VERSION = 1
 
+MAX_BYTES = 64 * 2**20
+"""Of a file that is read at all. 32 pairs with everything that may be in their state have below 1 MB."""
+
+BROKEN, NEWER = ".broken", ".newer"
+"""Suffixes of what is kept aside."""
+
 
 @dataclass(frozen=True, slots=True)
 class LoadedState:
@@ -27,6 +34,10 @@ class LoadedState:
     damage: tuple[str, ...]
 
 
+class _NewerError(StateError):
+    """A copy that a later version of the service wrote."""
+
+
 class StateFile:
     """One state file. Not safe for use from several threads at once."""
 
@@ -34,31 +45,42 @@ class StateFile:
         self._path = path
         self._previous = path.with_name(path.name + ".previous")
         self._current_is_good = False
+        self._aside: dict[Path, str] = {}
 
     def load(self) -> LoadedState:
         """The body of the current copy, else of the previous one, else None. Never raises for a bad file."""
         damage = []
         for path in (self._path, self._previous):
             try:
-                body = _decode(path.read_bytes())
+                body = _decode(_read(path))
             except FileNotFoundError:
                 continue
             except OSError as error:
                 damage.append(f"{path.name}: {error.strerror}")
             except StateError as error:
                 damage.append(f"{path.name}: {error}")
+                self._aside[path] = NEWER if isinstance(error, _NewerError) else BROKEN
             else:
                 self._current_is_good = path == self._path
                 return LoadedState(body, tuple(damage))
         return LoadedState(None, tuple(damage))
 
+    def distrust(self) -> None:
+        """What was loaded turned out to be of no use: it is kept aside, and does not become the previous copy."""
+        self._aside[self._path if self._current_is_good else self._previous] = BROKEN
+        self._current_is_good = False
+
     def save(self, body: dict[str, Any]) -> None:
-        """Replace the file; the copy it replaces, if good, becomes the previous one. On the disk when this returns.
+        """Replace the file; the copy it replaces, if good, becomes the previous one. What was found and could not be
+        used is kept aside first. On the disk when this returns.
 
         Raises:
             StateError: the disk is full or the folder not writable; there is a good copy on the disk all the same.
         """
         try:
+            for path in tuple(self._aside):
+                durable.set_aside(path, self._aside[path])
+                del self._aside[path]
             durable.replace(self._path, _encode(body), self._previous if self._current_is_good else None)
         except OSError as error:
             raise StateError(f"cannot write {self._path}: {error.strerror}; it needs space and permission") from error
@@ -74,6 +96,14 @@ def _encode(body: dict[str, Any]) -> bytes:
     return _canonical({"body": body, "checksum": checksum, "schema_version": SCHEMA_VERSION})
 
 
+def _read(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        data = stream.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise StateError(f"has more than {MAX_BYTES} bytes")
+    return data
+
+
 def _decode(data: bytes) -> dict[str, Any]:
     try:
         document = json.loads(data)
@@ -82,7 +112,10 @@ def _decode(data: bytes) -> dict[str, Any]:
     body = document.get("body") if isinstance(document, dict) else None
     if not isinstance(body, dict):
         raise StateError("has no body")
-    if document.get("schema_version") != SCHEMA_VERSION:
+    version = document.get("schema_version")
+    if isinstance(version, int) and version > SCHEMA_VERSION:
+        raise _NewerError(f"is of a newer schema version than {SCHEMA_VERSION}")
+    if version != SCHEMA_VERSION:
         raise StateError(f"is not of schema version {SCHEMA_VERSION}")
     try:
         expected = _encode(body)

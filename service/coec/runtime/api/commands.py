@@ -1,5 +1,5 @@
 """Commands of people: each is carried out whole by the thread that owns what it changes, or not at all; either is
-acknowledged, logged and written down."""
+acknowledged, logged and written down. Those that come faster than their sender may give them are only answered."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from coec.calibration import lifecycle
 from coec.calibration.types import Rig
 from coec.config import PairConfig
 from coec.errors import NotFoundError
+from coec.runtime.api.rate_limit import PER_S, RateLimit
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.mailbox import Mailbox
 from coec.runtime.decisions.pair_store import PairStore
@@ -64,6 +65,7 @@ class Commands:
         self._recorder = recorder
         self._folder = folder
         self._questions = questions
+        self._rate = RateLimit()
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
 
@@ -82,8 +84,12 @@ class Commands:
             "commission": self._commission,
             "hold": partial(self._hold, release=bool(arguments.get("release", False))),
         }
+        wait_s = self._rate.take(sender)
         try:
-            if name == "calibrate":
+            if wait_s > 0.0:
+                text = f"You give commands faster than {PER_S:g} per second; nothing was done. Wait {wait_s:.1f} s."
+                acknowledged = self._acknowledge(name, "too_many", text, accepted=False)
+            elif name == "calibrate":
                 acknowledged = self._stream.ask(self._calibrate, TIMEOUT_S)
                 # It is done: what cannot be waited for any more is written down all the same.
                 self._mailbox.post(partial(self._write_down, acknowledged, sender))

@@ -20,6 +20,9 @@ ARGUMENTS: Final[Mapping[str, Mapping[str, type]]] = {"rollback": {"to": str}, "
 MAX_SENDER: Final = 96
 """Characters of a sender in log and history."""
 
+MAX_PAYLOAD: Final = 4096
+"""Bytes of a payload. Ours have below 100; a message of 32 MB in JSON would unpack to a gigabyte."""
+
 MAX_ATTACHMENT: Final = 4096
 """Bytes of an attachment that are looked at."""
 
@@ -60,6 +63,8 @@ def sender_of(attachment: bytes | None) -> str:
 def _document(payload: bytes) -> dict[str, Any]:
     if not payload:
         return {}
+    if len(payload) > MAX_PAYLOAD:
+        raise UsageError(f"the payload has more than {MAX_PAYLOAD} bytes")
     try:
         document = (
             json.loads(payload) if payload[:1] == b"{" else msgpack.unpackb(payload, max_map_len=8, max_str_len=256)

@@ -1,106 +1,80 @@
-"""The history of a pair: append-only, a line per entry, each holding the sha256 of the one before (tamper-evident).
+"""The history of a pair, in three books with a quota each, so that none can push what another holds out of it.
 
-A line is `<sha256 of the entry> <entry, JSON><tab><result, JSON or null>`; the entry names the sha256 of its result.
-Hashes are over the bytes of the line, so that a later version with more fields can still verify it. Only the newest
-`limit` entries are kept: the first line's `previous_sha256` is then the hash of what was dropped. Place and hash of the
-last entry on the disk also stand in the state file, so that a tail that was cut off is noticed. A chain that does not
-hold is kept aside as it is, and goes on from the part that does.
+`results`: the estimate of each window, and the extrinsic that became served by it: all that a roll back and a
+commissioning need. `states`: changes of health, and what was found wrong with a book. `commands`: what people had done,
+the extrinsics that this put in place, and what comes of windows that are solved again, which is only done by command.
+Whoever floods the service with commands flushes this book.
+
+Each book is a hash chain in a file of its own. The entries of all are numbered together, in the order in which they
+came.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import threading
-from collections import deque
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
-from coec.adapters.files import durable
-from coec.adapters.files.durable import Log
-from coec.errors import DecodeError, StateError
-from coec.schemas.base import from_json, to_json
-from coec.schemas.replies import CalibrationResult, ChainedEntry, HistoryEntry
+from coec.calibration.lifecycle import Provenance
+from coec.errors import StateError
+from coec.runtime.decisions.chain import Chain, Kept
+from coec.schemas.replies import Book, CalibrationResult, HistoryEntry
 
-GENESIS = 64 * "0"
-"""`previous_sha256` of the first entry."""
-
-
-@dataclass(frozen=True, slots=True)
-class Kept:
-    """An entry with its hash, its result if it is one of a window, and its line in the file."""
-
-    sha256: str
-    entry: HistoryEntry
-    result: CalibrationResult | None
-    line: bytes
-
-    @property
-    def chained(self) -> ChainedEntry:
-        """Without the result."""
-        return ChainedEntry(sha256=self.sha256, entry=self.entry)
+FILES: Final[Mapping[Book, str]] = {"results": "history", "states": "states", "commands": "commands"}
+"""First part of the name of the file of a book."""
 
 
 class History:
-    """All that is kept of one pair, oldest first. Safe to use from several threads.
+    """All that is kept of one pair. Safe to use from several threads.
 
-    An entry that could not be put on the disk is kept, and goes there with the next one, in order: the chain on the
-    disk holds at any time.
+    An entry that could not be put on the disk is kept, and goes there with the next one of its book, in order: the
+    chains on the disk hold at any time.
 
     Attributes:
-        damage: what was wrong with the chain that was found, one sentence; None when it held.
+        damage: what was wrong with the chains that were found, one sentence; None when they held.
     """
 
-    def __init__(self, path: Path, limit: int, head: str | None = None) -> None:
-        """`head` is the `durable_head` that the state file knows of: the chain must reach it, or it was cut off."""
-        self._path = path
+    def __init__(self, folder: Path, pair: str, limit: int, heads: Mapping[str, str]) -> None:
+        """
+        Args:
+            limit: entries kept in each book, the newest.
+            heads: the `durable_heads` that the state file knows of: the chains must reach them, or were cut off.
+        """
         self._lock = threading.Lock()
-        self._kept: deque[Kept] = deque(maxlen=limit)
-        self._log = Log(path, limit, lambda: [kept.line for kept in self._kept])
-        self._durable_head: str | None = None
-        self._to_keep_aside = False
-        self.damage: str | None = None
-        self._load(head)
+        self._books = {
+            book: Chain(folder / f"{name}-{pair}.jsonl", limit, heads.get(book)) for book, name in FILES.items()
+        }
+        found = [f"{book}: {chain.damage}" for book, chain in self._books.items() if chain.damage is not None]
+        self.damage = "; ".join(found) or None
+        self._next = 1 + max((kept.entry.sequence for kept in self.entries()), default=-1)
 
     @property
-    def durable_head(self) -> str | None:
-        """Place and hash of the newest entry that is on the disk, in the words of this module; None before the first.
-        This, and nothing newer, is for the state file to remember."""
-        with self._lock:
-            return self._durable_head
+    def durable_heads(self) -> dict[str, str]:
+        """Of each book that has one, the newest entry that is on the disk. These, and nothing newer, are for the state
+        file to remember."""
+        heads = ((book, chain.durable_head) for book, chain in self._books.items())
+        return {book: head for book, head in heads if head is not None}
 
     def entries(self) -> tuple[Kept, ...]:
-        """All that are kept."""
-        with self._lock:
-            return tuple(self._kept)
+        """All that are kept, oldest first."""
+        every = (kept for chain in self._books.values() for kept in chain.entries())
+        return tuple(sorted(every, key=lambda kept: kept.entry.sequence))
 
     def results(self) -> tuple[CalibrationResult, ...]:
-        """Results of windows."""
+        """Results of windows, oldest first."""
         return tuple(kept.result for kept in self.entries() if kept.result is not None)
 
     def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
-        """Keep one more; its place in the chain is filled in. On the disk, with all before it, when this returns.
+        """Keep one more, in its book; its place is filled in. On the disk when this returns.
 
         Raises:
             StateError: it is kept in memory, but not on the disk; the next append or `flush` tries again.
         """
         with self._lock:
-            last = self._kept[-1] if self._kept else None
-            placed = entry.model_copy(
-                update={
-                    "sequence": last.entry.sequence + 1 if last else 0,
-                    "previous_sha256": last.sha256 if last else GENESIS,
-                    "result_sha256": _sha256(to_json(result)) if result else None,
-                }
-            )
-            document = to_json(placed)
-            sha256 = _sha256(document)
-            body = document + b"\t" + (to_json(result) if result else b"null")
-            kept = Kept(sha256, placed, result, sha256.encode() + b" " + body)
-            self._kept.append(kept)
-            self._log.add(kept.line)
-            self._flush()
-            return kept
+            book = self._book_of(entry)
+            number, self._next = self._next, self._next + 1
+            return self._books[book].append(entry.model_copy(update={"sequence": number, "book": book}), result)
 
     def flush(self) -> None:
         """Put on the disk what an append could not.
@@ -109,83 +83,27 @@ class History:
             StateError: it is still not possible.
         """
         with self._lock:
-            self._flush()
+            failed = []
+            for chain in self._books.values():
+                try:
+                    chain.flush()
+                except StateError as error:
+                    failed.append(str(error))
+            if failed:
+                raise StateError("; ".join(failed))
 
-    def _flush(self) -> None:
-        try:
-            if self._to_keep_aside:
-                self._keep_aside()
-            self._log.flush()
-        except OSError as error:
-            raise StateError(f"cannot write {self._path}: {error.strerror}") from error
-        if self._kept:
-            self._durable_head = _head_of(self._kept[-1])
+    def _book_of(self, entry: HistoryEntry) -> Book:
+        match entry.kind:
+            case "state" | "chain":
+                return "states"
+            case "extrinsic" if entry.code != Provenance.ESTIMATED.value:
+                return "commands"
+            case "estimate" | "extrinsic" if not self._is_in_results(entry):
+                return "results"
+            case _:
+                return "commands"
 
-    def _load(self, head: str | None) -> None:
-        lines = self._read()
-        for number, line in enumerate(lines, start=1):
-            kept = _parsed(line)
-            last = self._kept[-1] if self._kept else None
-            if kept is None or (last is not None and kept.entry.previous_sha256 != last.sha256):
-                self.damage = f"line {number} of {len(lines)} is not what its hash, or the one before it, says"
-                break
-            self._kept.append(kept)
-        if self.damage is None and not _reaches(self._kept, head):
-            self.damage = "its end was cut off: it lacks an entry that the state file knows of"
-        if self._kept:
-            self._durable_head = _head_of(self._kept[-1])
-        if self.damage is not None:
-            self._to_keep_aside = True
-            self._log.renew()
-            with contextlib.suppress(StateError):
-                self._flush()
-
-    def _read(self) -> list[bytes]:
-        try:
-            return self._log.load()
-        except OSError as error:
-            self.damage = f"it cannot be read: {error.strerror}"
-            return []
-
-    def _keep_aside(self) -> None:
-        aside, number = self._path.with_name(f"{self._path.name}.broken"), 0
-        while aside.exists():
-            number += 1
-            aside = self._path.with_name(f"{self._path.name}.broken-{number}")
-        with contextlib.suppress(FileNotFoundError):
-            durable.keep_under(self._path, aside)
-        self._to_keep_aside = False
-
-
-def _parsed(line: bytes) -> Kept | None:
-    """The entry of a line, None when the line is not what its hashes say."""
-    sha256, _, body = line.partition(b" ")
-    document, _, result = body.partition(b"\t")
-    try:
-        entry = from_json(HistoryEntry, document)
-        told = None if entry.result_sha256 is None else from_json(CalibrationResult, result)
-    except DecodeError:
-        return None
-    if _sha256(document).encode() != sha256 or (_sha256(result) if told else None) != entry.result_sha256:
-        return None
-    return Kept(sha256.decode(), entry, told, line)
-
-
-def _head_of(kept: Kept) -> str:
-    return f"{kept.entry.sequence} {kept.sha256}"
-
-
-def _reaches(chain: deque[Kept], head: str | None) -> bool:
-    """Whether a sound chain holds the entry that `head` names, or only ones after it: the oldest are dropped."""
-    if head is None:
-        return True
-    number, _, sha256 = head.partition(" ")
-    if not number.isdecimal() or not chain:
-        return False
-    return int(number) < chain[0].entry.sequence or any(
-        kept.entry.sequence == int(number) and kept.sha256 == sha256 for kept in chain
-    )
-
-
-def _sha256(document: bytes) -> str:
-    return hashlib.sha256(document).hexdigest()
+    def _is_in_results(self, entry: HistoryEntry) -> bool:
+        """Whether the window of an entry has one of its kind there already."""
+        kept = (kept.entry for kept in self._books["results"].entries())
+        return any((one.kind, one.window_id) == (entry.kind, entry.window_id) for one in kept)

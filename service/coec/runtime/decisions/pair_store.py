@@ -11,7 +11,7 @@ import contextlib
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,8 +23,9 @@ from coec.calibration.lifecycle import HealthState, PairState, Provenance, aged,
 from coec.calibration.types import Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
+from coec.runtime.decisions.chain import GENESIS, Kept
 from coec.runtime.decisions.check_log import CheckLog
-from coec.runtime.decisions.history import GENESIS, History, Kept
+from coec.runtime.decisions.history import History
 from coec.runtime.decisions.incidents import Incidents
 from coec.runtime.decisions.state_store import Clocks, StateStore
 from coec.runtime.ingest.chooser import Served
@@ -85,9 +86,9 @@ class PairStore:
         self.damage: Reason | None = None
         self.transitions: Counter[str] = Counter()
         self._epoch = 0
-        remembered, head = self._recall()
+        remembered, heads = self._recall()
         self._state = restored(remembered)
-        self.history = History(config.directory / f"history-{rig.pair}.jsonl", config.history, head)
+        self.history = History(config.directory, rig.pair, config.history, heads)
         self.incidents = Incidents(config.directory / "evidence", rig.pair, config.evidence)
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
         folder.protect(rig.pair, self.incidents.window_ids)
@@ -96,6 +97,8 @@ class PairStore:
             text = f"The chain of the history is broken: {self.history.damage}. It is kept aside."
             self.damage = self.damage or Reason("history_damaged", text)
             self._write(_entry("chain", "broken", text))
+            self.save()
+        elif self.damage is not None:
             self.save()
         if self._state.health is not remembered.health:
             self._since_ns = time.time_ns()
@@ -175,8 +178,7 @@ class PairStore:
         return self._checks.checks()
 
     def note_command(self, name: str, code: str, text: str, sender: str, *, accepted: bool) -> None:
-        """A command was carried out or refused. Of equal refusals in a row only the first is written down: whoever
-        floods the service with them must not push the calibrations out of the history."""
+        """A command was carried out or refused. Of equal refusals in a row only the first is written down."""
         last = next(reversed(self.history.entries()), None)
         told = f"{name}: {text}"
         if not accepted and last is not None:
@@ -234,7 +236,7 @@ class PairStore:
         with contextlib.suppress(StateError):  # counted when it was appended
             self.history.flush()
         try:
-            self._store.remember(self._rig, self._state, clocks, self.history.durable_head)
+            self._store.remember(self._rig, self._state, clocks, self.history.durable_heads)
         except StateError as error:
             self._losses.add("storage", "state_not_saved", detail=str(error))
 
@@ -250,7 +252,7 @@ class PairStore:
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
-    def _recall(self) -> tuple[PairState, str | None]:
+    def _recall(self) -> tuple[PairState, Mapping[str, str]]:
         damage = self._store.damage
         try:
             remembered = self._store.recall(self._rig)
@@ -258,10 +260,11 @@ class PairStore:
             damage, remembered = (*damage, str(error)), None
         if damage:
             source = "the previous copy" if remembered else "the nominal calibration"
-            self.damage = Reason("state_damaged", f"The state on the disk was damaged; {source} is served.")
+            text = f"The state on the disk cannot be used: {'; '.join(damage)}. It is kept aside; {source} is served."
+            self.damage = Reason("state_damaged", text)
             self._losses.add("storage", "state_damaged", len(damage), detail="; ".join(damage))
         if remembered is None:
-            return initial_state(self._rig), None
+            return initial_state(self._rig), {}
         clocks = remembered.clocks
         now_ns = time.time_ns()
         if clocks.since_wall_ns is not None and clocks.since_wall_ns <= now_ns:
@@ -270,7 +273,7 @@ class PairStore:
         if clocks.completed_wall_ns is not None and clocks.completed_wall_ns <= now_ns:
             self._completed_s = time.monotonic() - (now_ns - clocks.completed_wall_ns) / NS_PER_S
             self._completed_stamp_ns = clocks.completed_stamp_ns
-        return remembered.state, remembered.history_head
+        return remembered.state, remembered.history_heads
 
     def _note(self, before: PairState, after: PairState, stamp_ns: int | None) -> None:
         window_id = after.accepted.window_id if after.accepted else None

@@ -6,21 +6,23 @@ import hashlib
 import json
 import logging
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import rig_to_json
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState, Provenance, Status
 from coec.calibration.monitor.change_detector import MonitorState
-from coec.calibration.tracker import track_from_dict, track_to_dict
-from coec.calibration.types import Reason, Rig
+from coec.calibration.tracker import Track, track_from_dict, track_to_dict
+from coec.calibration.types import Estimate, Matrix4, Reason, Rig
 from coec.errors import CoecError, StateError
+from coec.geometry import se3
 from coec.schemas import replies
 from coec.schemas.base import Part
 from coec.schemas.replies import CalibrationResult
@@ -29,6 +31,9 @@ _log = logging.getLogger(__name__)
 
 
 Rows = tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]
+
+WallNs = Annotated[int, Field(ge=0, lt=2**63)]
+"""Nanoseconds since 1970, as the clocks of Linux count them."""
 
 
 class StoredCandidate(Part):
@@ -49,7 +54,7 @@ class StoredChange(Part):
 
 class StoredPair(Part):
     """`PairState` on the disk; when (wall clock) a check was last completed and since when it is in its state of
-    health; and the head of its history on the disk. What is not in a file of an earlier version is as at the first
+    health; and the heads of its history on the disk. What is not in a file of an earlier version is as at the first
     start."""
 
     rig_sha256: str
@@ -60,7 +65,7 @@ class StoredPair(Part):
     latest: CalibrationResult | None
     accepted: CalibrationResult | None
     failures: tuple[replies.Reason, ...]
-    completed_wall_ns: int | None
+    completed_wall_ns: WallNs | None
     health: replies.HealthState = "unknown"
     reasons: tuple[replies.Reason, ...] = ()
     pending: StoredCandidate | None = None
@@ -71,9 +76,9 @@ class StoredPair(Part):
     flagged_since_ns: int | None = None
     poor_since_ns: int | None = None
     changes: tuple[StoredChange, ...] = ()
-    since_wall_ns: int | None = None
+    since_wall_ns: WallNs | None = None
     completed_stamp_ns: int | None = None
-    history_head: str | None = None
+    history_heads: dict[str, str] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +97,7 @@ class Remembered:
 
     state: PairState
     clocks: Clocks
-    history_head: str | None
+    history_heads: Mapping[str, str]
 
 
 class StateStore:
@@ -115,7 +120,8 @@ class StateStore:
         """What is known of the pair; None when nothing is, or when it belongs to another rig (then said in the log).
 
         Raises:
-            StateError: the file is intact, but not what this version can read.
+            StateError: the file is intact, but not what this version can read, or a pose in it is none. It is kept
+                aside when the state is put on the disk next.
         """
         document = self._pairs.get(rig.pair)
         if document is None:
@@ -129,11 +135,13 @@ class StateStore:
                 )
                 return None
             clocks = Clocks(stored.completed_wall_ns, stored.completed_stamp_ns, stored.since_wall_ns)
-            return Remembered(_state_of(stored), clocks, stored.history_head)
-        except (ValidationError, CoecError, ValueError, TypeError) as error:
-            raise StateError(f"the state of pair {rig.pair} cannot be used: it has another form") from error
+            return Remembered(_state_of(stored), clocks, stored.history_heads)
+        except (ValidationError, CoecError, ArithmeticError, LookupError, ValueError, TypeError) as error:
+            self._file.distrust()
+            why = "a pose in it is no rigid transform" if isinstance(error, _NoPoseError) else "it has another form"
+            raise StateError(f"the state of pair {rig.pair} cannot be used: {why}") from error
 
-    def remember(self, rig: Rig, state: PairState, clocks: Clocks, history_head: str | None = None) -> None:
+    def remember(self, rig: Rig, state: PairState, clocks: Clocks, history_heads: Mapping[str, str]) -> None:
         """Put the pair's state on the disk.
 
         Raises:
@@ -161,7 +169,7 @@ class StateStore:
             changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
             since_wall_ns=clocks.since_wall_ns,
             completed_stamp_ns=clocks.completed_stamp_ns,
-            history_head=history_head,
+            history_heads=dict(history_heads),
         )
         with self._lock:
             self._pairs[rig.pair] = stored.model_dump(mode="json")
@@ -193,29 +201,56 @@ def _reasons(stored: tuple[replies.Reason, ...]) -> tuple[Reason, ...]:
     return tuple(Reason(reason.code, reason.text) for reason in stored)
 
 
+class _NoPoseError(StateError):
+    """A matrix that should be a pose, and is no rigid transform."""
+
+
+def _pose(rows: Rows) -> Matrix4:
+    """A checksum tells that a file is as it was written, not that who wrote it was this service."""
+    T = np.array(rows, dtype=np.float64)
+    if not se3.is_rigid(T):
+        raise _NoPoseError("no rigid transform")
+    return T
+
+
+def _estimate(stored: CalibrationResult) -> Estimate:
+    moved = () if stored.moved is None else (stored.moved.before, stored.moved.after)
+    for transform in (stored.camera_from_lidar, *moved):
+        _pose(transform.matrix)
+    return estimate_of(stored)
+
+
+def _track(stored: dict[str, Any]) -> Track:
+    track = track_from_dict(stored)
+    for belief in (track.slow, track.candidate):
+        if belief is not None:
+            _pose(_rows(belief.T_camera_lidar.tolist()))
+    return track
+
+
 def _state_of(stored: StoredPair) -> PairState:
     pending = stored.pending
     return PairState(
-        T_camera_lidar=np.array(stored.T_camera_lidar, dtype=np.float64),
+        T_camera_lidar=_pose(stored.T_camera_lidar),
         provenance=Provenance(stored.provenance),
         status=Status(stored.status),
         valid_from_ns=stored.valid_from_ns,
-        latest=estimate_of(stored.latest) if stored.latest else None,
-        accepted=estimate_of(stored.accepted) if stored.accepted else None,
+        latest=_estimate(stored.latest) if stored.latest else None,
+        accepted=_estimate(stored.accepted) if stored.accepted else None,
         failures=_reasons(stored.failures),
         health=HealthState(stored.health),
         reasons=_reasons(stored.reasons),
         pending=None
         if pending is None
         else Candidate(
-            np.array(pending.T_camera_lidar, dtype=np.float64),
-            estimate_of(pending.result),
+            _pose(pending.T_camera_lidar),
+            _estimate(pending.result),
             Reason(pending.waits.code, pending.waits.text),
             pending.contradicts,
         ),
         frozen=stored.frozen,
         proven=stored.proven,
-        track=track_from_dict(stored.track) if stored.track else None,
+        track=_track(stored.track) if stored.track else None,
         monitor=stored.monitor,
         flagged_since_ns=stored.flagged_since_ns,
         poor_since_ns=stored.poor_since_ns,

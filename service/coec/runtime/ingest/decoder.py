@@ -13,14 +13,12 @@ from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import LimitsConfig, PairConfig
 from coec.errors import DecodeError
 from coec.runtime.ingest.inbox import Parcel
+from coec.runtime.ingest.sequence_numbers import SequenceNumbers
 
 _log = logging.getLogger(__name__)
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-
-MAX_SEQUENCE_GAP = 100_000
-"""A larger step is a sender that started to count anew: at 100 Hz this would be a quarter of an hour of loss."""
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 
@@ -40,7 +38,7 @@ class Decoder:
         self._pair = pair
         self._limits = limits
         self._losses = losses
-        self._sequence: dict[str, int] = {}
+        self._numbers: dict[str, SequenceNumbers] = {}
         self._received: Counter[str] = Counter()
         self._accepted: Counter[str] = Counter()
 
@@ -65,7 +63,10 @@ class Decoder:
             _log.exception("a decoder failed", extra={"fields": {"pair": self._pair.name, "stream": stream}})
             self._losses.add(stream, "decoder_fault")
             return None
-        self._count_gap(stream, frame.sequence)
+        if frame.sequence is not None:
+            numbers = self._numbers.setdefault(stream, SequenceNumbers())
+            if lost := numbers.lost_by(frame.sequence):
+                self._losses.add(stream, "sequence_gap", lost)
         self._accepted[stream] += 1
         return frame
 
@@ -107,11 +108,3 @@ class Decoder:
             raise DecodeError("frame_id", "not the frame id of the configuration")
         if (frame.image.width, frame.image.height) != (camera.intrinsics.width, camera.intrinsics.height):
             raise DecodeError("image_size", "not the size of the intrinsics")
-
-    def _count_gap(self, stream: str, sequence: int | None) -> None:
-        if sequence is None:
-            return
-        previous = self._sequence.get(stream)
-        self._sequence[stream] = sequence
-        if previous is not None and 1 < sequence - previous <= MAX_SEQUENCE_GAP:
-            self._losses.add(stream, "sequence_gap", sequence - previous - 1)

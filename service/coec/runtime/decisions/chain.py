@@ -1,0 +1,195 @@
+"""A book of the history of a pair: append-only, a line per entry, each holding the sha256 of the one before
+(tamper-evident).
+
+A line is `<sha256 of the entry> <entry, JSON><tab><result, JSON or null>`; the entry names the sha256 of its result.
+Hashes are over the bytes of the line, so that a later version with more fields can still verify it. Only the newest
+`limit` entries are kept: the first line's `previous_sha256` is then the hash of what was dropped. Place and hash of the
+last entry on the disk also stand in the state file, so that a tail that was cut off is noticed. A chain that does not
+hold is kept aside as it is, and goes on from the part that does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import threading
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+
+from coec.adapters.files import durable
+from coec.adapters.files.conversions import matrix_of
+from coec.adapters.files.durable import Log
+from coec.adapters.files.state_file import BROKEN
+from coec.errors import DecodeError, StateError
+from coec.geometry.se3 import is_rigid
+from coec.schemas.base import from_json, to_json
+from coec.schemas.replies import CalibrationResult, ChainedEntry, HistoryEntry
+
+GENESIS = 64 * "0"
+"""`previous_sha256` of the first entry."""
+
+
+MAX_DIGITS = 19
+"""Of the number of an entry: more than can ever be written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """An entry with its hash, its result if it is one of a window, and its line in the file."""
+
+    sha256: str
+    entry: HistoryEntry
+    result: CalibrationResult | None
+    line: bytes
+
+    @property
+    def chained(self) -> ChainedEntry:
+        """Without the result."""
+        return ChainedEntry(sha256=self.sha256, entry=self.entry)
+
+
+class Chain:
+    """All that is kept in one book, oldest first. Safe to use from several threads.
+
+    An entry that could not be put on the disk is kept, and goes there with the next one, in order: the chain on the
+    disk holds at any time.
+
+    Attributes:
+        damage: what was wrong with the chain that was found, one sentence; None when it held.
+    """
+
+    def __init__(self, path: Path, limit: int, head: str | None = None) -> None:
+        """`head` is the `durable_head` that the state file knows of: the chain must reach it, or it was cut off."""
+        self._path = path
+        self._lock = threading.Lock()
+        self._kept: deque[Kept] = deque(maxlen=limit)
+        self._log = Log(path, limit, lambda: [kept.line for kept in self._kept])
+        self._durable_head: str | None = None
+        self._to_keep_aside = False
+        self.damage: str | None = None
+        self._load(head)
+
+    @property
+    def durable_head(self) -> str | None:
+        """Place and hash of the newest entry that is on the disk, in the words of this module; None before the first.
+        This, and nothing newer, is for the state file to remember."""
+        with self._lock:
+            return self._durable_head
+
+    def entries(self) -> tuple[Kept, ...]:
+        """All that are kept."""
+        with self._lock:
+            return tuple(self._kept)
+
+    def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
+        """Keep one more; its place in the chain is filled in, its number is its own or, where that is taken, the next.
+        On the disk, with all before it, when this returns.
+
+        Raises:
+            StateError: it is kept in memory, but not on the disk; the next append or `flush` tries again.
+        """
+        with self._lock:
+            last = self._kept[-1] if self._kept else None
+            placed = entry.model_copy(
+                update={
+                    "sequence": max(entry.sequence, last.entry.sequence + 1 if last else 0),
+                    "previous_sha256": last.sha256 if last else GENESIS,
+                    "result_sha256": _sha256(to_json(result)) if result else None,
+                }
+            )
+            document = to_json(placed)
+            sha256 = _sha256(document)
+            body = document + b"\t" + (to_json(result) if result else b"null")
+            kept = Kept(sha256, placed, result, sha256.encode() + b" " + body)
+            self._kept.append(kept)
+            self._log.add(kept.line)
+            self._flush()
+            return kept
+
+    def flush(self) -> None:
+        """Put on the disk what an append could not.
+
+        Raises:
+            StateError: it is still not possible.
+        """
+        with self._lock:
+            self._flush()
+
+    def _flush(self) -> None:
+        try:
+            if self._to_keep_aside:
+                self._keep_aside()
+            self._log.flush()
+        except OSError as error:
+            raise StateError(f"cannot write {self._path}: {error.strerror}") from error
+        if self._kept:
+            self._durable_head = _head_of(self._kept[-1])
+
+    def _load(self, head: str | None) -> None:
+        lines = self._read()
+        for number, line in enumerate(lines, start=1):
+            kept = _parsed(line)
+            last = self._kept[-1] if self._kept else None
+            if kept is None or (last is not None and kept.entry.previous_sha256 != last.sha256):
+                self.damage = f"line {number} of {len(lines)} is not what its hash, or the one before it, says"
+                break
+            self._kept.append(kept)
+        if self.damage is None and not _reaches(self._kept, head):
+            self.damage = "its end was cut off: it lacks an entry that the state file knows of"
+        if self._kept:
+            self._durable_head = _head_of(self._kept[-1])
+        if self.damage is not None:
+            self._to_keep_aside = True
+            self._log.renew()
+            with contextlib.suppress(StateError):
+                self._flush()
+
+    def _read(self) -> list[bytes]:
+        try:
+            return self._log.load()
+        except OSError as error:
+            self.damage = f"it cannot be read: {error.strerror}"
+            return []
+
+    def _keep_aside(self) -> None:
+        durable.set_aside(self._path, BROKEN)
+        self._to_keep_aside = False
+
+
+def _parsed(line: bytes) -> Kept | None:
+    """The entry of a line, None when the line is not what its hashes say, or holds a pose that is none."""
+    sha256, _, body = line.partition(b" ")
+    document, _, result = body.partition(b"\t")
+    try:
+        entry = from_json(HistoryEntry, document)
+        told = None if entry.result_sha256 is None else from_json(CalibrationResult, result)
+    except DecodeError:
+        return None
+    if entry.camera_from_lidar is not None and not is_rigid(matrix_of(entry.camera_from_lidar)):
+        return None
+    if told is not None and not is_rigid(matrix_of(told.camera_from_lidar)):
+        return None
+    if _sha256(document).encode() != sha256 or (_sha256(result) if told else None) != entry.result_sha256:
+        return None
+    return Kept(sha256.decode(), entry, told, line)
+
+
+def _head_of(kept: Kept) -> str:
+    return f"{kept.entry.sequence} {kept.sha256}"
+
+
+def _reaches(chain: deque[Kept], head: str | None) -> bool:
+    """Whether a sound chain holds the entry that `head` names, or only ones after it: the oldest are dropped."""
+    if head is None:
+        return True
+    number, _, sha256 = head.partition(" ")
+    if not (number.isdecimal() and len(number) <= MAX_DIGITS and chain):
+        return False
+    return int(number) < chain[0].entry.sequence or any(
+        kept.entry.sequence == int(number) and kept.sha256 == sha256 for kept in chain
+    )
+
+
+def _sha256(document: bytes) -> str:
+    return hashlib.sha256(document).hexdigest()

@@ -1,0 +1,98 @@
+"""Files of which nothing is known yet: none is read that is larger than what it may be, and NumPy's are checked before
+anything is allocated for them."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Collection
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.errors import SourceError
+
+MAX_FILE_BYTES = 256 * 2**20
+"""Of one image, cloud or table. An 8K image has 100 MB as raw pixels, a million points with eight columns 32 MB."""
+
+
+def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """A whole file.
+
+    Raises:
+        SourceError: absent, not readable or too large.
+    """
+    try:
+        with path.open("rb") as stream:
+            large = os.fstat(stream.fileno()).st_size > max_bytes
+            data = b"" if large else stream.read(max_bytes + 1)
+    except FileNotFoundError as error:
+        raise SourceError(f"{path} does not exist") from error
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror}") from error
+    if large or len(data) > max_bytes:
+        raise SourceError(f"{path} has more than {max_bytes} bytes: too large for a single file of a recording")
+    return data
+
+
+def read_npy(path: Path) -> NDArray[np.generic]:
+    """The array of a `.npy` file, a map of it: what its header promises is held against the length of the file.
+
+    Raises:
+        SourceError: absent, not such a file, truncated or too large.
+    """
+    try:
+        array = np.lib.format.open_memmap(path, mode="r")
+    except FileNotFoundError as error:
+        raise SourceError(f"{path} does not exist") from error
+    except Exception as error:  # the header is Python source to NumPy, which raises whatever a parser of that may
+        raise SourceError(f"{path} is not a NumPy array, or is truncated: {_told(error)}") from error
+    if array.nbytes > MAX_FILE_BYTES:
+        raise SourceError(f"{path} has more than {MAX_FILE_BYTES} bytes: too large for a single file of a recording")
+    return array
+
+
+def read_npz(path: Path, names: Collection[str]) -> dict[str, NDArray[np.generic]]:
+    """Those of these arrays that a `.npz` file has.
+
+    Raises:
+        SourceError: absent, not such a file, damaged, or larger when it is unpacked than a file may be.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = {item.filename: item for item in archive.infolist()}
+            wanted = {name: members[f"{name}.npy"] for name in names if f"{name}.npy" in members}
+            unpacked = sum(item.file_size for item in wanted.values())
+            if unpacked > MAX_FILE_BYTES:
+                raise SourceError(f"{path} would unpack to {unpacked} bytes: refused")
+            return {name: _member(archive, item) for name, item in wanted.items()}
+    except (FileNotFoundError, SourceError) as error:
+        raise SourceError(f"{path} does not exist" if isinstance(error, OSError) else str(error)) from error
+    except Exception as error:  # zip, zlib and NumPy's header: each raises more than it says
+        raise SourceError(f"{path} is not an .npz file, or is damaged: {_told(error)}") from error
+
+
+def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> NDArray[np.generic]:
+    with archive.open(item) as stream:
+        shape, _, dtype = _header(stream)
+        if shape and (min(shape) < 0 or max(shape) > MAX_FILE_BYTES):
+            raise ValueError("its shape is none")
+        if int(np.prod(shape, dtype=object)) * dtype.itemsize > item.file_size:
+            raise ValueError("it promises more than the archive holds")
+    with archive.open(item) as stream:
+        return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+
+
+def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[np.generic]]:
+    match np.lib.format.read_magic(stream):
+        case (1, 0):
+            return np.lib.format.read_array_header_1_0(stream)
+        case _:
+            return np.lib.format.read_array_header_2_0(stream)
+
+
+def _told(error: Exception) -> str:
+    """What an error says, in a line that fits on a screen: some quote the file that they complain about."""
+    return f"{type(error).__name__}: {str(error).splitlines()[0][:120]}" if str(error) else type(error).__name__

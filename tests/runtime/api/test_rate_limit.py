@@ -1,0 +1,48 @@
+"""How often a sender may give commands."""
+
+from __future__ import annotations
+
+from coec.runtime.api.rate_limit import BURST, PER_S, SENDERS, RateLimit
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def accepted(limit: RateLimit, sender: str, count: int) -> int:
+    return sum(limit.take(sender) == 0.0 for _ in range(count))
+
+
+def test_a_burst_is_taken_and_then_one_after_the_other() -> None:
+    clock = Clock()
+    limit = RateLimit(clock)
+    assert accepted(limit, "a", 10 * BURST) == BURST
+    wait_s = limit.take("a")
+    assert 0.0 < wait_s <= 1.0 / PER_S
+    clock.now_s += wait_s
+    assert accepted(limit, "a", 5) == 1
+    clock.now_s += 1e6
+    assert accepted(limit, "a", 10 * BURST) == BURST
+
+
+def test_senders_do_not_take_each_others_turns() -> None:
+    limit = RateLimit(Clock())
+    assert accepted(limit, "a", 10 * BURST) == BURST
+    assert accepted(limit, "b", 10 * BURST) == BURST
+
+
+def test_invented_names_gain_little_and_take_no_memory() -> None:
+    clock = Clock()
+    limit = RateLimit(clock)
+    assert accepted(limit, "operator", 1) == 1
+    taken = sum(limit.take(f"name {number}") == 0.0 for number in range(10_000))
+    assert taken == SENDERS - 1 + BURST
+    assert len(limit._buckets) == SENDERS
+    assert accepted(limit, "operator", 1) == 1, "who was there before is not locked out"
+    clock.now_s += BURST / PER_S
+    assert accepted(limit, "newcomer", 10 * BURST) == BURST, "the names are forgotten when they are idle"
+    assert len(limit._buckets) == 1

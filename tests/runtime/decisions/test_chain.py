@@ -1,0 +1,260 @@
+"""The hash chain: what it keeps over a restart, and that no change of it goes unseen."""
+
+from __future__ import annotations
+
+import hashlib
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from coec.adapters.files.conversions import result_of
+from coec.adapters.files.state_file import StateFile
+from coec.errors import StateError
+from coec.runtime.decisions.chain import GENESIS, Chain
+from coec.schemas.base import to_json
+from coec.schemas.replies import CalibrationResult, HistoryEntry
+from disks import EVERYTHING, Disk
+from estimates import RIG, estimate
+
+
+def result(window: int) -> CalibrationResult:
+    return result_of(estimate(window), RIG, "test")
+
+
+def entry(text: str = "something") -> HistoryEntry:
+    return HistoryEntry(sequence=0, previous_sha256="", kind="command", code="hold", text=text, wall_ns=1)
+
+
+def written(path: Path, count: int, limit: int = 100) -> Chain:
+    history = Chain(path, limit)
+    for window in range(count):
+        history.append(entry(str(window)), result(window) if window % 2 else None)
+    return history
+
+
+def test_every_entry_holds_the_hash_of_the_one_before(tmp_path: Path) -> None:
+    kept = written(tmp_path / "h", 4).entries()
+    previous = GENESIS
+    for number, item in enumerate(kept):
+        assert (item.entry.sequence, item.entry.previous_sha256) == (number, previous)
+        assert item.sha256 == hashlib.sha256(to_json(item.entry)).hexdigest()
+        if item.result is not None:
+            assert item.entry.result_sha256 == hashlib.sha256(to_json(item.result)).hexdigest()
+        previous = item.sha256
+
+
+def test_a_restart_finds_the_same_chain_and_goes_on(tmp_path: Path) -> None:
+    before = written(tmp_path / "h", 4)
+    again = Chain(tmp_path / "h", 100, before.durable_head)
+    assert again.damage is None
+    assert again.entries() == before.entries()
+    assert [kept.result for kept in again.entries()] == [None, result(1), None, result(3)]
+    assert again.append(entry()).entry.previous_sha256 == before.entries()[-1].sha256
+
+
+def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
+    history = written(tmp_path / "h", 20, limit=3)
+    assert [item.entry.sequence for item in history.entries()] == [17, 18, 19]
+    assert len((tmp_path / "h").read_bytes().splitlines()) <= 6
+    again = Chain(tmp_path / "h", 3, history.durable_head)
+    assert again.damage is None
+    assert again.entries() == history.entries()
+
+
+@pytest.mark.parametrize("what", ["text", "result", "removed", "swapped", "inserted"])
+def test_any_change_is_noticed_and_the_file_kept_aside(tmp_path: Path, what: str) -> None:
+    path = tmp_path / "h"
+    head = written(path, 5).durable_head
+    original = path.read_bytes()
+    lines = original.splitlines(keepends=True)
+    changed = {
+        "text": [*lines[:2], lines[2].replace(b'"text":"2"', b'"text":"9"'), *lines[3:]],
+        "result": [*lines[:3], lines[3].replace(b'"pairs":3', b'"pairs":4'), lines[4]],
+        "removed": [*lines[:2], *lines[3:]],
+        "swapped": [*lines[:2], lines[3], lines[2], lines[4]],
+        "inserted": [*lines[:2], lines[1], *lines[2:]],
+    }[what]
+    path.write_bytes(b"".join(changed))
+    again = Chain(path, 100, head)
+    assert again.damage is not None
+    good = 3 if what == "result" else 2
+    assert [item.entry.text for item in again.entries()] == [str(i) for i in range(good)]
+    assert (tmp_path / "h.broken").read_bytes() == b"".join(changed)
+    assert Chain(path, 100).damage is None, "what is left is sound"
+
+
+def test_an_end_that_was_cut_off_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "h"
+    head = written(path, 5).durable_head
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:3]))
+    assert Chain(path, 100).damage is None, "the chain alone cannot tell"
+    path.write_bytes(path.read_bytes())
+    cut = Chain(path, 100, head)
+    assert cut.damage is not None
+    assert "cut off" in cut.damage
+    assert len(cut.entries()) == 3
+
+
+def test_a_torn_last_line_of_a_power_cut_is_no_tampering(tmp_path: Path) -> None:
+    path = tmp_path / "h"
+    before = written(path, 3)
+    path.write_bytes(path.read_bytes() + b"0123 half a li")
+    again = Chain(path, 100, before.durable_head)
+    assert again.damage is None
+    assert again.entries() == before.entries()
+    again.append(entry())
+    assert Chain(path, 100).damage is None
+
+
+def test_two_broken_chains_do_not_overwrite_each_other(tmp_path: Path) -> None:
+    path = tmp_path / "h"
+    for _ in range(2):
+        path.write_bytes(b"junk\n")
+        assert Chain(path, 100).damage is not None
+    assert {item.name for item in tmp_path.iterdir()} >= {"h.broken", "h.broken-1"}
+
+
+def test_a_head_that_was_dropped_for_its_age_is_no_tampering(tmp_path: Path) -> None:
+    path = tmp_path / "h"
+    head = written(path, 1, limit=2).durable_head
+    history = Chain(path, 2, head)
+    for number in range(1, 9):
+        history.append(entry(str(number)))
+    assert Chain(path, 2, head).damage is None
+
+
+def test_another_entry_at_the_place_of_the_head_is_noticed(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    head = written(tmp_path / "other" / "h", 3).durable_head
+    history = Chain(tmp_path / "h", 100)
+    for number in range(5):
+        history.append(entry(f"forged {number}"))
+    assert Chain(tmp_path / "h", 100, head).damage is not None
+
+
+# --- disks ----------------------------------------------------------------------------------------------------------
+
+LIMIT = 3
+
+
+class Life:
+    """A history and the state file that knows its head, as the service writes them."""
+
+    def __init__(self, root: Path) -> None:
+        self.history = Chain(root / "h", LIMIT)
+        self.state = StateFile(root / "state.json")
+        self.said = 0
+
+    def append(self) -> int | None:
+        """One entry more, then the state: the number of the entry if both say that it is safe."""
+        number, self.said = self.said, self.said + 1
+        try:
+            self.history.append(entry(str(number)))
+        except StateError:
+            return None
+        finally:
+            with suppress(StateError):
+                self.state.save({"head": self.history.durable_head})
+        return number
+
+
+def assert_restarts(root: Path, safe: int) -> None:
+    """Nothing is called tampered with, and entry `safe` (-1: none) and those kept before it are there."""
+    body = StateFile(root / "state.json").load().body
+    again = Chain(root / "h", LIMIT, body["head"] if body else None)
+    assert again.damage is None
+    found = [int(kept.entry.text) for kept in again.entries()]
+    assert found == list(range(found[0], found[-1] + 1)) if found else safe == -1
+    if found:
+        assert found[-1] >= safe
+        assert found[0] <= max(0, found[-1] - LIMIT + 1)
+
+
+@pytest.mark.parametrize("length", [1, 2, 4, 30])
+def test_a_disk_that_refuses_for_a_while_loses_nothing_and_is_no_tampering(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int
+) -> None:
+    """Each write, fsync, rename and the like of a life fails once, with `length` - 1 after it."""
+    first, refused = 0, True
+    while refused:
+        root = tmp_path / str(first)
+        root.mkdir()
+        with monkeypatch.context() as patch:
+            disk = Disk(root, patch)
+            disk.refuses = range(first, first + length)
+            life, safe = Life(root), -1
+            for _ in range(8):
+                number = life.append()
+                safe = safe if number is None else number
+                assert_restarts(root, safe)
+            refused = disk.operations > first
+            disk.refuses = ()
+            assert life.append() == 8
+            assert_restarts(root, 8)
+        first += 1
+    assert first > 40
+
+
+def test_what_waits_is_written_without_another_entry_and_the_head_follows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(tmp_path, monkeypatch)
+    history = written(tmp_path / "h", 2)
+    before = history.durable_head
+    disk.refuses = EVERYTHING
+    with pytest.raises(StateError, match="No space"):
+        history.append(entry("third"))
+    with pytest.raises(StateError, match="No space"):
+        history.flush()
+    assert [kept.entry.text for kept in history.entries()] == ["0", "1", "third"]
+    assert history.durable_head == before
+    disk.refuses = ()
+    history.flush()
+    assert history.durable_head != before
+    again = Chain(tmp_path / "h", 100, history.durable_head)
+    assert again.damage is None
+    assert again.entries() == history.entries()
+
+
+def test_a_broken_chain_is_kept_aside_once_the_disk_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(tmp_path, monkeypatch)
+    path = tmp_path / "h"
+    written(path, 3)
+    broken = path.read_bytes().replace(b'"text":"1"', b'"text":"9"')
+    path.write_bytes(broken)
+    disk.refuses = EVERYTHING
+    history = Chain(path, 100)
+    assert history.damage is not None
+    assert path.read_bytes() == broken
+    disk.refuses = ()
+    history.append(entry("on"))
+    assert (tmp_path / "h.broken").read_bytes() == broken
+    assert [kept.entry.text for kept in Chain(path, 100, history.durable_head).entries()] == ["0", "on"]
+
+
+def test_a_history_that_cannot_be_read_is_damage(tmp_path: Path) -> None:
+    (tmp_path / "h").mkdir()
+    history = Chain(tmp_path / "h", 100)
+    assert history.damage is not None
+    assert "cannot be read" in history.damage
+    with pytest.raises(StateError):
+        history.append(entry())
+
+
+def test_a_power_cut_at_any_byte_loses_nothing_and_is_no_tampering(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "disk").mkdir()
+    with monkeypatch.context() as patch:
+        disk = Disk(tmp_path / "disk", patch)
+        life = Life(tmp_path / "disk")
+        for attempt in range(8):
+            disk.refuses = [number for number in range(1000) if number % 5] if attempt in (2, 3) else ()
+            number = life.append()
+            if number is not None:
+                disk.acknowledge(number)
+    count = 0
+    for count, cut in enumerate(disk.power_cuts()):
+        assert_restarts(cut.put(tmp_path / str(count)), max(cut.acknowledged, default=-1))
+    assert count > 3000
