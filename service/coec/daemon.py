@@ -24,10 +24,12 @@ from coec.adapters.system import logs
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
+from coec.adapters.zenoh.settings import settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
-from coec.errors import CoecError, ConfigError
+from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
+from coec.runtime.api.configuration import shown
 from coec.runtime.api.health import reasons_of
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
@@ -92,7 +94,8 @@ class Daemon:
         """Build everything; nothing runs yet, but the Zenoh session is open.
 
         Raises:
-            ConfigError: a rig, an endpoint or a port cannot be used.
+            ConfigError: a rig or an endpoint cannot be used.
+            UnavailableError: a port is taken.
             RecordingError: the state directory cannot be used.
         """
         self._config = config
@@ -103,6 +106,7 @@ class Daemon:
         self._keys = Keys(config.prefix, config.vehicle)
         self._folder = WindowStore(config.state.directory / "windows", config.state)
         self._worker = Worker(config.worker, config.model_dump_json())
+        self._insecure = _insecure(unguarded(settings_of(config.zenoh, config.limits)))
         self._bus = Bus(open_session(config.zenoh, config.limits))
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
@@ -140,7 +144,7 @@ class Daemon:
             {
                 "schema_version": 1,
                 "config_hash": self._status_reply.config_hash,
-                "config": self._config.model_dump(mode="json"),
+                "config": shown(self._config),
             }
         )
         answers = {name: pair.answers for name, pair in self._pairs.items()}
@@ -243,7 +247,7 @@ class Daemon:
         """What ails every pair alike."""
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
-        return tuple(reason for reason in (self._fault, failing) if reason is not None)
+        return tuple(reason for reason in (self._fault, failing, self._insecure) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
 
@@ -278,6 +282,17 @@ class Daemon:
     def _metrics(self) -> bytes:
         health = {name: pair.answers.health_reply for name, pair in self._pairs.items()}
         return metrics.render(self._status_reply, health, self._worker.status().rss_bytes)
+
+
+def _insecure(doors: Sequence[str]) -> Reason | None:
+    """What there is to say of endpoints that let in whoever comes."""
+    if not doors:
+        return None
+    text = (
+        f"Whoever reaches {', '.join(doors)} can read, send frames and give commands, without a certificate: "
+        "`zenoh.insecure` is set. Listen on loopback, or on tls with client certificates."
+    )
+    return Reason("insecure", text)
 
 
 def _attempt(name: str, step: Callable[[], object]) -> object:
@@ -322,16 +337,17 @@ def _state_folder(folder: Path) -> Iterator[None]:
     """The state directory, made if need be, and nobody else's while the daemon serves.
 
     Raises:
-        ConfigError: it cannot be made or written, or another daemon uses it.
+        UnavailableError: it cannot be made or written, or another daemon uses it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / "lock").open("w")
     except OSError as error:
-        raise ConfigError(f"state.directory {folder} cannot be used: {error.strerror}") from error
+        text = f"state.directory {folder} cannot be made or written: {error.strerror}; see to its disk and its owner"
+        raise UnavailableError(text) from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise ConfigError(f"state.directory {folder} is in use by another daemon") from error
+            raise UnavailableError(f"state.directory {folder} is in use by another daemon") from error
         yield

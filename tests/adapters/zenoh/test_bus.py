@@ -16,7 +16,7 @@ import zenoh
 
 from coec.adapters.zenoh.bus import JSON, MSGPACK, SLOW_QUERIES_WAITING, Answer, Bus, Request, Route, open_session
 from coec.config import LimitsConfig, ZenohConfig
-from coec.errors import ConfigError, NotFoundError
+from coec.errors import NotFoundError, UnavailableError
 from fakes import wait_until
 from ports import free_port
 
@@ -182,7 +182,7 @@ def test_a_published_value_and_the_liveliness_token_are_seen(bus: Bus, client: z
 
 def test_a_port_in_use_is_a_clear_error(bus: Bus, endpoint: str) -> None:
     del bus
-    with pytest.raises(ConfigError, match="cannot open the Zenoh session"):
+    with pytest.raises(UnavailableError, match="cannot open the Zenoh session"):
         open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
 
 

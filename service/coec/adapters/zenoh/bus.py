@@ -7,7 +7,6 @@ callback, and every query is finished, because an unfinished one makes its clien
 
 from __future__ import annotations
 
-import json
 import logging
 import queue
 import threading
@@ -18,8 +17,10 @@ from functools import partial
 import zenoh
 
 from coec.adapters.system.threads import ServiceThread
+from coec.adapters.zenoh.endpoints import without_secrets
+from coec.adapters.zenoh.settings import endpoints_of, settings_of, where
 from coec.config import LimitsConfig, ZenohConfig
-from coec.errors import CoecError, ConfigError, UsageError
+from coec.errors import CoecError, UnavailableError, UsageError
 from coec.schemas.base import to_json, to_msgpack
 from coec.schemas.replies import ErrorReply
 
@@ -70,37 +71,19 @@ class Route:
 
 
 def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
-    """A peer that connects and reconnects to the router, or the router itself. What `config.file` says stands; what it
-    does not say opens no door: nobody listens, and nobody is looked for, who was not told to.
+    """A peer that connects and reconnects to the router, or the router itself.
 
     Raises:
-        ConfigError: the file, an endpoint or a port cannot be used.
+        ConfigError: as `settings_of`.
+        UnavailableError: a port is taken, an address is not there, or a certificate cannot be used.
     """
     zenoh.init_log_from_env_or("error")
+    settings = settings_of(config, limits)
     try:
-        settings = zenoh.Config.from_file(config.file) if config.file else zenoh.Config()
-        listen = config.listen if config.embedded_router else ()
-        connect = tuple(endpoint for endpoint in config.connect if endpoint not in listen)
-        silent = {
-            "mode": "router" if config.embedded_router else "peer",
-            "listen/endpoints": listen,
-            "connect/endpoints": connect,
-            "scouting/gossip/enabled": False,
-        }
-        unsaid = zenoh.Config()
-        for key, value in silent.items():
-            # A peer listens on every interface by default, at any port.
-            if settings.get_json(key) == unsaid.get_json(key):
-                settings.insert_json5(key, json.dumps(value))
-        settings.insert_json5("scouting/multicast/enabled", "false")
-        settings.insert_json5("timestamping/enabled", "true")
-        settings.insert_json5("transport/link/rx/max_message_size", str(limits.max_message_bytes))
-        # Queries and replies through shared memory can vanish under load.
-        settings.insert_json5("transport/shared_memory/transport_optimization/messages", '["put"]')
         return zenoh.open(settings)
-    except (zenoh.ZError, OSError, ValueError) as error:
-        where = f"zenoh.file {config.file}" if config.file else f"zenoh.listen {list(listen)}, connect {list(connect)}"
-        raise ConfigError(f"cannot open the Zenoh session ({where}): {error}") from error
+    except zenoh.ZError as error:
+        text = without_secrets(str(error), endpoints_of(config))
+        raise UnavailableError(f"cannot open the Zenoh session ({where(config)}): {text}") from None
 
 
 _Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route]]]
