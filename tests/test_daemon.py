@@ -316,6 +316,16 @@ def test_a_door_for_everybody_is_said_and_keys_are_hidden(tmp_path: Path, drive:
         assert secret not in running.log.read_text()
 
 
+def test_a_second_daemon_of_the_vehicle_leaves_and_says_who_is_there(idle: Service, tmp_path: Path) -> None:
+    config = str(idle.log.with_name("coec.yaml"))
+    command = [*COMMAND, "run", "--config", config, "--state-dir", str(tmp_path / "other")]
+    second = subprocess.run(command, env=environment(), capture_output=True, timeout=PATIENCE_S, check=False)
+    assert second.returncode == EXIT_TRY_AGAIN
+    assert b"is served by another daemon, started 20" in second.stdout
+    assert b'"code": "unavailable"' in second.stdout
+    assert idle.status()["pairs"], "the first goes on"
+
+
 def test_a_damaged_state_is_said_and_nominal_is_served(tmp_path: Path, drive: Drive, router: Router) -> None:
     (tmp_path / "state").mkdir()
     (tmp_path / "state" / "state.json").write_text('{"body":{}}')

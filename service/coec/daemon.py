@@ -24,6 +24,7 @@ from coec.adapters.system import logs
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
+from coec.adapters.zenoh.presence import Presence, told
 from coec.adapters.zenoh.settings import settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
@@ -60,7 +61,7 @@ STALLED_S = 20.0
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S = 2.0, 4.0, 2.0
-QUERIES_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 3.0, 1.0
+QUERIES_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 1.5, 3.0, 1.0
 
 
 def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
@@ -107,7 +108,9 @@ class Daemon:
         self._folder = WindowStore(config.state.directory / "windows", config.state)
         self._worker = Worker(config.worker, config.model_dump_json())
         self._insecure = _insecure(unguarded(settings_of(config.zenoh, config.limits)))
-        self._bus = Bus(open_session(config.zenoh, config.limits))
+        session = open_session(config.zenoh, config.limits)
+        self._bus = Bus(session)
+        self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
@@ -118,12 +121,16 @@ class Daemon:
         """Run until a signal or a fault; returns the exit status."""
         status = 0
         try:
+            self._presence.claim(signals.stop)
             self._start()
             while status == 0 and not signals.stop.wait(TICK_S):
                 status = self._tick()
                 if signals.reread.is_set():
                     signals.reread.clear()
                     self._compare(reread)
+        except CoecError as error:
+            _log.error(str(error), extra={"fields": {"code": error.reply_code}})
+            status = error.exit_code
         except Exception:
             _log.exception("the main loop failed")
             status = EXIT_THREAD_DIED
@@ -137,7 +144,7 @@ class Daemon:
 
     def _start(self) -> None:
         deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
-        for thread in (self._bus.thread, self._bus.drawing_thread, *deciding):
+        for thread in (self._presence.thread, self._bus.thread, self._bus.drawing_thread, *deciding):
             thread.start()
         self._worker.start()
         config = Snapshot.of_document(
@@ -167,6 +174,8 @@ class Daemon:
         dead = [thread for thread in threads if thread.dead]
         if dead:
             self._fault = Reason("thread_died", f"The thread {dead[0].name} died: {dead[0].failure!r}.")
+        elif self._presence.rival is not None:
+            self._fault = Reason("two_daemons", told(self._config.vehicle, self._presence.rival))
         elif self._worker.unusable is not None:
             self._fault = self._worker.unusable
         elif self._state == "starting" and self._worker.status().state is not WorkerState.STARTING:
@@ -180,7 +189,9 @@ class Daemon:
                 pair.answers.fail(self._fault)
         self._renew()
         if self._fault is not None:
-            return EXIT_THREAD_DIED if dead else CoecError.exit_code
+            if dead:
+                return EXIT_THREAD_DIED
+            return CoecError.exit_code if self._presence.rival is None else UnavailableError.exit_code
         if all(thread.silence_s < STALLED_S for thread in threads):
             self._notifier.watchdog()
         return 0
@@ -206,10 +217,11 @@ class Daemon:
         )
         for name, step in steps:
             _attempt(name, step)
+        ended = _attempt("look for no other daemon", lambda: self._presence.close(LOOK_OUT_STOP_S))
         closed = _attempt("close the session", lambda: self._bus.close(SESSION_STOP_S))
         _attempt("wait for the worker", lambda: _joined([self._worker.thread], WORKER_STOP_S))
         _log.info("stopped", extra={"fields": {"session_closed": closed}})
-        return bool(closed)
+        return bool(ended and closed)
 
     @staticmethod
     def _end(pairs: Iterable[Pair], part: Callable[[Pair], Stream | Recorder | Decider], within_s: float) -> None:
@@ -254,7 +266,7 @@ class Daemon:
     def _threads(self) -> list[ServiceThread]:
         pairs = self._pairs.values()
         own = [thread for pair in pairs for thread in pair.threads]
-        return [self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
+        return [self._presence.thread, self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()

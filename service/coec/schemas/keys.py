@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -28,6 +29,21 @@ class Address:
     pair: str | None
     resource: str
     argument: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """What a daemon says of itself to other daemons of its vehicle.
+
+    Attributes:
+        daemon: its Zenoh id, hexadecimal.
+        since_ns: wall clock at its start.
+        serving: whether it answers; before that it starts.
+    """
+
+    daemon: str
+    since_ns: int
+    serving: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +112,27 @@ class Keys:
     def alive(self, pair: str) -> str:
         """Liveliness token."""
         return f"{self.root}/{pair}/alive"
+
+    @property
+    def claims(self) -> str:
+        """Liveliness tokens of the vehicle's daemons, all of them."""
+        return f"{self.root}/alive/*/*/*"
+
+    def claim(self, claim: Claim) -> str:
+        """Liveliness token of a daemon: `alive/<starting or serving>/<daemon>/<since_ns>`."""
+        return f"{self.root}/alive/{'serving' if claim.serving else 'starting'}/{claim.daemon}/{claim.since_ns}"
+
+    def parse_claim(self, key: str) -> Claim:
+        """The inverse of `claim`.
+
+        Raises:
+            UsageError: not the token of a daemon of this vehicle.
+        """
+        form = re.escape(f"{self.root}/alive/") + r"(starting|serving)/([0-9a-f]{1,32})/([0-9]{1,19})"
+        match = re.fullmatch(form, key)
+        if match is None:
+            raise UsageError("not the token of a daemon of this vehicle")
+        return Claim(match[2], int(match[3]), serving=match[1] == "serving")
 
     def parse(self, key: str) -> Address:
         """The inverse of the builders above.

@@ -86,6 +86,14 @@ def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
         raise UnavailableError(f"cannot open the Zenoh session ({where(config)}): {text}") from None
 
 
+def closed(session: zenoh.Session, deadline_s: float) -> bool:
+    """Close a session; False when it did not close within `deadline_s` (under loss it can take 10 s)."""
+    closer = threading.Thread(target=session.close, name="zenoh-close", daemon=True)
+    closer.start()
+    closer.join(deadline_s)
+    return not closer.is_alive()
+
+
 _Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route]]]
 
 
@@ -160,11 +168,8 @@ class Bus:
                     _reply_error(query, "stopping", "the service is stopping; ask again when it is back")
 
     def close(self, deadline_s: float) -> bool:
-        """Close the session; False when it did not close within `deadline_s` (under loss it can take 10 s)."""
-        closer = threading.Thread(target=self._session.close, name="zenoh-close", daemon=True)
-        closer.start()
-        closer.join(deadline_s)
-        return not closer.is_alive()
+        """Close the session; False when it did not close within `deadline_s`."""
+        return closed(self._session, deadline_s)
 
     def _receive(self, query: zenoh.Query, find: Callable[[str], Sequence[Route]]) -> None:
         try:

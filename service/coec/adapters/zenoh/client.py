@@ -71,8 +71,8 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
     except (zenoh.ZError, ValueError) as error:
         asked = ", ".join(redacted(endpoint) for endpoint in endpoints)
         raise ConnectionFailedError(
-            f"no Zenoh router answered at {asked} within {wait_s:g} s: start one, start `coec run --embedded-router`, or "
-            "name the endpoint with --connect"
+            f"no Zenoh router answered at {asked} within {wait_s:g} s: start one, start `coec run --embedded-router`, "
+            "or name the endpoint with --connect"
         ) from error
     try:
         yield session
