@@ -17,6 +17,12 @@ MAX_LIMIT: Final = 10_000
 MAX_LENGTH: Final = 16 * 2**20
 """Most bytes in one reply of `windows/<id>`: half of Zenoh's configured message size."""
 
+COMMAND_TIMEOUT_MS: Final = 10_000
+"""Of a command that does not say: after this a Zenoh client gives up that does not say either
+(`queries_default_timeout`)."""
+
+MAX_COMMAND_TIMEOUT_MS: Final = 600_000
+
 Format = Literal["msgpack", "json"]
 _FORMATS: Final[dict[str, Format]] = {"msgpack": "msgpack", "json": "json"}
 
@@ -166,6 +172,15 @@ class Selector:
 
 
 @dataclass(frozen=True, slots=True)
+class CommandSelector:
+    """How long the sender of a command waits for its acknowledgement, ms from when the command comes to the service; no
+    clock is shared. What could not be begun by then is not done."""
+
+    timeout_ms: int = COMMAND_TIMEOUT_MS
+    format: Format = "msgpack"
+
+
+@dataclass(frozen=True, slots=True)
 class HistorySelector:
     """`since` and `until` bound `data_stamp_ns` (inclusive); `limit` keeps the newest of them."""
 
@@ -207,6 +222,17 @@ def parse_selector(parameters: str) -> Selector:
         UsageError: unknown, doubled or malformed parameter; names it.
     """
     return Selector(format=_format(_split(parameters, ("format",))))
+
+
+def parse_command_selector(parameters: str) -> CommandSelector:
+    """`timeout_ms=<ms>;format=json`, each optional.
+
+    Raises:
+        UsageError: unknown, doubled, malformed or out-of-range parameter; names it.
+    """
+    given = _split(parameters, ("timeout_ms", "format"))
+    timeout_ms = _integer(given, "timeout_ms", COMMAND_TIMEOUT_MS, 1, MAX_COMMAND_TIMEOUT_MS)
+    return CommandSelector(timeout_ms, _format(given))
 
 
 def parse_history_selector(parameters: str) -> HistorySelector:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -43,11 +44,13 @@ POLL_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A query, as far as an answer depends on it. `key` is concrete; `attachment` tells who asks, in whatever form."""
+    """A query, as far as an answer depends on it. `key` is concrete; `attachment` tells who asks, in whatever form;
+    `received_s` is when it came (steady clock): it may have waited since."""
 
     key: str
     parameters: str
     payload: bytes
+    received_s: float
     attachment: bytes | None = None
 
 
@@ -94,7 +97,7 @@ def closed(session: zenoh.Session, deadline_s: float) -> bool:
     return not closer.is_alive()
 
 
-_Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route]]]
+_Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route], float]]
 
 
 class Bus:
@@ -163,7 +166,7 @@ class Bus:
         self._queryables.clear()
         for waiting in (self._slow, self._drawing):
             while not waiting.empty():
-                query, _ = waiting.get_nowait()
+                query, _, _ = waiting.get_nowait()
                 with query:
                     _reply_error(query, "stopping", "the service is stopping; ask again when it is back")
 
@@ -172,6 +175,7 @@ class Bus:
         return closed(self._session, deadline_s)
 
     def _receive(self, query: zenoh.Query, find: Callable[[str], Sequence[Route]]) -> None:
+        received_s = time.monotonic()
         try:
             routes = find(str(query.key_expr))
             if query.payload is not None and len(query.payload) > MAX_COMMAND_BYTES:
@@ -181,21 +185,23 @@ class Bus:
                 _reply_error(query, error.reply_code, str(error))
             return
         if all(route.quick for route in routes):
-            self._answer(query, routes)
+            self._answer(query, routes, received_s)
             return
         try:
-            (self._drawing if any(route.draws for route in routes) else self._slow).put_nowait((query, routes))
+            (self._drawing if any(route.draws for route in routes) else self._slow).put_nowait(
+                (query, routes, received_s)
+            )
         except queue.Full:
             with query:
                 _reply_error(query, "busy", "too many queries wait; ask again in a moment")
 
-    def _answer(self, query: zenoh.Query, routes: Sequence[Route]) -> None:
+    def _answer(self, query: zenoh.Query, routes: Sequence[Route], received_s: float) -> None:
         with query:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             attachment = query.attachment.to_bytes() if query.attachment is not None else None
             for route in routes:
                 try:
-                    answer = route.answer(Request(route.key, str(query.parameters), payload, attachment))
+                    answer = route.answer(Request(route.key, str(query.parameters), payload, received_s, attachment))
                 except CoecError as error:
                     _reply_error(query, error.reply_code, str(error))
                 except Exception:
@@ -207,16 +213,16 @@ class Bus:
 
 
 def _answer_from(
-    waiting: _Waiting, answer: Callable[[zenoh.Query, Sequence[Route]], None], thread: ServiceThread
+    waiting: _Waiting, answer: Callable[[zenoh.Query, Sequence[Route], float], None], thread: ServiceThread
 ) -> None:
     while not thread.stopping:
         thread.beat()
         try:
-            query, routes = waiting.get(timeout=POLL_S)
+            query, routes, received_s = waiting.get(timeout=POLL_S)
         except queue.Empty:
             continue
         try:
-            answer(query, routes)
+            answer(query, routes, received_s)
         except zenoh.ZError:  # the client is gone
             _log.debug("a reply found no receiver")
 
