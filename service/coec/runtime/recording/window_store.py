@@ -179,6 +179,7 @@ class WindowStore:
             if found is not None:
                 found = self._found[recorded.window_id] = replace(found, order=self._index.next_order())
                 self._put(recorded.window_id, found.order, version)
+        self._index.flush()  # without the lock: a disk may take seconds, and whoever asks for the list does not wait
 
     def note(self, window_id: str, version: WindowVersion) -> None:
         """The file of a window was read or written again: this is what it was then. If it is another by now, nothing
@@ -188,6 +189,7 @@ class WindowStore:
             found = self._found.get(window_id)
             if found is not None:
                 self._put(window_id, found.order, version)
+        self._index.flush()
 
     def version(self, window_id: str) -> WindowVersion | None:
         """What was read of a window as it is now; None: not read yet, or no such window."""
