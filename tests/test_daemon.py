@@ -298,12 +298,11 @@ def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None
 def test_a_door_for_everybody_is_said_and_keys_are_hidden(tmp_path: Path, drive: Drive, router: Router) -> None:
     path = configured(tmp_path, drive, router)
     config = load_config(path)
-    (endpoint,) = config.zenoh.connect
     secret = "c2VjcmV0"
     zenoh_config = ZenohConfig(
         embedded_router=True,
         listen=(f"tcp/0.0.0.0:{free_port()}",),
-        connect=(f"tls/127.0.0.1:{endpoint.rpartition(':')[2]}#connect_private_key_base64={secret}",),
+        connect=(f"tls/127.0.0.1:{free_port()}#connect_private_key_base64={secret}",),
         insecure=True,
     )
     path.write_text(commented_yaml(config.model_copy(update={"zenoh": zenoh_config})))

@@ -40,8 +40,9 @@ CONNECT_S = 1.0
 LOOK_S = 1.0
 """For one look."""
 
-SEEN_S = 2.0
-"""For the own claim to be seen: it is a message to the router. Beyond, access control hides it."""
+SEEN_S = 5.0
+"""For the own claim to be seen: it is a message to the router, and the processor may be busy. Beyond, access control
+hides it."""
 
 DECIDED_S = 5.0
 """For others that start to leave or to serve; they need less than that, and one that hangs is not waited for."""
@@ -170,7 +171,7 @@ class Presence:
         """The first look in which the own claim is there, or the last of `SEEN_S`."""
         deadline_s = time.monotonic() + SEEN_S
         while not (seen := self._look()).own:
-            if self._through is None:
+            if self._through is None and not list(self._session.info.routers_zid()):
                 _log.warning("no router answers yet: whether another daemon serves the vehicle is seen when one does")
                 break
             if time.monotonic() > deadline_s or stop.wait(POLL_S):
