@@ -18,19 +18,29 @@ from coec.adapters.mcap.windows import read_result, read_window
 from coec.adapters.zenoh.bus import MSGPACK
 from coec.adapters.zenoh.client import RemoteError
 from coec.calibration.types import LidarFrame
-from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig, SearchConfig, WindowConfig, load_config
+from coec.config import (
+    CalibrationConfig,
+    DepthConfig,
+    ObjectiveConfig,
+    SearchConfig,
+    WindowConfig,
+    ZenohConfig,
+    load_config,
+)
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.base import from_msgpack
 from coec.schemas.replies import HealthReply
 from e2e.drives import SHORT, SHORT_PAIRS, Drive, later, rendered
 from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment, routing, service, write_configuration
 from fakes import wait_until
+from ports import free_port
 
 SHORT_S = 12
 LATER_S = 60.0
 """When the second drive begins, after the first."""
 
 EXIT_THREAD_DIED = 70
+EXIT_TRY_AGAIN = 75
 FRONT, REAR = "sim", "rear"
 BROKEN = (
     sys.executable,
@@ -281,8 +291,38 @@ def test_the_configuration_is_read_again_when_asked(idle: Service) -> None:
 def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None:
     command = [*COMMAND, "run", "--config", str(idle.log.with_name("coec.yaml"))]
     second = subprocess.run(command, env=environment(), capture_output=True, timeout=PATIENCE_S, check=False)
-    assert second.returncode == 78
+    assert second.returncode == EXIT_TRY_AGAIN
     assert b"in use by another daemon" in second.stdout
+
+
+def test_a_door_for_everybody_is_said_and_keys_are_hidden(tmp_path: Path, drive: Drive, router: Router) -> None:
+    path = configured(tmp_path, drive, router)
+    config = load_config(path)
+    secret = "c2VjcmV0"
+    zenoh_config = ZenohConfig(
+        embedded_router=True,
+        listen=(f"tcp/0.0.0.0:{free_port()}",),
+        connect=(f"tls/127.0.0.1:{free_port()}#connect_private_key_base64={secret}",),
+        insecure=True,
+    )
+    path.write_text(commented_yaml(config.model_copy(update={"zenoh": zenoh_config})))
+    with service(path, None, warm=False) as running:
+        for told in (running.health(), running.status()):
+            assert "insecure" in [reason["code"] for reason in told["reasons"]]
+        (shown,) = running.ask(running.keys.config)["config"]["zenoh"]["connect"]
+        assert shown.endswith("#connect_private_key_base64=***")
+        assert running.terminate() == 0
+        assert secret not in running.log.read_text()
+
+
+def test_a_second_daemon_of_the_vehicle_leaves_and_says_who_is_there(idle: Service, tmp_path: Path) -> None:
+    config = str(idle.log.with_name("coec.yaml"))
+    command = [*COMMAND, "run", "--config", config, "--state-dir", str(tmp_path / "other")]
+    second = subprocess.run(command, env=environment(), capture_output=True, timeout=PATIENCE_S, check=False)
+    assert second.returncode == EXIT_TRY_AGAIN
+    assert b"is served by another daemon, started 20" in second.stdout
+    assert b'"code": "unavailable"' in second.stdout
+    assert idle.status()["pairs"], "the first goes on"
 
 
 def test_a_damaged_state_is_said_and_nominal_is_served(tmp_path: Path, drive: Drive, router: Router) -> None:

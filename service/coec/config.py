@@ -390,6 +390,9 @@ class ZenohConfig(Stage):
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     embedded_router: bool = Field(default=False, description="be the router and listen on `listen`")
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    insecure: bool = Field(
+        default=False, description="listen even where whoever comes is let in without a certificate; health says so"
+    )
     file: Path | None = None
 
     @property

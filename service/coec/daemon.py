@@ -24,10 +24,13 @@ from coec.adapters.system import logs
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
+from coec.adapters.zenoh.presence import Presence, told
+from coec.adapters.zenoh.settings import settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
-from coec.errors import CoecError, ConfigError
+from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
+from coec.runtime.api.configuration import shown
 from coec.runtime.api.health import reasons_of
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
@@ -58,7 +61,7 @@ STALLED_S = 20.0
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S = 2.0, 4.0, 2.0
-QUERIES_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 3.0, 1.0
+QUERIES_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 1.5, 3.0, 1.0
 
 
 def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
@@ -92,7 +95,8 @@ class Daemon:
         """Build everything; nothing runs yet, but the Zenoh session is open.
 
         Raises:
-            ConfigError: a rig, an endpoint or a port cannot be used.
+            ConfigError: a rig or an endpoint cannot be used.
+            UnavailableError: a port is taken.
             RecordingError: the state directory cannot be used.
         """
         self._config = config
@@ -103,7 +107,10 @@ class Daemon:
         self._keys = Keys(config.prefix, config.vehicle)
         self._folder = WindowStore(config.state.directory / "windows", config.state)
         self._worker = Worker(config.worker, config.model_dump_json())
-        self._bus = Bus(open_session(config.zenoh, config.limits))
+        self._insecure = _insecure(unguarded(settings_of(config.zenoh, config.limits)))
+        session = open_session(config.zenoh, config.limits)
+        self._bus = Bus(session)
+        self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
@@ -114,12 +121,16 @@ class Daemon:
         """Run until a signal or a fault; returns the exit status."""
         status = 0
         try:
+            self._presence.claim(signals.stop)
             self._start()
             while status == 0 and not signals.stop.wait(TICK_S):
                 status = self._tick()
                 if signals.reread.is_set():
                     signals.reread.clear()
                     self._compare(reread)
+        except CoecError as error:
+            _log.error(str(error), extra={"fields": {"code": error.reply_code}})
+            status = error.exit_code
         except Exception:
             _log.exception("the main loop failed")
             status = EXIT_THREAD_DIED
@@ -133,14 +144,14 @@ class Daemon:
 
     def _start(self) -> None:
         deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
-        for thread in (self._bus.thread, self._bus.drawing_thread, *deciding):
+        for thread in (self._presence.thread, self._bus.thread, self._bus.drawing_thread, *deciding):
             thread.start()
         self._worker.start()
         config = Snapshot.of_document(
             {
                 "schema_version": 1,
                 "config_hash": self._status_reply.config_hash,
-                "config": self._config.model_dump(mode="json"),
+                "config": shown(self._config),
             }
         )
         answers = {name: pair.answers for name, pair in self._pairs.items()}
@@ -163,6 +174,8 @@ class Daemon:
         dead = [thread for thread in threads if thread.dead]
         if dead:
             self._fault = Reason("thread_died", f"The thread {dead[0].name} died: {dead[0].failure!r}.")
+        elif self._presence.rival is not None:
+            self._fault = Reason("two_daemons", told(self._config.vehicle, self._presence.rival))
         elif self._worker.unusable is not None:
             self._fault = self._worker.unusable
         elif self._state == "starting" and self._worker.status().state is not WorkerState.STARTING:
@@ -176,7 +189,9 @@ class Daemon:
                 pair.answers.fail(self._fault)
         self._renew()
         if self._fault is not None:
-            return EXIT_THREAD_DIED if dead else CoecError.exit_code
+            if dead:
+                return EXIT_THREAD_DIED
+            return CoecError.exit_code if self._presence.rival is None else UnavailableError.exit_code
         if all(thread.silence_s < STALLED_S for thread in threads):
             self._notifier.watchdog()
         return 0
@@ -202,10 +217,11 @@ class Daemon:
         )
         for name, step in steps:
             _attempt(name, step)
+        ended = _attempt("look for no other daemon", lambda: self._presence.close(LOOK_OUT_STOP_S))
         closed = _attempt("close the session", lambda: self._bus.close(SESSION_STOP_S))
         _attempt("wait for the worker", lambda: _joined([self._worker.thread], WORKER_STOP_S))
         _log.info("stopped", extra={"fields": {"session_closed": closed}})
-        return bool(closed)
+        return bool(ended and closed)
 
     @staticmethod
     def _end(pairs: Iterable[Pair], part: Callable[[Pair], Stream | Recorder | Decider], within_s: float) -> None:
@@ -243,14 +259,14 @@ class Daemon:
         """What ails every pair alike."""
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
-        return tuple(reason for reason in (self._fault, failing) if reason is not None)
+        return tuple(reason for reason in (self._fault, failing, self._insecure) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
 
     def _threads(self) -> list[ServiceThread]:
         pairs = self._pairs.values()
         own = [thread for pair in pairs for thread in pair.threads]
-        return [self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
+        return [self._presence.thread, self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()
@@ -278,6 +294,17 @@ class Daemon:
     def _metrics(self) -> bytes:
         health = {name: pair.answers.health_reply for name, pair in self._pairs.items()}
         return metrics.render(self._status_reply, health, self._worker.status().rss_bytes)
+
+
+def _insecure(doors: Sequence[str]) -> Reason | None:
+    """What there is to say of endpoints that let in whoever comes."""
+    if not doors:
+        return None
+    text = (
+        f"Whoever reaches {', '.join(doors)} can read, send frames and give commands, without a certificate: "
+        "`zenoh.insecure` is set. Listen on loopback, or on tls with client certificates."
+    )
+    return Reason("insecure", text)
 
 
 def _attempt(name: str, step: Callable[[], object]) -> object:
@@ -322,16 +349,17 @@ def _state_folder(folder: Path) -> Iterator[None]:
     """The state directory, made if need be, and nobody else's while the daemon serves.
 
     Raises:
-        ConfigError: it cannot be made or written, or another daemon uses it.
+        UnavailableError: it cannot be made or written, or another daemon uses it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / "lock").open("w")
     except OSError as error:
-        raise ConfigError(f"state.directory {folder} cannot be used: {error.strerror}") from error
+        text = f"state.directory {folder} cannot be made or written: {error.strerror}; see to its disk and its owner"
+        raise UnavailableError(text) from error
     with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise ConfigError(f"state.directory {folder} is in use by another daemon") from error
+            raise UnavailableError(f"state.directory {folder} is in use by another daemon") from error
         yield

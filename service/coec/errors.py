@@ -29,6 +29,14 @@ class ConfigError(CoecError):
     reply_code = "bad_configuration"
 
 
+class UnavailableError(CoecError):
+    """Something outside that is taken, away or not writable now, though nothing is wrong with the configuration: a
+    port, the state directory, the vehicle's place on the network. Another start later may succeed."""
+
+    exit_code = 75  # EX_TEMPFAIL of sysexits.h: a service manager tries again
+    reply_code = "unavailable"
+
+
 class SourceError(CoecError):
     """A recording that is absent, incomplete or not in the layout its name promises."""
 

@@ -11,12 +11,20 @@ from pathlib import Path
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.zenoh.bus import JSON, Answer, Bus, Route, open_session
+from coec.adapters.zenoh.bus import JSON, Answer, Bus, Request, Route, open_session
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError
 from coec.schemas.base import Message, to_json
-from coec.schemas.keys import Keys, parse_range_selector
-from coec.schemas.replies import PairStatus, StatusReply, StorageStatus, WindowInfo, WindowsReply, WorkerStatus
+from coec.schemas.keys import Keys, parse_command_selector, parse_range_selector
+from coec.schemas.replies import (
+    Acknowledgement,
+    PairStatus,
+    StatusReply,
+    StorageStatus,
+    WindowInfo,
+    WindowsReply,
+    WorkerStatus,
+)
 from conftest import REPOSITORY
 from ports import free_port
 
@@ -46,6 +54,7 @@ def vehicle() -> Iterator[str]:
     serve_document(bus, KEYS.windows("front"), WindowsReply(vehicle="vehicle", pair="front", windows=(info,)))
     bus.serve(KEYS.window("front", "*"), window_routes)
     bus.serve(KEYS.evidence_of("front", "*"), no_event)
+    bus.serve(KEYS.command("front", "*"), acknowledging)
     yield endpoint
     bus.undeclare_inputs()
     for thread in (bus.thread, bus.drawing_thread):
@@ -81,6 +90,18 @@ def window_routes(key: str) -> Sequence[Route]:
         return Answer(WINDOW[chosen.offset : chosen.offset + chosen.length], "application/octet-stream")
 
     return [Route(key, lambda request: answer(request.parameters), quick=False)]
+
+
+def acknowledging(key: str) -> Sequence[Route]:
+    """With the parameters that came."""
+
+    def answer(request: Request) -> Answer:
+        done = Acknowledgement(
+            vehicle="vehicle", pair="front", command="hold", accepted=True, code="held", text=request.parameters
+        )
+        return Answer(to_json(done), JSON)
+
+    return [Route(key, answer, quick=True)]
 
 
 def no_event(_: str) -> Sequence[Route]:
@@ -195,6 +216,15 @@ def test_what_the_service_does_not_have_is_what_it_answered(
     assert outcome.document["error"]["code"] == "not_found"
     assert said in outcome.err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("key", ["command/hold", KEYS.command("front", "hold")])
+def test_a_command_says_how_long_its_sender_waits(coec: Coec, vehicle: str, key: str) -> None:
+    outcome = coec("query", key, "--timeout", "4", "--connect", vehicle, "--json")
+    assert outcome.status == 0
+    assert parse_command_selector(outcome.document["text"]).timeout_ms == 3600, "less than the four seconds"
+    given = coec("query", key, "--param", "timeout_ms=7", "--connect", vehicle, "--json")
+    assert parse_command_selector(given.document["text"]).timeout_ms == 7
 
 
 def test_of_several_pairs_one_has_to_be_named(coec: Coec, endpoint: str, tmp_path: Path) -> None:

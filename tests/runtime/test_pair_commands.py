@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
 
 from baselines import a_baseline
 from coec.adapters.files.baseline_file import save_baseline
+from coec.adapters.zenoh.bus import Bus, Request, Route
 from coec.calibration.commissioning.baseline import learned_hash
 from coec.geometry import se3
 from coec.runtime.api import commands, rate_limit
+from coec.runtime.api.routes import VehicleAnswers
+from coec.runtime.api.snapshots import Snapshot
+from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
 from pair_bench import BEGIN_S, END_S, STEP_S, Bench
 
 
@@ -145,3 +152,35 @@ def test_commands_that_come_too_fast_are_answered_and_do_nothing(tmp_path: Path)
     assert bench.store.state.frozen
     assert bench.store.history.entries() == before
     assert bench.answers.status().commands == {"hold_accepted": rate_limit.BURST, "hold_refused": 5}
+
+
+def route_of(bench: Bench, command: str) -> Route:
+    """Who answers the command."""
+    keys, pair, unasked = Keys("coec", "test"), bench.pair, Snapshot(b"", b"")
+    bus = create_autospec(Bus, instance=True)
+    VehicleAnswers(
+        keys, {pair.name: pair.answers}, {pair.name: pair.commands}, lambda: unasked, lambda: b"", unasked
+    ).declare(bus)
+    finders = {call.args[0]: call.args[1] for call in bus.serve.call_args_list}
+    (route,) = finders[f"{keys.root}/{pair.name}/**"](keys.command(pair.name, command))
+    assert isinstance(route, Route)
+    return route
+
+
+@pytest.mark.parametrize("name", ["hold", "calibrate"])
+def test_what_its_sender_has_given_up_on_is_not_done(tmp_path: Path, name: str) -> None:
+    bench = Bench(tmp_path / "state")
+    bench.drive(BEGIN_S, BEGIN_S + 30)
+    selected, entries = bench.pair.stream.report.chosen.selected, len(bench.entries("command"))
+    route = route_of(bench, name)
+    came_s = time.monotonic() - COMMAND_TIMEOUT_MS / 1e3
+    for parameters, received_s in (("", came_s), ("timeout_ms=500", time.monotonic() - 0.5), ("timeout_ms=20", None)):
+        received_s = time.monotonic() if received_s is None else received_s  # nobody gets to it for 20 ms
+        answer = route.answer(Request(route.key, f"format=json;{parameters}", b"", received_s))
+        assert (json.loads(answer.payload)["accepted"], json.loads(answer.payload)["code"]) == (False, "expired")
+    bench.settle()
+    assert not bench.store.state.frozen
+    assert (bench.pair.stream.report.chosen.selected, bench.recorder.recorded) == (selected, 0)
+    assert len(bench.entries("command")) == entries
+    assert bench.answers.status().commands == {f"{name}_refused": 3}
+    assert bench.do("hold") == "held", "the next is done"

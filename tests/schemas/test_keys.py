@@ -3,17 +3,22 @@
 import contextlib
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
 from coec.errors import UsageError
 from coec.schemas.keys import (
+    COMMAND_TIMEOUT_MS,
     MAX_LENGTH,
     Address,
+    Claim,
+    CommandSelector,
     HistorySelector,
     Keys,
     RangeSelector,
     Selector,
+    parse_command_selector,
     parse_history_selector,
     parse_range_selector,
     parse_selector,
@@ -124,6 +129,24 @@ def test_what_is_echoed_is_short_and_printable() -> None:
 
 @given(st.text(max_size=60))
 def test_no_text_raises_anything_else(text: str) -> None:
-    for parse in (parse_selector, parse_history_selector, parse_range_selector, KEYS.parse):
+    for parse in (parse_selector, parse_command_selector, parse_history_selector, parse_range_selector, KEYS.parse):
         with contextlib.suppress(UsageError):
             parse(text)
+
+
+def test_how_long_the_sender_of_a_command_waits() -> None:
+    assert parse_command_selector("") == CommandSelector(COMMAND_TIMEOUT_MS, "msgpack")
+    assert parse_command_selector("timeout_ms=1500;format=json") == CommandSelector(1500, "json")
+    for wrong in ("timeout_ms=0", "timeout_ms=600001", "timeout_ms=-5", "timeout_ms=1e3", "timeout=5"):
+        with pytest.raises(UsageError, match="timeout"):
+            parse_command_selector(wrong)
+
+
+def test_claims_of_daemons_are_read_back_and_nothing_else_is() -> None:
+    for claim in (Claim("1a", 5, serving=True), Claim("f" * 32, 0, serving=False)):
+        key = KEYS.claim(claim)
+        assert KEYS.parse_claim(key) == claim
+        assert zenoh.KeyExpr(KEYS.claims).intersects(zenoh.KeyExpr(key))
+        assert not zenoh.KeyExpr(KEYS.alive("*")).intersects(zenoh.KeyExpr(key)), "no pair's"
+        with pytest.raises(UsageError):
+            Keys("coec", "other").parse_claim(key)

@@ -1,7 +1,8 @@
 """The command line: what every command takes. What it does is in the module of its name, imported when it is called.
 
 Exit codes (CONTRACT, "Command line"): 0 success, 1 the work failed or the verdict is negative, 2 usage, 70 a fault of
-coec itself, 78 bad configuration. With `--json`, standard output holds one JSON document and nothing else.
+coec itself, 75 what a start needs is taken or away and may be there later (a port, the state directory, the vehicle's
+place on the network), 78 bad configuration. With `--json`, standard output holds one JSON document and nothing else.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files.rig import rig_of
+from coec.adapters.zenoh.settings import settings_of
 from coec.config import (
     CameraConfig,
     CameraIntrinsics,
@@ -48,6 +49,7 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
     checks = [check for pair in config.pairs for check in _check(pair, config)]
     if config.zenoh.file is not None:
         checks.append(_check_file(config.zenoh.file, "zenoh.file"))
+    settings_of(config.zenoh, config.limits)
     digest = config_hash(config)
     if as_json:
         document = {"config": config.model_dump(mode="json"), "config_hash": digest, "checks": checks}

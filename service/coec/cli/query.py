@@ -20,7 +20,7 @@ from coec.config import Config, ZenohConfig, load_config
 from coec.errors import UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
-from coec.schemas.keys import MAX_LENGTH, VERSION_CHUNK, Keys
+from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, VERSION_CHUNK, Keys
 from coec.schemas.replies import StatusReply, WindowInfo, WindowsReply
 
 VEHICLE_KEYS = ("status", "config", "metrics")
@@ -30,6 +30,9 @@ WITH_ARGUMENT = {"windows": "ID", "evidence": "ID", "command": "NAME"}
 JPEG = "image/jpeg"
 DIGEST_POLL_S = 0.2
 """Between questions whether the service has read a window: as often as its recorder looks for one."""
+ON_SITE = 0.9
+"""Share of the time that a command's acknowledgement is waited for that the service may take; the rest is for the way
+there and back."""
 OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d+")
 """What windows and red events are called: their pair, and a time in nanoseconds."""
 
@@ -96,7 +99,7 @@ def run(options: Options) -> int:
         return _save_picture(options, keys, head, argument)
     with connected(options.service.connect, options.timeout_s) as session:
         key, kind = _resolve(session, options, keys)
-        replies = ask(session, _selector(key, options.params), options.timeout_s, _payload(options.payload))
+        replies = ask(session, _selector(key, _params(key, options)), options.timeout_s, _payload(options.payload))
     if not replies:
         raise nobody(key)
     return _show(replies, kind, options, key)
@@ -153,6 +156,14 @@ def _only_pair(session: zenoh.Session, options: Options, keys: Keys) -> str:
     if len(names) != 1:
         raise UsageError(f"several pairs are served, name one with --pair: {', '.join(names)}")
     return names[0]
+
+
+def _params(key: str, options: Options) -> tuple[str, ...]:
+    """Those that were given; with a command goes for how long its acknowledgement is waited for."""
+    if key.split("/")[-2] != "command" or any(item.startswith("timeout_ms=") for item in options.params):
+        return options.params
+    timeout_ms = min(max(round(options.timeout_s * 1e3 * ON_SITE), 1), MAX_COMMAND_TIMEOUT_MS)
+    return (*options.params, f"timeout_ms={timeout_ms}")
 
 
 def _selector(key: str, params: tuple[str, ...]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -16,6 +17,12 @@ MAX_LIMIT: Final = 10_000
 MAX_LENGTH: Final = 16 * 2**20
 """Most bytes in one reply of `windows/<id>`: half of Zenoh's configured message size."""
 
+COMMAND_TIMEOUT_MS: Final = 10_000
+"""Of a command that does not say: after this a Zenoh client gives up that does not say either
+(`queries_default_timeout`)."""
+
+MAX_COMMAND_TIMEOUT_MS: Final = 600_000
+
 Format = Literal["msgpack", "json"]
 _FORMATS: Final[dict[str, Format]] = {"msgpack": "msgpack", "json": "json"}
 
@@ -28,6 +35,21 @@ class Address:
     pair: str | None
     resource: str
     argument: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """What a daemon says of itself to other daemons of its vehicle.
+
+    Attributes:
+        daemon: its Zenoh id, hexadecimal.
+        since_ns: wall clock at its start.
+        serving: whether it answers; before that it starts.
+    """
+
+    daemon: str
+    since_ns: int
+    serving: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +119,27 @@ class Keys:
         """Liveliness token."""
         return f"{self.root}/{pair}/alive"
 
+    @property
+    def claims(self) -> str:
+        """Liveliness tokens of the vehicle's daemons, all of them."""
+        return f"{self.root}/alive/*/*/*"
+
+    def claim(self, claim: Claim) -> str:
+        """Liveliness token of a daemon: `alive/<starting or serving>/<daemon>/<since_ns>`."""
+        return f"{self.root}/alive/{'serving' if claim.serving else 'starting'}/{claim.daemon}/{claim.since_ns}"
+
+    def parse_claim(self, key: str) -> Claim:
+        """The inverse of `claim`.
+
+        Raises:
+            UsageError: not the token of a daemon of this vehicle.
+        """
+        form = re.escape(f"{self.root}/alive/") + r"(starting|serving)/([0-9a-f]{1,32})/([0-9]{1,19})"
+        match = re.fullmatch(form, key)
+        if match is None:
+            raise UsageError("not the token of a daemon of this vehicle")
+        return Claim(match[2], int(match[3]), serving=match[1] == "serving")
+
     def parse(self, key: str) -> Address:
         """The inverse of the builders above.
 
@@ -125,6 +168,15 @@ class Keys:
 class Selector:
     """Parameters behind the `?` of a query that has none of its own."""
 
+    format: Format = "msgpack"
+
+
+@dataclass(frozen=True, slots=True)
+class CommandSelector:
+    """How long the sender of a command waits for its acknowledgement, ms from when the command comes to the service; no
+    clock is shared. What could not be begun by then is not done."""
+
+    timeout_ms: int = COMMAND_TIMEOUT_MS
     format: Format = "msgpack"
 
 
@@ -170,6 +222,17 @@ def parse_selector(parameters: str) -> Selector:
         UsageError: unknown, doubled or malformed parameter; names it.
     """
     return Selector(format=_format(_split(parameters, ("format",))))
+
+
+def parse_command_selector(parameters: str) -> CommandSelector:
+    """`timeout_ms=<ms>;format=json`, each optional.
+
+    Raises:
+        UsageError: unknown, doubled, malformed or out-of-range parameter; names it.
+    """
+    given = _split(parameters, ("timeout_ms", "format"))
+    timeout_ms = _integer(given, "timeout_ms", COMMAND_TIMEOUT_MS, 1, MAX_COMMAND_TIMEOUT_MS)
+    return CommandSelector(timeout_ms, _format(given))
 
 
 def parse_history_selector(parameters: str) -> HistorySelector:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import queue
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import zenoh
 
 from coec.adapters.zenoh.bus import JSON, MSGPACK, SLOW_QUERIES_WAITING, Answer, Bus, Request, Route, open_session
 from coec.config import LimitsConfig, ZenohConfig
-from coec.errors import ConfigError, NotFoundError
+from coec.errors import NotFoundError, UnavailableError
 from fakes import wait_until
 from ports import free_port
 
@@ -182,7 +183,7 @@ def test_a_published_value_and_the_liveliness_token_are_seen(bus: Bus, client: z
 
 def test_a_port_in_use_is_a_clear_error(bus: Bus, endpoint: str) -> None:
     del bus
-    with pytest.raises(ConfigError, match="cannot open the Zenoh session"):
+    with pytest.raises(UnavailableError, match="cannot open the Zenoh session"):
         open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
 
 
@@ -244,3 +245,28 @@ def test_a_picture_that_takes_long_keeps_no_other_query_waiting(bus: Bus, client
     (reply,) = waiting
     assert reply.ok is not None
     assert reply.ok.payload.to_bytes() == b"jpeg"
+
+
+def test_when_a_query_came_is_known_however_long_it_waited(bus: Bus, client: zenoh.Session) -> None:
+    came: list[float] = []
+    entered, release = threading.Event(), threading.Event()
+
+    def slow(request: Request) -> Answer:
+        came.append(request.received_s)
+        entered.set()
+        assert release.wait(DEADLINE_S)
+        return Answer(b"", MSGPACK)
+
+    serve_value(bus, "test/quick", b"q")
+    bus.serve("test/slow", lambda key: [Route(key, slow, quick=False)])
+    ask_ok(client, "test/quick")
+    replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
+    client.get("test/slow", replies.put, timeout=DEADLINE_S)
+    assert entered.wait(DEADLINE_S)
+    client.get("test/slow", replies.put, timeout=DEADLINE_S)
+    ask_ok(client, "test/quick")  # one link, one order: the second has arrived
+    arrived_s = time.monotonic()
+    release.set()
+    for _ in range(2):
+        assert replies.get(timeout=DEADLINE_S).ok is not None
+    assert came[0] <= came[1] <= arrived_s

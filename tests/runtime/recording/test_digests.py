@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import pytest
 
 from coec.config import StateConfig
+from coec.runtime.recording import digests as digests_module
 from coec.runtime.recording.digests import DigestReader
 from coec.runtime.recording.window_store import WindowStore
 
 PIECE = 1000
+DEADLINE_S = 20.0
 
 
 @pytest.fixture
@@ -95,3 +100,59 @@ def test_closing_leaves_the_window_unread(store: WindowStore) -> None:
     reader.close()
     reader.close()
     assert store.unread("front") == (path,)
+
+
+def test_on_a_slow_disk_a_round_is_short_and_the_list_is_there_at_once(
+    store: WindowStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = put(store, 1, 2**20)
+    now_s, gives_bytes_per_s = [0.0], 100_000
+    real = Path.open
+
+    class Slow:
+        def __init__(self, stream: BinaryIO) -> None:
+            self._stream = stream
+            self.fileno, self.close = stream.fileno, stream.close
+
+        def read(self, size: int) -> bytes:
+            data = self._stream.read(size)
+            now_s[0] += len(data) / gives_bytes_per_s
+            return data
+
+    monkeypatch.setattr(digests_module, "_result_in", lambda _: None)
+    monkeypatch.setattr(Path, "open", lambda path, mode="r": Slow(cast(BinaryIO, real(path, mode))))
+    reader = DigestReader(store, "front", lambda: now_s[0])
+    longest_s = 0.0
+    while True:
+        before_s, told = now_s[0], digests(store)
+        if not reader.read(4 * 2**20):
+            break
+        assert told == {"front-1": None}, "the list waits for no reading"
+        longest_s = max(longest_s, now_s[0] - before_s)
+    assert longest_s < 1.0
+    monkeypatch.undo()
+    assert digests(store) == {"front-1": sha256(path)}
+
+
+def test_the_list_does_not_wait_for_the_index_to_be_written(
+    store: WindowStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(store, 1)
+    entered, go_on, real = threading.Event(), threading.Event(), os.fsync
+
+    def slow(descriptor: int) -> None:
+        entered.set()
+        assert go_on.wait(DEADLINE_S)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    with ThreadPoolExecutor(2) as pool:
+        reading = pool.submit(read_all, DigestReader(store, "front"))
+        try:
+            assert entered.wait(DEADLINE_S)
+            told = pool.submit(digests, store).result(DEADLINE_S / 4)
+            assert pool.submit(store.usage).result(DEADLINE_S / 4).used == 3 * PIECE
+        finally:
+            go_on.set()
+        reading.result(DEADLINE_S)
+    assert told == digests(store)

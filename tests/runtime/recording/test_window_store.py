@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import EXPIRED_AT_ONCE, WindowStore
 from disks import EVERYTHING, Disk
 
+DEADLINE_S = 20.0
 DAY_NS = 86_400 * 10**9
 START_NS = 1_700_000_000 * 10**9
 
@@ -345,3 +348,29 @@ def test_a_list_of_thousands_reads_the_folder_once_and_no_file(tmp_path: Path, m
     (tmp_path / "windows" / "front-7.mcap").unlink()
     assert len(store.listing("front")) == 1999
     assert scans <= 2
+
+
+def test_the_list_does_not_wait_for_windows_to_be_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = WindowStore(tmp_path / "windows", StateConfig(min_free_bytes=0, max_bytes=2**20))
+    for number in (1, 2, 3):
+        store.path(f"front-{number}").write_bytes(bytes(2**19))
+    entered, go_on, real = threading.Event(), threading.Event(), os.fsync
+
+    def slow(descriptor: int) -> None:
+        entered.set()
+        assert go_on.wait(DEADLINE_S)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    with ThreadPoolExecutor(2) as pool:
+        removing = pool.submit(make_room, store)
+        try:
+            assert entered.wait(DEADLINE_S)
+            told = pool.submit(store.listing, "front").result(DEADLINE_S / 4)
+            store.hold("front-2")  # a question about it has come meanwhile
+        finally:
+            go_on.set()
+        removing.result(DEADLINE_S)
+    assert [info.window_id for info in told] == ["front-2", "front-3"]
+    assert [path.stem for path in store.windows("front")] == ["front-2", "front-3"]
+    assert store.removed == 1

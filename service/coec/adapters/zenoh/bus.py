@@ -7,10 +7,10 @@ callback, and every query is finished, because an unfinished one makes its clien
 
 from __future__ import annotations
 
-import json
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,8 +18,10 @@ from functools import partial
 import zenoh
 
 from coec.adapters.system.threads import ServiceThread
+from coec.adapters.zenoh.endpoints import without_secrets
+from coec.adapters.zenoh.settings import endpoints_of, settings_of, where
 from coec.config import LimitsConfig, ZenohConfig
-from coec.errors import CoecError, ConfigError, UsageError
+from coec.errors import CoecError, UnavailableError, UsageError
 from coec.schemas.base import to_json, to_msgpack
 from coec.schemas.replies import ErrorReply
 
@@ -42,11 +44,13 @@ POLL_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A query, as far as an answer depends on it. `key` is concrete; `attachment` tells who asks, in whatever form."""
+    """A query, as far as an answer depends on it. `key` is concrete; `attachment` tells who asks, in whatever form;
+    `received_s` is when it came (steady clock): it may have waited since."""
 
     key: str
     parameters: str
     payload: bytes
+    received_s: float
     attachment: bytes | None = None
 
 
@@ -70,40 +74,30 @@ class Route:
 
 
 def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
-    """A peer that connects and reconnects to the router, or the router itself. What `config.file` says stands; what it
-    does not say opens no door: nobody listens, and nobody is looked for, who was not told to.
+    """A peer that connects and reconnects to the router, or the router itself.
 
     Raises:
-        ConfigError: the file, an endpoint or a port cannot be used.
+        ConfigError: as `settings_of`.
+        UnavailableError: a port is taken, an address is not there, or a certificate cannot be used.
     """
     zenoh.init_log_from_env_or("error")
+    settings = settings_of(config, limits)
     try:
-        settings = zenoh.Config.from_file(config.file) if config.file else zenoh.Config()
-        listen = config.listen if config.embedded_router else ()
-        connect = tuple(endpoint for endpoint in config.connect if endpoint not in listen)
-        silent = {
-            "mode": "router" if config.embedded_router else "peer",
-            "listen/endpoints": listen,
-            "connect/endpoints": connect,
-            "scouting/gossip/enabled": False,
-        }
-        unsaid = zenoh.Config()
-        for key, value in silent.items():
-            # A peer listens on every interface by default, at any port.
-            if settings.get_json(key) == unsaid.get_json(key):
-                settings.insert_json5(key, json.dumps(value))
-        settings.insert_json5("scouting/multicast/enabled", "false")
-        settings.insert_json5("timestamping/enabled", "true")
-        settings.insert_json5("transport/link/rx/max_message_size", str(limits.max_message_bytes))
-        # Queries and replies through shared memory can vanish under load.
-        settings.insert_json5("transport/shared_memory/transport_optimization/messages", '["put"]')
         return zenoh.open(settings)
-    except (zenoh.ZError, OSError, ValueError) as error:
-        where = f"zenoh.file {config.file}" if config.file else f"zenoh.listen {list(listen)}, connect {list(connect)}"
-        raise ConfigError(f"cannot open the Zenoh session ({where}): {error}") from error
+    except zenoh.ZError as error:
+        text = without_secrets(str(error), endpoints_of(config))
+        raise UnavailableError(f"cannot open the Zenoh session ({where(config)}): {text}") from None
 
 
-_Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route]]]
+def closed(session: zenoh.Session, deadline_s: float) -> bool:
+    """Close a session; False when it did not close within `deadline_s` (under loss it can take 10 s)."""
+    closer = threading.Thread(target=session.close, name="zenoh-close", daemon=True)
+    closer.start()
+    closer.join(deadline_s)
+    return not closer.is_alive()
+
+
+_Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route], float]]
 
 
 class Bus:
@@ -172,18 +166,16 @@ class Bus:
         self._queryables.clear()
         for waiting in (self._slow, self._drawing):
             while not waiting.empty():
-                query, _ = waiting.get_nowait()
+                query, _, _ = waiting.get_nowait()
                 with query:
                     _reply_error(query, "stopping", "the service is stopping; ask again when it is back")
 
     def close(self, deadline_s: float) -> bool:
-        """Close the session; False when it did not close within `deadline_s` (under loss it can take 10 s)."""
-        closer = threading.Thread(target=self._session.close, name="zenoh-close", daemon=True)
-        closer.start()
-        closer.join(deadline_s)
-        return not closer.is_alive()
+        """Close the session; False when it did not close within `deadline_s`."""
+        return closed(self._session, deadline_s)
 
     def _receive(self, query: zenoh.Query, find: Callable[[str], Sequence[Route]]) -> None:
+        received_s = time.monotonic()
         try:
             routes = find(str(query.key_expr))
             if query.payload is not None and len(query.payload) > MAX_COMMAND_BYTES:
@@ -193,21 +185,23 @@ class Bus:
                 _reply_error(query, error.reply_code, str(error))
             return
         if all(route.quick for route in routes):
-            self._answer(query, routes)
+            self._answer(query, routes, received_s)
             return
         try:
-            (self._drawing if any(route.draws for route in routes) else self._slow).put_nowait((query, routes))
+            (self._drawing if any(route.draws for route in routes) else self._slow).put_nowait(
+                (query, routes, received_s)
+            )
         except queue.Full:
             with query:
                 _reply_error(query, "busy", "too many queries wait; ask again in a moment")
 
-    def _answer(self, query: zenoh.Query, routes: Sequence[Route]) -> None:
+    def _answer(self, query: zenoh.Query, routes: Sequence[Route], received_s: float) -> None:
         with query:
             payload = query.payload.to_bytes() if query.payload is not None else b""
             attachment = query.attachment.to_bytes() if query.attachment is not None else None
             for route in routes:
                 try:
-                    answer = route.answer(Request(route.key, str(query.parameters), payload, attachment))
+                    answer = route.answer(Request(route.key, str(query.parameters), payload, received_s, attachment))
                 except CoecError as error:
                     _reply_error(query, error.reply_code, str(error))
                 except Exception:
@@ -219,16 +213,16 @@ class Bus:
 
 
 def _answer_from(
-    waiting: _Waiting, answer: Callable[[zenoh.Query, Sequence[Route]], None], thread: ServiceThread
+    waiting: _Waiting, answer: Callable[[zenoh.Query, Sequence[Route], float], None], thread: ServiceThread
 ) -> None:
     while not thread.stopping:
         thread.beat()
         try:
-            query, routes = waiting.get(timeout=POLL_S)
+            query, routes, received_s = waiting.get(timeout=POLL_S)
         except queue.Empty:
             continue
         try:
-            answer(query, routes)
+            answer(query, routes, received_s)
         except zenoh.ZError:  # the client is gone
             _log.debug("a reply found no receiver")
 

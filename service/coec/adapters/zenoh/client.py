@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import zenoh
 
+from coec.adapters.zenoh.endpoints import redacted
 from coec.errors import CoecError, DecodeError, NotFoundError, UsageError
 from coec.schemas.base import from_json, from_msgpack
 from coec.schemas.replies import ErrorReply
@@ -55,7 +56,9 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
     """
     for endpoint in endpoints:
         if not ENDPOINT.fullmatch(endpoint):
-            raise UsageError(f"{endpoint!r} is no endpoint of a router: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447")
+            raise UsageError(
+                f"{redacted(endpoint)!r} is no endpoint of a router: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447"
+            )
     zenoh.init_log_from_env_or("off")
     settings = zenoh.Config()
     settings.insert_json5("mode", '"client"')
@@ -66,9 +69,10 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
         settings.insert_json5("connect/endpoints", json.dumps(list(endpoints)))
         session = zenoh.open(settings)
     except (zenoh.ZError, ValueError) as error:
+        asked = ", ".join(redacted(endpoint) for endpoint in endpoints)
         raise ConnectionFailedError(
-            f"no Zenoh router answered at {', '.join(endpoints)} within {wait_s:g} s: start one, start `coec run "
-            "--embedded-router`, or name the endpoint with --connect"
+            f"no Zenoh router answered at {asked} within {wait_s:g} s: start one, start `coec run --embedded-router`, "
+            "or name the endpoint with --connect"
         ) from error
     try:
         yield session

@@ -4,7 +4,9 @@ acknowledged, logged and written down. Those that come faster than their sender 
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -31,6 +33,8 @@ _log = logging.getLogger(__name__)
 
 TIMEOUT_S = 4.0
 """To begin a command, and again to end it: together below the 10 s after which clients give up."""
+
+EXPIRED = "The command waited for longer than its sender does; nothing was done. Send it again."
 
 COMMISSIONING_WINDOWS = 8
 """Windows that a rig is commissioned from, the newest: 200 pairs."""
@@ -75,8 +79,11 @@ class Commands:
         with self._lock:
             return dict(self._counts)
 
-    def carry_out(self, name: str, arguments: dict[str, Any], sender: str) -> Acknowledgement:
-        """Carry out a command of `payloads.NAMES`, or say why not."""
+    def carry_out(
+        self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = math.inf
+    ) -> Acknowledgement:
+        """Carry out a command of `payloads.NAMES`, or say why not. What is not begun by the deadline (steady clock), at
+        which its sender gives up, is not done."""
         decided: dict[str, Callable[[], Acknowledgement]] = {
             "apply": self._apply,
             "rollback": partial(self._roll_back, arguments.get("to")),
@@ -84,19 +91,33 @@ class Commands:
             "commission": self._commission,
             "hold": partial(self._hold, release=bool(arguments.get("release", False))),
         }
+        begun = threading.Event()
+
+        def in_time(command: Callable[[], Acknowledgement]) -> Acknowledgement:
+            if time.monotonic() > deadline_s:
+                raise BusyError(EXPIRED)
+            begun.set()
+            return command()
+
+        within_s = min(TIMEOUT_S, max(deadline_s - time.monotonic(), 0.0))
         wait_s = self._rate.take(sender)
         try:
             if wait_s > 0.0:
                 text = f"You give commands faster than {PER_S:g} per second; nothing was done. Wait {wait_s:.1f} s."
                 acknowledged = self._acknowledge(name, "too_many", text, accepted=False)
             elif name == "calibrate":
-                acknowledged = self._stream.ask(self._calibrate, TIMEOUT_S)
+                acknowledged = self._stream.ask(partial(in_time, self._calibrate), within_s)
                 # It is done: what cannot be waited for any more is written down all the same.
                 self._mailbox.post(partial(self._write_down, acknowledged, sender))
             else:
-                acknowledged = self._mailbox.ask(partial(self._decide, name, decided[name], sender), TIMEOUT_S)
+                decide = partial(self._decide, name, decided[name], sender)
+                acknowledged = self._mailbox.ask(partial(in_time, decide), within_s)
         except BusyError as error:
-            acknowledged = self._acknowledge(name, error.reply_code, str(error), accepted=False)
+            late = time.monotonic() >= deadline_s and not begun.is_set()
+            code, text = ("expired", EXPIRED) if late else (error.reply_code, str(error))
+            fields = {"pair": self._pair.name, "command": name, "sender": sender, "code": code}
+            _log.warning(f"a command was not carried out in time: {text}", extra={"fields": fields})
+            acknowledged = self._acknowledge(name, code, text, accepted=False)
         with self._lock:
             self._counts[f"{name}_{'accepted' if acknowledged.accepted else 'refused'}"] += 1
         return acknowledged

@@ -17,6 +17,7 @@ from coec.runtime.api.snapshots import Snapshot, answer_of
 from coec.schemas.keys import (
     Format,
     Keys,
+    parse_command_selector,
     parse_evidence_selector,
     parse_history_selector,
     parse_overlay_selector,
@@ -127,9 +128,10 @@ class VehicleAnswers:
 
     def _command(self, commands: Commands, name: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
-            form = _format(request)
-            arguments = payloads.parse(name, request.payload)
-            return answer_of(commands.carry_out(name, arguments, payloads.sender_of(request.attachment)), form)
+            chosen = parse_command_selector(request.parameters)
+            arguments, sender = payloads.parse(name, request.payload), payloads.sender_of(request.attachment)
+            deadline_s = request.received_s + chosen.timeout_ms / 1e3
+            return answer_of(commands.carry_out(name, arguments, sender, deadline_s), chosen.format)
 
         return answer
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
+from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -45,7 +47,8 @@ class IndexedWindow(Part):
 
 
 class WindowIndex:
-    """A line for each version of a window that was read; the last of a window counts. Not safe from several threads.
+    """A line for each version of a window that was read; the last of a window counts. Not safe from several threads,
+    but for `flush`.
 
     A line that is lost costs that the window is read again, and that it is taken for the latest: the index is written
     at once, but no window is refused because it cannot be.
@@ -54,7 +57,9 @@ class WindowIndex:
     def __init__(self, path: Path) -> None:
         """`path`: a file of lines; need not exist."""
         self._known: dict[str, IndexedWindow] = {}
-        self._log = Log(path, LINES, lambda: [to_json(known) for known in self._known.values()])
+        self._log = Log(path, LINES, lambda: [to_json(known) for known in tuple(self._known.values())])
+        self._waiting: deque[bytes] = deque()
+        self._writing = threading.Lock()
         lines: list[bytes] = []
         with contextlib.suppress(OSError):  # then it begins anew
             lines = self._log.load()
@@ -74,14 +79,20 @@ class WindowIndex:
         return order
 
     def put(self, known: IndexedWindow) -> None:
-        """Another version was read."""
+        """Another version was read; `flush` writes it."""
         self._known[known.window_id] = known
-        self._log.add(to_json(known))
-        try:
-            self._log.flush()
-        except OSError as error:
-            fields = {"window": known.window_id}
-            _log.warning(f"the index of the windows cannot be written: {error.strerror}", extra={"fields": fields})
+        self._waiting.append(to_json(known))
+
+    def flush(self) -> None:
+        """Write what was put. Safe from any thread, and for as long as the disk takes: who reads and puts meanwhile
+        does not wait."""
+        with self._writing:
+            while self._waiting:
+                self._log.add(self._waiting.popleft())
+            try:
+                self._log.flush()
+            except OSError as error:
+                _log.warning(f"the index of the windows cannot be written: {error.strerror}")
 
     def prune(self, window_ids: Iterable[str]) -> None:
         """Forget all windows but these."""

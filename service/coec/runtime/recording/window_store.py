@@ -179,6 +179,7 @@ class WindowStore:
             if found is not None:
                 found = self._found[recorded.window_id] = replace(found, order=self._index.next_order())
                 self._put(recorded.window_id, found.order, version)
+        self._index.flush()  # without the lock: a disk may take seconds, and whoever asks for the list does not wait
 
     def note(self, window_id: str, version: WindowVersion) -> None:
         """The file of a window was read or written again: this is what it was then. If it is another by now, nothing
@@ -188,6 +189,7 @@ class WindowStore:
             found = self._found.get(window_id)
             if found is not None:
                 self._put(window_id, found.order, version)
+        self._index.flush()
 
     def version(self, window_id: str) -> WindowVersion | None:
         """What was read of a window as it is now; None: not read yet, or no such window."""
@@ -232,43 +234,56 @@ class WindowStore:
         Raises:
             RecordingError: too little is free all the same, or a window cannot be removed.
         """
-        with self._lock:
-            try:
-                self._make_room(progress)
-            except OSError as error:
-                raise RecordingError(f"no room can be made in {self._folder}: {error.strerror}") from error
+        try:
+            self._make_room(progress)
+        except OSError as error:
+            raise RecordingError(f"no room can be made in {self._folder}: {error.strerror}") from error
 
     def _make_room(self, progress: Callable[[], None]) -> None:
+        """The lock is held for one window at a time, and not while the disk is waited for."""
         durable.make_folder(self._folder)
-        self._look()
-        latest = {found.pair: window_id for window_id, found in self._in_order()}
-        evidence = frozenset().union(*self._protected.values())
-        used = sum(found.size_bytes for found in self._found.values())
-        reserve = max((found.size_bytes for found in self._found.values()), default=0)
-        removable = [item for item in self._in_order() if item[0] not in self._held and item[0] != latest[item[1].pair]]
+        with self._lock:
+            self._look()
+            latest = {found.pair: window_id for window_id, found in self._in_order()}
+            newest = {pair: self._found[window_id] for pair, window_id in latest.items()}
+            removable = [item for item in self._in_order() if item[0] != latest[item[1].pair]]
+            evidence = self._evidence()
+            used = sum(found.size_bytes for found in self._found.values())
+            reserve = max((found.size_bytes for found in self._found.values()), default=0)
         expired = 0
         for window_id, found in sorted(removable, key=lambda item: item[0] in evidence):
             too_much = used + reserve > self._config.max_bytes
             too_full = _free_bytes(self._folder) < self._config.min_free_bytes + reserve
-            if not too_much and not too_full:
-                newest = self._found[latest[found.pair]]
-                if window_id in evidence or expired == EXPIRED_AT_ONCE or not self._is_too_old(found, newest):
-                    continue
-                expired += 1
-            durable.remove(self.path(window_id))
-            self.removed += 1
+            by_age = not too_much and not too_full
+            if by_age and (expired == EXPIRED_AT_ONCE or not self._is_too_old(found, newest[found.pair])):
+                continue
+            if not self._remove(window_id, spare_evidence=by_age or window_id not in evidence):
+                continue
+            expired += by_age
             used -= found.size_bytes
-            del self._found[window_id]
-            self._views.clear()
+            durable.sync_folder(self._folder)
             _log.info("an old window was removed", extra={"fields": {"window": window_id, "bytes": found.size_bytes}})
             progress()
-        self._index.prune(self._found)
+        with self._lock:
+            self._index.prune(self._found)
         free = _free_bytes(self._folder)
         if free < self._config.min_free_bytes:
             raise RecordingError(
                 f"only {free >> 20} MiB are free on the disk of {self._folder}; state.min_free_bytes asks for "
                 f"{self._config.min_free_bytes >> 20} MiB: free space"
             )
+
+    def _remove(self, window_id: str, *, spare_evidence: bool) -> bool:
+        """Remove a window, unless something is under way with it by now, it has gone, or it is to be spared."""
+        with self._lock:
+            spared = spare_evidence and window_id in self._evidence()
+            if spared or window_id in self._held or window_id not in self._found:
+                return False
+            self.path(window_id).unlink(missing_ok=True)
+            self.removed += 1
+            del self._found[window_id]
+            self._views.clear()
+            return True
 
     def _is_too_old(self, found: _Found, newest: _Found) -> bool:
         """A clock that was set back makes an age negative, which is no age."""
@@ -277,6 +292,9 @@ class WindowStore:
         return by_wall_clock and newest.start_ns - found.start_ns > oldest_ns
 
     # --- inside; the lock is held -----------------------------------------------------------------------------------
+
+    def _evidence(self) -> frozenset[str]:
+        return frozenset().union(*self._protected.values())
 
     def _in_order(self) -> list[tuple[str, _Found]]:
         return sorted(self._found.items(), key=lambda item: item[1].order)

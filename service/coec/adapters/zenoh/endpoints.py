@@ -1,0 +1,115 @@
+"""Endpoints of Zenoh, `PROTOCOL/ADDRESS[?METADATA][#CONFIGURATION]`: whom they let in, what of them may be shown."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from dataclasses import dataclass
+
+from coec.errors import ConfigError
+
+WITH_PORT = frozenset({"tcp", "udp", "tls", "quic", "ws"})
+OF_THIS_COMPUTER = frozenset({"unixsock-stream", "unixpipe"})
+"""Who may open them is for the file system to say."""
+CERTIFIED = frozenset({"tls", "quic"})
+"""Those that can ask for the certificate of whoever connects."""
+OTHERS = frozenset({"vsock", "serial"})
+
+MTLS = "enable_mtls"
+"""Of an endpoint's configuration, and of `transport/link/tls` for those that say nothing of it."""
+
+HARMLESS = frozenset({"bind", "dscp", "iface", "multistream", "prio", "rel", "so_rcvbuf", "so_sndbuf", MTLS})
+HARMLESS_ENDING = ("_certificate_file", "_private_key_file", "_on_connect", "_on_expiration")
+"""Parameters that may be shown: what they mean is known, and it is no secret. The rest may be anything."""
+
+HIDDEN = "***"
+
+_FORM = re.compile(
+    r"(?P<protocol>[a-z0-9-]+)/(?P<address>[^?#]*)(\?(?P<metadata>[^#]*))?(#(?P<settings>.*))?", re.DOTALL
+)
+_HOST_PORT = re.compile(r"(?P<host>.+):(?P<port>\d{1,5})", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """An endpoint in its parts; `metadata` and `settings` as they were written, empty where nothing was."""
+
+    protocol: str
+    address: str
+    metadata: str
+    settings: str
+
+    @classmethod
+    def parse(cls, text: str) -> Endpoint:
+        """The inverse of writing one.
+
+        Raises:
+            ConfigError: the text is none, whatever the network is like.
+        """
+        match = _FORM.fullmatch(text)
+        if match is None:
+            raise ConfigError(f"{redacted(text)!r} is no endpoint: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447")
+        endpoint = cls(match["protocol"], match["address"], match["metadata"] or "", match["settings"] or "")
+        if endpoint.protocol in WITH_PORT:
+            parts = _HOST_PORT.fullmatch(endpoint.address)
+            if parts is None or int(parts["port"]) > 65535:
+                raise ConfigError(f"{redacted(text)!r} names no host and port: write tcp/127.0.0.1:7447")
+        elif endpoint.protocol not in OF_THIS_COMPUTER | OTHERS:
+            known = ", ".join(sorted(WITH_PORT | OF_THIS_COMPUTER | OTHERS))
+            raise ConfigError(f"{redacted(text)!r} is of no protocol that Zenoh knows: {known}")
+        return endpoint
+
+    def lets_in_whoever_comes(self, *, certificates_asked: bool) -> bool:
+        """Whether a program on another computer gets in without a certificate, when this is listened on.
+
+        Args:
+            certificates_asked: what holds where the endpoint itself does not say whether a certificate is asked for.
+        """
+        if self.protocol in OF_THIS_COMPUTER or (self.protocol in WITH_PORT and _is_loopback(self.address)):
+            return False
+        said = dict(item.partition("=")[::2] for item in self.settings.split(";")).get(MTLS)
+        asked = certificates_asked if said is None else said == "true"
+        return not (asked and self.protocol in CERTIFIED)
+
+
+def redacted(text: str) -> str:
+    """An endpoint as it may be shown: who is meant stays, what is not known to be harmless is hidden. Of a text that is
+    no endpoint nothing stays behind the first `?` or `#`."""
+    match = _FORM.fullmatch(text)
+    if match is None:
+        head = re.split(r"[?#]", text, maxsplit=1)[0]
+        return _without_user(head) + ("" if head == text else HIDDEN)
+    metadata = "" if match["metadata"] is None else f"?{_shown(match['metadata'])}"
+    settings = "" if match["settings"] is None else f"#{_shown(match['settings'])}"
+    return f"{match['protocol']}/{_without_user(match['address'])}{metadata}{settings}"
+
+
+def without_secrets(text: str, endpoints: tuple[str, ...]) -> str:
+    """A message of Zenoh's about these endpoints, as it may be shown."""
+    for endpoint in sorted(endpoints, key=len, reverse=True):
+        text = text.replace(endpoint, redacted(endpoint))
+    return re.sub(r"(base64|password)(\W{1,3})[^\s;,\"')\]]+", rf"\1\2{HIDDEN}", text)
+
+
+def _shown(parameters: str) -> str:
+    shown = []
+    for item in parameters.split(";"):
+        name, equals, value = item.partition("=")
+        harmless = name in HARMLESS or name.endswith(HARMLESS_ENDING)
+        shown.append(item if harmless or not (equals and value) else f"{name}={HIDDEN}")
+    return ";".join(shown)
+
+
+def _without_user(address: str) -> str:
+    """Neither the user nor the password that may stand before the host."""
+    return f"{HIDDEN}@{address.rpartition('@')[2]}" if "@" in address else address
+
+
+def _is_loopback(address: str) -> bool:
+    host = address.rpartition(":")[0].removeprefix("[").removesuffix("]")
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name: who answers to it is not for us to know
+        return False

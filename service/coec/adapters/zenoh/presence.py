@@ -1,0 +1,240 @@
+"""One daemon per vehicle: each says that it is there by liveliness tokens, looks for others, and one stays.
+
+A daemon holds a claim from before it looks for others until it answers no more: `starting`, then `serving`. Routers
+hand nothing on between two peers, so that a peer looks through a client session of its own. What is seen there is what
+the router holds; once a daemon sees its own claim, whoever looks later sees it, too. Of two that start at once at least
+one therefore sees the other:
+
+- Who sees one that serves leaves, and so does who sees one that starts with a smaller Zenoh id.
+- Who sees others that start with larger ids waits: they leave, or they had looked before and are about to serve.
+- Who sees nobody serves, and goes on looking: two that have started on different sides of a broken network, or before
+  their router, see each other when it is there, and the one with the larger id leaves.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+import uuid
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal
+
+import zenoh
+
+from coec.adapters.system.threads import ServiceThread
+from coec.adapters.zenoh.bus import closed
+from coec.adapters.zenoh.settings import mode_of, settings_of
+from coec.config import LimitsConfig, ZenohConfig
+from coec.errors import UnavailableError, UsageError
+from coec.schemas.keys import Claim, Keys
+
+_log = logging.getLogger(__name__)
+
+CONNECT_S = 1.0
+"""For a session to look with; a router on the same network answers in milliseconds."""
+
+LOOK_S = 1.0
+"""For one look."""
+
+SEEN_S = 5.0
+"""For the own claim to be seen: it is a message to the router, and the processor may be busy. Beyond, access control
+hides it."""
+
+DECIDED_S = 5.0
+"""For others that start to leave or to serve; they need less than that, and one that hangs is not waited for."""
+
+POLL_S = 0.05
+"""Between two looks while something is waited for."""
+
+WATCH_S = 5.0
+"""Between two looks while serving."""
+
+
+def next_step(own: str, others: Iterable[Claim]) -> Literal["serve", "wait", "leave"]:
+    """What a daemon with this Zenoh id does that starts and sees these claims."""
+    claims = list(others)
+    if any(claim.serving or claim.daemon < own for claim in claims):
+        return "leave"
+    return "wait" if claims else "serve"
+
+
+def outranking(own: str, others: Iterable[Claim]) -> Claim | None:
+    """Of those that serve beside a daemon with this Zenoh id, one that it leaves the vehicle to."""
+    return next((claim for claim in others if claim.serving and claim.daemon < own), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What the router holds of one vehicle.
+
+    Attributes:
+        own: whether the own claim is there.
+        others: claims of other daemons.
+        tokens: liveliness tokens of pairs, whoever holds them.
+    """
+
+    own: bool
+    others: tuple[Claim, ...]
+    tokens: tuple[str, ...]
+
+
+class Presence:
+    """That of one daemon. `thread` looks for others while it serves, and closes what it looks through."""
+
+    def __init__(
+        self, session: zenoh.Session, config: ZenohConfig, limits: LimitsConfig, keys: Keys, since_ns: int
+    ) -> None:
+        """Says and looks for nothing yet.
+
+        Args:
+            session: the daemon's.
+            since_ns: wall clock at the start of the daemon, for others to tell.
+        """
+        self.thread = ServiceThread("look-out", self._watch)
+        self.rival: Claim | None = None
+        self._session = session
+        self._config, self._limits = config, limits
+        self._keys = keys
+        self._daemon = str(session.info.zid())
+        self._since_ns = since_ns
+        self._through: zenoh.Session | None = None
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._stop = threading.Event()
+
+    def claim(self, stop: threading.Event) -> None:
+        """Have the vehicle, if nobody else has. For a thread that may wait; returns early when `stop` is set.
+
+        Raises:
+            UnavailableError: another daemon serves the vehicle, or is about to; says which. Nothing is claimed then.
+        """
+        self._declare(serving=False)
+        try:
+            self._decide(stop)
+        except UnavailableError:
+            self._withdraw()
+            raise
+
+    def close(self, deadline_s: float) -> bool:
+        """Look no more, and claim nothing; for when nothing is answered any more. False when it took longer than the
+        deadline."""
+        end_s = time.monotonic() + deadline_s
+        self.thread.request_stop()
+        self._stop.set()
+        ended, through = self.thread.join(deadline_s), self._through
+        self._withdraw()
+        if not ended or through is None or through is self._session:
+            return ended
+        return closed(through, max(end_s - time.monotonic(), 0.0))
+
+    def _decide(self, stop: threading.Event) -> None:
+        seen = self._look_until_seen(stop)
+        deadline_s = time.monotonic() + DECIDED_S
+        while not stop.is_set():
+            if seen.tokens and not seen.others:
+                raise UnavailableError(
+                    f"vehicle {self._keys.vehicle!r} is served already: somebody holds the token {seen.tokens[0]}"
+                )
+            step = next_step(self._daemon, seen.others)
+            if step == "serve":
+                # The first stays until the second is there: whoever looks finds one of them.
+                self._declare(serving=True)
+                self._tokens.pop(0).undeclare()
+                return
+            if step == "leave" or time.monotonic() > deadline_s:
+                raise UnavailableError(told(self._keys.vehicle, min(seen.others, key=lambda claim: not claim.serving)))
+            stop.wait(POLL_S)
+            seen = self._look()
+
+    def _declare(self, *, serving: bool) -> None:
+        key = self._keys.claim(Claim(self._daemon, self._since_ns, serving))
+        self._tokens.append(self._session.liveliness().declare_token(key))
+
+    def _withdraw(self) -> None:
+        for token in self._tokens:
+            token.undeclare()
+        self._tokens.clear()
+
+    # --- looking ----------------------------------------------------------------------------------------------------
+
+    def _watch(self, thread: ServiceThread) -> None:
+        while not self._stop.wait(WATCH_S):
+            thread.beat()
+            rival = outranking(self._daemon, self._look().others)
+            if rival is not None:
+                self.rival = rival
+
+    def _look_until_seen(self, stop: threading.Event) -> Seen:
+        """The first look in which the own claim is there, or the last of `SEEN_S`."""
+        deadline_s = time.monotonic() + SEEN_S
+        while not (seen := self._look()).own:
+            if self._through is None and not list(self._session.info.routers_zid()):
+                _log.warning("no router answers yet: whether another daemon serves the vehicle is seen when one does")
+                break
+            if time.monotonic() > deadline_s or stop.wait(POLL_S):
+                _log.warning(
+                    "the liveliness tokens of this vehicle cannot be seen: the router's access control must allow the "
+                    "service `liveliness_query` and `liveliness_token`, or two daemons may serve it"
+                )
+                break
+        return seen
+
+    def _look(self) -> Seen:
+        """What is there now; nothing, while no router is."""
+        if self._through is None:
+            self._through = self._looking_glass()
+        if self._through is None:
+            return Seen(False, (), ())
+        claims = {claim for key in _tokens(self._through, self._keys.claims) if (claim := self._claim_of(key))}
+        return Seen(
+            own=any(claim.daemon == self._daemon for claim in claims),
+            others=tuple(claim for claim in claims if claim.daemon != self._daemon),
+            tokens=tuple(_tokens(self._through, self._keys.alive("*"))),
+        )
+
+    def _looking_glass(self) -> zenoh.Session | None:
+        """The own session, or where that is a peer one that sees what other peers say; None: no router is there."""
+        settings = settings_of(self._config, self._limits)
+        if mode_of(settings) != "peer":
+            return self._session
+        own = {
+            "mode": "client",
+            "id": uuid.uuid4().hex.lstrip("0"),  # the file may name that of the daemon
+            "listen/endpoints": [],
+            "connect/timeout_ms": round(CONNECT_S * 1000),
+            "connect/exit_on_failure": True,
+        }
+        for key, value in own.items():
+            settings.insert_json5(key, json.dumps(value))
+        try:
+            return zenoh.open(settings)
+        except zenoh.ZError:
+            return None
+
+    def _claim_of(self, key: str) -> Claim | None:
+        try:
+            return self._keys.parse_claim(key)
+        except UsageError:  # anybody may hold a token of any name
+            return None
+
+
+def told(vehicle: str, other: Claim) -> str:
+    """Who has the vehicle, in a sentence for people."""
+    since = datetime.fromtimestamp(other.since_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    does = "is served" if other.serving else "is about to be served"
+    return (
+        f"vehicle {vehicle!r} {does} by another daemon, started {since}, Zenoh id {other.daemon}: end one of the two, "
+        "or give them different vehicles"
+    )
+
+
+def _tokens(session: zenoh.Session, key: str) -> list[str]:
+    """Keys that are held; none, while the router is away."""
+    try:
+        replies = list(session.liveliness().get(key, timeout=LOOK_S))
+    except zenoh.ZError:
+        return []
+    return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]

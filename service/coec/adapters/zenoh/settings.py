@@ -1,0 +1,94 @@
+"""What a session is opened with: the configuration of the service over the file that it names."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import zenoh
+
+from coec.adapters.zenoh.endpoints import Endpoint, redacted, without_secrets
+from coec.config import LimitsConfig, ZenohConfig
+from coec.errors import ConfigError
+
+TLS = "transport/link/tls"
+
+
+def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
+    """What `config.file` says stands; what it does not say opens no door: nobody listens, and nobody is looked for, who
+    was not told to.
+
+    Raises:
+        ConfigError: the file or an endpoint is none, or a door is open to everybody and `config.insecure` is not set.
+    """
+    listen = config.listen if config.embedded_router else ()
+    connect = tuple(endpoint for endpoint in config.connect if endpoint not in listen)
+    for endpoint in (*listen, *connect):
+        Endpoint.parse(endpoint)
+    silent = {
+        "mode": "router" if config.embedded_router else "peer",
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        "scouting/gossip/enabled": False,
+    }
+    try:
+        settings = zenoh.Config.from_file(config.file) if config.file else zenoh.Config()
+        unsaid = zenoh.Config()
+        for key, value in silent.items():
+            # A peer listens on every interface by default, at any port.
+            if settings.get_json(key) == unsaid.get_json(key):
+                settings.insert_json5(key, json.dumps(value))
+        settings.insert_json5("scouting/multicast/enabled", "false")
+        settings.insert_json5("timestamping/enabled", "true")
+        settings.insert_json5("transport/link/rx/max_message_size", str(limits.max_message_bytes))
+        # Queries and replies through shared memory can vanish under load.
+        settings.insert_json5("transport/shared_memory/transport_optimization/messages", '["put"]')
+    except (zenoh.ZError, OSError, ValueError) as error:
+        raise ConfigError(f"{where(config)}: {without_secrets(str(error), endpoints_of(config))}") from None
+    doors = unguarded(settings)
+    if doors and not config.insecure:
+        raise ConfigError(
+            f"{where(config)}: whoever reaches {', '.join(doors)} would be let in, to read, to send frames and to give "
+            "commands: listen on loopback, or on tls with enable_mtls and a root_ca_certificate; or set "
+            "`zenoh.insecure: true`, and health will say so"
+        )
+    return settings
+
+
+def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
+    """Endpoints that are listened on, as they may be shown, where a program on another computer gets in without a
+    certificate.
+
+    Raises:
+        ConfigError: one of them is no endpoint.
+    """
+    certificates_asked = bool(json.loads(settings.get_json(TLS)).get("enable_mtls"))
+    return tuple(
+        redacted(endpoint)
+        for endpoint in _of_mode(json.loads(settings.get_json("listen/endpoints")), mode_of(settings))
+        if Endpoint.parse(endpoint).lets_in_whoever_comes(certificates_asked=certificates_asked)
+    )
+
+
+def mode_of(settings: zenoh.Config) -> str:
+    """`router`, `peer` or `client`."""
+    return str(json.loads(settings.get_json("mode")))
+
+
+def endpoints_of(config: ZenohConfig) -> tuple[str, ...]:
+    """All that the configuration names."""
+    return (*config.listen, *config.connect)
+
+
+def where(config: ZenohConfig) -> str:
+    """What part of the configuration a complaint is about."""
+    if config.file:
+        return f"zenoh.file {config.file}"
+    listen = [redacted(endpoint) for endpoint in config.listen] if config.embedded_router else []
+    return f"zenoh.listen {listen}, connect {[redacted(endpoint) for endpoint in config.connect]}"
+
+
+def _of_mode(value: Any, mode: str) -> list[str]:
+    """A list of endpoints, or one per mode; a list in the list is a choice of endpoints."""
+    found = value.get(mode, []) if isinstance(value, dict) else value
+    return [one for item in found or [] for one in ([item] if isinstance(item, str) else item)]

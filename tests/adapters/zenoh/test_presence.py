@@ -1,0 +1,156 @@
+"""Of several daemons of one vehicle exactly one stays, in whatever order they look."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+
+import pytest
+import zenoh
+
+from coec.adapters.zenoh import presence
+from coec.adapters.zenoh.bus import open_session
+from coec.adapters.zenoh.presence import Presence, next_step, outranking
+from coec.config import LimitsConfig, ZenohConfig
+from coec.errors import UnavailableError
+from coec.schemas.keys import Claim, Keys
+from fakes import wait_until
+from ports import free_port
+
+KEYS = Keys("coec", "vehicle")
+LIMITS = LimitsConfig()
+STARTED_NS = 1_700_000_000 * 10**9
+DEADLINE_S = 20.0
+ROUNDS = 20
+
+Made = Callable[..., Presence]
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture(scope="module")
+def router(endpoint: str) -> Iterator[zenoh.Session]:
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LIMITS) as session:
+        yield session
+
+
+@pytest.fixture(scope="module")
+def sessions(router: zenoh.Session, endpoint: str) -> Iterator[list[zenoh.Session]]:
+    """Of two daemons on the router."""
+    del router  # it has to be there first
+    config = ZenohConfig(connect=(endpoint,))
+    with open_session(config, LIMITS) as one, open_session(config, LIMITS) as two:
+        yield [one, two]
+
+
+@pytest.fixture
+def daemon(endpoint: str) -> Iterator[Made]:
+    """Makes one of a vehicle, which is closed at the end of the test."""
+    with ExitStack() as stack:
+
+        def make(session: zenoh.Session, keys: Keys = KEYS) -> Presence:
+            one = Presence(session, ZenohConfig(connect=(endpoint,)), LIMITS, keys, STARTED_NS)
+            stack.callback(lambda: one.close(DEADLINE_S))
+            return one
+
+        yield make
+
+
+def serves(one: Presence) -> bool:
+    try:
+        one.claim(threading.Event())
+    except UnavailableError:
+        return False
+    return True
+
+
+def test_in_no_order_of_looks_do_two_serve_and_one_always_does() -> None:
+    """Every reachable state of three daemons that start, look and decide in any order, each any number of times."""
+    start: tuple[str, ...] = ("new", "new", "new")
+    reached, waiting = {start}, [start]
+    while waiting:
+        states = waiting.pop()
+        following = set()
+        for index, state in enumerate(states):
+            others = [
+                Claim(str(number), 0, serving=there == "serving")
+                for number, there in enumerate(states)
+                if number != index and there in ("starting", "serving")
+            ]
+            step = {"new": "starting", "starting": next_step(str(index), others)}.get(state, state)
+            after = {"serve": "serving", "leave": "left", "wait": state}.get(step, step)
+            following.add((*states[:index], after, *states[index + 1 :]))
+        assert states.count("serving") <= 1, states
+        if following == {states}:
+            assert states.count("serving") == 1, f"nobody moves: {states}"
+        waiting += following - reached
+        reached |= following
+    assert len(reached) > len(start), "the model moves"
+
+
+def test_of_two_that_serve_on_different_sides_of_a_network_the_larger_leaves() -> None:
+    one, two = Claim("1", 5, serving=True), Claim("2", 4, serving=True)
+    assert outranking("2", [one]) == one
+    assert outranking("1", [two]) is None
+    assert outranking("2", [Claim("1", 5, serving=False)]) is None, "who starts has to leave itself"
+
+
+def test_of_two_that_start_at_once_one_stays(sessions: list[zenoh.Session], daemon: Made) -> None:
+    for _ in range(ROUNDS):
+        both = [daemon(session) for session in sessions]
+        with ThreadPoolExecutor(len(both)) as pool:
+            assert sorted(pool.map(serves, both)) == [False, True]
+        assert all(one.close(DEADLINE_S) for one in both)
+
+
+def test_who_comes_later_says_who_is_there_and_is_no_matter_to_another_vehicle(
+    sessions: list[zenoh.Session], daemon: Made
+) -> None:
+    one, two = sessions
+    assert serves(daemon(one))
+    with pytest.raises(UnavailableError, match=r"'vehicle' is served .* started 2023-11-14 22:13:20 UTC, Zenoh id"):
+        daemon(two).claim(threading.Event())
+    assert serves(daemon(two, Keys("coec", "other")))
+
+
+def test_the_token_of_a_pair_tells_of_a_daemon_too(
+    router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made
+) -> None:
+    token = router.liveliness().declare_token(KEYS.alive("front"))
+    with pytest.raises(UnavailableError, match=r"somebody holds the token coec/@v1/vehicle/front/alive"):
+        daemon(sessions[0]).claim(threading.Event())
+    token.undeclare()
+    assert serves(daemon(sessions[0]))
+
+
+def test_a_token_of_another_form_is_nobody(router: zenoh.Session, sessions: list[zenoh.Session], daemon: Made) -> None:
+    ends = ("serving/zz/1", "serving/1/" + "9" * 40, "gone/1/1")
+    tokens = [router.liveliness().declare_token(f"{KEYS.root}/alive/{end}") for end in ends]
+    assert serves(daemon(sessions[0]))
+    for token in tokens:
+        token.undeclare()
+
+
+def test_two_that_started_before_their_router_see_each_other_when_it_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(presence, "WATCH_S", 0.02)
+    monkeypatch.setattr(presence, "CONNECT_S", 0.1)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    config = ZenohConfig(connect=(endpoint,))
+    with open_session(config, LIMITS) as here, open_session(config, LIMITS) as there:
+        both = [Presence(session, config, LIMITS, KEYS, STARTED_NS) for session in (here, there)]
+        assert [serves(one) for one in both] == [True, True]
+        with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LIMITS):
+            for one in both:
+                one.thread.start()
+            wait_until(lambda: any(one.rival for one in both), "one sees the other")
+            (leaving,) = [one for one in both if one.rival]
+            assert all(one.close(DEADLINE_S) for one in both)
+        (staying,) = [one for one in both if one is not leaving]
+        assert staying.rival is None

@@ -1,0 +1,76 @@
+"""No door is open to everybody unless the configuration says so in so many words, whichever file it is in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from coec.adapters.zenoh.settings import settings_of, unguarded
+from coec.config import LimitsConfig, ZenohConfig
+from coec.errors import ConfigError
+
+LIMITS = LimitsConfig()
+EVERYBODY = "tcp/[::]:7447"
+SECRET = "c2VjcmV0"
+
+
+def of_file(folder: Path, text: str, *, insecure: bool = False) -> ZenohConfig:
+    path = folder / "zenoh.json5"
+    path.write_text(text)
+    return ZenohConfig(file=path, insecure=insecure)
+
+
+DOORS = (
+    f'mode: "peer", listen: {{ endpoints: ["{EVERYBODY}"] }}',
+    f'listen: {{ endpoints: {{ peer: ["tcp/127.0.0.1:0", "{EVERYBODY}"] }} }}',
+    f'mode: "router", listen: {{ endpoints: {{ peer: [], router: ["{EVERYBODY}"] }} }}',
+    'mode: "peer", listen: { endpoints: ["tls/[::]:7448"] }',
+    'mode: "peer", listen: { endpoints: ["tls/[::]:7448"] }, transport: { link: { tls: { enable_mtls: false } } }',
+)
+
+
+@pytest.mark.parametrize("said", DOORS)
+def test_a_door_for_everybody_in_a_file_is_refused_unless_spelled_out(tmp_path: Path, said: str) -> None:
+    with pytest.raises(ConfigError, match=r"whoever reaches t.*zenoh.insecure"):
+        settings_of(of_file(tmp_path, f"{{ {said} }}"), LIMITS)
+    (door,) = unguarded(settings_of(of_file(tmp_path, f"{{ {said} }}", insecure=True), LIMITS))
+    assert door in said
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "",
+        'mode: "peer"',
+        'mode: "router"',
+        'mode: "router", listen: { endpoints: ["tcp/127.0.0.1:7447"] }',
+        f'mode: "peer", listen: {{ endpoints: {{ peer: [], router: ["{EVERYBODY}"] }} }}',
+        'listen: { endpoints: ["tls/[::]:7448"] }, transport: { link: { tls: { enable_mtls: true } } }',
+    ],
+)
+def test_what_lets_nobody_in_unknown_is_allowed(tmp_path: Path, said: str) -> None:
+    assert unguarded(settings_of(of_file(tmp_path, f"{{ {said} }}"), LIMITS)) == ()
+
+
+def test_the_router_that_is_the_service_is_held_to_the_same() -> None:
+    router = ZenohConfig(embedded_router=True, listen=(EVERYBODY,))
+    with pytest.raises(ConfigError, match="whoever reaches tcp"):
+        settings_of(router, LIMITS)
+    spelled_out = router.model_copy(update={"insecure": True})
+    assert unguarded(settings_of(spelled_out, LIMITS)) == (EVERYBODY,)
+    assert unguarded(settings_of(ZenohConfig(listen=(EVERYBODY,)), LIMITS)) == (), "nobody listens there"
+
+
+@pytest.mark.parametrize("endpoint", [f"tls/[::]:1#listen_private_key_base64={SECRET}", f"tls/h#password={SECRET}"])
+def test_a_refusal_does_not_tell_a_secret(endpoint: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        settings_of(ZenohConfig(embedded_router=True, listen=(endpoint,)), LIMITS)
+    assert SECRET not in str(refused.value)
+
+
+def test_a_damaged_file_does_not_tell_what_is_in_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as refused:
+        settings_of(of_file(tmp_path, f"{{ transport: {{ auth: {{ usrpwd: {{ password: {SECRET} }} }} }} }}"), LIMITS)
+    assert SECRET not in str(refused.value)
+    assert "zenoh.json5" in str(refused.value)
