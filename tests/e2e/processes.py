@@ -156,7 +156,8 @@ class Service:
         return self.ask(self.keys.health(self.pair))
 
     def history(self) -> Any:
-        return self.ask(self.keys.history(self.pair))
+        """All that is kept: the newest hundred of each kind are told unless more are asked for."""
+        return self.ask(self.keys.history(self.pair), ";limit=1000")
 
     def windows(self) -> list[Any]:
         found: list[Any] = self.ask(self.keys.windows(self.pair))["windows"]
