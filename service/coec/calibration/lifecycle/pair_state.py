@@ -25,7 +25,7 @@ from coec.calibration.monitor.change_detector import (
     diagnose,
 )
 from coec.calibration.monitor.change_detector import after_observation as check_taken
-from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.calibration.monitor.sensor_faults import CAUSES, Cause
 from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
 from coec.calibration.types import Decision, Estimate, Matrix4, MovedWithin, Reason, Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
@@ -227,8 +227,13 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
 
 def _objected(state: PairState) -> bool:
     """Whether the monitor has something against the mount, and nothing against the data."""
-    cause = diagnose(state.monitor)
-    return state.flagged_since_ns is not None and (cause is None or cause.code == BENT_MOUNT)
+    return state.flagged_since_ns is not None and _data_cause(state.monitor) is None
+
+
+def _data_cause(monitor: MonitorState) -> Cause | None:
+    """What is wrong with the data, if anything is certain enough."""
+    cause = diagnose(monitor)
+    return None if cause is None or cause.code == BENT_MOUNT else cause
 
 
 def _well_told_move(estimate: Estimate) -> MovedWithin | None:
@@ -304,7 +309,7 @@ def _confirmed(state: PairState, stamp_ns: int) -> PairState:
     """A window vouches for what is served: whatever the monitor had against it is settled. What is wrong with the data
     is not."""
     fresh = MonitorState(blind=state.monitor.blind, dirt=state.monitor.dirt)
-    cause = diagnose(fresh)
+    cause = _data_cause(fresh)
     state = replace(state, proven=True, monitor=fresh, flagged_since_ns=None)
     if cause is None:
         return _well_again(state, Event.CONFIRMED_BY_WINDOW, stamp_ns)
@@ -327,12 +332,11 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
     elif monitor.outcome in (Finding.CLEAR, Finding.UNKNOWN):
         since_ns = None
     state = replace(state, monitor=monitor, flagged_since_ns=since_ns)
-    cause = diagnose(monitor)
-    if cause is not None and cause.code != BENT_MOUNT:
+    cause = _data_cause(monitor)
+    if cause is not None:
         return _poor(state, Event.DATA_CAUSE, observation.stamp_ns, cause.as_reason())
     if monitor.outcome is Finding.CONFIRMED:
-        why = () if cause is None else (cause.as_reason(),)
-        return happened(state, Event.MOUNT_MOVED, *(why or (Reason(BENT_MOUNT, "The mount has moved."),)))
+        return happened(state, Event.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
     if monitor.outcome is Finding.SUSPECT:
         text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to tell."
         return _unless_red(state, Event.SUSPECTED, Reason("monitor_suspects", text))
