@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+
+from faults import FaultTable, rows_of_item
 
 if TYPE_CHECKING:
     from e2e.processes import Router
@@ -21,12 +24,28 @@ hypothesis.settings.register_profile("coec", derandomize=True, deadline=None, da
 hypothesis.settings.load_profile("coec")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--faults FILE``: write the table of faults and promises at the end of the run (``tests/faults.py``)."""
+    parser.addoption("--faults", type=Path, metavar="FILE", help="write the table of faults and promises")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The process that hears of all tests writes the table, not the workers of a parallel run."""
+    table: Path | None = config.getoption("faults")
+    if table is not None and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(FaultTable(table))
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave benchmarks to the long run: how fast the machine is at the moment is no verdict on a change."""
+    """Leave benchmarks to the long run: how fast the machine is at the moment is no verdict on a change.
+
+    What a test is marked to hold travels with its report, from whatever process it runs in.
+    """
     for item in items:
         if item.path.is_relative_to(BENCHMARKS):
             item.add_marker("slow")
+        item.user_properties.extend(("fault", json.dumps(row)) for row in rows_of_item(item))
 
 
 @pytest.fixture(scope="session")

@@ -315,6 +315,10 @@ def test_a_door_for_everybody_is_said_and_keys_are_hidden(tmp_path: Path, drive:
         assert secret not in running.log.read_text()
 
 
+@pytest.mark.fault(
+    "a second daemon of the same vehicle",
+    "it leaves with exit code 75 and says who is there",
+)
 def test_a_second_daemon_of_the_vehicle_leaves_and_says_who_is_there(idle: Service, tmp_path: Path) -> None:
     config = str(idle.log.with_name("coec.yaml"))
     command = [*COMMAND, "run", "--config", config, "--state-dir", str(tmp_path / "other")]

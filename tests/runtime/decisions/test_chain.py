@@ -171,6 +171,10 @@ def assert_restarts(root: Path, safe: int) -> None:
         assert found[0] <= max(0, found[-1] - LIMIT + 1)
 
 
+@pytest.mark.fault(
+    "a disk that refuses writes for a while",
+    "no entry of the history is lost, and nothing is called tampered with",
+)
 @pytest.mark.parametrize("length", [1, 2, 4, 30])
 def test_a_disk_that_refuses_for_a_while_loses_nothing_and_is_no_tampering(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int
