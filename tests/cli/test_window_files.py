@@ -124,3 +124,11 @@ def test_slices_of_a_recording_choose_among_their_own_frames() -> None:
     # A frame every two seconds.
     later = windows.load(SMALL, 2, 25, lambda *_: None, (3.0, 9.0)).window.pairs
     assert [pair.stamp_ns for pair in later] == [whole[2].stamp_ns, whole[4].stamp_ns]
+
+
+def test_export_of_a_window_knows_the_lens(coec: Coec, recorded: Path) -> None:
+    outcome = coec("export", recorded, "--format", "json")
+    result = read_result(recorded)
+    assert result is not None
+    np.testing.assert_array_equal(outcome.document["T_child_parent"], result.camera_from_lidar.matrix)
+    assert outcome.document["camera"]["width"] == read_window(recorded)[0].rig.camera.width

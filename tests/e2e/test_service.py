@@ -99,6 +99,14 @@ def _check_same_by_calibrate(endpoint: str, extrinsic: Any, folder: Path) -> Pat
     return window
 
 
+def _check_exported(endpoint: str, state: Path, config: Path) -> None:
+    """The file that the service answers is the one that its state directory exports to."""
+    answered = _asked(endpoint, "extrinsic", "--param", "format=kalibr")
+    exported = coec("export", state, "--config", config, "--format", "kalibr")
+    assert exported.returncode == 0, exported.stderr
+    assert exported.stdout == answered
+
+
 def _check_opens_in_ros_tools(window: Path, topic: str, pairs: int) -> None:
     with window.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -113,11 +121,14 @@ def test_from_frames_to_extrinsic_and_after_a_restart(tmp_path: Path, drive: Dri
     with service(config, router) as running:
         before = _asked(router.endpoint, "extrinsic")
         assert (before["provenance"], before["status"]) == ("nominal", "not_accepted")
+        refused = coec("query", "extrinsic", "--param", "format=urdf", "--connect", router.endpoint)
+        assert (refused.returncode, "nothing has been accepted yet" in refused.stderr) == (1, True)
         _played(router.endpoint, drive.source, config, 0.0)
         extrinsic = _solved(running, router.endpoint, SHORT_PAIRS)
         assert (extrinsic["provenance"], extrinsic["status"]) == ("estimated", "accepted")
         _check_corrected(extrinsic, PERTURBATION)
         assert _asked(router.endpoint, "health")["state"] == "healthy"
+        _check_exported(router.endpoint, tmp_path / "state", config)
         window = _check_same_by_calibrate(router.endpoint, extrinsic, tmp_path)
         (listed,) = _asked(router.endpoint, "windows")["windows"]
         assert listed["decision"] == "accepted"

@@ -14,11 +14,13 @@ from coec.schemas.keys import (
     Address,
     Claim,
     CommandSelector,
+    ExtrinsicSelector,
     HistorySelector,
     Keys,
     RangeSelector,
     Selector,
     parse_command_selector,
+    parse_extrinsic_selector,
     parse_history_selector,
     parse_range_selector,
     parse_selector,
@@ -150,3 +152,12 @@ def test_claims_of_daemons_are_read_back_and_nothing_else_is() -> None:
         assert not zenoh.KeyExpr(KEYS.alive("*")).intersects(zenoh.KeyExpr(key)), "no pair's"
         with pytest.raises(UsageError):
             Keys("coec", "other").parse_claim(key)
+
+
+def test_an_extrinsic_is_asked_for_as_a_reply_or_as_a_file() -> None:
+    assert parse_extrinsic_selector("", ("urdf",)) == ExtrinsicSelector()
+    assert parse_extrinsic_selector("format=json", ("urdf", "json")) == ExtrinsicSelector("json")
+    asked = parse_extrinsic_selector("format=urdf;parent=base_link", ("urdf", "json"))
+    assert asked == ExtrinsicSelector(export="urdf", parent="base_link")
+    with pytest.raises(UsageError, match="must be one of msgpack, json, urdf"):
+        parse_extrinsic_selector("format=cuneiform", ("urdf", "json"))

@@ -702,6 +702,68 @@ def _bench(as_json: Json = False) -> None:
     raise typer.Exit(command.run(as_json=as_json))
 
 
+@app.command("export")
+def _export(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            help="A state directory, a recorded window (.mcap), the JSON of `calibrate` or of `query extrinsic`.",
+            show_default=False,
+        ),
+    ],
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            help="tf, urdf, autoware, kalibr, kitti, kitti360, nuscenes, openlabel, colmap, opencv or json.",
+            metavar="NAME",
+            show_default=False,
+        ),
+    ],
+    parent: Annotated[str | None, typer.Option(help="Frame to write it in.", show_default="the LiDAR's")] = None,
+    child: Annotated[str | None, typer.Option(help="Frame of the camera.", show_default="the camera's")] = None,
+    parent_pose: Annotated[
+        str | None,
+        typer.Option(
+            help="Pose of the LiDAR in the parent: metres and a quaternion.",
+            metavar="X,Y,Z,QX,QY,QZ,QW",
+            show_default="the LiDAR is the parent",
+        ),
+    ] = None,
+    pair: Annotated[str | None, typer.Option(help="Which pair, where there are several.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Configuration of the daemon, for intrinsics and frames.", metavar="FILE")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write there, at once or not at all; of a file that holds others, this entry alone is changed. "
+            "Otherwise it is printed.",
+            metavar="FILE",
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Also what is not accepted; the file says so.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write a calibration into the files of other programs: exit 1 if it is not accepted."""
+    from coec.cli import export as command
+
+    options = command.Options(
+        source=source,
+        format=form,
+        parent=parent,
+        child=child,
+        parent_pose=parent_pose,
+        pair=pair,
+        config=config,
+        output=output,
+        force=force,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
 @app.command("demo")
 def _demo(
     output: Annotated[Path, typer.Option(help="Folder for pictures, window and result.", metavar="DIR")] = Path(

@@ -99,6 +99,8 @@ def run(options: Options) -> int:
         return _save_picture(options, keys, head, argument)
     with connected(options.service.connect, options.timeout_s) as session:
         key, kind = _resolve(session, options, keys)
+        if any(item.startswith("format=") for item in options.params):
+            kind = None
         replies = ask(session, _selector(key, _params(key, options)), options.timeout_s, _payload(options.payload))
     if not replies:
         raise nobody(key)

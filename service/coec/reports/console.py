@@ -42,6 +42,12 @@ def print_json(document: Any) -> None:
     sys.stdout.flush()
 
 
+def raw(text: str) -> None:
+    """What is to be a file, on standard output, as it is."""
+    sys.stdout.write(text)
+    sys.stdout.flush()
+
+
 def say(text: str) -> None:
     """A remark, as it is, on standard error."""
     err.print(Text(text), soft_wrap=True)

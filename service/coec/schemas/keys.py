@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -172,6 +173,16 @@ class Selector:
 
 
 @dataclass(frozen=True, slots=True)
+class ExtrinsicSelector:
+    """A reply, or (`export` is not None) a file of another program, between its frames or those that are named."""
+
+    format: Format = "msgpack"
+    export: str | None = None
+    parent: str | None = None
+    child: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class CommandSelector:
     """How long the sender of a command waits for its acknowledgement, ms from when the command comes to the service; no
     clock is shared. What could not be begun by then is not done."""
@@ -222,6 +233,20 @@ def parse_selector(parameters: str) -> Selector:
         UsageError: unknown, doubled or malformed parameter; names it.
     """
     return Selector(format=_format(_split(parameters, ("format",))))
+
+
+def parse_extrinsic_selector(parameters: str, exports: Collection[str]) -> ExtrinsicSelector:
+    """`format=json`, or `format=<one of exports>;parent=<frame>;child=<frame>`, each optional.
+
+    Raises:
+        UsageError: unknown, doubled or malformed parameter; names it.
+    """
+    given = _split(parameters, ("format", "parent", "child"))
+    form = given.get("format", "msgpack")
+    if form in _FORMATS or form not in exports:
+        known = ", ".join((*_FORMATS, *(name for name in exports if name not in _FORMATS)))
+        return ExtrinsicSelector(_format(given, known))
+    return ExtrinsicSelector(export=form, parent=given.get("parent"), child=given.get("child"))
 
 
 def parse_command_selector(parameters: str) -> CommandSelector:
@@ -318,8 +343,8 @@ def _integer(given: dict[str, str], name: str, default: int, low: int, high: int
     return int(text)
 
 
-def _format(given: dict[str, str]) -> Format:
+def _format(given: dict[str, str], known: str = ", ".join(_FORMATS)) -> Format:
     text = given.get("format", "msgpack")
     if text not in _FORMATS:
-        raise UsageError(f"parameter `format` must be one of {', '.join(_FORMATS)}")
+        raise UsageError(f"parameter `format` must be one of {known}")
     return _FORMATS[text]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from coec.adapters.files import durable
 from coec.errors import CoecError
 
 
@@ -22,6 +23,25 @@ def write(path: Path, data: bytes) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    return path
+
+
+def replace(path: Path, data: bytes) -> Path:
+    """Likewise, and at no moment is half of it there: for files that other programs read. One that is there keeps its
+    permissions, and a link stays one.
+
+    Raises:
+        OutputError: it cannot be written; what was there is there still.
+    """
+    try:
+        real = path.resolve()
+        real.parent.mkdir(parents=True, exist_ok=True)
+        mode = real.stat().st_mode if real.exists() else None
+        durable.replace(real, data)
+        if mode is not None:
+            real.chmod(mode)
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
     return path

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from coec.adapters.exports import FORMATS
+from coec.adapters.exports.told import Frames, NotAcceptedError
 from coec.adapters.files.conversions import result_of
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.bus import Answer
@@ -12,6 +14,7 @@ from coec.calibration.lifecycle import Health, HealthState
 from coec.calibration.types import Reason, Rig
 from coec.config import Config, PairConfig, config_hash
 from coec.errors import NotFoundError
+from coec.runtime.api.exports import exported
 from coec.runtime.api.extrinsic import extrinsic_of
 from coec.runtime.api.health import Told, health_of, reasons_of, with_troubles
 from coec.runtime.api.overlays import Overlays
@@ -114,6 +117,21 @@ class PairAnswers:
     def extrinsic(self, form: Format) -> Answer:
         """The current calibration, serialised before."""
         return self._snapshots["extrinsic"].answer(form)
+
+    def exported(self, form: str, frames: Frames) -> Answer:
+        """The current calibration as a file of another program.
+
+        Raises:
+            NotAcceptedError: it is the nominal calibration still.
+            OutputError: a frame has a name that not every format can hold.
+        """
+        camera, lidar = self._pair.camera, self._pair.lidar
+        own = (lidar.frame_id, camera.frame_id)
+        told = exported(self._known.state, self._vehicle, self.name, own, camera.intrinsics, frames)
+        if told.origin.objections:
+            raise NotAcceptedError(" ".join(told.origin.objections))
+        written = FORMATS[form]
+        return Answer(written.text(told, None).encode(), written.encoding)
 
     def health(self, form: Format) -> Answer:
         """The health, serialised at most a second ago; what is older is answered as what it is."""

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 import zenoh
 from pydantic import BaseModel
 
+from coec.adapters.exports import FORMATS
+from coec.adapters.exports.told import Frames
 from coec.adapters.zenoh.bus import Answer, Bus, Request, Route
 from coec.errors import UsageError
 from coec.runtime.api import metrics as metrics_text
@@ -19,6 +21,7 @@ from coec.schemas.keys import (
     Keys,
     parse_command_selector,
     parse_evidence_selector,
+    parse_extrinsic_selector,
     parse_history_selector,
     parse_overlay_selector,
     parse_range_selector,
@@ -101,7 +104,7 @@ class VehicleAnswers:
     def _readable(self, pair: PairAnswers) -> dict[str, Route]:
         keys, name = self._keys, pair.name
         routes = (
-            Route(keys.extrinsic(name), lambda request: pair.extrinsic(_format(request)), quick=True),
+            Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), quick=True),
             Route(keys.health(name), lambda request: pair.health(_format(request)), quick=True),
             Route(keys.history(name), lambda request: _history(pair, request), quick=False),
             Route(keys.windows(name), lambda request: _in_format(request, pair.windows), quick=False),
@@ -134,6 +137,13 @@ class VehicleAnswers:
             return answer_of(commands.carry_out(name, arguments, sender, deadline_s), chosen.format)
 
         return answer
+
+
+def _extrinsic(pair: PairAnswers, request: Request) -> Answer:
+    chosen = parse_extrinsic_selector(request.parameters, FORMATS)
+    if chosen.export is None:
+        return pair.extrinsic(chosen.format)
+    return pair.exported(chosen.export, Frames(chosen.parent, chosen.child))
 
 
 def _overlay(pair: PairAnswers, request: Request) -> Answer:

@@ -21,7 +21,7 @@ from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState
 from coec.calibration.monitor.change_detector import MonitorState
 from coec.calibration.tracker import Track, track_from_dict, track_to_dict
 from coec.calibration.types import Estimate, Matrix4, Reason, Rig
-from coec.errors import CoecError, StateError
+from coec.errors import CoecError, NotFoundError, StateError
 from coec.geometry import se3
 from coec.schemas import replies
 from coec.schemas.base import Part
@@ -29,6 +29,8 @@ from coec.schemas.replies import CalibrationResult
 
 _log = logging.getLogger(__name__)
 
+
+STATE_FILE = "state.json"
 
 Rows = tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]
 
@@ -108,7 +110,7 @@ class StateStore:
     """
 
     def __init__(self, folder: Path, vehicle: str) -> None:
-        self._file = StateFile(folder / "state.json")
+        self._file = StateFile(folder / STATE_FILE)
         self._vehicle = vehicle
         self._lock = threading.Lock()
         loaded = self._file.load()
@@ -182,6 +184,25 @@ class StateStore:
             waits=replies.Reason(code=pending.waits.code, text=pending.waits.text),
             contradicts=pending.contradicts,
         )
+
+
+def read_pairs(folder: Path) -> dict[str, tuple[StoredPair, PairState]]:
+    """What a state directory holds of every pair, for readers beside the service, or without one.
+
+    Raises:
+        NotFoundError: it holds no state file.
+        StateError: there is one, but no copy of it can be used; says why.
+    """
+    loaded = StateFile(folder / STATE_FILE).load()
+    if loaded.body is None:
+        if loaded.damage:
+            raise StateError(f"{folder / STATE_FILE} cannot be used: {'; '.join(loaded.damage)}")
+        raise NotFoundError(f"{folder} holds no {STATE_FILE}")
+    try:
+        stored = {name: StoredPair.model_validate(pair) for name, pair in loaded.body["pairs"].items()}
+        return {name: (pair, _state_of(pair)) for name, pair in stored.items()}
+    except (ValidationError, CoecError, ArithmeticError, LookupError, ValueError, TypeError, AttributeError) as error:
+        raise StateError(f"{folder / STATE_FILE} cannot be used: it has another form") from error
 
 
 def _rig_sha256(rig: Rig) -> str:

@@ -1,0 +1,46 @@
+"""An extrinsic in the files of other programs: one module a format, and the names of all.
+
+Formats that can hold more than one transform change theirs alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from coec.adapters.exports import autoware, json_files, kalibr, kitti, opencv, tf, urdf
+from coec.adapters.exports.extrinsic import Extrinsic
+
+JSON, TEXT, XML, YAML = "application/json", "text/plain", "application/xml", "application/yaml"
+
+
+class Format(NamedTuple):
+    """How a file is written.
+
+    Attributes:
+        text: what the file shall hold, given what it holds already; None where there is no file yet. Raises
+            `OutputError` where that cannot be.
+        encoding: of its text, as Zenoh names encodings.
+    """
+
+    text: Callable[[Extrinsic, str | None], str]
+    encoding: str
+
+
+FORMATS: Final[Mapping[str, Format]] = MappingProxyType(
+    {
+        "tf": Format(tf.text, TEXT),
+        "urdf": Format(urdf.text, XML),
+        "autoware": Format(autoware.text, YAML),
+        "kalibr": Format(kalibr.text, YAML),
+        "kitti": Format(kitti.raw_text, TEXT),
+        "kitti360": Format(kitti.kitti360_text, TEXT),
+        "nuscenes": Format(json_files.nuscenes_text, JSON),
+        "openlabel": Format(json_files.openlabel_text, JSON),
+        "colmap": Format(json_files.colmap_text, JSON),
+        "opencv": Format(opencv.text, YAML),
+        "json": Format(json_files.plain_text, JSON),
+    }
+)
+"""By the names that a user writes."""

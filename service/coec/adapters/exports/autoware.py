@@ -1,0 +1,30 @@
+"""Autoware's `sensor_kit_calibration.yaml`: the pose of a camera's body frame (`<camera>/camera_link`) in the kit."""
+
+from __future__ import annotations
+
+from coec.adapters.exports.blocks import set_entry
+from coec.adapters.exports.extrinsic import Extrinsic, roll_pitch_yaw, translation_m
+
+DIRECTION = (
+    "pose in the parent of the camera's body frame (x forward, y left, z up); the optical frame is the body frame "
+    "turned by the quaternion x y z w = -0.5 0.5 -0.5 0.5; rad, R = Rz(yaw) Ry(pitch) Rx(roll)"
+)
+
+
+def text(extrinsic: Extrinsic, existing: str | None) -> str:
+    """The file with this camera below its parent.
+
+    Raises:
+        OutputError: what exists cannot be changed.
+    """
+    T = extrinsic.T_parent_body
+    names = ("x", "y", "z", "roll", "pitch", "yaw")
+    values = [*translation_m(T), *roll_pitch_yaw(T)]
+    lines = [
+        *(f"# {remark}" for remark in extrinsic.remarks(DIRECTION)),
+        *(f"{name}: {value!r}" for name, value in zip(names, values, strict=True)),
+    ]
+    if existing is None:
+        rows = (f"    {line}" for line in lines)
+        return "\n".join((f"{extrinsic.parent}:", f"  {extrinsic.child}:", *rows)) + "\n"
+    return set_entry(existing, (extrinsic.parent, extrinsic.child), lines)

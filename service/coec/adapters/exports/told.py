@@ -1,0 +1,146 @@
+"""What is exported, from what the service and its commands tell: results of windows, and replies to `extrinsic`."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import coec
+from coec.adapters.exports.extrinsic import AXES, Extrinsic, Origin
+from coec.adapters.files.conversions import estimate_of, matrix_of
+from coec.adapters.files.output import OutputError
+from coec.config import CameraIntrinsics
+from coec.errors import CoecError
+from coec.geometry import se3
+from coec.schemas.replies import CalibrationResult, ExtrinsicReply
+
+FRAME = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]{0,127}")
+"""Names of frames that are words in XML, YAML, JSON and a shell alike."""
+
+NOMINAL = "It is the nominal calibration: nothing has been accepted yet."
+
+PITCH_HEIGHT, YAW_SIDE = (0, 4), (1, 3)
+"""Axes of the two correlations that a reply tells."""
+
+
+class NotAcceptedError(CoecError):
+    """A calibration that its own verdict speaks against was to be written into the files of a vehicle."""
+
+    reply_code = "not_accepted"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """Between which frames a transform is written; None: those that the pair's frames are called.
+
+    Attributes:
+        T_parent_lidar: (4, 4) pose of the LiDAR in the parent; None: the parent is the LiDAR.
+    """
+
+    parent: str | None = None
+    child: str | None = None
+    T_parent_lidar: NDArray[np.float64] | None = None
+
+
+def of_result(result: CalibrationResult, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
+    """A window's result, with its whole covariance; what its verdict says against it are the objections."""
+    objections = tuple(reason.text for reason in result.verdict.reasons)
+    origin = Origin(
+        vehicle=result.vehicle,
+        pair=result.pair,
+        version=coec.__version__,
+        provenance="estimated",
+        window_id=result.window_id,
+        data_stamp_ns=result.data_stamp_ns,
+        config_hash=result.config_hash,
+        objections=() if result.verdict.decision == "accepted" else objections or ("Its verdict is negative.",),
+    )
+    return framed(
+        matrix_of(result.camera_from_lidar),
+        estimate_of(result).uncertainty.covariance,
+        (result.lidar_frame, result.camera_frame),
+        frames,
+        camera,
+        origin,
+    )
+
+
+def of_reply(reply: ExtrinsicReply, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
+    """What a service serves, with what a reply tells of its covariance: σ of each axis, and two correlations. Nothing
+    speaks against it but that it is the nominal calibration still."""
+    served = reply.provenance != "nominal"
+    origin = Origin(
+        vehicle=reply.vehicle,
+        pair=reply.pair,
+        version=coec.__version__,
+        provenance=reply.provenance,
+        window_id=reply.window_id,
+        data_stamp_ns=reply.data_stamp_ns,
+        config_hash=reply.config_hash,
+        objections=() if served else (NOMINAL,),
+    )
+    return framed(
+        matrix_of(reply.camera_from_lidar),
+        _covariance(reply),
+        (reply.lidar_frame, reply.camera_frame),
+        frames,
+        camera,
+        origin,
+    )
+
+
+def framed(
+    T_camera_lidar: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    own: tuple[str, str],
+    frames: Frames,
+    camera: CameraIntrinsics | None,
+    origin: Origin,
+) -> Extrinsic:
+    """An extrinsic between the frames that were asked for, else between its own: those of the LiDAR and the camera.
+
+    Raises:
+        OutputError: a frame has a name that not every format can hold.
+    """
+    for name in (frames.parent or own[0], frames.child or own[1]):
+        if not FRAME.fullmatch(name):
+            raise OutputError(f"{name[:64]!a} names no frame: letters, digits and _ . / - are known to all formats")
+    return Extrinsic(
+        T_camera_lidar=T_camera_lidar,
+        covariance=covariance,
+        parent=frames.parent or own[0],
+        child=frames.child or own[1],
+        T_parent_lidar=np.eye(4) if frames.T_parent_lidar is None else frames.T_parent_lidar,
+        camera=camera,
+        origin=origin,
+    )
+
+
+def _covariance(reply: ExtrinsicReply) -> NDArray[np.float64]:
+    axes = [getattr(reply.axes, name) for name in AXES]
+    sigma = np.array(
+        [math.nan if axis.sigma is None else axis.sigma * (math.pi / 180 if axis.unit == "deg" else 1) for axis in axes]
+    )
+    covariance = np.full((6, 6), np.nan)
+    covariance[np.diag_indices(6)] = sigma**2
+    told = {PITCH_HEIGHT: reply.correlation_pitch_height, YAW_SIDE: reply.correlation_yaw_side}
+    for (one, other), correlation in told.items():
+        if correlation is not None:
+            covariance[one, other] = covariance[other, one] = correlation * sigma[one] * sigma[other]
+    return covariance
+
+
+def pose_of(text: str) -> NDArray[np.float64]:
+    """(4, 4) of ``x,y,z,qx,qy,qz,qw``: metres, and a quaternion of any length.
+
+    Raises:
+        ValueError: not seven finite numbers, or a quaternion of length zero.
+    """
+    values = [float(item) for item in text.split(",")]
+    if len(values) != 7 or not all(math.isfinite(value) for value in values):
+        raise ValueError("seven finite numbers are expected: x,y,z,qx,qy,qz,qw")
+    return se3.transform_from(se3.rotation_from_quaternion_xyzw(np.array(values[3:])), np.array(values[:3]))

@@ -1,0 +1,97 @@
+"""URDF (and xacro): a fixed joint. Format: http://wiki.ros.org/urdf/XML/joint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+from coec.adapters.exports.extrinsic import Extrinsic, roll_pitch_yaw, translation_m
+from coec.adapters.files.output import OutputError
+
+DIRECTION = "origin: pose of the child (optical: z forward) in the parent; rpy in rad, R = Rz(y) Ry(p) Rx(r)"
+
+
+@dataclass(slots=True)
+class _Joint:
+    """A joint of a document: its name, its child link, and where it stands, bytes."""
+
+    name: str
+    begin: int
+    child: str | None = None
+    end: int = 0
+
+
+@dataclass(slots=True)
+class _Found:
+    """The joints of a document, and where its root ends."""
+
+    joints: list[_Joint] = field(default_factory=list)
+    open: list[str] = field(default_factory=list)
+    root_end: int = 0
+
+
+def text(extrinsic: Extrinsic, existing: str | None) -> str:
+    """The robot with this joint: in the place of the one that has the same child link, else as the last.
+
+    Raises:
+        OutputError: what exists is no XML.
+    """
+    if existing is None:
+        joint = _joint(extrinsic, f"{extrinsic.child}_joint")
+        links = "".join(f"  <link name={quoteattr(name)}/>\n" for name in (extrinsic.parent, extrinsic.child))
+        return f'<?xml version="1.0"?>\n<robot name="{_ROBOT}">\n{links}  {joint}\n</robot>\n'
+    data = existing.encode()
+    found = _joints(data)
+    same = next((joint for joint in found.joints if joint.child == extrinsic.child), None)
+    if same is None:
+        fresh = _joint(extrinsic, f"{extrinsic.child}_joint").encode()
+        return (data[: found.root_end] + b"  " + fresh + b"\n" + data[found.root_end :]).decode()
+    return (data[: same.begin] + _joint(extrinsic, same.name).encode() + data[same.end :]).decode()
+
+
+_ROBOT = "vehicle"
+"""Name of a robot that has none yet."""
+
+
+def _joint(extrinsic: Extrinsic, name: str) -> str:
+    xyz = " ".join(repr(value) for value in translation_m(extrinsic.T_parent_child))
+    rpy = " ".join(repr(value) for value in roll_pitch_yaw(extrinsic.T_parent_child))
+    # Two hyphens in a row end a comment.
+    remarks = "".join(f"    <!-- {remark.replace('--', '- -')} -->\n" for remark in extrinsic.remarks(DIRECTION))
+    return (
+        f'<joint name={quoteattr(name)} type="fixed">\n'
+        f"{remarks}"
+        f"    <parent link={quoteattr(extrinsic.parent)}/>\n"
+        f"    <child link={quoteattr(extrinsic.child)}/>\n"
+        f'    <origin xyz="{xyz}" rpy="{rpy}"/>\n'
+        "  </joint>"
+    )
+
+
+def _joints(data: bytes) -> _Found:
+    parser = expat.ParserCreate(encoding="utf-8")
+    found = _Found()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        # A joint stands below the root, or in a macro of xacro; one in a transmission has no child.
+        if tag == "joint":
+            found.joints.append(_Joint(attributes.get("name", ""), parser.CurrentByteIndex))
+        elif tag == "child" and found.open[-1:] == ["joint"]:
+            found.joints[-1].child = attributes.get("link")
+        found.open.append(tag)
+
+    def end(tag: str) -> None:
+        found.open.pop()
+        if tag == "joint":
+            closing = data.index(b">", parser.CurrentByteIndex) + 1
+            found.joints[-1].end = closing
+        if not found.open:
+            found.root_end = parser.CurrentByteIndex
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise OutputError(f"the file is no XML: {error}") from error
+    return found

@@ -1,0 +1,154 @@
+"""`coec export`: a calibration in the files of other programs."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from coec.adapters.exports import FORMATS
+from coec.adapters.exports.extrinsic import Extrinsic
+from coec.adapters.exports.told import Frames, NotAcceptedError, of_reply, of_result, pose_of
+from coec.adapters.files import output
+from coec.adapters.files.rig import intrinsics_config
+from coec.adapters.mcap.windows import read_result, read_window
+from coec.calibration.types import Matrix4
+from coec.config import CameraIntrinsics, Config, PairConfig, load_config
+from coec.errors import DecodeError, SourceError, UsageError
+from coec.reports import console
+from coec.runtime.api.exports import exported
+from coec.runtime.decisions.state_store import STATE_FILE, read_pairs
+from coec.schemas.base import from_json
+from coec.schemas.replies import CalibrationResult, ExtrinsicReply
+from coec.sources.reading import read_bytes
+
+MAX_BYTES = 64 * 2**20
+"""Of a file that is read, or of another program's that is changed: a robot's URDF has below one million."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    source: Path
+    format: str
+    parent: str | None
+    child: str | None
+    parent_pose: str | None
+    pair: str | None
+    config: Path | None
+    output: Path | None
+    force: bool
+    as_json: bool
+
+
+def run(options: Options) -> int:
+    """Writes the file, or prints it.
+
+    Raises:
+        UsageError: no such format, or an option that does not fit.
+        SourceError, WindowError, StateError: the source cannot be read, or holds no calibration.
+        NotAcceptedError: it is not accepted, and `--force` was not given.
+        OutputError: the file cannot be written, or what it holds cannot be changed.
+    """
+    if options.format not in FORMATS:
+        raise UsageError(f"--format {options.format}: known are {', '.join(FORMATS)}")
+    extrinsic = _read(options)
+    if extrinsic.origin.objections and not options.force:
+        raise NotAcceptedError(
+            f"{options.source}: not accepted: {' '.join(extrinsic.origin.objections)} "
+            "`--force` exports it all the same, and says so in the file."
+        )
+    text = FORMATS[options.format].text(extrinsic, None if options.output is None else _held(options.output))
+    if options.output is not None:
+        output.replace(options.output, text.encode())
+    if options.as_json:
+        written = None if options.output is None else str(options.output)
+        console.print_json({"format": options.format, "text": text, "written": written})
+    elif options.output is None:
+        console.raw(text)
+    else:
+        console.show(f"{options.output}  {extrinsic.child} in {extrinsic.parent}, {extrinsic.origin.provenance}")
+    return 0
+
+
+def _held(path: Path) -> str | None:
+    """What is in the file that is to be changed; None where there is none.
+
+    Raises:
+        SourceError: it cannot be read, or is no text.
+    """
+    if not path.exists():
+        return None
+    try:
+        return read_bytes(path, MAX_BYTES).decode()
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{path} is no text in UTF-8: it cannot be changed") from error
+
+
+def _read(options: Options) -> Extrinsic:
+    config = None if options.config is None else load_config(options.config)
+    frames = Frames(options.parent, options.child, _pose(options.parent_pose))
+    source = options.source
+    if source.is_dir() or source.name == STATE_FILE:
+        return _of_state(source if source.is_dir() else source.parent, options.pair, config, frames)
+    if source.suffix == ".mcap":
+        return _of_window(source, frames)
+    return _of_document(source, None if config is None else _pair_of(config, options.pair).camera.intrinsics, frames)
+
+
+def _of_window(path: Path, frames: Frames) -> Extrinsic:
+    result = read_result(path)
+    if result is None:
+        raise SourceError(f"{path} holds no result: `coec calibrate {path} --output DIR` makes one")
+    window, _ = read_window(path)
+    return of_result(result, intrinsics_config(window.rig.camera), frames)
+
+
+def _of_document(path: Path, camera: CameraIntrinsics | None, frames: Frames) -> Extrinsic:
+    data = read_bytes(path, MAX_BYTES)
+    with suppress(DecodeError):
+        return of_result(from_json(CalibrationResult, data), camera, frames)
+    with suppress(DecodeError):
+        return of_reply(from_json(ExtrinsicReply, data), camera, frames)
+    raise SourceError(
+        f"{path} is neither the result of `coec calibrate --json` nor a reply of `coec query extrinsic --json`, nor a "
+        "state directory, nor a window (.mcap)"
+    )
+
+
+def _of_state(folder: Path, name: str | None, config: Config | None, frames: Frames) -> Extrinsic:
+    """What the service of a state directory serves, with its whole covariance."""
+    pairs = read_pairs(folder)
+    if name is None and len(pairs) != 1:
+        raise UsageError(f"{folder} holds the pairs {', '.join(sorted(pairs))}: choose one with --pair")
+    chosen = next(iter(pairs)) if name is None else name
+    if chosen not in pairs:
+        raise UsageError(f"{folder} holds no pair {chosen}; it holds {', '.join(sorted(pairs))}")
+    stored, state = pairs[chosen]
+    if config is not None:
+        pair = _pair_of(config, chosen)
+        own = (pair.lidar.frame_id, pair.camera.frame_id)
+        return exported(state, config.vehicle, chosen, own, pair.camera.intrinsics, frames)
+    if stored.accepted is None:
+        raise UsageError(f"{folder}: nothing was accepted yet; --config says which frames the nominal calibration has")
+    own = (stored.accepted.lidar_frame, stored.accepted.camera_frame)
+    return exported(state, stored.accepted.vehicle, chosen, own, None, frames)
+
+
+def _pair_of(config: Config, name: str | None) -> PairConfig:
+    pairs = {pair.name: pair for pair in config.pairs}
+    if name is None and len(pairs) == 1:
+        return config.pairs[0]
+    if name not in pairs:
+        raise UsageError(f"--pair: the configuration has the pairs {', '.join(pairs)}; choose one")
+    return pairs[name]
+
+
+def _pose(text: str | None) -> Matrix4 | None:
+    if text is None:
+        return None
+    try:
+        return pose_of(text)
+    except ValueError as error:
+        raise UsageError(f"--parent-pose {text}: {error}") from error
