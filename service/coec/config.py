@@ -94,7 +94,13 @@ class LidarConfig(Stage):
     """LiDAR stream of a pair."""
 
     key: KeyExpression
-    frame_id: str = Field(default="lidar", max_length=128, description="frames of another id are refused")
+    frame_id: str = Field(default="lidar", max_length=128, description="of the LiDAR; clouds of another id are refused")
+    T_cloud_lidar: Matrix4x4 = Field(
+        default=IDENTITY, description="pose of the LiDAR in the frame in which its driver gives the points"
+    )
+    cloud_frame_id: str | None = Field(
+        default=None, max_length=128, description="of the clouds as they come, where it is not that of the LiDAR"
+    )
     encoding: Encoding = "msgpack"
     sweep: SweepConfig | None = Field(default=None, description="needed for clouds without per-point time")
 

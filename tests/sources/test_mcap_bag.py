@@ -155,6 +155,19 @@ def test_a_bag_is_read_by_sensor_time_with_its_rig_from_the_bag(tmp_path: Path, 
     assert {m.frame_id for m in messages if isinstance(m, EgoMotion)} == {"base"}
 
 
+def test_a_cloud_in_the_vehicles_frame_is_taken_back_to_the_lidars(tmp_path: Path) -> None:
+    drive = a_drive(tree=[a_joint("lidar", "roof", T_BASE_LIDAR), *TREE])
+    recording = open_source(f"{Bag(drive).write(tmp_path / 'b.mcap')}?lidar_frame=roof")
+    assert recording.rig.lidar_frame == "roof"
+    T_camera_roof = se3.inverse(T_BASE_MOUNT @ T_MOUNT_OPTICAL) @ T_BASE_LIDAR @ T_BASE_LIDAR
+    np.testing.assert_allclose(recording.rig.T_camera_lidar_nominal, T_camera_roof, atol=1e-12)
+    sweep = next(m for m in recording.messages() if isinstance(m, LidarFrame))
+    measured_m = se3.inverse(T_BASE_LIDAR) @ [1.0, 1.0, 1.0, 1.0]
+    np.testing.assert_allclose(sweep.xyz_m[0], measured_m[:3], atol=1e-6)
+    with pytest.raises(SourceError, match="/tf_static does not connect 'lidar' and 'cellar'"):
+        open_source(f"{tmp_path / 'b.mcap'}?lidar_frame=cellar")
+
+
 def test_a_bag_without_chunks(tmp_path: Path) -> None:
     path = Bag(a_drive(), chunking=False).write(tmp_path / "bag.mcap")
     assert len(list(open_source(str(path)).messages())) == 4 + 8 + 20

@@ -153,6 +153,19 @@ class SweepTiming:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CloudFrame:
+    """The frame in which a driver gives points that were measured from elsewhere.
+
+    Attributes:
+        frame_id: of the clouds as they come.
+        T_cloud_lidar: (4, 4) pose of the LiDAR in it, metres.
+    """
+
+    frame_id: str
+    T_cloud_lidar: Matrix4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Rig:
     """What is known of one camera-LiDAR pair before the first frame.
 
@@ -164,6 +177,7 @@ class Rig:
         mask: (height, width) bool or None; False = ignore this pixel (vehicle body, outside the lens).
         sweep: azimuth timing, or None when unknown or when the clouds carry per-point time.
         camera_residual_px: what `camera` misses of the lens that it was fitted to, at most, pixels.
+        cloud: in which frame the LiDAR's driver gives its points; None: in the LiDAR's own.
     """
 
     pair: str
@@ -175,6 +189,7 @@ class Rig:
     mask: NDArray[np.bool_] | None = None
     sweep: SweepTiming | None = None
     camera_residual_px: float = 0.0
+    cloud: CloudFrame | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,6 +28,10 @@ def extrinsic(payload: bytes) -> None:
     _axes(reply.axes)
     for row in reply.camera_from_lidar.matrix:
         console.show("  " + "  ".join(f"{value:+.6f}" for value in row))
+    if reply.camera_from_cloud is not None:
+        console.show(f"for points as the driver gives them, in {reply.cloud_frame}:")
+        for row in reply.camera_from_cloud.matrix:
+            console.show("  " + "  ".join(f"{value:+.6f}" for value in row))
     if reply.held:
         console.show("held by command: nothing is applied", "bold yellow")
     if reply.pending is not None:

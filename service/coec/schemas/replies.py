@@ -187,6 +187,12 @@ class ExtrinsicReply(Message):
     camera_frame: str
     lidar_frame: str
     camera_from_lidar: Transform = Field(description="current; an unaccepted estimate is never served here")
+    cloud_frame: str | None = Field(
+        default=None, description="frame in which the driver gives the points; null where it is `lidar_frame`"
+    )
+    camera_from_cloud: Transform | None = Field(
+        default=None, description="the same calibration for points in `cloud_frame`; null where that is `lidar_frame`"
+    )
     provenance: Provenance = Field(description="where `camera_from_lidar` comes from")
     status: Status = Field(description="of the latest attempt; not_accepted before the first")
     percent_complete: float = Field(ge=0, le=100, description="of the open window")

@@ -17,8 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.images.codec import encode_depth_png, probe, raw_image
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, Rig
-from coec.config import CameraIntrinsics, LimitsConfig, Matrix4x4, Name, describe, load_yaml
+from coec.calibration.frames.origin import apparent_origin, from_origin
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
+from coec.config import IDENTITY, CameraIntrinsics, LimitsConfig, Matrix4x4, Name, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.sources.clouds import load_cloud
 from coec.sources.kitti_files import load_image
@@ -66,6 +67,9 @@ class ManifestDocument(_Strict):
     camera: CameraIntrinsics
     mask: Path | None = None
     T_camera_lidar: Matrix4x4
+    T_cloud_lidar: Matrix4x4 = Field(
+        default=IDENTITY, description="pose of the LiDAR in the frame in which the points are given"
+    )
     frames: tuple[FrameDocument, ...] = Field(min_length=1)
 
 
@@ -84,6 +88,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         document = ManifestDocument.model_validate(load_yaml(path))
         camera = camera_of(document.camera)
         T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
+        T_cloud_lidar = rigid_matrix(document.T_cloud_lidar, "T_cloud_lidar")
         mask = None if document.mask is None else load_mask(path.parent / document.mask, camera)
     except ValidationError as error:
         raise SourceError(f"{path}: {describe(error)}") from error
@@ -111,7 +116,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         f"{path.parent.name}/{document.pair}",
         rig,
         T_camera_lidar,
-        tuple(_recorded(path.parent, frame, scale) for frame in frames),
+        tuple(_recorded(path.parent, frame, scale, T_cloud_lidar) for frame in frames),
         tuple(motions),
     )
 
@@ -132,14 +137,22 @@ def _cloud_stamp_ns(frame: FrameDocument) -> int:
     return frame.stamp_ns if frame.cloud_stamp_ns is None else frame.cloud_stamp_ns
 
 
-def _recorded(folder: Path, frame: FrameDocument, scale: _DepthScale) -> RecordedFrame:
+def _recorded(folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: Matrix4) -> RecordedFrame:
     cloud_stamp_ns = _cloud_stamp_ns(frame)
     return RecordedFrame(
         frame.stamp_ns,
         partial(_load_camera, folder, frame, scale),
         cloud_stamp_ns,
-        partial(load_cloud, cloud_stamp_ns, LIDAR_FRAME, folder / frame.cloud),
+        partial(_load_lidar, folder / frame.cloud, cloud_stamp_ns, T_cloud_lidar),
     )
+
+
+def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: Matrix4) -> LidarFrame:
+    sweep = from_origin(load_cloud(stamp_ns, LIDAR_FRAME, path), T_cloud_lidar, LIDAR_FRAME)
+    contradiction = apparent_origin(sweep)
+    if contradiction is not None:
+        raise SourceError(f"{path}: {contradiction.sentence} State the LiDAR's pose there as `T_cloud_lidar`.")
+    return sweep
 
 
 def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> CameraFrame:

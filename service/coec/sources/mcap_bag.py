@@ -23,7 +23,8 @@ from coec.adapters.mcap.files import Channel, McapDamaged, MessageReader, Schema
 from coec.adapters.mcap.files import Message as McapMessage
 from coec.adapters.mcap.windows import is_window, read_window
 from coec.adapters.ros import cdr
-from coec.calibration.types import CameraFrame, FramePair, Matrix4, Rig
+from coec.calibration.frames.origin import apparent_origin, from_origin
+from coec.calibration.types import CameraFrame, FramePair, LidarFrame, Matrix4, Rig
 from coec.config import CalibrationConfig, CameraIntrinsics, LimitsConfig, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.geometry import cameras
@@ -62,19 +63,20 @@ class RigFile(BaseModel):
 
 
 def open_mcap(spec: SourceSpec) -> Recording:
-    """`FILE.mcap[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC]`.
+    """`FILE.mcap[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]`.
 
     Without a query, a recorded window is opened as such. In any other bag topics are found by their type where there is
     only one of it. Intrinsics come from the `CameraInfo` of the camera's frame (or of the topic named), or from a YAML
     file; the extrinsic from that file, else from `/tf_static`, over any number of joints. Where `/tf_static` does not
-    lead to the frame of the odometry, its twist is taken as the LiDAR's own.
+    lead to the frame of the odometry, its twist is taken as the LiDAR's own. Points that a driver gives in another
+    frame than the LiDAR's (`base_link`) are taken back to it where `lidar_frame` names it and `/tf_static` leads there.
 
     Raises:
         UsageError: unknown query key.
         SourceError: not MCAP, cut off or damaged; no topic, or several, of a type; no intrinsics, no extrinsic.
         WindowError: a recorded window that is damaged.
     """
-    query = spec.only("camera", "points", "odometry", "intrinsics")
+    query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame")
     if not query and is_window(spec.path):
         return _window_recording(spec.path)
     index = _index(spec.path)
@@ -89,8 +91,13 @@ def open_mcap(spec: SourceSpec) -> Recording:
     with spec.path.open("rb") as stream:
         reader = MessageReader(stream)
         firsts = {kind: _load(spec.path, reader, places[0]) for kind, places in streams.items() if places}
-    rig = _rig(spec, index, query.get("intrinsics"), firsts)
-    return BagRecording(f"{spec.path.name}{camera_topic}", rig, rig.T_camera_lidar_nominal, spec.path, streams)
+    lidar_frame = query.get("lidar_frame", firsts[_LIDAR].frame_id)
+    T_cloud_lidar = index.transform(firsts[_LIDAR].frame_id.lstrip("/"), lidar_frame.lstrip("/"))
+    if T_cloud_lidar is None:
+        raise SourceError(f"{spec.path}: /tf_static does not connect {firsts[_LIDAR].frame_id!r} and {lidar_frame!r}")
+    rig = _rig(spec, index, query.get("intrinsics"), firsts, lidar_frame)
+    name = f"{spec.path.name}{camera_topic}"
+    return BagRecording(name, rig, rig.T_camera_lidar_nominal, spec.path, streams, T_cloud_lidar)
 
 
 def _window_recording(path: Path) -> FramewiseRecording:
@@ -127,6 +134,7 @@ class BagRecording:
     Attributes:
         path: the bag.
         streams: places of the messages by kind, ascending by stamp.
+        T_cloud_lidar: (4, 4) pose of the LiDAR in the frame in which the points are given.
     """
 
     name: str
@@ -134,6 +142,7 @@ class BagRecording:
     T_camera_lidar_start: Matrix4
     path: Path
     streams: dict[int, list[_Place]]
+    T_cloud_lidar: Matrix4
     configuration: CalibrationConfig | None = None
 
     @property
@@ -156,7 +165,18 @@ class BagRecording:
         with self.path.open("rb") as stream:
             reader = MessageReader(stream)
             for _, _, place in sorted(queue):
-                yield _load(self.path, reader, place)
+                message = _load(self.path, reader, place)
+                yield self._from_origin(message) if isinstance(message, LidarFrame) else message
+
+    def _from_origin(self, cloud: LidarFrame) -> LidarFrame:
+        sweep = from_origin(cloud, self.T_cloud_lidar, self.rig.lidar_frame)
+        contradiction = apparent_origin(sweep)
+        if contradiction is not None:
+            raise SourceError(
+                f"{self.path}: {contradiction.sentence} Name the LiDAR's frame with ?lidar_frame=..., if /tf_static "
+                "has it."
+            )
+        return sweep
 
 
 def _load(path: Path, reader: MessageReader, place: _Place) -> Message:
@@ -292,8 +312,10 @@ def _header_stamp_ns(data: bytes) -> int | None:
 # --- its rig --------------------------------------------------------------------------------------------------
 
 
-def _rig(spec: SourceSpec, index: _Index, intrinsics: str | None, firsts: dict[int, Message]) -> Rig:
-    camera_frame, lidar_frame = firsts[_CAMERA].frame_id.lstrip("/"), firsts[_LIDAR].frame_id.lstrip("/")
+def _rig(
+    spec: SourceSpec, index: _Index, intrinsics: str | None, firsts: dict[int, Message], lidar_frame_id: str
+) -> Rig:
+    camera_frame, lidar_frame = firsts[_CAMERA].frame_id.lstrip("/"), lidar_frame_id.lstrip("/")
     mask = None
     T_camera_lidar = index.transform(camera_frame, lidar_frame)
     try:
@@ -327,7 +349,7 @@ def _rig(spec: SourceSpec, index: _Index, intrinsics: str | None, firsts: dict[i
         pair=re.sub(r"[^A-Za-z0-9_.-]", "_", spec.path.stem)[:64],
         camera=camera,
         camera_frame=firsts[_CAMERA].frame_id,
-        lidar_frame=firsts[_LIDAR].frame_id,
+        lidar_frame=lidar_frame_id,
         T_camera_lidar_nominal=T_camera_lidar,
         T_lidar_ego=np.eye(4) if T_lidar_ego is None else T_lidar_ego,
         mask=mask,

@@ -45,6 +45,16 @@ def test_a_configuration_becomes_a_rig(tmp_path: Path) -> None:
     assert np.array_equal(rig.mask, mask > 0)
 
 
+def test_the_frame_of_the_clouds_is_told_where_it_is_another() -> None:
+    assert rig_of(a_config()).cloud is None
+    rig = rig_of(a_config(lidar=LidarConfig(key="k", cloud_frame_id="base_link", T_cloud_lidar=T)))
+    assert rig.cloud is not None
+    assert (rig.cloud.frame_id, rig.lidar_frame) == ("base_link", "lidar")
+    back = rig_from_json(rig_to_json(rig), None).cloud
+    assert back is not None
+    assert np.array_equal(back.T_cloud_lidar, np.array(T))
+
+
 def test_a_mask_in_colour_ignores_only_what_is_black(tmp_path: Path) -> None:
     mask = np.zeros((30, 40, 3), np.uint8)
     mask[:10, :, 2] = 1

@@ -27,6 +27,7 @@ from coec.config import (
 )
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
 from coec.runtime.ingest.inbox import Call, Inbox, Parcel
+from sweeps import ROOF, a_sweep, in_frame
 
 MSGPACK, CDR = "application/msgpack", "application/cdr"
 PAIR = PairConfig(
@@ -52,9 +53,9 @@ def camera(sequence: int | None = None, frame_id: str = "camera", width: int = 4
 class Desk:
     """An intake and what it lost."""
 
-    def __init__(self) -> None:
+    def __init__(self, pair: PairConfig = PAIR) -> None:
         self.losses = LossCounter(logging.getLogger("test"), "front")
-        self.intake = Decoder(PAIR, LimitsConfig(), self.losses)
+        self.intake = Decoder(pair, LimitsConfig(), self.losses)
         self._order = itertools.count()
 
     def take(self, stream: str, payload: bytes, encoding: str = "zenoh/bytes") -> object:
@@ -74,6 +75,29 @@ def test_the_samples_encoding_is_believed(desk: Desk) -> None:
     assert isinstance(desk.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK), LidarFrame)
     assert isinstance(desk.take(EGO, cdr.encode_odometry(MOTION, "base"), CDR), EgoMotion)
     assert not desk.losses.snapshot()
+
+
+def test_clouds_in_another_frame_come_back_to_the_lidars() -> None:
+    T = ((0.0, -1.0, 0.0, 1.0), (1.0, 0.0, 0.0, 2.0), (0.0, 0.0, 1.0, 3.0), (0.0, 0.0, 0.0, 1.0))
+    lidar = LidarConfig(key="l", cloud_frame_id="base_link", T_cloud_lidar=T)
+    desk = Desk(PAIR.model_copy(update={"lidar": lidar}))
+    in_base = LidarFrame(5, "base_link", np.array([[1.0, 3.0, 4.0]], np.float32))
+    frame = desk.take(LIDAR, msgpack_frames.encode_lidar(in_base), MSGPACK)
+    assert isinstance(frame, LidarFrame)
+    assert frame.frame_id == "lidar"
+    np.testing.assert_array_equal(frame.xyz_m, [[1.0, 0.0, 1.0]])
+    assert desk.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK) is None, "no frame of the configuration"
+
+
+@pytest.mark.fault(
+    "a cloud in the vehicle's frame, its origin not stated",
+    "refused as `cloud_origin`, and the log says from where it looks measured",
+)
+def test_a_cloud_that_contradicts_its_origin_is_refused(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+    cloud = replace(in_frame(a_sweep(), ROOF), frame_id="lidar")
+    assert desk.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is None
+    assert desk.losses.snapshot() == {(LIDAR, "cloud_origin"): 1}
+    assert "look measured from" in caplog.text
 
 
 def test_else_the_configurations(desk: Desk) -> None:

@@ -11,8 +11,17 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coec.adapters.images.codec import decode_bgr, encode_png, probe
-from coec.calibration.types import Matrix4, Rig, SweepTiming
-from coec.config import CameraIntrinsics, LimitsConfig, Matrix4x4, PairConfig, SweepConfig, describe
+from coec.calibration.types import CloudFrame, Matrix4, Rig, SweepTiming
+from coec.config import (
+    IDENTITY,
+    CameraIntrinsics,
+    LidarConfig,
+    LimitsConfig,
+    Matrix4x4,
+    PairConfig,
+    SweepConfig,
+    describe,
+)
 from coec.errors import ConfigError, DecodeError, WindowError
 from coec.geometry import cameras, se3
 
@@ -27,6 +36,15 @@ class SweepDocument(BaseModel):
     stamp_azimuth_rad: float
 
 
+class CloudDocument(BaseModel):
+    """`CloudFrame`."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    frame_id: str
+    T_cloud_lidar: Matrix4x4
+
+
 class RigDocument(BaseModel):
     """`rig.json`: everything of a `Rig` but its mask. Floats are written so that they read back to the same bits."""
 
@@ -39,6 +57,7 @@ class RigDocument(BaseModel):
     T_camera_lidar_nominal: Matrix4x4
     T_lidar_ego: Matrix4x4
     sweep: SweepDocument | None = None
+    cloud: CloudDocument | None = None
 
 
 def rig_of(pair: PairConfig) -> Rig:
@@ -59,6 +78,7 @@ def rig_of(pair: PairConfig) -> Rig:
         T_lidar_ego=np.eye(4) if ego is None else rigid_matrix(ego.T_lidar_ego, f"pair {pair.name}, ego.T_lidar_ego"),
         mask=None if pair.camera.mask is None else load_mask(pair.camera.mask, camera),
         sweep=None if pair.lidar.sweep is None else _sweep(pair.lidar.sweep),
+        cloud=_cloud(pair.lidar, f"pair {pair.name}, lidar.T_cloud_lidar"),
     )
 
 
@@ -139,6 +159,9 @@ def rig_to_json(rig: Rig) -> dict[str, Any]:
             sign=1 if rig.sweep.sign > 0 else -1,
             stamp_azimuth_rad=rig.sweep.stamp_azimuth_rad,
         ),
+        cloud=None
+        if rig.cloud is None
+        else CloudDocument(frame_id=rig.cloud.frame_id, T_cloud_lidar=matrix_rows(rig.cloud.T_cloud_lidar)),
     )
     return document.model_dump(mode="json", exclude_none=True)
 
@@ -164,6 +187,9 @@ def rig_from_json(document: object, mask_png: bytes | None) -> Rig:
             sweep=None
             if parsed.sweep is None
             else SweepTiming(parsed.sweep.period_s, parsed.sweep.sign, parsed.sweep.stamp_azimuth_rad),
+            cloud=None
+            if parsed.cloud is None
+            else CloudFrame(parsed.cloud.frame_id, rigid_matrix(parsed.cloud.T_cloud_lidar, "T_cloud_lidar")),
         )
     except ValidationError as error:
         raise WindowError(f"the rig is damaged: {describe(error)}") from error
@@ -182,6 +208,12 @@ def _camera(intrinsics: CameraIntrinsics, where: str) -> cameras.Camera:
         return cameras.build(intrinsics.model, **intrinsics.parameters())
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from error
+
+
+def _cloud(lidar: LidarConfig, where: str) -> CloudFrame | None:
+    if lidar.cloud_frame_id is None and lidar.T_cloud_lidar == IDENTITY:
+        return None
+    return CloudFrame(lidar.cloud_frame_id or lidar.frame_id, rigid_matrix(lidar.T_cloud_lidar, where))
 
 
 def _sweep(sweep: SweepConfig) -> SweepTiming:

@@ -12,6 +12,7 @@ from coec.adapters.files.conversions import number_or_null, transform_of
 from coec.calibration.lifecycle import PairState, Status
 from coec.calibration.lifecycle.policy import step_between
 from coec.calibration.types import Rig, Uncertainty
+from coec.geometry import se3
 from coec.schemas import replies
 from coec.schemas.replies import CalibrationResult
 
@@ -50,13 +51,17 @@ def extrinsic_of(
     config_hash: str,
 ) -> replies.ExtrinsicReply:
     """What to use now. `accepted` is `state.accepted` in its wire form; `config_hash` is said while there is none."""
-    of = uncertainty_of_served(state)
+    of, cloud = uncertainty_of_served(state), rig.cloud
     return replies.ExtrinsicReply(
         vehicle=vehicle,
         pair=rig.pair,
         camera_frame=rig.camera_frame,
         lidar_frame=rig.lidar_frame,
         camera_from_lidar=transform_of(state.T_camera_lidar),
+        cloud_frame=None if cloud is None else cloud.frame_id,
+        camera_from_cloud=None
+        if cloud is None
+        else transform_of(state.T_camera_lidar @ se3.inverse(cloud.T_cloud_lidar)),
         provenance=state.provenance.value,
         status=state.status.value,
         percent_complete=percent_complete,

@@ -6,9 +6,12 @@ import logging
 from collections import Counter
 from dataclasses import dataclass
 
+import numpy as np
+
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import cdr
 from coec.adapters.system.logs import LossCounter
+from coec.calibration.frames.origin import OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import LimitsConfig, PairConfig
 from coec.errors import DecodeError
@@ -19,6 +22,9 @@ _log = logging.getLogger(__name__)
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+
+CLOUD_ORIGIN = "cloud_origin"
+"""Cause of a loss: the points were not measured from where the configuration says."""
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 
@@ -41,6 +47,8 @@ class Decoder:
         self._numbers: dict[str, SequenceNumbers] = {}
         self._received: Counter[str] = Counter()
         self._accepted: Counter[str] = Counter()
+        self._T_cloud_lidar = np.array(pair.lidar.T_cloud_lidar, dtype=np.float64)
+        self._origin = OriginCheck()
 
     def counts(self, stream: str) -> StreamCounts:
         """Counters of a stream since the start."""
@@ -53,10 +61,9 @@ class Decoder:
         try:
             if len(parcel.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
-            frame = self._decode(parcel)
-            self._check(stream, frame)
+            frame = self._checked(stream, self._decode(parcel))
         except DecodeError as error:
-            self._losses.add(stream, error.reason)
+            self._losses.add(stream, error.reason, detail=str(error) if error.reason == CLOUD_ORIGIN else "")
             return None
         except Exception:
             # A fault of a decoder must cost the message, not the service.
@@ -93,14 +100,25 @@ class Decoder:
             return POINT_CLOUD
         return self._pair.ego.type
 
-    def _check(self, stream: str, frame: Frame) -> None:
+    def _checked(self, stream: str, frame: Frame) -> Frame:
         expected = {CAMERA: CameraFrame, LIDAR: LidarFrame, EGO: EgoMotion}[stream]
         if not isinstance(frame, expected):
             raise DecodeError("wrong_type", f"a {type(frame).__name__} on the {stream} stream")
         if isinstance(frame, CameraFrame):
             self._check_camera(frame)
-        elif isinstance(frame, LidarFrame) and frame.frame_id != self._pair.lidar.frame_id:
+        elif isinstance(frame, LidarFrame):
+            return self._from_origin(frame)
+        return frame
+
+    def _from_origin(self, cloud: LidarFrame) -> LidarFrame:
+        """The sweep in the LiDAR's own frame, from which its ranges must have been measured."""
+        if cloud.frame_id != (self._pair.lidar.cloud_frame_id or self._pair.lidar.frame_id):
             raise DecodeError("frame_id", "not the frame id of the configuration")
+        sweep = from_origin(cloud, self._T_cloud_lidar, self._pair.lidar.frame_id)
+        contradiction = self._origin.look(sweep)
+        if contradiction is not None:
+            raise DecodeError(CLOUD_ORIGIN, f"{contradiction.sentence} See lidar.T_cloud_lidar.")
+        return sweep
 
     def _check_camera(self, frame: CameraFrame) -> None:
         camera = self._pair.camera
