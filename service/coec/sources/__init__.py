@@ -38,12 +38,12 @@ def open_source(spec: str) -> Recording:
 def _open_path(spec: SourceSpec) -> Recording:
     if not spec.path.exists():
         raise SourceError(f"{spec.path} does not exist\n{FORMS}")
-    if spec.path.suffix == ".mcap" and spec.path.is_file():
-        from coec.sources.mcap_bag import open_mcap
+    if spec.path.suffix in (".mcap", ".db3") or (spec.path / "metadata.yaml").is_file():
+        from coec.sources.bag.recording import open_bag
 
-        return open_mcap(spec)
+        return open_bag(spec)
     if spec.path.is_dir() or spec.path.suffix in (".yaml", ".yml"):
         from coec.sources.manifest import open_manifest
 
         return open_manifest(spec)
-    raise UsageError(f"{spec.path} is neither a folder nor an .mcap, .yaml or .yml file\n{FORMS}")
+    raise UsageError(f"{spec.path} is neither a folder nor an .mcap, .db3, .yaml or .yml file\n{FORMS}")

@@ -1,0 +1,156 @@
+"""What is in a bag: one pass that verifies it, and notes where each frame lies and what its header's stamp is.
+
+The header stamp is the sensor's time; the recorder's is not looked at.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from coec.adapters.ros import cdr
+from coec.calibration.types import Matrix4
+from coec.errors import SourceError
+from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
+from coec.sources.bag.storage import Entry, Storage
+
+IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
+CLOUD_TYPES = (cdr.POINT_CLOUD,)
+MOTION_TYPES = (cdr.ODOMETRY, cdr.TWIST)
+
+_STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+_HEADER = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
+"""`std_msgs/Header.stamp` (sec, nanosec), with which every type above begins, by the byte order of the message."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Place:
+    """Where a message lies, ordered by the stamp of its header, and where that is the same as they lie in the bag."""
+
+    stamp_ns: int
+    at: tuple[int, ...]
+    type_name: str = field(compare=False)
+
+
+@dataclass(slots=True)
+class Stream:
+    """The frames of a topic."""
+
+    type_name: str
+    places: list[Place] = field(default_factory=list)
+
+    def ordered(self) -> list[Place]:
+        """By their stamps."""
+        return sorted(self.places)
+
+
+@dataclass(slots=True)
+class Index:
+    """One pass over a bag.
+
+    Attributes:
+        streams: frames by topic.
+        infos: the first camera info of each topic.
+        parents: static transforms: T_neighbour_frame (4, 4) by frame and neighbour.
+    """
+
+    path: Path
+    streams: dict[str, Stream] = field(default_factory=dict)
+    infos: dict[str, Any] = field(default_factory=dict)
+    parents: dict[str, dict[str, Matrix4]] = field(default_factory=dict)
+
+    def topic(self, types: tuple[str, ...], asked: str | None, key: str) -> str:
+        """The topic of these types that was asked for, or the only one."""
+        found = self.optional_topic(types, asked, key)
+        if found is None:
+            raise SourceError(f"{self.path} has no message of type {' or '.join(types)}")
+        return found
+
+    def optional_topic(self, types: tuple[str, ...], asked: str | None, key: str) -> str | None:
+        """As `topic`, but None where there is none at all and none was asked for."""
+        there = [topic for topic, stream in self.streams.items() if stream.type_name in types]
+        if asked is not None:
+            if asked not in there:
+                raise SourceError(f"{self.path} has no topic {asked} for {key}; there: {', '.join(there) or 'none'}")
+            return asked
+        if len(there) > 1:
+            raise SourceError(
+                f"{self.path} has several topics for {key}, choose one with ?{key}=...: {', '.join(there)}"
+            )
+        return there[0] if there else None
+
+    def transform(self, target: str, source: str) -> Matrix4 | None:
+        """T_target_source (4, 4) along the static transforms, or None where they do not connect the two."""
+        reached = {source: np.eye(4)}
+        frontier = [source]
+        while frontier and target not in reached:
+            frame = frontier.pop(0)
+            for neighbour, T_neighbour_frame in self.parents.get(frame, {}).items():
+                if neighbour not in reached:
+                    reached[neighbour] = T_neighbour_frame @ reached[frame]
+                    frontier.append(neighbour)
+        return reached.get(target)
+
+    def take(self, entry: Entry) -> None:
+        """Notes a message.
+
+        Raises:
+            SourceError: it is not what its topic says.
+        """
+        name = entry.type_name
+        if name in (*IMAGE_TYPES, *CLOUD_TYPES, *MOTION_TYPES):
+            stream = self.streams.setdefault(entry.topic, Stream(name))
+            stamp_ns = _header_stamp_ns(entry.data)
+            if stamp_ns is None:
+                raise SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
+            stream.places.append(Place(stamp_ns, entry.place, name))
+        elif name == cdr.CAMERA_INFO and entry.topic not in self.infos:
+            self.infos[entry.topic] = self._decoded(entry)
+        elif name == cdr.TF and entry.topic == "/tf_static":
+            for joint in self._decoded(entry).transforms:
+                self._join(entry.topic, joint)
+
+    def _join(self, topic: str, joint: Any) -> None:
+        rotation, translation = joint.transform.rotation, joint.transform.translation
+        quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
+        offset_m = np.array([translation.x, translation.y, translation.z])
+        try:
+            T_parent_child = transform_from(rotation_from_quaternion_xyzw(quaternion), offset_m)
+        except ValueError as error:
+            raise SourceError(f"{self.path}: a transform on {topic} is not one: {error}") from error
+        parent, child = joint.header.frame_id.lstrip("/"), joint.child_frame_id.lstrip("/")
+        self.parents.setdefault(child, {})[parent] = T_parent_child
+        self.parents.setdefault(parent, {})[child] = inverse(T_parent_child)
+
+    def _decoded(self, entry: Entry) -> Any:
+        try:
+            return _STORE.deserialize_cdr(entry.data, entry.type_name)
+        except (SerdeError, ValueError, IndexError, struct.error) as error:
+            raise SourceError(f"{self.path}: a message on {entry.topic} is not a {entry.type_name}") from error
+
+
+def index_of(storage: Storage) -> Index:
+    """The index of a bag.
+
+    Raises:
+        SourceError: a file is absent, cut off or damaged, or a message is not what its topic says.
+    """
+    index = Index(storage.path)
+    for entry in storage.entries():
+        index.take(entry)
+    return index
+
+
+def _header_stamp_ns(data: bytes) -> int | None:
+    layout = _HEADER.get(data[1]) if len(data) >= 12 else None
+    if layout is None:
+        return None
+    seconds, nanoseconds = layout.unpack_from(data, 4)
+    return seconds * 1_000_000_000 + nanoseconds if seconds >= 0 and nanoseconds < 1_000_000_000 else None

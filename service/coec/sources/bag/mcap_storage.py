@@ -1,0 +1,68 @@
+"""Bags that are MCAP files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from coec.adapters.mcap.files import Channel, McapDamaged, Message, MessageReader, Schema, read_records
+from coec.errors import SourceError
+from coec.sources.bag.storage import Entry, Reader
+
+_OUTSIDE_CHUNKS = -1
+
+
+@dataclass(frozen=True, slots=True)
+class McapStorage:
+    """A `Storage`. A place is: file offset of the chunk (-1 outside chunks), offset in it, length."""
+
+    path: Path
+
+    def entries(self) -> Iterator[Entry]:
+        """See `Storage`."""
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        try:
+            with self.path.open("rb") as stream:
+                for record in read_records(stream):
+                    match record:
+                        case Schema():
+                            schemas[record.schema_id] = record
+                        case Channel():
+                            channels[record.channel_id] = record
+                        case Message():
+                            channel = channels.get(record.channel_id)
+                            schema = None if channel is None else schemas.get(channel.schema_id)
+                            if channel is not None and schema is not None and channel.message_encoding == "cdr":
+                                yield Entry(channel.topic, schema.name, record.data, _place_of(record))
+        except OSError as error:
+            raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
+        except McapDamaged as error:
+            raise SourceError(f"{self.path} is damaged: {error}. `mcap recover` saves what is whole") from error
+
+    @contextmanager
+    def open(self) -> Iterator[Reader]:
+        """See `Storage`."""
+        with self.path.open("rb") as stream:
+            yield _McapReader(self.path, MessageReader(stream))
+
+
+@dataclass(frozen=True, slots=True)
+class _McapReader:
+    path: Path
+    reader: MessageReader
+
+    def read(self, place: tuple[int, ...]) -> bytes:
+        """See `Reader`."""
+        chunk_at, at, length = place
+        try:
+            return self.reader.read(None if chunk_at == _OUTSIDE_CHUNKS else chunk_at, at, length)
+        except McapDamaged as error:
+            raise SourceError(f"{self.path}: {error}") from error
+
+
+def _place_of(message: Message) -> tuple[int, int, int]:
+    chunk_at = _OUTSIDE_CHUNKS if message.chunk_at is None else message.chunk_at
+    return chunk_at, message.at, len(message.data)

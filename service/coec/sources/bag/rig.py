@@ -1,0 +1,117 @@
+"""The rig of a pair in a bag."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
+from coec.adapters.ros import cdr
+from coec.calibration.types import CameraFrame, EgoMotion, Rig
+from coec.config import CameraIntrinsics, Matrix4x4, describe, load_yaml
+from coec.errors import ConfigError, SourceError
+from coec.geometry import cameras
+from coec.sources.bag.index import Index
+
+
+class RigFile(BaseModel):
+    """`intrinsics=FILE`: the head of a `dataset.yaml`, for bags without camera info or without a transform."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    camera: CameraIntrinsics
+    T_camera_lidar: Matrix4x4 | None = None
+    mask: Path | None = None
+
+
+def rig_of_bag(
+    index: Index, intrinsics: str | None, image: CameraFrame, lidar_frame_id: str, motion: EgoMotion | None
+) -> Rig:
+    """The rig of a pair: intrinsics from the `CameraInfo` of the camera's frame (or of the topic `intrinsics`), or from
+    the YAML file `intrinsics`; the extrinsic from that file, else along `/tf_static`.
+
+    Raises:
+        SourceError: no intrinsics, or more than one, or of another image; no extrinsic.
+    """
+    camera_frame, lidar_frame = image.frame_id.lstrip("/"), lidar_frame_id.lstrip("/")
+    mask = None
+    T_camera_lidar = index.transform(camera_frame, lidar_frame)
+    try:
+        if intrinsics is None or intrinsics in index.infos:
+            camera = _camera_of_info(_info(index, intrinsics, camera_frame))
+        else:
+            path = Path(intrinsics).expanduser()
+            document = RigFile.model_validate(load_yaml(path))
+            camera = camera_of(document.camera)
+            if document.T_camera_lidar is not None:
+                T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
+            if document.mask is not None:
+                mask = load_mask(path.parent / document.mask, camera)
+    except ValidationError as error:
+        raise SourceError(f"{intrinsics}: {describe(error)}") from error
+    except (ConfigError, ValueError) as error:
+        raise SourceError(f"intrinsics of {index.path}: {error}") from error
+    if T_camera_lidar is None:
+        raise SourceError(
+            f"{index.path}: /tf_static does not connect {camera_frame!r} and {lidar_frame!r}; "
+            "give ?intrinsics=FILE with `camera:` and `T_camera_lidar:` as in a dataset.yaml"
+        )
+    if (image.image.width, image.image.height) != (camera.width, camera.height):
+        raise SourceError(
+            f"{index.path}: images are {image.image.width} x {image.image.height} px, "
+            f"the intrinsics are for {camera.width} x {camera.height} px"
+        )
+    T_lidar_ego = index.transform(lidar_frame, motion.frame_id.lstrip("/")) if motion else None
+    return Rig(
+        pair=re.sub(r"[^A-Za-z0-9_.-]", "_", index.path.stem)[:64],
+        camera=camera,
+        camera_frame=image.frame_id,
+        lidar_frame=lidar_frame_id,
+        T_camera_lidar_nominal=T_camera_lidar,
+        T_lidar_ego=np.eye(4) if T_lidar_ego is None else T_lidar_ego,
+        mask=mask,
+    )
+
+
+def _info(index: Index, asked: str | None, camera_frame: str) -> Any:
+    """The camera info that was asked for, the one of the camera's frame, or the only one."""
+    if asked is not None:
+        return index.infos[asked]
+    matching = [info for info in index.infos.values() if info.header.frame_id.lstrip("/") == camera_frame]
+    candidates = matching or list(index.infos.values())
+    if len(candidates) != 1:
+        topics = ", ".join(index.infos) or "none"
+        raise SourceError(
+            f"{index.path}: {len(candidates)} camera infos fit; "
+            f"name one with ?intrinsics=/TOPIC, or give ?intrinsics=FILE; there: {topics}"
+        )
+    return candidates[0]
+
+
+def _camera_of_info(info: Any) -> cameras.Camera:
+    """The camera of a `CameraInfo`, by the names in `cdr.DISTORTION` and ROS 1's `fisheye`.
+
+    Raises:
+        ValueError: another model, or too few parameters.
+    """
+    size = {"width": int(info.width), "height": int(info.height)}
+    matrix = [float(v) for v in info.k]
+    focal = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
+    d = [float(v) for v in info.d]
+    model = {"fisheye": "equidistant"}.get(info.distortion_model, info.distortion_model)
+    if model in ("", "plumb_bob", "rational_polynomial") and not any(d):
+        return cameras.build("pinhole", **size, **focal)
+    if model == "rational_polynomial" and not any(d[5:]):
+        model = "plumb_bob"
+    for name, (distortion, parameters) in cdr.DISTORTION.items():
+        if distortion == model and parameters:
+            values = [*d, 0.0][: len(parameters)] if model == "plumb_bob" else d[: len(parameters)]
+            if len(values) < len(parameters):
+                raise ValueError(f"{model} has the parameters {' '.join(parameters)}, the camera info only {len(d)}")
+            return cameras.build(name, **size, **focal, **dict(zip(parameters, values, strict=True)))
+    known = ", ".join(sorted({distortion for distortion, _ in cdr.DISTORTION.values()}))
+    raise ValueError(f"distortion model {model!r} is not known ({known} are); give ?intrinsics=FILE")

@@ -1,0 +1,87 @@
+"""Where the messages of a bag lie: one door for MCAP files, SQLite files, and the folders of rosbag2 that hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from coec.errors import SourceError
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A message, and the place at which it can be read again.
+
+    Attributes:
+        type_name: of ROS, for example `sensor_msgs/msg/Image`.
+        data: CDR.
+        place: means something to the storage that gave it.
+    """
+
+    topic: str
+    type_name: str
+    data: bytes
+    place: tuple[int, ...]
+
+
+class Reader(Protocol):
+    """Reads messages again while the files are open."""
+
+    def read(self, place: tuple[int, ...]) -> bytes:
+        """The data of the message at a place.
+
+        Raises:
+            SourceError: the file is no longer what it was.
+        """
+        ...
+
+
+class Storage(Protocol):
+    """The messages of a bag.
+
+    Attributes:
+        path: what a person calls the bag.
+    """
+
+    @property
+    def path(self) -> Path:
+        """See above."""
+        ...
+
+    def entries(self) -> Iterator[Entry]:
+        """All CDR messages, in the order in which they lie.
+
+        Raises:
+            SourceError: a file is absent, cut off or damaged; names it.
+        """
+        ...
+
+    def open(self) -> AbstractContextManager[Reader]:
+        """A reader; the files are closed when it is left."""
+        ...
+
+
+def open_storage(path: Path) -> Storage:
+    """The storage of an `.mcap` or `.db3` file, or of a folder with rosbag2's `metadata.yaml`.
+
+    Raises:
+        SourceError: it is none of them; says what would be.
+    """
+    if path.is_dir():
+        from coec.sources.bag.folder import open_folder
+
+        return open_folder(path)
+    match path.suffix:
+        case ".mcap":
+            from coec.sources.bag.mcap_storage import McapStorage
+
+            return McapStorage(path)
+        case ".db3":
+            from coec.sources.bag.sqlite_storage import SqliteStorage
+
+            return SqliteStorage(path)
+        case _:
+            raise SourceError(f"{path} is no bag: .mcap, .db3, or a folder with metadata.yaml")

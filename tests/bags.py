@@ -1,0 +1,128 @@
+"""ROS 2 messages and bags that nobody recorded; they are written by `mcap` and `rosbags`, not by us."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.stores import ros2_humble as ros
+
+from coec.geometry import se3
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+WIDTH, HEIGHT = 64, 48
+FLOAT32 = 7  # sensor_msgs/PointField
+
+R_OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+T_BASE_LIDAR = se3.transform_from(se3.rotation_exp(np.array([0.0, 0.0, 0.3])), np.array([1.0, 0.0, 1.9]))
+T_BASE_MOUNT = se3.transform_from(np.eye(3), np.array([1.5, 0.2, 1.4]))
+T_MOUNT_OPTICAL = se3.transform_from(R_OPTICAL.T, np.array([0.01, 0.02, 0.03]))
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    return ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(stamp_ns, 10**9)), frame_id)
+
+
+def an_image(stamp_ns: int, frame_id: str = "optical") -> Any:
+    data = np.frombuffer(cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), 99, np.uint8))[1].tobytes(), np.uint8)
+    return ros.sensor_msgs__msg__CompressedImage(header(stamp_ns, frame_id), "jpeg", data)
+
+
+def a_raw_image(stamp_ns: int) -> Any:
+    data = np.zeros(HEIGHT * WIDTH, np.uint8)
+    return ros.sensor_msgs__msg__Image(header(stamp_ns, "optical"), HEIGHT, WIDTH, "mono8", 0, WIDTH, data)
+
+
+def a_cloud(stamp_ns: int, value: float = 1.0) -> Any:
+    fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, FLOAT32, 1) for i, name in enumerate("xyz")]
+    data = np.frombuffer(np.full((4, 3), value, "<f4").tobytes(), np.uint8)
+    return ros.sensor_msgs__msg__PointCloud2(header(stamp_ns, "lidar"), 1, 4, fields, False, 12, 48, data, True)
+
+
+def an_odometry(stamp_ns: int, forward_mps: float) -> Any:
+    zero, unit = ros.geometry_msgs__msg__Point(0.0, 0.0, 0.0), ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0)
+    twist = ros.geometry_msgs__msg__Twist(
+        ros.geometry_msgs__msg__Vector3(forward_mps, 0.0, 0.0), ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.1)
+    )
+    return ros.nav_msgs__msg__Odometry(
+        header(stamp_ns, "odom"),
+        "base",
+        ros.geometry_msgs__msg__PoseWithCovariance(ros.geometry_msgs__msg__Pose(zero, unit), np.zeros(36)),
+        ros.geometry_msgs__msg__TwistWithCovariance(twist, np.zeros(36)),
+    )
+
+
+def an_info(model: str, d: list[float], frame_id: str = "optical", width: int = WIDTH) -> Any:
+    return ros.sensor_msgs__msg__CameraInfo(
+        header(0, frame_id),
+        HEIGHT,
+        width,
+        model,
+        np.array(d, np.float64),
+        np.array([50.0, 0, 31.5, 0, 51, 23.5, 0, 0, 1]),
+        np.eye(3).reshape(-1),
+        np.zeros(12),
+        0,
+        0,
+        ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, False),
+    )
+
+
+def a_joint(parent: str, child: str, T: NDArray[np.float64]) -> Any:
+    return ros.geometry_msgs__msg__TransformStamped(
+        header(0, parent),
+        child,
+        ros.geometry_msgs__msg__Transform(
+            ros.geometry_msgs__msg__Vector3(*T[:3, 3].tolist()),
+            ros.geometry_msgs__msg__Quaternion(*se3.quaternion_xyzw_from_rotation(T[:3, :3]).tolist()),
+        ),
+    )
+
+
+TREE = [
+    a_joint("base", "lidar", T_BASE_LIDAR),
+    a_joint("base", "mount", T_BASE_MOUNT),
+    a_joint("mount", "optical", T_MOUNT_OPTICAL),
+]
+
+
+@dataclass
+class Bag:
+    """Messages by topic, written in the order of their list."""
+
+    messages: list[tuple[str, Any]] = field(default_factory=list)
+    compression: CompressionType = CompressionType.NONE
+    chunking: bool = True
+
+    def write(self, path: Path) -> Path:
+        with path.open("wb") as stream:
+            writer = Writer(stream, chunk_size=2000, compression=self.compression, use_chunking=self.chunking)
+            writer.start("ros2")
+            channels: dict[tuple[str, str], int] = {}
+            for time, (topic, message) in enumerate(self.messages):
+                name = message.__msgtype__
+                if (topic, name) not in channels:
+                    definition, _ = STORE.generate_msgdef(name, ros_version=2)
+                    schema = writer.register_schema(name, "ros2msg", definition.encode())
+                    channels[topic, name] = writer.register_channel(topic, "cdr", schema)
+                data = bytes(STORE.serialize_cdr(message, name))
+                writer.add_message(channels[topic, name], time, data, time)
+            writer.finish()  # type: ignore[no-untyped-call]
+        return path
+
+
+def a_drive(*, info: Any = None, tree: list[Any] | None = None, image: Any = an_image) -> list[tuple[str, Any]]:
+    """Camera at 10 Hz, LiDAR at 20 Hz and 4 ms later, odometry at 50 Hz; the recorder got them out of order."""
+    second = 10**9
+    images = [("/front/image", image(second + k * 100_000_000)) for k in range(4)]
+    clouds = [("/points", a_cloud(second + 4_000_000 + k * 50_000_000, float(k + 1))) for k in range(8)]
+    motions = [("/odom", an_odometry(second + k * 20_000_000, float(k))) for k in range(20)]
+    head = [
+        ("/tf_static", ros.tf2_msgs__msg__TFMessage(TREE if tree is None else tree)),
+        ("/front/camera_info", info or an_info("plumb_bob", [0.0] * 5)),
+    ]
+    return [*head, *motions[::-1], *clouds[::-1], *images]

@@ -1,0 +1,155 @@
+"""Every storage of rosbag2, written by `rosbags`, holds the same recording; and files that nobody vouches for."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from ruamel.yaml import YAML
+
+from bags import STORE, Bag, a_drive
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.errors import SourceError
+from coec.sources import open_source
+from coec.sources.recording import Message
+
+SQLITE, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
+NONE, FILE, MESSAGE = CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE
+
+
+def a_folder(path: Path, plugin: StoragePlugin, mode: CompressionMode = CompressionMode.NONE) -> Path:
+    """The drive as a folder of rosbag2."""
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if mode is not NONE:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        for time, (topic, message) in enumerate(a_drive()):
+            name = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=STORE)
+            writer.write(connections[topic], time, STORE.serialize_cdr(message, name))
+    return path
+
+
+def told(message: Message) -> tuple[object, ...]:
+    match message:
+        case CameraFrame():
+            return message.stamp_ns, message.image.data
+        case LidarFrame():
+            return message.stamp_ns, message.xyz_m.tobytes()
+        case EgoMotion():
+            return message.stamp_ns, message.linear_mps
+
+
+@pytest.mark.parametrize("plugin", [SQLITE, MCAP])
+@pytest.mark.parametrize("mode", [NONE, FILE, MESSAGE])
+def test_every_folder_holds_the_same_recording(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
+    wanted = open_source(str(Bag(a_drive()).write(tmp_path / "drive.mcap")))
+    found = open_source(str(a_folder(tmp_path / "drive", plugin, mode)))
+    assert [told(m) for m in found.messages()] == [told(m) for m in wanted.messages()]
+    assert found.rig.camera == wanted.rig.camera
+    assert found.rig.pair == "drive"
+    np.testing.assert_array_equal(found.rig.T_camera_lidar_nominal, wanted.rig.T_camera_lidar_nominal)
+
+
+def test_a_file_of_a_folder_may_be_opened_alone(tmp_path: Path) -> None:
+    folder = a_folder(tmp_path / "drive", SQLITE)
+    (file,) = folder.glob("*.db3")
+    assert len(list(open_source(str(file)).messages())) == 4 + 8 + 20
+
+
+def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
+    folder = tmp_path / "split"
+    folder.mkdir()
+    drive = a_drive()
+    for number in range(3):
+        Bag(drive[number::3]).write(folder / f"split_{number}.mcap")
+    information = {"storage_identifier": "mcap", "relative_file_paths": [f"split_{n}.mcap" for n in range(3)]}
+    with (folder / "metadata.yaml").open("w") as stream:
+        YAML().dump({"rosbag2_bagfile_information": information}, stream)
+    wanted = open_source(str(Bag(drive).write(tmp_path / "drive.mcap")))
+    assert [told(m) for m in open_source(str(folder)).messages()] == [told(m) for m in wanted.messages()]
+    (folder / "split_1.mcap").unlink()
+    with pytest.raises(SourceError, match=r"split lacks split_1\.mcap"):
+        open_source(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("metadata", "said"),
+    [
+        ("", "is no metadata of rosbag2"),
+        ("[1]", "is no metadata of rosbag2"),
+        ("{", "is not valid YAML"),
+        ("rosbag2_bagfile_information: {storage_identifier: mcap}", "relative_file_paths"),
+        (
+            "rosbag2_bagfile_information: {storage_identifier: mcap, relative_file_paths: [../../etc/passwd]}",
+            "lacks passwd",
+        ),
+        (
+            "rosbag2_bagfile_information: {storage_identifier: bag, relative_file_paths: [a]}",
+            "is neither mcap nor sqlite3",
+        ),
+        (
+            "rosbag2_bagfile_information: {storage_identifier: mcap, relative_file_paths: [a], compression_format: lz4,"
+            " compression_mode: FILE}",
+            "is not zstd",
+        ),
+    ],
+)
+def test_metadata_that_cannot_be_used_is_said(tmp_path: Path, metadata: str, said: str) -> None:
+    (tmp_path / "metadata.yaml").write_text(metadata)
+    with pytest.raises(SourceError, match=said):
+        open_source(str(tmp_path))
+
+
+@pytest.mark.parametrize("suffix", ["db3", "mcap.zstd", "db3.zstd"])
+@pytest.mark.fault("a bag that is cut off or has flipped bits", "an error that names the file; nothing else is raised")
+def test_damaged_files_are_refused(tmp_path: Path, suffix: str) -> None:
+    plugin, mode = SQLITE if "db3" in suffix else MCAP, FILE if suffix.endswith("zstd") else NONE
+    folder = a_folder(tmp_path / "drive", plugin, mode)
+    (file,) = folder.glob(f"*.{suffix}")
+    whole = file.read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(40):
+        size = int(rng.integers(0, len(whole)))
+        damaged = bytearray(whole[:size] if rng.random() < 0.5 else whole)
+        for place in rng.integers(0, max(len(damaged), 1), 8).tolist():
+            if damaged:
+                damaged[place] ^= int(rng.integers(1, 256))
+        file.write_bytes(damaged)
+        try:
+            list(open_source(str(folder)).messages())
+        except SourceError:
+            refused += 1
+    assert refused > 20  # a flipped bit in a picture is a flipped bit in a picture
+
+
+def test_a_view_that_calls_itself_a_table_is_none(tmp_path: Path) -> None:
+    file = tmp_path / "evil.db3"
+    with closing(sqlite3.connect(file)) as connection:
+        connection.execute("CREATE TABLE topics(id, name, type, serialization_format)")
+        connection.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
+            "SELECT id, 1 AS topic_id, zeroblob(1000000) AS data FROM n"
+        )
+        connection.commit()
+    with pytest.raises(SourceError, match="has no tables messages and topics"):
+        open_source(str(file))
+
+
+def test_rows_that_are_no_messages_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "odd.db3"
+    with closing(sqlite3.connect(file)) as connection:
+        connection.execute("CREATE TABLE topics(id, name, type, serialization_format)")
+        connection.execute("CREATE TABLE messages(id, topic_id, timestamp, data)")
+        connection.execute("INSERT INTO topics VALUES(1, '/a', 'sensor_msgs/msg/Image', 'cdr')")
+        connection.execute("INSERT INTO messages VALUES(1, 1, 0, 'text')")
+        connection.commit()
+    with pytest.raises(SourceError, match="message 1 holds no bytes"):
+        open_source(str(file))
