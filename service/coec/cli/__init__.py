@@ -702,6 +702,14 @@ def _bench(as_json: Json = False) -> None:
     raise typer.Exit(command.run(as_json=as_json))
 
 
+@app.command("check")
+def _check(source: Source, depth: Depth = None, as_json: Json = False) -> None:
+    """What a recording holds, and what it is good for: exit 1 if no calibration can come of it."""
+    from coec.cli import check as command
+
+    raise typer.Exit(command.run(source, depth=depth, as_json=as_json))
+
+
 @app.command("export")
 def _export(
     source: Annotated[

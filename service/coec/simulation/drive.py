@@ -167,6 +167,16 @@ class SimulatedDrive:
         """Stamps of the camera frames that arrive, ascending."""
         return tuple(stamp for stamp, stream, _ in self._plan if stream == _CAMERA)
 
+    @cached_property
+    def sweep_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the sweeps that arrive, ascending."""
+        return tuple(stamp for stamp, stream, _ in self._plan if stream == _LIDAR)
+
+    @cached_property
+    def motion_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the ego-motion that arrives, ascending."""
+        return tuple(stamp for stamp, stream, _ in self._plan if stream == _EGO)
+
     def truth(self, stamp_ns: int) -> Matrix4:
         """True T_camera_lidar (4, 4) at a time."""
         return shifted(self._true, self.config.faults, (stamp_ns - START_NS) / 1e9)

@@ -47,6 +47,16 @@ class Recording(Protocol):
         """Stamps of the camera frames, ascending, nanoseconds."""
         ...
 
+    @property
+    def sweep_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the sweeps, ascending, nanoseconds."""
+        ...
+
+    @property
+    def motion_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the ego-motion, ascending, nanoseconds; empty where there is none."""
+        ...
+
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
         """Messages in ascending order of their stamps, each loaded when it is its turn.
 
@@ -100,6 +110,16 @@ class FramewiseRecording:
     def camera_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the camera frames, ascending, nanoseconds."""
         return tuple(frame.camera_stamp_ns for frame in self.frames)
+
+    @property
+    def sweep_stamps_ns(self) -> tuple[int, ...]:
+        """See `Recording`."""
+        return tuple(sorted({frame.lidar_stamp_ns for frame in self.frames}))
+
+    @property
+    def motion_stamps_ns(self) -> tuple[int, ...]:
+        """See `Recording`."""
+        return tuple(motion.stamp_ns for motion in self.motions)
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
         """See `Recording.messages`."""

@@ -90,7 +90,9 @@ def test_several_topics_of_a_type_have_to_be_chosen_from(tmp_path: Path) -> None
     path = Bag([*a_drive(), ("/rear/image", an_image(5)), ("/imu/odom", an_odometry(5, 1.0))]).write(
         tmp_path / "b.mcap"
     )
-    with pytest.raises(SourceError, match=r"several topics for camera, choose one with \?camera=.*/front/image, /rear"):
+    with pytest.raises(
+        SourceError, match=r"several topics for camera, choose one with \?camera=.*/front/image \(.*/rear"
+    ):
         open_source(str(path))
     recording = open_source(f"{path}?camera=/rear/image&odometry=/imu/odom")
     assert recording.camera_stamps_ns == (5,)

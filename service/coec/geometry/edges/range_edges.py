@@ -86,7 +86,7 @@ def range_edges(xyz_m: NDArray[np.float32], ring: NDArray[np.uint16] | None) -> 
     kept_m, range_m = xyz_m[far], range_m[far]
     azimuth = np.arctan2(kept_m[:, 1], kept_m[:, 0])
     elevation = np.arcsin(np.clip(kept_m[:, 2] / np.maximum(range_m, MIN_RANGE_M), -1.0, 1.0))
-    if ring is None:
+    if ring is None or (len(ring) and ring.min() == ring.max()):  # one number for all beams tells none from another
         row, same_line = np.floor(elevation / BAND_RAD).astype(np.int64), SAME_LINE_RAD
     else:
         row, same_line = ring[far].astype(np.int64), math.pi

@@ -81,9 +81,11 @@ class Index:
                 raise SourceError(f"{self.path} has no topic {asked} for {key}; there: {', '.join(there) or 'none'}")
             return asked
         if len(there) > 1:
-            raise SourceError(
-                f"{self.path} has several topics for {key}, choose one with ?{key}=...: {', '.join(there)}"
+            told = ", ".join(
+                f"{topic} ({self.streams[topic].type_name}, {len(self.streams[topic].places)} messages)"
+                for topic in there
             )
+            raise SourceError(f"{self.path} has several topics for {key}, choose one with ?{key}=...: {told}")
         return there[0] if there else None
 
     def transform(self, target: str, source: str) -> Matrix4 | None:

@@ -122,6 +122,16 @@ class BagRecording:
         """Stamps of the camera frames, ascending, nanoseconds."""
         return tuple(place.stamp_ns for place in self.streams.camera)
 
+    @property
+    def sweep_stamps_ns(self) -> tuple[int, ...]:
+        """See `Recording`."""
+        return tuple(place.stamp_ns for place in self.streams.lidar)
+
+    @property
+    def motion_stamps_ns(self) -> tuple[int, ...]:
+        """See `Recording`."""
+        return tuple(place.stamp_ns for place in self.streams.motion)
+
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
         """See `Recording.messages`. Of the sweeps, the nearest to each chosen camera frame is handed out."""
         chosen = [self.streams.camera[index] for index in chosen_indices(cameras, len(self.streams.camera))]

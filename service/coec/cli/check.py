@@ -1,0 +1,132 @@
+"""`coec check`: what a recording holds, what is missing, and what it is good for."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.calibrator import calibrate
+from coec.calibration.search.mount_prior import MOUNT_RAD
+from coec.calibration.types import Estimate
+from coec.cli import calibrate as calibrate_command
+from coec.config import LimitsConfig
+from coec.errors import CalibrationError
+from coec.evaluation.fitness import Cadence, Fitness, Remark, fitness_of
+from coec.reports import console
+from coec.sources import open_source, windows
+
+PAIRS = 6
+"""Of the trial, evenly chosen: as many as a check of the monitor has."""
+
+LEVEL_STYLES = {"fail": "bold red", "warn": "bold yellow", "ok": ""}
+
+
+def run(source: str, *, depth: str | None, as_json: bool) -> int:
+    """Says what is there; 1 where a calibration cannot come of it.
+
+    Raises:
+        UsageError, SourceError: the recording cannot be opened, or a file of it cannot be read.
+    """
+    recording = open_source(source)
+    with console.progress() as bars:
+        times = calibrate_command.StageTimes(bars)
+        seen = fitness_of(recording)
+        times.step("look", 1, 1)
+        failed = any(remark.level == "fail" for remark in seen.remarks)
+        trial = None if failed else _trial(source, depth, times)
+    remarks = (*seen.remarks, *_of_trial(trial))
+    if as_json:
+        console.print_json(_document(source, replace(seen, remarks=remarks), trial))
+    else:
+        _show(recording.name, replace(seen, remarks=remarks), trial)
+    return int(failed or isinstance(trial, CalibrationError))
+
+
+def _trial(source: str, depth: str | None, times: calibrate_command.StageTimes) -> Estimate | CalibrationError:
+    """A calibration of a few pairs about the recording's own extrinsic: how sharply this scene tells the pose."""
+    loaded = windows.load(source, PAIRS, PAIRS, lambda done, total: times.step("load", done, total))
+    options = calibrate_command.Options(source=source, depth=depth)
+    configuration = calibrate_command.configuration_of(options, loaded.configuration)
+    limits = LimitsConfig()
+    window = replace(loaded.window, start_known_to_rad=MOUNT_RAD)
+    try:
+        return calibrate(window, open_depth(configuration.depth, limits), GreyImages(limits), configuration, times)
+    except CalibrationError as error:
+        return error
+
+
+def _of_trial(trial: Estimate | CalibrationError | None) -> tuple[Remark, ...]:
+    if isinstance(trial, CalibrationError):
+        return (Remark("fail", "no_calibration", str(trial)),)
+    if trial is None:
+        return ()
+    return tuple(Remark("warn", reason.code, reason.text) for reason in trial.verdict.reasons)
+
+
+def _document(source: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> dict[str, Any]:
+    document = {"source": source, **asdict(seen), "trial": None}
+    if isinstance(trial, Estimate):
+        document["trial"] = {
+            "pairs": trial.pairs,
+            "decision": trial.verdict.decision.value,
+            "correction": _in_degrees(trial.correction),
+            "sigma": _in_degrees(trial.sigma),
+        }
+    return document
+
+
+def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> None:
+    console.show(f"{name}: {seen.seconds:.1f} s")
+    streams = console.table("stream", "frames", "Hz", "longest gap", "what", right=(1, 2, 3))
+    camera = f"{seen.width} x {seen.height} px"
+    rings = f", {seen.rings} rings" if seen.rings > 1 else ""
+    near, far = seen.range_m
+    lidar = f"{seen.points} points{rings}, {near:.1f} to {far:.0f} m, {'with' if seen.point_time else 'without'} time"
+    _add(streams, "camera", seen.camera, camera)
+    _add(streams, "LiDAR", seen.lidar, lidar)
+    _add(streams, "motion", seen.motion, _motion_text(seen))
+    console.out.print(streams)
+    sync = (
+        ""
+        if seen.sync_ms is None
+        else f", camera {seen.sync_ms[0]:+.1f} ms after the sweep ({seen.sync_ms[1]:.1f} at most)"
+    )
+    console.show(f"{seen.paired:.0%} of the camera frames have a sweep{sync}; {seen.in_view:.0%} of its points in view")
+    if isinstance(trial, Estimate):
+        axes = console.table("axis", "from the recording's own", "± σ", "unit", right=(1, 2))
+        correction, sigma = _in_degrees(trial.correction), _in_degrees(trial.sigma)
+        for axis, axis_name in enumerate(console.AXIS_NAMES):
+            if sigma[axis] is not None:
+                found = console.figure(correction[axis], sign=True)
+                axes.add_row(axis_name, found, console.figure(sigma[axis]), console.UNITS[axis])
+        console.show(f"{trial.pairs} pairs, tried at the recording's own extrinsic:")
+        console.out.print(axes)
+    for remark in seen.remarks:
+        console.show(f"{remark.level:4}  {remark.text}", LEVEL_STYLES[remark.level])
+    if not seen.remarks:
+        console.show("nothing is missing", "green")
+
+
+def _add(table: Any, name: str, cadence: Cadence | None, what: str) -> None:
+    if cadence is None:
+        table.add_row(name, "none", "", "", what)
+    else:
+        table.add_row(name, str(cadence.frames), f"{cadence.rate_hz:.2f}", f"{cadence.longest_gap_s:.2f} s", what)
+
+
+def _motion_text(seen: Fitness) -> str:
+    if seen.speed_mps is None or seen.turn_degps is None:
+        return ""
+    return (
+        f"{seen.speed_mps[0]:.1f} m/s ({seen.speed_mps[1]:.1f} at most), "
+        f"{seen.turn_degps[0]:.1f} deg/s ({seen.turn_degps[1]:.1f})"
+    )
+
+
+def _in_degrees(rad_m: np.ndarray[Any, np.dtype[np.float64]]) -> list[float | None]:
+    values = [*np.degrees(rad_m[:3]).tolist(), *rad_m[3:].tolist()]
+    return [value if np.isfinite(value) else None for value in values]

@@ -1,0 +1,239 @@
+"""What a recording holds and what it is good for, before anyone waits for a calibration.
+
+Stamps of all frames are known without loading them; of the frames themselves a few are looked at, evenly chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.monitor.check_verdict import MIN_PAIRS
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Rig
+from coec.config import PairingConfig, WindowConfig
+from coec.geometry.projection import project
+from coec.geometry.vectors import lengths
+from coec.sources.recording import Recording
+from coec.sources.windows import evenly
+
+NS_PER_S = 1e9
+
+LOOKED_AT = 12
+"""Camera frames that are loaded."""
+
+LITTLE_IN_VIEW = 0.03
+"""Share of a sweep's points. A camera of 60° sees a tenth of a turning LiDAR's."""
+
+SMEARING_MPS = 1.0
+"""Speed from which an uncompensated sweep of 0.1 s smears what is near by more than its beams are apart."""
+
+MANY_GAPS = 3.0
+"""Gaps between frames are long from so many median intervals on."""
+
+Level = Literal["ok", "warn", "fail"]
+
+
+@dataclass(frozen=True, slots=True)
+class Cadence:
+    """How one stream comes: frames, Hz (of the median interval), and its longest gap, seconds."""
+
+    frames: int
+    rate_hz: float
+    longest_gap_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """Something that a person should know: machine-readable code, and a sentence that says what to do."""
+
+    level: Level
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fitness:
+    """A recording, as far as it was looked at.
+
+    Attributes:
+        seconds: from its first camera frame to its last.
+        camera, lidar, motion: cadence of the streams; motion None where there is none.
+        width, height: of the images, pixels.
+        points, rings: of a sweep, medians; no rings: 0.
+        range_m: (near, far) within which nine of ten points lie.
+        point_time: whether points carry their own time, or the rig knows the sweep's.
+        speed_mps, turn_degps: (median, most) of the vehicle; None without ego-motion.
+        standing: share of the pairs that were taken while the vehicle stood; None without ego-motion.
+        paired: share of the frames looked at that found a sweep.
+        sync_ms: (median, most) of camera stamp minus sweep stamp, milliseconds.
+        in_view: share of a sweep's points that the nominal extrinsic puts into the image, median.
+        remarks: those that matter most first.
+    """
+
+    seconds: float
+    camera: Cadence
+    lidar: Cadence
+    motion: Cadence | None
+    width: int
+    height: int
+    points: int
+    rings: int
+    range_m: tuple[float, float]
+    point_time: bool
+    speed_mps: tuple[float, float] | None
+    turn_degps: tuple[float, float] | None
+    standing: float | None
+    paired: float
+    sync_ms: tuple[float, float] | None
+    in_view: float
+    remarks: tuple[Remark, ...]
+
+
+def fitness_of(recording: Recording) -> Fitness:
+    """Looks at a recording.
+
+    Raises:
+        SourceError: a file cannot be read, or a cloud contradicts its origin; names it.
+    """
+    stamps_ns = recording.camera_stamps_ns
+    chosen = evenly(len(stamps_ns), min(LOOKED_AT, len(stamps_ns)))
+    pairer = Pairer(PairingConfig(max_stamp_jump_s=1e9), expects_motion=bool(recording.motion_stamps_ns))
+    pairs: list[FramePair] = []
+    sweeps: list[LidarFrame] = []
+    motions: list[EgoMotion] = []
+    image: CameraFrame | None = None
+    for message in recording.messages(chosen):
+        match message:
+            case CameraFrame():
+                image = message
+            case LidarFrame():
+                sweeps.append(message)
+            case EgoMotion():
+                motions.append(message)
+        pairs += pairer.push(message)
+    pairs += pairer.flush()
+    rig = recording.rig
+    moving = [pair.motion.speed_mps for pair in pairs if pair.motion is not None]
+    standing = None if not moving else float(np.mean(np.array(moving) < WindowConfig().min_speed_mps))
+    sync_ms = np.array([(pair.camera.stamp_ns - pair.lidar.stamp_ns) / 1e6 for pair in pairs])
+    ranges_m = np.concatenate([lengths(sweep.xyz_m) for sweep in sweeps] or [np.zeros(1, np.float32)])
+    near, far = np.percentile(ranges_m[ranges_m > 0.0] if ranges_m.any() else ranges_m, [5, 95]).tolist()
+    seen = Fitness(
+        seconds=(stamps_ns[-1] - stamps_ns[0]) / NS_PER_S if stamps_ns else 0.0,
+        camera=cadence(stamps_ns),
+        lidar=cadence(recording.sweep_stamps_ns),
+        motion=cadence(recording.motion_stamps_ns) if recording.motion_stamps_ns else None,
+        width=rig.camera.width if image is None else image.image.width,
+        height=rig.camera.height if image is None else image.image.height,
+        points=_median([len(sweep.xyz_m) for sweep in sweeps]),
+        rings=_median([0 if sweep.ring is None else len(np.unique(sweep.ring)) for sweep in sweeps]),
+        range_m=(near, far),
+        point_time=rig.sweep is not None or any(sweep.time_offset_s is not None for sweep in sweeps),
+        speed_mps=_spread([motion.speed_mps for motion in motions]),
+        turn_degps=_spread([float(np.degrees(np.linalg.norm(motion.angular_radps))) for motion in motions]),
+        standing=standing,
+        paired=len(pairs) / len(chosen) if chosen else 0.0,
+        sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
+        in_view=float(np.median([in_view(sweep, rig) for sweep in sweeps])) if sweeps else 0.0,
+        remarks=(),
+    )
+    return _with_remarks(seen)
+
+
+def cadence(stamps_ns: Sequence[int]) -> Cadence:
+    """Of ascending stamps, nanoseconds. Of fewer than two the rate is 0."""
+    if len(stamps_ns) < 2:
+        return Cadence(len(stamps_ns), 0.0, 0.0)
+    gaps_s = np.diff(np.array(stamps_ns, dtype=np.int64)) / NS_PER_S
+    median_s = float(np.median(gaps_s))
+    return Cadence(len(stamps_ns), 1.0 / median_s if median_s > 0.0 else 0.0, float(gaps_s.max()))
+
+
+def in_view(sweep: LidarFrame, rig: Rig) -> float:
+    """Share of a sweep's points that the nominal extrinsic puts into the image."""
+    T = rig.T_camera_lidar_nominal
+    p_camera: NDArray[np.float64] = sweep.xyz_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    uv_px, valid = project(rig.camera, p_camera)
+    inside = valid & (uv_px > -0.5).all(axis=1)
+    inside &= (uv_px[:, 0] < rig.camera.width - 0.5) & (uv_px[:, 1] < rig.camera.height - 0.5)
+    return float(inside.mean()) if len(inside) else 0.0
+
+
+def _with_remarks(seen: Fitness) -> Fitness:
+    remarks = [remark for remark in _remarks(seen) if remark is not None]
+    return replace(seen, remarks=tuple(sorted(remarks, key=lambda remark: _ORDER[remark.level])))
+
+
+_ORDER: dict[Level, int] = {"fail": 0, "warn": 1, "ok": 2}
+
+
+def _remarks(seen: Fitness) -> list[Remark | None]:
+    return [_too_short(seen), _unpaired(seen), _view(seen), _motion(seen), _standing(seen), _rings(seen), _gaps(seen)]
+
+
+def _too_short(seen: Fitness) -> Remark | None:
+    if seen.camera.frames >= MIN_PAIRS:
+        return None
+    return Remark("fail", "too_few_frames", f"{seen.camera.frames} camera frames; a calibration needs {MIN_PAIRS}.")
+
+
+def _unpaired(seen: Fitness) -> Remark | None:
+    tolerance_ms = 1e3 * PairingConfig().tolerance_s
+    if seen.paired == 0.0:
+        return Remark(
+            "fail", "no_pairs", f"No camera frame has a sweep within {tolerance_ms:.0f} ms: are the clocks in step?"
+        )
+    if seen.paired < 0.9:
+        return Remark("warn", "few_pairs", f"{1 - seen.paired:.0%} of the camera frames have no sweep near them.")
+    return None
+
+
+def _view(seen: Fitness) -> Remark | None:
+    if seen.in_view >= LITTLE_IN_VIEW:
+        return None
+    text = f"{seen.in_view:.1%} of the points lie in the image at the nominal extrinsic: is it from LiDAR to camera?"
+    return Remark("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
+
+
+def _motion(seen: Fitness) -> Remark | None:
+    if seen.motion is None:
+        return Remark("warn", "no_ego_motion", "No ego-motion: sweeps taken while driving cannot be compensated.")
+    if not seen.point_time and seen.speed_mps is not None and seen.speed_mps[1] > SMEARING_MPS:
+        text = "Points have no time and the rig no sweep timing: sweeps taken while driving cannot be compensated."
+        return Remark("warn", "no_point_time", text)
+    return None
+
+
+def _standing(seen: Fitness) -> Remark | None:
+    if seen.standing is None or seen.standing < 0.5:
+        return None
+    return Remark(
+        "warn", "standing", f"The vehicle stood in {seen.standing:.0%} of the pairs: they count as few looks."
+    )
+
+
+def _rings(seen: Fitness) -> Remark | None:
+    if seen.rings != 1:
+        return None
+    return Remark("warn", "constant_ring", "The field `ring` holds one number: beams are told by their elevation.")
+
+
+def _gaps(seen: Fitness) -> Remark | None:
+    for name, stream in (("camera", seen.camera), ("LiDAR", seen.lidar)):
+        if stream.rate_hz > 1.0 and stream.longest_gap_s * stream.rate_hz > MANY_GAPS:
+            text = f"The {name} is silent for {stream.longest_gap_s:.1f} s, at {stream.rate_hz:.1f} Hz otherwise."
+            return Remark("ok", "gaps", text)
+    return None
+
+
+def _median(counts: Sequence[int]) -> int:
+    return int(np.median(counts)) if counts else 0
+
+
+def _spread(values: Sequence[float]) -> tuple[float, float] | None:
+    return (float(np.median(values)), float(np.max(values))) if values else None

@@ -1,0 +1,99 @@
+"""What a recording is good for: rates, partners, views, and what a person should know."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
+from coec.evaluation.fitness import cadence, fitness_of, in_view
+from coec.geometry.cameras import build
+from coec.sources.recording import FramewiseRecording, RecordedFrame
+
+FORWARD = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+RIG = Rig(
+    "front",
+    build("pinhole", width=40, height=30, fx=20.0, fy=20.0, cx=19.5, cy=14.5),
+    "camera",
+    "lidar",
+    FORWARD,
+    np.eye(4),
+)
+MS = 1_000_000
+POINTS = np.array([[5.0, 0.0, 0.0], [5.0, 1.0, 0.5], [-5.0, 0.0, 0.0], [5.0, 50.0, 0.0]], np.float32)
+"""Two ahead, one behind, one far to the left."""
+
+
+def a_recording(
+    frames: int = 10, period_ms: int = 100, late_ms: int = 5, speed_mps: float = 8.0, rig: Rig = RIG, ring: bool = False
+) -> FramewiseRecording:
+    image = EncodedImage(ImageFormat.MONO8, 40, 30, bytes(1200))
+
+    def frame(number: int) -> RecordedFrame:
+        at = 1000 * MS + number * period_ms * MS
+        sweep_ns = at - late_ms * MS
+        numbers = np.full(len(POINTS), 7, np.uint16) if ring else None
+        return RecordedFrame(
+            at,
+            lambda: CameraFrame(at, "camera", image),
+            sweep_ns,
+            lambda: LidarFrame(sweep_ns, "lidar", POINTS, ring=numbers),
+        )
+
+    motions = tuple(
+        EgoMotion(1000 * MS + n * 50 * MS, "ego", (speed_mps, 0.0, 0.0), (0.0, 0.0, 0.1)) for n in range(2 * frames)
+    )
+    return FramewiseRecording("test", rig, FORWARD, tuple(map(frame, range(frames))), motions)
+
+
+def codes(recording: FramewiseRecording) -> dict[str, str]:
+    return {remark.code: remark.level for remark in fitness_of(recording).remarks}
+
+
+def test_the_figures_of_a_recording() -> None:
+    seen = fitness_of(a_recording())
+    assert seen.seconds == pytest.approx(0.9)
+    assert seen.camera.frames == 10
+    np.testing.assert_allclose([seen.camera.rate_hz, seen.lidar.rate_hz], 10.0)
+    np.testing.assert_allclose(np.array(seen.sync_ms), 5.0)
+    assert (seen.paired, seen.in_view, seen.points) == (1.0, 0.5, 4)
+    assert seen.speed_mps == (8.0, 8.0)
+    np.testing.assert_allclose(np.array(seen.turn_degps), np.degrees(0.1))
+    assert seen.standing == 0.0
+
+
+def test_a_cadence_tells_its_longest_gap() -> None:
+    told = cadence([0, 100 * MS, 200 * MS, 1200 * MS])
+    np.testing.assert_allclose([told.rate_hz, told.longest_gap_s], [10.0, 1.0])
+    assert cadence([]).frames == 0
+    assert cadence([5]).rate_hz == 0.0
+
+
+@pytest.mark.parametrize(
+    ("recording", "code", "level"),
+    [
+        (a_recording(frames=3), "too_few_frames", "fail"),
+        (a_recording(period_ms=1000, late_ms=60), "no_pairs", "fail"),
+        (replace(a_recording(), motions=()), "no_ego_motion", "warn"),
+        (a_recording(), "no_point_time", "warn"),
+        (a_recording(speed_mps=0.0), "standing", "warn"),
+        (a_recording(ring=True), "constant_ring", "warn"),
+    ],
+)
+def test_what_is_missing_is_said(recording: FramewiseRecording, code: str, level: str) -> None:
+    assert codes(recording)[code] == level
+
+
+def test_an_extrinsic_the_wrong_way_round_is_said() -> None:
+    away = FORWARD.copy()
+    away[2, 3] = -100.0
+    assert codes(a_recording(rig=replace(RIG, T_camera_lidar_nominal=away)))["little_in_view"] == "fail"
+
+
+def test_points_at_the_border_of_the_image_are_in_view() -> None:
+    at = np.array([[20.0, 0.0, 0.0]]) + np.array([[0.0, 19.9, 0.0]])
+    sweep = LidarFrame(0, "lidar", at.astype(np.float32))
+    assert in_view(sweep, RIG) == 1.0
+    assert in_view(replace(sweep, xyz_m=(at + np.array([[0.0, 0.2, 0.0]])).astype(np.float32)), RIG) == 0.0
