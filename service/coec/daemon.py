@@ -144,7 +144,7 @@ class Daemon:
 
     def _start(self) -> None:
         deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
-        for thread in (self._presence.thread, self._bus.thread, self._bus.drawing_thread, *deciding):
+        for thread in (self._presence.thread, *self._bus.threads, *deciding):
             thread.start()
         self._worker.start()
         config = Snapshot.of_document(
@@ -202,7 +202,6 @@ class Daemon:
         if self._state != "failing":
             self._state = "stopping"
         pairs = self._pairs.values()
-        answering = (self._bus.thread, self._bus.drawing_thread)
         steps: tuple[tuple[str, Callable[[], object]], ...] = (
             ("announce", self._notifier.stopping),
             ("tell", self._renew),
@@ -212,7 +211,7 @@ class Daemon:
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
             ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
-            ("end the answers", lambda: _stopped(answering, QUERIES_STOP_S)),
+            ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
         )
         for name, step in steps:
@@ -266,7 +265,7 @@ class Daemon:
     def _threads(self) -> list[ServiceThread]:
         pairs = self._pairs.values()
         own = [thread for pair in pairs for thread in pair.threads]
-        return [self._presence.thread, self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
+        return [self._presence.thread, *self._bus.threads, self._worker.thread, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()

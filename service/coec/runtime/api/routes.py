@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import zenoh
 from pydantic import BaseModel
 
-from coec.adapters.zenoh.bus import Answer, Bus, Request, Route
+from coec.adapters.zenoh.bus import Answer, Bus, Lane, Request, Route
 from coec.errors import UsageError
 from coec.runtime.api import metrics as metrics_text
 from coec.runtime.api import payloads
@@ -46,9 +46,9 @@ class VehicleAnswers:
         self._pairs = pairs
         self._commands = commands
         self._vehicle_routes = {
-            keys.status: Route(keys.status, lambda request: status().answer(_format(request)), quick=True),
-            keys.config: Route(keys.config, lambda request: config.answer(_format(request)), quick=True),
-            keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), quick=False),
+            keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
+            keys.config: Route(keys.config, lambda request: config.answer(_format(request)), Lane.AT_ONCE),
+            keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), Lane.FILES),
         }
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
 
@@ -77,14 +77,18 @@ class VehicleAnswers:
             asked = zenoh.KeyExpr(key)
             matching = [route for known, route in readable.items() if asked.intersects(zenoh.KeyExpr(known))]
             # A picture is drawn for whoever asks for one, not for everything at once.
-            return matching if key.endswith("/overlay") else [route for route in matching if not route.draws]
+            return (
+                matching
+                if key.endswith("/overlay")
+                else [route for route in matching if route.lane is not Lane.DRAWING]
+            )
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
-            return [Route(key, self._window(self._pairs[pair], address.argument), quick=False)]
+            return [Route(key, self._window(self._pairs[pair], address.argument), Lane.FILES)]
         if address.resource == "command":
-            return [Route(key, self._command(self._commands[pair], str(address.argument)), quick=False)]
+            return [Route(key, self._command(self._commands[pair], str(address.argument)), Lane.COMMANDS)]
         if address.resource == "evidence" and address.argument is not None:
-            return [Route(key, self._evidence(self._pairs[pair], address.argument), quick=False)]
+            return [Route(key, self._evidence(self._pairs[pair], address.argument), Lane.FILES)]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_unknown(self, key: str) -> Sequence[Route]:
@@ -101,12 +105,12 @@ class VehicleAnswers:
     def _readable(self, pair: PairAnswers) -> dict[str, Route]:
         keys, name = self._keys, pair.name
         routes = (
-            Route(keys.extrinsic(name), lambda request: pair.extrinsic(_format(request)), quick=True),
-            Route(keys.health(name), lambda request: pair.health(_format(request)), quick=True),
-            Route(keys.history(name), lambda request: _history(pair, request), quick=False),
-            Route(keys.windows(name), lambda request: _in_format(request, pair.windows), quick=False),
-            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), quick=False),
-            Route(keys.overlay(name), lambda request: _overlay(pair, request), quick=False, draws=True),
+            Route(keys.extrinsic(name), lambda request: pair.extrinsic(_format(request)), Lane.AT_ONCE),
+            Route(keys.health(name), lambda request: pair.health(_format(request)), Lane.AT_ONCE),
+            Route(keys.history(name), lambda request: _history(pair, request), Lane.FILES),
+            Route(keys.windows(name), lambda request: _in_format(request, pair.windows), Lane.FILES),
+            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), Lane.FILES),
+            Route(keys.overlay(name), lambda request: _overlay(pair, request), Lane.DRAWING),
         )
         return {route.key: route for route in routes}
 
