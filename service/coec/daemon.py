@@ -23,15 +23,19 @@ from coec import __version__
 from coec.adapters.system import logs
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
+from coec.adapters.tls.conversation import Listener, credentials_of
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.presence import Presence, told
+from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.settings import settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
 from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
+from coec.runtime.api.authority import Authority
 from coec.runtime.api.configuration import shown
 from coec.runtime.api.health import reasons_of
+from coec.runtime.api.reception import Reception
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.api.status import worker_status_of
@@ -95,7 +99,7 @@ class Daemon:
         """Build everything; nothing runs yet, but the Zenoh session is open.
 
         Raises:
-            ConfigError: a rig or an endpoint cannot be used.
+            ConfigError: a rig, an endpoint or a certificate cannot be used.
             UnavailableError: a port is taken.
             RecordingError: the state directory cannot be used.
         """
@@ -107,13 +111,18 @@ class Daemon:
         self._keys = Keys(config.prefix, config.vehicle)
         self._folder = WindowStore(config.state.directory / "windows", config.state)
         self._worker = Worker(config.worker, config.model_dump_json())
-        self._insecure = _insecure(unguarded(settings_of(config.zenoh, config.limits)))
+        settings = settings_of(config.zenoh, config.limits)
+        self._insecure = _insecure(unguarded(settings))
+        authority, credentials = Authority(config.authority, Reach(settings).outside), credentials_of(config.authority)
+        listener = None if credentials is None else Listener(credentials)
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
+        commands = {name: pair.commands for name, pair in self._pairs.items()}
+        self._reception = Reception(authority, listener, commands)
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
 
@@ -155,8 +164,9 @@ class Daemon:
             }
         )
         answers = {name: pair.answers for name, pair in self._pairs.items()}
-        commands = {name: pair.commands for name, pair in self._pairs.items()}
-        VehicleAnswers(self._keys, answers, commands, lambda: self._status, self._metrics, config).declare(self._bus)
+        VehicleAnswers(self._keys, answers, self._reception, lambda: self._status, self._metrics, config).declare(
+            self._bus
+        )
         for pair_config in self._config.pairs:
             pair = self._pairs[pair_config.name]
             pair.stream.thread.start()
@@ -300,8 +310,9 @@ def _insecure(doors: Sequence[str]) -> Reason | None:
     if not doors:
         return None
     text = (
-        f"Whoever reaches {', '.join(doors)} can read, send frames and give commands, without a certificate: "
-        "`zenoh.insecure` is set. Listen on loopback, or on tls with client certificates."
+        f"Whoever reaches {', '.join(doors)} can read and send frames without a certificate, and give commands if "
+        "`authority.anonymous` is `always`: `zenoh.insecure` is set. Listen on loopback, or on tls with client "
+        "certificates."
     )
     return Reason("insecure", text)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import zenoh
 from pydantic import BaseModel
@@ -10,14 +11,12 @@ from pydantic import BaseModel
 from coec.adapters.zenoh.bus import Answer, Bus, Lane, Request, Route
 from coec.errors import UsageError
 from coec.runtime.api import metrics as metrics_text
-from coec.runtime.api import payloads
-from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
+from coec.runtime.api.reception import Reception
 from coec.runtime.api.snapshots import Snapshot, answer_of
 from coec.schemas.keys import (
     Format,
     Keys,
-    parse_command_selector,
     parse_evidence_selector,
     parse_history_selector,
     parse_overlay_selector,
@@ -36,7 +35,7 @@ class VehicleAnswers:
         self,
         keys: Keys,
         pairs: Mapping[str, PairAnswers],
-        commands: Mapping[str, Commands],
+        reception: Reception,
         status: Callable[[], Snapshot],
         metrics: Callable[[], bytes],
         config: Snapshot,
@@ -44,7 +43,7 @@ class VehicleAnswers:
         """`status()` and `config` are serialised before; `metrics()` is rendered when asked."""
         self._keys = keys
         self._pairs = pairs
-        self._commands = commands
+        self._reception = reception
         self._vehicle_routes = {
             keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
             keys.config: Route(keys.config, lambda request: config.answer(_format(request)), Lane.AT_ONCE),
@@ -86,7 +85,7 @@ class VehicleAnswers:
         if address.resource == "windows" and address.argument is not None:
             return [Route(key, self._window(self._pairs[pair], address.argument), Lane.FILES)]
         if address.resource == "command":
-            return [Route(key, self._command(self._commands[pair], str(address.argument)), Lane.COMMANDS)]
+            return [Route(key, partial(self._reception.take, pair, str(address.argument)), Lane.COMMANDS)]
         if address.resource == "evidence" and address.argument is not None:
             return [Route(key, self._evidence(self._pairs[pair], address.argument), Lane.FILES)]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
@@ -127,15 +126,6 @@ class VehicleAnswers:
             if chosen.overlay is not None:
                 return Answer(pair.event_overlay(event_id, chosen.overlay), JPEG)
             return answer_of(pair.event(event_id), chosen.format)
-
-        return answer
-
-    def _command(self, commands: Commands, name: str) -> Callable[[Request], Answer]:
-        def answer(request: Request) -> Answer:
-            chosen = parse_command_selector(request.parameters)
-            arguments, sender = payloads.parse(name, request.payload), payloads.sender_of(request.attachment)
-            deadline_s = request.received_s + chosen.timeout_ms / 1e3
-            return answer_of(commands.carry_out(name, arguments, sender, deadline_s), chosen.format)
 
         return answer
 
