@@ -174,7 +174,7 @@ def test_a_service_without_a_certificate_says_so(
 
 
 @pytest.mark.fault("an unproven command while the session or its router is open to other computers", "it is denied")
-@pytest.mark.parametrize("door", ["tcp/0.0.0.0", "tcp/[::]"])
+@pytest.mark.parametrize("door", ["tcp/0.0.0.0", pytest.param("tcp/[::]", marks=pytest.mark.slow)])
 def test_what_comes_through_a_door_for_everybody_is_denied(tmp_path: Path, door: str) -> None:
     port = free_port()
     wide = ZenohConfig(embedded_router=True, listen=(f"{door}:{port}",), insecure=True)
