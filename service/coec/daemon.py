@@ -59,6 +59,12 @@ EXIT_THREAD_DIED = 70
 SWITCH_INTERVAL_S = 0.0005
 """How long a thread may keep the interpreter while a query waits for it; Python's own 5 ms would be half the budget."""
 
+TOKENS_HIDDEN = Reason(
+    "tokens_hidden",
+    "The router hides the liveliness tokens of this vehicle: a second daemon could serve it unseen. Its rules must "
+    "allow the service `liveliness_token` and `liveliness_query` (deploy/router.json5).",
+)
+
 TICK_S = 1.0
 STALLED_S = 20.0
 """A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed."""
@@ -268,7 +274,8 @@ class Daemon:
         """What ails every pair alike."""
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
-        return tuple(reason for reason in (self._fault, failing, self._insecure) if reason is not None)
+        hidden = TOKENS_HIDDEN if self._presence.hidden else None
+        return tuple(reason for reason in (self._fault, failing, self._insecure, hidden) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
 

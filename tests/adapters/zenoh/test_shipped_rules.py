@@ -7,8 +7,10 @@ To a client a denied query is an empty list, as if nobody were there: Zenoh tell
 from __future__ import annotations
 
 import json
+import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -283,3 +285,17 @@ def test_a_second_daemon_on_another_computer_sees_the_first(authority: TestAutho
             second.claim(threading.Event())
         assert first.close(PATIENCE_S)
         assert second.close(PATIENCE_S)
+
+
+@pytest.mark.fault("100 sockets opened on the router's loopback door that say nothing", "an operator gets in at once")
+def test_sockets_that_say_nothing_keep_nobody_out(
+    authority: TestAuthority, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    with ExitStack() as stack:
+        door = stack.enter_context(opened(authority, tmp_path))
+        port = int(door.loopback.rpartition(":")[2])
+        for _ in range(100):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+        began_s = time.monotonic()
+        with connected_by(door.session("operator"), PATIENCE_S):
+            record_property("figure", f"{time.monotonic() - began_s:.2f} s")
