@@ -10,6 +10,7 @@ from certificates import TestAuthority
 from cli.conftest import Coec
 from coec.adapters.zenoh.bus import open_session
 from coec.config import SenderConfig, ZenohConfig
+from doors import opened
 from fakes import wait_until
 from ports import free_port
 from vehicles import KEYS, LIMITS, serving
@@ -49,3 +50,24 @@ def test_a_file_that_is_none_is_named(coec: Coec, tmp_path: Path) -> None:
     outcome = coec("query", "health", "--zenoh", file)
     assert outcome.status == 78
     assert f"{file} is no configuration of Zenoh (JSON5): line 1" in outcome.err
+
+
+@pytest.mark.fault("`coec query` for what the router's rules keep back", "it says that this may be why")
+def test_what_the_router_keeps_back_reads_as_denied(authority: TestAuthority, coec: Coec, tmp_path: Path) -> None:
+    may = authority.of_service(SenderConfig(name="operator"))
+    with (
+        opened(authority, tmp_path) as door,
+        serving(tmp_path / "state", ZenohConfig(connect=(door.loopback,)), may) as there,
+    ):
+        viewer, operator = ("--zenoh", door.file("viewer")), ("--zenoh", door.file("operator"))
+        wait_until(lambda: coec("query", "status", *viewer).status == 0, "the viewer reads")
+        assert coec("query", "evidence", *operator).status == 0
+        for arguments in (("command/hold", *viewer), ("coec/@v1/vehicle/**", *viewer)):
+            denied = coec("query", *arguments, "--json")
+            assert (denied.status, denied.document["error"]["code"]) == (1, "not_found")
+            assert "though the service is there (its liveliness token is seen)" in denied.err
+            assert "the router's rules may not allow it to you" in denied.err
+        assert coec("query", "command/hold", *operator).status == 0
+        assert there.commands == {"hold_accepted": 1}
+    gone = coec("query", "status", *viewer, "--timeout", "0.5")
+    assert (gone.status, "or it refuses the certificate" in gone.err) == (1, True)

@@ -36,7 +36,7 @@ from coec.adapters.zenoh.proven import give
 from coec.adapters.zenoh.settings import connected_of
 from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.config import Config, ZenohConfig, load_config
-from coec.errors import UsageError
+from coec.errors import NotFoundError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, VERSION_CHUNK, Keys
@@ -144,7 +144,10 @@ def _answers(session: zenoh.Session, key: str, options: Options) -> list[Reply]:
         return ask(session, selector, options.timeout_s, payload, _myself())
     speaker = Speaker(credentials, options.service.vehicle)
     encoding = MSGPACK if "format=msgpack" in options.params else JSON
-    return [give(session, selector, payload, options.timeout_s, speaker, encoding)]
+    try:
+        return [give(session, selector, payload, options.timeout_s, speaker, encoding)]
+    except NotFoundError:  # nobody answered: as with every other key
+        return []
 
 
 def _is_command(key: str) -> bool:

@@ -11,7 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,9 +26,8 @@ from coec.adapters.zenoh.presence import Presence
 from coec.adapters.zenoh.proven import give
 from coec.config import SenderConfig, ZenohConfig
 from coec.errors import UnavailableError
-from conftest import REPOSITORY
+from doors import Door, opened
 from fakes import wait_until
-from ports import free_port
 from vehicles import KEYS, LIMITS, PAIR, Vehicle, serving
 
 PATIENCE_S = 20.0
@@ -52,37 +51,6 @@ READABLE = {
 }
 COMMAND = KEYS.command(PAIR, "hold")
 NOT_READABLE = (f"{KEYS.root}/**", "coec/@v1/**", "coec/**", "**", "@/**", "@/*/router", "@/**/config/**", FRAMES)
-
-
-@dataclass(frozen=True)
-class Door:
-    """A router with the shipped rules."""
-
-    authority: TestAuthority
-    loopback: str
-    certified: str
-
-    def session(self, name: str) -> Way:
-        """That of somebody on another computer."""
-        return Way((self.certified,), self.authority.session(name, self.certified))
-
-
-@contextmanager
-def opened(authority: TestAuthority, folder: Path) -> Iterator[Door]:
-    """A router with the shipped rules, on ports and with certificates of the test."""
-    ports = free_port(), free_port()
-    rules = (REPOSITORY / "deploy" / "router.json5").read_text()
-    for shipped, here in (
-        ("/etc/zenoh/tls", str(authority.folder)),
-        ("tls/[::]:7448", f"tls/127.0.0.1:{ports[1]}"),
-        ("tcp/127.0.0.1:7447", f"tcp/127.0.0.1:{ports[0]}"),
-    ):
-        assert shipped in rules
-        rules = rules.replace(shipped, here)
-    file = folder / "router.json5"
-    file.write_text(rules)
-    with zenoh.open(zenoh.Config.from_file(file)):
-        yield Door(authority, f"tcp/127.0.0.1:{ports[0]}", f"tls/localhost:{ports[1]}")
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +87,7 @@ def town(request: pytest.FixtureRequest, door: Door, tmp_path_factory: pytest.Te
         vehicle = stack.enter_context(serving(tmp_path_factory.mktemp("state"), config, may))
         vehicle.bus.subscribe(FRAMES, lambda payload, _: frames.append(payload))
         sessions = {
-            name: stack.enter_context(connected_by(door.session(name), PATIENCE_S))
+            name: stack.enter_context(connected_by(door.way(name), PATIENCE_S))
             for name in ("sensors", "operator", "viewer")
         }
         made = Town(vehicle, vehicle.bus._session, frames=frames, **sessions)
@@ -297,5 +265,5 @@ def test_sockets_that_say_nothing_keep_nobody_out(
         for _ in range(100):
             stack.enter_context(socket.create_connection(("127.0.0.1", port)))
         began_s = time.monotonic()
-        with connected_by(door.session("operator"), PATIENCE_S):
+        with connected_by(door.way("operator"), PATIENCE_S):
             record_property("figure", f"{time.monotonic() - began_s:.2f} s")
