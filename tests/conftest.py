@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ import pytest
 from faults import FaultTable, rows_of_item
 
 if TYPE_CHECKING:
+    from certificates import TestAuthority
     from e2e.processes import Router
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -59,6 +61,16 @@ def sample_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"needs the sample recordings: {folder} is absent; COEC_SAMPLE_DATA may name another folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> TestAuthority:
+    """Certificates of one authority; skips the test where there is no openssl to make them."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl")
+    from certificates import make_authority
+
+    return make_authority(tmp_path_factory.mktemp("authority"))
 
 
 @pytest.fixture(scope="session")

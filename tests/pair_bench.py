@@ -29,7 +29,7 @@ from coec.calibration.types import (
     Reason,
     Uncertainty,
 )
-from coec.config import CalibrationConfig, Config, LimitsConfig
+from coec.config import AuthorityConfig, CalibrationConfig, Config, LimitsConfig
 from coec.geometry import se3
 from coec.runtime import pair as runtime_pair
 from coec.runtime.decisions.pair_store import PairStore
@@ -63,7 +63,7 @@ def truth(stamp_ns: int) -> Matrix4:
     return BEFORE if stamp_ns < STEP_S * S else AFTER
 
 
-def configuration(folder: Path, apply: str = "within_limits") -> Config:
+def configuration(folder: Path, apply: str = "within_limits", vehicle: str = "test") -> Config:
     pair = {
         "name": "front",
         "camera": {
@@ -95,7 +95,7 @@ def configuration(folder: Path, apply: str = "within_limits") -> Config:
         "calibration": {"depth": {"model": "stereo"}},
     }
     return Config.model_validate(
-        {"vehicle": "test", "state": {"directory": str(folder), "min_free_bytes": 0}, "pairs": [pair]}
+        {"vehicle": vehicle, "state": {"directory": str(folder), "min_free_bytes": 0}, "pairs": [pair]}
     )
 
 
@@ -240,8 +240,16 @@ class InstantRecorder:
 class Bench:
     """A pair without threads, driven pair by pair; `restart` replaces it by one that reads the same folder."""
 
-    def __init__(self, folder: Path, apply: str = "within_limits", worker: type[KnowingWorker] = KnowingWorker) -> None:
-        self.config = configuration(folder, apply)
+    def __init__(
+        self,
+        folder: Path,
+        apply: str = "within_limits",
+        worker: type[KnowingWorker] = KnowingWorker,
+        vehicle: str = "test",
+        authority: AuthorityConfig | None = None,
+    ) -> None:
+        config = configuration(folder, apply, vehicle)
+        self.config = config.model_copy(update={"authority": authority or config.authority})
         self.kind = worker
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
@@ -250,10 +258,10 @@ class Bench:
     def restart(self) -> None:
         windows = WindowStore(self.folder / "windows", self.config.state)
         self.worker = self.kind()
-        store = StateStore(self.folder, "test")
+        store = StateStore(self.folder, self.config.vehicle)
         self.published: list[str] = []
         outside = Outside(
-            Keys("coec", "test"),
+            Keys("coec", self.config.vehicle),
             store,
             windows,
             cast("Worker", self.worker),

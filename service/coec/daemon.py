@@ -23,15 +23,19 @@ from coec import __version__
 from coec.adapters.system import logs
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
+from coec.adapters.tls.conversation import Listener, credentials_of
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.presence import Presence, told
+from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.settings import settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
 from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
+from coec.runtime.api.authority import Authority
 from coec.runtime.api.configuration import shown
 from coec.runtime.api.health import reasons_of
+from coec.runtime.api.reception import Reception
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.api.status import worker_status_of
@@ -54,6 +58,12 @@ EXIT_THREAD_DIED = 70
 
 SWITCH_INTERVAL_S = 0.0005
 """How long a thread may keep the interpreter while a query waits for it; Python's own 5 ms would be half the budget."""
+
+TOKENS_HIDDEN = Reason(
+    "tokens_hidden",
+    "The router hides the liveliness tokens of this vehicle: a second daemon could serve it unseen. Its rules must "
+    "allow the service `liveliness_token` and `liveliness_query` (deploy/router.json5).",
+)
 
 TICK_S = 1.0
 STALLED_S = 20.0
@@ -95,7 +105,7 @@ class Daemon:
         """Build everything; nothing runs yet, but the Zenoh session is open.
 
         Raises:
-            ConfigError: a rig or an endpoint cannot be used.
+            ConfigError: a rig, an endpoint or a certificate cannot be used.
             UnavailableError: a port is taken.
             RecordingError: the state directory cannot be used.
         """
@@ -107,13 +117,18 @@ class Daemon:
         self._keys = Keys(config.prefix, config.vehicle)
         self._folder = WindowStore(config.state.directory / "windows", config.state)
         self._worker = Worker(config.worker, config.model_dump_json())
-        self._insecure = _insecure(unguarded(settings_of(config.zenoh, config.limits)))
+        settings = settings_of(config.zenoh, config.limits)
+        self._insecure = _insecure(unguarded(settings))
+        authority, credentials = Authority(config.authority, Reach(settings).outside), credentials_of(config.authority)
+        listener = None if credentials is None else Listener(credentials)
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
+        commands = {name: pair.commands for name, pair in self._pairs.items()}
+        self._reception = Reception(authority, listener, commands)
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
 
@@ -144,7 +159,7 @@ class Daemon:
 
     def _start(self) -> None:
         deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
-        for thread in (self._presence.thread, self._bus.thread, self._bus.drawing_thread, *deciding):
+        for thread in (self._presence.thread, *self._bus.threads, *deciding):
             thread.start()
         self._worker.start()
         config = Snapshot.of_document(
@@ -155,8 +170,9 @@ class Daemon:
             }
         )
         answers = {name: pair.answers for name, pair in self._pairs.items()}
-        commands = {name: pair.commands for name, pair in self._pairs.items()}
-        VehicleAnswers(self._keys, answers, commands, lambda: self._status, self._metrics, config).declare(self._bus)
+        VehicleAnswers(self._keys, answers, self._reception, lambda: self._status, self._metrics, config).declare(
+            self._bus
+        )
         for pair_config in self._config.pairs:
             pair = self._pairs[pair_config.name]
             pair.stream.thread.start()
@@ -202,7 +218,6 @@ class Daemon:
         if self._state != "failing":
             self._state = "stopping"
         pairs = self._pairs.values()
-        answering = (self._bus.thread, self._bus.drawing_thread)
         steps: tuple[tuple[str, Callable[[], object]], ...] = (
             ("announce", self._notifier.stopping),
             ("tell", self._renew),
@@ -212,7 +227,7 @@ class Daemon:
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
             ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
-            ("end the answers", lambda: _stopped(answering, QUERIES_STOP_S)),
+            ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
         )
         for name, step in steps:
@@ -259,14 +274,15 @@ class Daemon:
         """What ails every pair alike."""
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
-        return tuple(reason for reason in (self._fault, failing, self._insecure) if reason is not None)
+        hidden = TOKENS_HIDDEN if self._presence.hidden else None
+        return tuple(reason for reason in (self._fault, failing, self._insecure, hidden) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
 
     def _threads(self) -> list[ServiceThread]:
         pairs = self._pairs.values()
         own = [thread for pair in pairs for thread in pair.threads]
-        return [self._presence.thread, self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
+        return [self._presence.thread, *self._bus.threads, self._worker.thread, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()
@@ -301,8 +317,9 @@ def _insecure(doors: Sequence[str]) -> Reason | None:
     if not doors:
         return None
     text = (
-        f"Whoever reaches {', '.join(doors)} can read, send frames and give commands, without a certificate: "
-        "`zenoh.insecure` is set. Listen on loopback, or on tls with client certificates."
+        f"Whoever reaches {', '.join(doors)} can read and send frames without a certificate, and give commands if "
+        "`authority.anonymous` is `always`: `zenoh.insecure` is set. Listen on loopback, or on tls with client "
+        "certificates."
     )
     return Reason("insecure", text)
 

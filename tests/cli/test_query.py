@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.adapters.zenoh.bus import JSON, Answer, Bus, Request, Route, open_session
+from coec.adapters.zenoh.bus import JSON, Answer, Bus, Lane, Request, Route, open_session
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError
 from coec.schemas.base import Message, to_json
@@ -45,7 +45,7 @@ def vehicle() -> Iterator[str]:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     session = open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
     bus = Bus(session)
-    for thread in (bus.thread, bus.drawing_thread):
+    for thread in bus.threads:
         thread.start()
     serve_status(bus, "front")
     info = WindowInfo(
@@ -57,7 +57,7 @@ def vehicle() -> Iterator[str]:
     bus.serve(KEYS.command("front", "*"), acknowledging)
     yield endpoint
     bus.undeclare_inputs()
-    for thread in (bus.thread, bus.drawing_thread):
+    for thread in bus.threads:
         thread.request_stop()
         assert thread.join(DEADLINE_S)
     bus.undeclare_queryables()
@@ -65,7 +65,7 @@ def vehicle() -> Iterator[str]:
 
 
 def serve_document(bus: Bus, key: str, document: Message) -> None:
-    route = Route(key, lambda _: Answer(to_json(document), JSON), quick=True)
+    route = Route(key, lambda _: Answer(to_json(document), JSON), Lane.AT_ONCE)
     bus.serve(key, lambda _: [route])
 
 
@@ -89,7 +89,7 @@ def window_routes(key: str) -> Sequence[Route]:
         chosen = parse_range_selector(parameters)
         return Answer(WINDOW[chosen.offset : chosen.offset + chosen.length], "application/octet-stream")
 
-    return [Route(key, lambda request: answer(request.parameters), quick=False)]
+    return [Route(key, lambda request: answer(request.parameters), Lane.FILES)]
 
 
 def acknowledging(key: str) -> Sequence[Route]:
@@ -101,7 +101,7 @@ def acknowledging(key: str) -> Sequence[Route]:
         )
         return Answer(to_json(done), JSON)
 
-    return [Route(key, answer, quick=True)]
+    return [Route(key, answer, Lane.AT_ONCE)]
 
 
 def no_event(_: str) -> Sequence[Route]:

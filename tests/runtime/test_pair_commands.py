@@ -16,8 +16,11 @@ from baselines import a_baseline
 from coec.adapters.files.baseline_file import save_baseline
 from coec.adapters.zenoh.bus import Bus, Request, Route
 from coec.calibration.commissioning.baseline import learned_hash
+from coec.config import AuthorityConfig
 from coec.geometry import se3
 from coec.runtime.api import commands, rate_limit
+from coec.runtime.api.authority import Authority
+from coec.runtime.api.reception import Reception
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
@@ -158,9 +161,8 @@ def route_of(bench: Bench, command: str) -> Route:
     """Who answers the command."""
     keys, pair, unasked = Keys("coec", "test"), bench.pair, Snapshot(b"", b"")
     bus = create_autospec(Bus, instance=True)
-    VehicleAnswers(
-        keys, {pair.name: pair.answers}, {pair.name: pair.commands}, lambda: unasked, lambda: b"", unasked
-    ).declare(bus)
+    reception = Reception(Authority(AuthorityConfig(), lambda: None), None, {pair.name: pair.commands})
+    VehicleAnswers(keys, {pair.name: pair.answers}, reception, lambda: unasked, lambda: b"", unasked).declare(bus)
     finders = {call.args[0]: call.args[1] for call in bus.serve.call_args_list}
     (route,) = finders[f"{keys.root}/{pair.name}/**"](keys.command(pair.name, command))
     assert isinstance(route, Route)

@@ -137,11 +137,19 @@ def test_no_text_raises_anything_else(text: str) -> None:
 
 
 def test_how_long_the_sender_of_a_command_waits() -> None:
-    assert parse_command_selector("") == CommandSelector(COMMAND_TIMEOUT_MS, "msgpack")
-    assert parse_command_selector("timeout_ms=1500;format=json") == CommandSelector(1500, "json")
+    assert parse_command_selector("") == CommandSelector(COMMAND_TIMEOUT_MS)
+    assert parse_command_selector("timeout_ms=1500;format=json") == CommandSelector(1500, None, "json")
     for wrong in ("timeout_ms=0", "timeout_ms=600001", "timeout_ms=-5", "timeout_ms=1e3", "timeout=5"):
         with pytest.raises(UsageError, match="timeout"):
             parse_command_selector(wrong)
+
+
+def test_the_conversation_of_a_command_is_named_by_32_digits() -> None:
+    name = "0123456789abcdef" * 2
+    assert parse_command_selector(f"tls={name}") == CommandSelector(COMMAND_TIMEOUT_MS, name)
+    for wrong in ("", name[1:], name + "0", name.upper(), name[1:] + "g", name[1:] + "\n"):
+        with pytest.raises(UsageError, match="`tls` must be 32 hexadecimal digits"):
+            parse_command_selector(f"tls={wrong}")
 
 
 def test_claims_of_daemons_are_read_back_and_nothing_else_is() -> None:

@@ -448,6 +448,16 @@ def _query(
     vehicle: Annotated[str | None, typer.Option(show_default="vehicle")] = None,
     prefix: Annotated[str | None, typer.Option(show_default="coec")] = None,
     connect: Connect = None,
+    zenoh: Annotated[
+        Path | None,
+        typer.Option(
+            help="Zenoh configuration (JSON5) to connect with; with its certificate commands are proven.",
+            metavar="FILE",
+        ),
+    ] = None,
+    anonymous: Annotated[
+        bool, typer.Option("--anonymous", help="Give a command without proof of who gives it.")
+    ] = False,
     param: Annotated[
         list[str] | None, typer.Option(help="Parameter of the query, for example limit=5; repeatable.", metavar="K=V")
     ] = None,
@@ -464,12 +474,13 @@ def _query(
     options = command.Options(
         key=key,
         pair=pair,
-        service=command.asked_of(config, vehicle, prefix, connect),
+        service=command.asked_of(config, vehicle, prefix, connect, zenoh),
         params=tuple(param or ()),
         payload=payload,
         timeout_s=timeout,
         output=output,
         as_json=as_json,
+        anonymous=anonymous,
     )
     raise typer.Exit(command.run(options))
 

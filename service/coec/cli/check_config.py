@@ -6,6 +6,7 @@ from pathlib import Path
 
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files.rig import rig_of
+from coec.adapters.tls.conversation import Listener, credentials_of
 from coec.adapters.zenoh.settings import settings_of
 from coec.config import (
     CameraConfig,
@@ -50,6 +51,10 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
     if config.zenoh.file is not None:
         checks.append(_check_file(config.zenoh.file, "zenoh.file"))
     settings_of(config.zenoh, config.limits)
+    credentials = credentials_of(config.authority)
+    if credentials is not None:
+        Listener(credentials)
+        checks.append(f"authority.certificate {credentials.certificate}")
     digest = config_hash(config)
     if as_json:
         document = {"config": config.model_dump(mode="json"), "config_hash": digest, "checks": checks}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import getpass
 import hashlib
 import json
 import math
 import re
+import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +18,25 @@ from typing import Any
 import zenoh
 
 from coec.adapters.files.output import OutputError
-from coec.adapters.zenoh.client import RemoteError, Reply, ask, ask_one, connected, key_expression, nobody, single_key
+from coec.adapters.tls.conversation import Credentials, Speaker
+from coec.adapters.zenoh.bus import JSON, MSGPACK
+from coec.adapters.zenoh.client import (
+    RemoteError,
+    Reply,
+    Way,
+    ask,
+    ask_one,
+    connected_by,
+    is_alive,
+    key_expression,
+    nobody,
+    single_key,
+)
+from coec.adapters.zenoh.proven import give
+from coec.adapters.zenoh.settings import connected_of
+from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.config import Config, ZenohConfig, load_config
-from coec.errors import UsageError
+from coec.errors import NotFoundError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, VERSION_CHUNK, Keys
@@ -42,29 +61,37 @@ PICTURE_KEYS = ("overlay", "evidence")
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Which service is asked. Of several endpoints of its router, one answers."""
+    """Which service is asked, and how its router is reached. `credentials` are those of the session, with which
+    commands are proven; None: it has none."""
 
     vehicle: str
     prefix: str
-    connect: tuple[str, ...]
+    way: Way
+    credentials: Credentials | None = None
 
 
-def asked_of(config: Path | None, vehicle: str | None, prefix: str | None, connect: str | None) -> Asked:
+def asked_of(
+    config: Path | None, vehicle: str | None, prefix: str | None, connect: str | None, zenoh_file: Path | None
+) -> Asked:
     """The service of a configuration, or one with the default names; what else is given comes first.
 
     Raises:
-        ConfigError: the configuration cannot be read.
+        ConfigError: the configuration, or the Zenoh configuration, cannot be read.
     """
     if config is not None:
         loaded = load_config(config)
-        usual = Asked(loaded.vehicle, loaded.prefix, loaded.zenoh.router)
+        usual_vehicle, usual_prefix, zenoh_config = loaded.vehicle, loaded.prefix, loaded.zenoh
     else:
         named = Config.model_fields
-        usual = Asked(named["vehicle"].default, named["prefix"].default, ZenohConfig().router)
+        usual_vehicle, usual_prefix, zenoh_config = named["vehicle"].default, named["prefix"].default, ZenohConfig()
+    file = zenoh_file or zenoh_config.file
+    settings = None if file is None else read_settings(file)
+    endpoints = () if settings is None else connected_of(settings)
     return Asked(
-        usual.vehicle if vehicle is None else vehicle,
-        usual.prefix if prefix is None else prefix,
-        usual.connect if connect is None else (connect,),
+        usual_vehicle if vehicle is None else vehicle,
+        usual_prefix if prefix is None else prefix,
+        Way((endpoints or zenoh_config.router) if connect is None else (connect,), file),
+        None if settings is None else credentials_in(settings),
     )
 
 
@@ -80,6 +107,7 @@ class Options:
     timeout_s: float
     output: Path | None
     as_json: bool
+    anonymous: bool = False
 
 
 def run(options: Options) -> int:
@@ -89,6 +117,7 @@ def run(options: Options) -> int:
         UsageError: no such key, what was typed makes no key, or it is not clear of which pair.
         NotFoundError: nobody answered.
         RemoteError: an error reply.
+        NotProvenError: who answered a command is not the service.
     """
     keys = _keys(options)
     head, _, argument = options.key.partition("/")
@@ -97,14 +126,41 @@ def run(options: Options) -> int:
         return _download(options, keys, argument)
     if options.output is not None:
         return _save_picture(options, keys, head, argument)
-    with connected(options.service.connect, options.timeout_s) as session:
+    with connected_by(options.service.way, options.timeout_s) as session:
         key, kind = _resolve(session, options, keys)
         if any(item.startswith("format=") for item in options.params):
             kind = None
-        replies = ask(session, _selector(key, _params(key, options)), options.timeout_s, _payload(options.payload))
-    if not replies:
-        raise nobody(key)
+        replies = _answers(session, key, options)
+        if not replies:
+            raise nobody(key, service_is_there=is_alive(session, keys, options.timeout_s))
     return _show(replies, kind, options, key)
+
+
+def _answers(session: zenoh.Session, key: str, options: Options) -> list[Reply]:
+    """To the query; a command is proven where the session has a certificate."""
+    selector, payload = _selector(key, _params(key, options)), _payload(options.payload)
+    credentials = options.service.credentials
+    if not _is_command(key):
+        return ask(session, selector, options.timeout_s, payload)
+    if credentials is None or options.anonymous:
+        return ask(session, selector, options.timeout_s, payload, _myself())
+    speaker = Speaker(credentials, options.service.vehicle)
+    encoding = MSGPACK if "format=msgpack" in options.params else JSON
+    try:
+        return [give(session, selector, payload, options.timeout_s, speaker, encoding)]
+    except NotFoundError:  # nobody answered: as with every other key
+        return []
+
+
+def _is_command(key: str) -> bool:
+    return key.split("/")[-2] == "command"
+
+
+def _myself() -> bytes:
+    """Who says that he gives a command: for the log, and for a rate of his own. It proves nothing."""
+    with suppress(OSError, KeyError):  # a user without a name
+        return f"{getpass.getuser()}@{socket.gethostname()}".encode("ascii", errors="replace")
+    return socket.gethostname().encode("ascii", errors="replace")
 
 
 def _keys(options: Options) -> Keys:
@@ -162,7 +218,7 @@ def _only_pair(session: zenoh.Session, options: Options, keys: Keys) -> str:
 
 def _params(key: str, options: Options) -> tuple[str, ...]:
     """Those that were given; with a command goes for how long its acknowledgement is waited for."""
-    if key.split("/")[-2] != "command" or any(item.startswith("timeout_ms=") for item in options.params):
+    if not _is_command(key) or any(item.startswith("timeout_ms=") for item in options.params):
         return options.params
     timeout_ms = min(max(round(options.timeout_s * 1e3 * ON_SITE), 1), MAX_COMMAND_TIMEOUT_MS)
     return (*options.params, f"timeout_ms={timeout_ms}")
@@ -228,7 +284,7 @@ def _save_picture(options: Options, keys: Keys, head: str, argument: str) -> int
         raise UsageError(
             "--output belongs to windows/ID, overlay, and evidence/ID with --param overlay=before or after"
         )
-    with connected(options.service.connect, options.timeout_s) as session:
+    with connected_by(options.service.way, options.timeout_s) as session:
         if head == "overlay":
             key = keys.overlay(options.pair or _only_pair(session, options, keys))
         else:
@@ -251,7 +307,7 @@ def _save_picture(options: Options, keys: Keys, head: str, argument: str) -> int
 def _download(options: Options, keys: Keys, window_id: str) -> int:
     if options.output is None:
         raise UsageError("say where to with --output FILE")
-    with connected(options.service.connect, options.timeout_s) as session, console.progress(counted=False) as bars:
+    with connected_by(options.service.way, options.timeout_s) as session, console.progress(counted=False) as bars:
         pair = _pair_of(session, options, keys, window_id)
         single_key(keys.window(pair, window_id))
         task = bars.add_task(window_id, note="")

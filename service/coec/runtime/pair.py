@@ -15,6 +15,7 @@ from coec.adapters.system.threads import ServiceThread
 from coec.config import Config, PairConfig
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
+from coec.runtime.api.payloads import proven_sender
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.incident_pictures import IncidentPictures
 from coec.runtime.decisions.mailbox import Mailbox
@@ -83,6 +84,7 @@ class Pair:
             self.recorder,
             folder,
             questions,
+            [proven_sender(sender.name) for sender in config.authority.senders],
         )
         self._chooser = chooser
         self.decider.tell_now()

@@ -8,13 +8,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import evaluation, frames, matrix, replies
+from coec.schemas import commands, evaluation, frames, matrix, replies
 from coec.schemas.base import Message
 
-FRAMES: tuple[type[Message], ...] = (frames.CameraFrame, frames.LidarFrame, frames.EgoMotion)
+SENT: tuple[type[Message], ...] = (
+    frames.CameraFrame,
+    frames.LidarFrame,
+    frames.EgoMotion,
+    commands.ProvenCommand,
+)
+"""To the service; all others come from it."""
 
 MESSAGES: tuple[type[Message], ...] = (
-    *FRAMES,
+    *SENT,
     replies.ExtrinsicReply,
     replies.HealthReply,
     replies.HistoryReply,
@@ -41,8 +47,8 @@ def schemas() -> dict[str, dict[str, Any]]:
     return {
         f"{message.__name__}.json": {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
-            # What a sender may leave out of a frame, and what a reply always holds.
-            **message.model_json_schema(mode="validation" if message in FRAMES else "serialization"),
+            # What a sender may leave out, and what a reply always holds.
+            **message.model_json_schema(mode="validation" if message in SENT else "serialization"),
         }
         for message in MESSAGES
     }

@@ -185,9 +185,11 @@ class ExtrinsicSelector:
 @dataclass(frozen=True, slots=True)
 class CommandSelector:
     """How long the sender of a command waits for its acknowledgement, ms from when the command comes to the service; no
-    clock is shared. What could not be begun by then is not done."""
+    clock is shared. What could not be begun by then is not done. `conversation` is the one in which its sender proves
+    who he is; None: he does not."""
 
     timeout_ms: int = COMMAND_TIMEOUT_MS
+    conversation: str | None = None
     format: Format = "msgpack"
 
 
@@ -250,14 +252,17 @@ def parse_extrinsic_selector(parameters: str, exports: Collection[str]) -> Extri
 
 
 def parse_command_selector(parameters: str) -> CommandSelector:
-    """`timeout_ms=<ms>;format=json`, each optional.
+    """`timeout_ms=<ms>;tls=<32 hexadecimal digits>;format=json`, each optional.
 
     Raises:
         UsageError: unknown, doubled, malformed or out-of-range parameter; names it.
     """
-    given = _split(parameters, ("timeout_ms", "format"))
+    given = _split(parameters, ("timeout_ms", "tls", "format"))
     timeout_ms = _integer(given, "timeout_ms", COMMAND_TIMEOUT_MS, 1, MAX_COMMAND_TIMEOUT_MS)
-    return CommandSelector(timeout_ms, _format(given))
+    conversation = given.get("tls")
+    if conversation is not None and not re.fullmatch("[0-9a-f]{32}", conversation):
+        raise UsageError("parameter `tls` must be 32 hexadecimal digits, drawn anew for each command")
+    return CommandSelector(timeout_ms, conversation, _format(given))
 
 
 def parse_history_selector(parameters: str) -> HistorySelector:

@@ -6,7 +6,7 @@ import json
 import queue
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import psutil
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.bus import JSON, MSGPACK, SLOW_QUERIES_WAITING, Answer, Bus, Request, Route, open_session
+from coec.adapters.zenoh.bus import JSON, MSGPACK, WAITING, Answer, Bus, Lane, Request, Route, open_session
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError, UnavailableError
 from fakes import wait_until
@@ -33,14 +33,13 @@ def endpoint() -> str:
 def bus(endpoint: str) -> Iterator[Bus]:
     session = open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
     bus = Bus(session)
-    answering = (bus.thread, bus.drawing_thread)
-    for thread in answering:
+    for thread in bus.threads:
         thread.start()
     yield bus
     bus.undeclare_inputs()
-    for thread in answering:
+    for thread in bus.threads:
         thread.request_stop()
-    assert all(thread.join(DEADLINE_S) for thread in answering)
+    assert all(thread.join(DEADLINE_S) for thread in bus.threads)
     bus.undeclare_queryables()
     assert bus.close(DEADLINE_S)
 
@@ -74,7 +73,7 @@ def ask_error(client: zenoh.Session, selector: str, payload: bytes | None = None
 
 
 def serve_value(bus: Bus, key: str, value: bytes) -> None:
-    route = Route(key, lambda _: Answer(value, MSGPACK), quick=True)
+    route = Route(key, lambda _: Answer(value, MSGPACK), Lane.AT_ONCE)
     bus.serve(key, lambda _: [route])
 
 
@@ -89,9 +88,9 @@ def test_a_query_is_answered_with_encoding_and_timestamp(bus: Bus, client: zenoh
 def test_errors_are_replies_in_the_format_asked_for(bus: Bus, client: zenoh.Session) -> None:
     def find(key: str) -> Sequence[Route]:
         if key.endswith("good"):
-            return [Route(key, lambda _: Answer(b"", MSGPACK), quick=True)]
+            return [Route(key, lambda _: Answer(b"", MSGPACK), Lane.AT_ONCE)]
         if key.endswith("fault"):
-            return [Route(key, fail, quick=True)]
+            return [Route(key, fail, Lane.AT_ONCE)]
         raise NotFoundError("no such thing")
 
     def fail(_: Request) -> Answer:
@@ -121,27 +120,28 @@ def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: B
         return Answer(request.parameters.encode(), MSGPACK)
 
     serve_value(bus, "test/quick", b"q")
-    bus.serve("test/slow", lambda key: [Route(key, slow, quick=False)])
+    bus.serve("test/slow", lambda key: [Route(key, slow, Lane.FILES)])
     ask_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow?n=0", replies.put, timeout=DEADLINE_S)
     assert entered.wait(DEADLINE_S)
-    for number in range(1, SLOW_QUERIES_WAITING + 2):
+    for number in range(1, WAITING[Lane.FILES] + 2):
         client.get(f"test/slow?n={number}", replies.put, timeout=DEADLINE_S)
     refused = replies.get(timeout=DEADLINE_S)
     assert refused.err is not None
     assert msgpack.unpackb(refused.err.payload.to_bytes())["code"] == "busy"
     assert ask_ok(client, "test/quick").payload.to_bytes() == b"q"
     release.set()
-    for _ in range(SLOW_QUERIES_WAITING + 1):
+    for _ in range(WAITING[Lane.FILES] + 1):
         assert replies.get(timeout=DEADLINE_S).ok is not None
 
 
 def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Session) -> None:
-    bus.thread.request_stop()
-    assert bus.thread.join(DEADLINE_S)
+    for thread in bus.threads:
+        thread.request_stop()
+        assert thread.join(DEADLINE_S)
     serve_value(bus, "test/quick", b"q")
-    bus.serve("test/slow", lambda key: [Route(key, lambda _: Answer(b"", MSGPACK), quick=False)])
+    bus.serve("test/slow", lambda key: [Route(key, lambda _: Answer(b"", MSGPACK), Lane.FILES)])
     ask_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow", replies.put, timeout=DEADLINE_S)
@@ -222,7 +222,7 @@ def test_the_attachment_of_a_query_is_handed_on(bus: Bus, client: zenoh.Session)
         seen.put(request.attachment)
         return Answer(b"", MSGPACK)
 
-    bus.serve("test/who", lambda _: [Route("test/who", answer, quick=False)])
+    bus.serve("test/who", lambda _: [Route("test/who", answer, Lane.FILES)])
     ask_ok(client, "test/who")
     assert seen.get(timeout=DEADLINE_S) is None
     list(client.get("test/who", attachment=b"me", timeout=DEADLINE_S))
@@ -236,8 +236,8 @@ def test_a_picture_that_takes_long_keeps_no_other_query_waiting(bus: Bus, client
         drawn.wait(DEADLINE_S)
         return Answer(b"jpeg", "image/jpeg")
 
-    bus.serve("test/overlay", lambda _: [Route("test/overlay", draw, quick=False, draws=True)])
-    bus.serve("test/list", lambda _: [Route("test/list", lambda _: Answer(b"list", MSGPACK), quick=False)])
+    bus.serve("test/overlay", lambda _: [Route("test/overlay", draw, Lane.DRAWING)])
+    bus.serve("test/list", lambda _: [Route("test/list", lambda _: Answer(b"list", MSGPACK), Lane.FILES)])
     assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
     waiting = client.get("test/overlay", timeout=DEADLINE_S)
     assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
@@ -245,6 +245,30 @@ def test_a_picture_that_takes_long_keeps_no_other_query_waiting(bus: Bus, client
     (reply,) = waiting
     assert reply.ok is not None
     assert reply.ok.payload.to_bytes() == b"jpeg"
+
+
+@pytest.mark.fault("files are read without an end in sight", "a command is answered all the same")
+def test_a_file_that_takes_long_keeps_no_command_waiting(
+    bus: Bus, client: zenoh.Session, record_property: Callable[[str, object], None]
+) -> None:
+    entered, read = threading.Event(), threading.Event()
+
+    def reading(_: Request) -> Answer:
+        entered.set()
+        assert read.wait(DEADLINE_S)
+        return Answer(b"window", MSGPACK)
+
+    bus.serve("test/window", lambda _: [Route("test/window", reading, Lane.FILES)])
+    bus.serve("test/hold", lambda _: [Route("test/hold", lambda _: Answer(b"held", MSGPACK), Lane.COMMANDS)])
+    assert ask_ok(client, "test/hold").payload.to_bytes() == b"held"
+    waiting = client.get("test/window", timeout=DEADLINE_S)
+    assert entered.wait(DEADLINE_S)
+    began_s = time.monotonic()
+    assert ask_ok(client, "test/hold").payload.to_bytes() == b"held"
+    record_property("figure", f"{(time.monotonic() - began_s) * 1e3:.0f} ms")
+    read.set()
+    (reply,) = waiting
+    assert reply.ok is not None
 
 
 def test_when_a_query_came_is_known_however_long_it_waited(bus: Bus, client: zenoh.Session) -> None:
@@ -258,7 +282,7 @@ def test_when_a_query_came_is_known_however_long_it_waited(bus: Bus, client: zen
         return Answer(b"", MSGPACK)
 
     serve_value(bus, "test/quick", b"q")
-    bus.serve("test/slow", lambda key: [Route(key, slow, quick=False)])
+    bus.serve("test/slow", lambda key: [Route(key, slow, Lane.FILES)])
     ask_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow", replies.put, timeout=DEADLINE_S)

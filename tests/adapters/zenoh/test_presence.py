@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -154,3 +156,53 @@ def test_two_that_started_before_their_router_see_each_other_when_it_is_there(
             assert all(one.close(DEADLINE_S) for one in both)
         (staying,) = [one for one in both if one is not leaving]
         assert staying.rival is None
+
+
+def hiding(*messages: str) -> dict[str, object]:
+    """Rules that deny these messages, either way, and allow all else."""
+    rule = {
+        "id": "hide",
+        "permission": "deny",
+        "flows": ["ingress", "egress"],
+        "messages": messages,
+        "key_exprs": ["coec/@v1/**"],
+    }
+    subject = {"id": "all", "link_protocols": ["tcp"]}
+    policy = {"subjects": ["all"], "rules": ["hide"]}
+    return {
+        "enabled": True,
+        "default_permission": "allow",
+        "rules": [rule],
+        "subjects": [subject],
+        "policies": [policy],
+    }
+
+
+@pytest.mark.fault(
+    "a router whose rules hide liveliness tokens", "status and health say `tokens_hidden` until it is over"
+)
+@pytest.mark.parametrize("messages", [("liveliness_token",), ("liveliness_query",)])
+def test_tokens_that_a_router_hides_are_told_of(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, messages: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(presence, "WATCH_S", 0.02)
+    monkeypatch.setattr(presence, "CONNECT_S", 0.5)
+    monkeypatch.setattr(presence, "SEEN_S", 0.2)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    file = tmp_path / "router.json5"
+    settings = {"mode": "router", "listen": {"endpoints": [endpoint]}, "access_control": hiding(*messages)}
+    file.write_text(json.dumps(settings))
+    config = ZenohConfig(connect=(endpoint,))
+    with ExitStack() as stack:
+        rules = stack.enter_context(ExitStack())
+        rules.enter_context(open_session(ZenohConfig(file=file), LIMITS))
+        session = stack.enter_context(open_session(config, LIMITS))
+        one = Presence(session, config, LIMITS, KEYS, STARTED_NS)
+        wait_until(lambda: bool(list(session.info.routers_zid())), "the router is there")
+        assert serves(one)
+        assert one.hidden
+        one.thread.start()
+        rules.close()
+        stack.enter_context(open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LIMITS))
+        wait_until(lambda: not one.hidden, "the tokens are seen")
+        assert one.close(DEADLINE_S)

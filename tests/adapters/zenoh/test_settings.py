@@ -74,3 +74,35 @@ def test_a_damaged_file_does_not_tell_what_is_in_it(tmp_path: Path) -> None:
         settings_of(of_file(tmp_path, f"{{ transport: {{ auth: {{ usrpwd: {{ password: {SECRET} }} }} }} }}"), LIMITS)
     assert SECRET not in str(refused.value)
     assert "zenoh.json5" in str(refused.value)
+
+
+HOSTILE = {
+    "deep": "{x:" + "[" * 100_000 + "]" * 100_000 + "}",
+    "deep in strings": "{x:" + "['[" * 100_000,
+    "long": " " * 2**19,
+    "not text": "\udcff",
+}
+
+
+@pytest.mark.fault("a Zenoh file nested 100,000 deep, half a megabyte long, or no text", "refused before it is parsed")
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_hostile_file_is_refused_before_it_is_parsed(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "zenoh.json5"
+    path.write_bytes(HOSTILE[kind].encode(errors="surrogateescape"))
+    with pytest.raises(ConfigError, match=r"zenoh.json5 is no (configuration of Zenoh: it has more|text in UTF-8)"):
+        settings_of(ZenohConfig(file=path), LIMITS)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{{ transport: {{ auth: {{ usrpwd: {{ password:\n\"{SECRET}' }} }} }} }}",
+        f'{{ transport: {{ link: {{ tls: {{ enable_mtls: "{SECRET}" }} }} }} }}',
+        f"{{ mode: '{SECRET}' }}",
+    ],
+)
+def test_what_is_wrong_in_a_file_is_told_without_what_stands_there(tmp_path: Path, text: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        settings_of(of_file(tmp_path, text), LIMITS)
+    assert SECRET not in str(refused.value)
+    assert "zenoh.json5 is no configuration of Zenoh" in str(refused.value)

@@ -1,82 +1,269 @@
-"""The router's rules as they are shipped, with real certificates: daemons of one vehicle see each other through it."""
+"""The router's rules as they are shipped, with real sessions and certificates: what they allow works, and nothing else.
+
+To a client a denied query is an empty list, as if nobody were there: Zenoh tells no more. What reads it for people is
+`coec query` (`tests/cli`).
+"""
 
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
+import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.bus import open_session
+from certificates import TestAuthority, make_authority
+from coec.adapters.tls.conversation import Speaker
+from coec.adapters.zenoh.bus import JSON, open_session
+from coec.adapters.zenoh.client import ConnectionFailedError, Way, connected_by, is_alive
 from coec.adapters.zenoh.presence import Presence
-from coec.config import LimitsConfig, ZenohConfig
+from coec.adapters.zenoh.proven import give
+from coec.config import SenderConfig, ZenohConfig
 from coec.errors import UnavailableError
-from coec.schemas.keys import Keys
-from conftest import REPOSITORY
-from ports import free_port
+from doors import Door, opened
+from fakes import wait_until
+from vehicles import KEYS, LIMITS, PAIR, Vehicle, serving
 
-LIMITS = LimitsConfig()
-KEYS = Keys("coec", "vehicle")
-DEADLINE_S = 20.0
-EXTENSIONS = "subjectAltName=DNS:localhost,IP:127.0.0.1\nextendedKeyUsage=serverAuth,clientAuth\n"
+PATIENCE_S = 20.0
+REFUSED_S = 0.5
+"""A session that is let in is open in some 20 ms."""
+
+FRAMES = "sensors/front/camera"
+READABLE = {
+    "extrinsic": KEYS.extrinsic(PAIR),
+    "health": KEYS.health(PAIR),
+    "history": KEYS.history(PAIR),
+    "windows": KEYS.windows(PAIR),
+    "a window": KEYS.window(PAIR, "front-1"),
+    "overlay": KEYS.overlay(PAIR),
+    "evidence": KEYS.evidence(PAIR),
+    "a red event": KEYS.evidence_of(PAIR, "front-1"),
+    "status": KEYS.status,
+    "metrics": KEYS.metrics,
+    "config": KEYS.config,
+    "health of all": "coec/@v1/*/*/health",
+}
+COMMAND = KEYS.command(PAIR, "hold")
+NOT_READABLE = (f"{KEYS.root}/**", "coec/@v1/**", "coec/**", "**", "@/**", "@/*/router", "@/**/config/**", FRAMES)
 
 
 @pytest.fixture(scope="module")
-def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an authority, and certificates of the router and the service that it signed."""
-    if shutil.which("openssl") is None:
-        pytest.skip("needs openssl")
-    folder = tmp_path_factory.mktemp("tls")
-    (folder / "extensions").write_text(EXTENSIONS)
-
-    def openssl(*arguments: str) -> None:
-        subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
-
-    key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
-    openssl("req", "-x509", *key, "-keyout", "ca-key.pem", "-out", "ca.pem", "-days", "2", "-subj", "/CN=authority")
-    for name in ("router", "vehicle"):
-        openssl("req", *key, "-keyout", f"{name}-key.pem", "-out", f"{name}.csr", "-subj", f"/CN={name}")
-        signed = ("-CA", "ca.pem", "-CAkey", "ca-key.pem", "-CAcreateserial", "-days", "2", "-extfile", "extensions")
-        openssl("x509", "-req", "-in", f"{name}.csr", "-out", f"{name}.pem", *signed)
-    return folder
+def door(authority: TestAuthority, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
+    with opened(authority, tmp_path_factory.mktemp("router")) as made:
+        yield made
 
 
-@pytest.fixture
-def service(certificates: Path) -> Iterator[ZenohConfig]:
-    """How the service reaches a router with the shipped rules, from another computer."""
-    port = free_port()
-    rules = (REPOSITORY / "deploy" / "router.json5").read_text()
-    for shipped, here in (
-        ("/etc/zenoh/tls", str(certificates)),
-        ("tls/[::]:7448", f"tls/127.0.0.1:{port}"),
-        ("tcp/127.0.0.1:7447", f"tcp/127.0.0.1:{free_port()}"),
-    ):
-        assert shipped in rules
-        rules = rules.replace(shipped, here)
-    (certificates / "router.json5").write_text(rules)
-    tls = {
-        "root_ca_certificate": str(certificates / "ca.pem"),
-        "enable_mtls": True,
-        "connect_certificate": str(certificates / "vehicle.pem"),
-        "connect_private_key": str(certificates / "vehicle-key.pem"),
-    }
-    session = {"connect": {"endpoints": [f"tls/localhost:{port}"]}, "transport": {"link": {"tls": tls}}}
-    file = certificates / "service.json5"
-    file.write_text(json.dumps(session))
-    with zenoh.open(zenoh.Config.from_file(certificates / "router.json5")):
-        yield ZenohConfig(file=file)
+@dataclass(frozen=True)
+class Town:
+    """A vehicle, and one session of everybody."""
+
+    vehicle: Vehicle
+    vehicle_session: zenoh.Session
+    sensors: zenoh.Session
+    operator: zenoh.Session
+    viewer: zenoh.Session
+    frames: list[bytes]
+
+    def of(self, name: str) -> zenoh.Session:
+        session = getattr(self, name)
+        assert isinstance(session, zenoh.Session)
+        return session
 
 
-def test_a_second_daemon_on_another_computer_sees_the_first(service: ZenohConfig) -> None:
-    with open_session(service, LIMITS) as here, open_session(service, LIMITS) as there:
+@pytest.fixture(scope="module", params=["on the router's computer", "on another computer"])
+def town(request: pytest.FixtureRequest, door: Door, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
+    away = request.param == "on another computer"
+    file = door.authority.session("vehicle", door.certified, mode="peer") if away else None
+    config = ZenohConfig(connect=(door.loopback,), file=file)
+    frames: list[bytes] = []
+    may = door.authority.of_service(SenderConfig(name="operator"))
+    with ExitStack() as stack:
+        vehicle = stack.enter_context(serving(tmp_path_factory.mktemp("state"), config, may))
+        vehicle.bus.subscribe(FRAMES, lambda payload, _: frames.append(payload))
+        sessions = {
+            name: stack.enter_context(connected_by(door.way(name), PATIENCE_S))
+            for name in ("sensors", "operator", "viewer")
+        }
+        made = Town(vehicle, vehicle.bus._session, frames=frames, **sessions)
+        wait_until(lambda: bool(answers(made.operator, KEYS.status)), "the operator reaches the vehicle")
+        wait_until(lambda: bool(answers(made.viewer, KEYS.status)), "the viewer reaches the vehicle")
+        yield made
+
+
+def answers(session: zenoh.Session, key: str, payload: bytes | None = None) -> list[zenoh.Reply]:
+    """Good ones and error replies of the service."""
+    elsewhere = zenoh.Locality.REMOTE  # a session has an admin space of its own
+    replies = list(session.get(key, payload=payload, timeout=PATIENCE_S, allowed_destination=elsewhere))
+    errors = [reply.err.payload.to_bytes() for reply in replies if reply.err is not None]
+    assert b"Timeout" not in errors
+    return replies
+
+
+def seen(town: Town, name: str) -> None:
+    """What a session did before has come through the router and to the vehicle, if it comes at all: each link keeps the
+    order."""
+    list(town.of(name).get(KEYS.status, timeout=PATIENCE_S))
+    assert answers(town.operator, KEYS.status)
+
+
+@pytest.mark.parametrize("what", READABLE)
+@pytest.mark.parametrize("name", ["operator", "viewer"])
+def test_operator_and_viewer_read_everything(town: Town, name: str, what: str) -> None:
+    assert answers(town.of(name), READABLE[what])
+
+
+@pytest.mark.fault("a sensor's certificate asks, by name or wildcard", "nothing is answered")
+@pytest.mark.parametrize("key", [*READABLE.values(), COMMAND])
+def test_sensors_read_nothing(town: Town, key: str) -> None:
+    assert answers(town.sensors, key) == []
+
+
+@pytest.mark.fault("wildcards, the admin space, and frames asked for with a certificate", "nothing is answered")
+@pytest.mark.parametrize("key", NOT_READABLE)
+@pytest.mark.parametrize("name", ["operator", "viewer", "sensors"])
+def test_what_includes_more_than_is_allowed_is_not_answered(town: Town, name: str, key: str) -> None:
+    assert answers(town.of(name), key) == []
+
+
+def test_the_operator_commands(town: Town, door: Door) -> None:
+    speaker = Speaker(door.authority.credentials("operator"), "vehicle")
+    told = give(town.operator, f"{COMMAND}?format=json", None, PATIENCE_S, speaker, JSON)
+    assert json.loads(told.payload)["code"] == "held"
+
+
+@pytest.mark.fault("a command with the certificate of a viewer or a sensor", "the router lets it not through")
+@pytest.mark.parametrize("name", ["viewer", "sensors"])
+def test_nobody_else_commands(town: Town, name: str) -> None:
+    before = town.vehicle.commands
+    assert answers(town.of(name), COMMAND) == []
+    assert answers(town.of(name), "coec/@v1/*/*/command/*") == []
+    assert town.vehicle.commands == before
+
+
+@pytest.mark.fault("forged frames with the certificate of an operator or a viewer", "the vehicle gets none")
+def test_frames_come_from_sensors_only(town: Town) -> None:
+    town.frames.clear()
+    for name in ("operator", "viewer"):
+        town.of(name).put(FRAMES, name.encode())
+        seen(town, name)
+    publisher = town.sensors.declare_publisher(FRAMES)
+    wait_until(lambda: bool(town.frames or publisher.put(b"true")), "a frame of the sensors")
+    publisher.undeclare()
+    assert set(town.frames) == {b"true"}
+
+
+@pytest.mark.fault("frames subscribed to with the certificate of a viewer", "he gets none")
+def test_frames_go_to_the_vehicle_only(town: Town) -> None:
+    got: list[bytes] = []
+
+    def receive(sample: zenoh.Sample) -> None:
+        got.append(sample.payload.to_bytes())
+
+    handler = zenoh.handlers.Callback(receive, indirect=False)
+    subscribers = [town.of(name).declare_subscriber("sensors/**", handler) for name in ("viewer", "operator")]
+    for name in ("viewer", "operator"):
+        seen(town, name)
+    town.frames.clear()
+    wait_until(lambda: bool(town.frames or town.sensors.put(FRAMES, b"true")), "a frame of the sensors")
+    for name in ("viewer", "operator"):
+        seen(town, name)
+    assert got == []
+    for subscriber in subscribers:
+        subscriber.undeclare()
+
+
+@pytest.mark.fault("spoofed health, and a spoofed answer, with any certificate", "nobody sees either")
+@pytest.mark.parametrize("name", ["operator", "viewer", "sensors"])
+def test_nobody_speaks_for_the_vehicle(town: Town, name: str) -> None:
+    asker = "viewer" if name == "operator" else "operator"
+    heard: list[bytes] = []
+
+    def hear(sample: zenoh.Sample) -> None:
+        heard.append(sample.payload.to_bytes())
+
+    def pretend(query: zenoh.Query) -> None:
+        with query:
+            query.reply(READABLE["health"], b"spoofed")
+
+    subscriber = town.of(asker).declare_subscriber(READABLE["health"], zenoh.handlers.Callback(hear, indirect=False))
+    spoof = town.of(name).declare_queryable(
+        READABLE["health"], zenoh.handlers.Callback(pretend, indirect=False), complete=True
+    )
+    town.of(name).put(READABLE["health"], b"spoofed")
+    seen(town, name)
+    replies = town.of(asker).get(READABLE["health"], target=zenoh.QueryTarget.ALL, timeout=PATIENCE_S)
+    told = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+    assert len(told) == 1
+    assert b"spoofed" not in told + heard
+    town.vehicle.bus.publish(READABLE["health"], town.vehicle.bench.answers.health("msgpack"))
+    wait_until(lambda: bool(heard), "the vehicle's own word")
+    assert b"spoofed" not in heard
+    subscriber.undeclare()
+    spoof.undeclare()
+
+
+@pytest.mark.fault("spoofed liveliness tokens with any certificate", "nobody sees them")
+@pytest.mark.parametrize("name", ["operator", "viewer", "sensors"])
+def test_nobody_is_alive_for_the_vehicle(town: Town, name: str) -> None:
+    tokens = [town.of(name).liveliness().declare_token(key) for key in (KEYS.alive("ghost"), "sensors/ghost")]
+    seen(town, name)
+    asker = town.viewer if name == "operator" else town.operator
+    replies = list(asker.liveliness().get(KEYS.alive("*"), timeout=PATIENCE_S))
+    assert [str(reply.ok.key_expr) for reply in replies if reply.ok is not None] == [KEYS.alive(PAIR)]
+    assert is_alive(asker, KEYS, PATIENCE_S)
+    for token in tokens:
+        token.undeclare()
+
+
+@pytest.mark.fault("a session with a certificate that has expired, is foreign, or none", "it is not opened")
+@pytest.mark.parametrize("kind", ["expired", "foreign", "none", "plain tcp"])
+def test_who_shows_no_good_certificate_gets_no_session(door: Door, tmp_path: Path, kind: str) -> None:
+    file: Path | None = None
+    endpoint = door.certified
+    if kind == "expired":
+        file = door.authority.session(door.authority.sign("operator", "expired-session", days=-1), endpoint)
+    elif kind == "foreign":
+        foreign = make_authority(tmp_path / "foreign")
+        foreign.root.write_bytes(door.authority.root.read_bytes())
+        file = foreign.session("operator", endpoint)
+    elif kind == "none":
+        file = tmp_path / "none.json5"
+        tls = {"root_ca_certificate": str(door.authority.root)}
+        file.write_text(json.dumps({"transport": {"link": {"tls": tls}}}))
+    else:
+        endpoint = f"tcp/127.0.0.1:{endpoint.rpartition(':')[2]}"
+    with pytest.raises(ConnectionFailedError), connected_by(Way((endpoint,), file), REFUSED_S):
+        pass
+
+
+def test_a_second_daemon_on_another_computer_sees_the_first(authority: TestAuthority, tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        door = stack.enter_context(opened(authority, tmp_path))
+        service = ZenohConfig(file=authority.session("vehicle", door.certified, mode="peer"))
+        here, there = (stack.enter_context(open_session(service, LIMITS)) for _ in range(2))
         first, second = (Presence(session, service, LIMITS, KEYS, 1) for session in (here, there))
         first.claim(threading.Event())
         with pytest.raises(UnavailableError, match="by another daemon"):
             second.claim(threading.Event())
-        assert first.close(DEADLINE_S)
-        assert second.close(DEADLINE_S)
+        assert first.close(PATIENCE_S)
+        assert second.close(PATIENCE_S)
+
+
+@pytest.mark.fault("100 sockets opened on the router's loopback door that say nothing", "an operator gets in at once")
+def test_sockets_that_say_nothing_keep_nobody_out(
+    authority: TestAuthority, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    with ExitStack() as stack:
+        door = stack.enter_context(opened(authority, tmp_path))
+        port = int(door.loopback.rpartition(":")[2])
+        for _ in range(100):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+        began_s = time.monotonic()
+        with connected_by(door.way("operator"), PATIENCE_S):
+            record_property("figure", f"{time.monotonic() - began_s:.2f} s")

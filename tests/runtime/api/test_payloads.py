@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coec.errors import UsageError
-from coec.runtime.api.payloads import MAX_SENDER, NAMES, parse, sender_of
+from coec.runtime.api.payloads import MAX_SENDER, parse, sender_of
+from coec.schemas.commands import NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)

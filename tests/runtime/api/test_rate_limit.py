@@ -19,7 +19,7 @@ def accepted(limit: RateLimit, sender: str, count: int) -> int:
 
 def test_a_burst_is_taken_and_then_one_after_the_other() -> None:
     clock = Clock()
-    limit = RateLimit(clock)
+    limit = RateLimit(clock=clock)
     assert accepted(limit, "a", 10 * BURST) == BURST
     wait_s = limit.take("a")
     assert 0.0 < wait_s <= 1.0 / PER_S
@@ -30,14 +30,14 @@ def test_a_burst_is_taken_and_then_one_after_the_other() -> None:
 
 
 def test_senders_do_not_take_each_others_turns() -> None:
-    limit = RateLimit(Clock())
+    limit = RateLimit(clock=Clock())
     assert accepted(limit, "a", 10 * BURST) == BURST
     assert accepted(limit, "b", 10 * BURST) == BURST
 
 
 def test_invented_names_gain_little_and_take_no_memory() -> None:
     clock = Clock()
-    limit = RateLimit(clock)
+    limit = RateLimit(clock=clock)
     assert accepted(limit, "operator", 1) == 1
     taken = sum(limit.take(f"name {number}") == 0.0 for number in range(10_000))
     assert taken == SENDERS - 1 + BURST
@@ -46,3 +46,12 @@ def test_invented_names_gain_little_and_take_no_memory() -> None:
     clock.now_s += BURST / PER_S
     assert accepted(limit, "newcomer", 10 * BURST) == BURST, "the names are forgotten when they are idle"
     assert len(limit._buckets) == 1
+
+
+def test_who_has_proven_his_name_has_a_bucket_of_his_own_however_many_others_there_are() -> None:
+    limit = RateLimit(["operator (certificate)"], clock=Clock())
+    for number in range(10 * SENDERS):
+        for _ in range(BURST):
+            limit.take(f"invented {number}")
+    assert limit.take("invented anew") > 0.0
+    assert limit.take("operator (certificate)") == 0.0

@@ -1,7 +1,7 @@
 """The Zenoh session: subscriptions that never block its receive thread, queries that are always answered, one exit.
 
 Callbacks run on Zenoh's own threads (`indirect=False`): they copy bytes into a bounded queue, or answer from what is
-already serialised. Everything slower goes to one thread of its own behind a bounded queue. No exception leaves a
+already serialised. Everything slower goes to the thread of its kind behind a bounded queue. No exception leaves a
 callback, and every query is finished, because an unfinished one makes its client wait for the whole timeout.
 """
 
@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from functools import partial
 
 import zenoh
@@ -30,16 +31,28 @@ _log = logging.getLogger(__name__)
 MSGPACK = "application/msgpack"
 JSON = "application/json"
 
-SLOW_QUERIES_WAITING = 32
-"""Queries that may wait for the slow thread; the next is told `busy`."""
-
-DRAWING_QUERIES_WAITING = 8
-"""Queries for pictures that may wait."""
-
 MAX_COMMAND_BYTES = 65_536
 """Largest payload of a query; commands are a few numbers."""
 
 POLL_S = 0.2
+
+
+class Lane(Enum):
+    """Where an answer is made: at once on Zenoh's thread, or on a thread that keeps only its own kind waiting."""
+
+    AT_ONCE = "at-once"
+    """Microseconds: what is serialised already."""
+    COMMANDS = "commands"
+    """Waits for those who carry a command out, and for nobody who reads files."""
+    FILES = "files"
+    """Reads a disk, or much of the history."""
+    DRAWING = "drawing"
+    """Waits for the worker."""
+
+
+WAITING = {Lane.COMMANDS: 32, Lane.FILES: 32, Lane.DRAWING: 8}
+"""Queries that may wait for a thread; the next is told `busy`. Commands of all pairs, as many as a rig may have; those
+that read keep 16 MB each when they are answered, pictures a second of the worker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +77,11 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """Who answers a key. `quick` answers take microseconds and are given on Zenoh's thread. Those that `draws` may wait
-    for the worker, and keep nobody waiting but each other."""
+    """Who answers a key, and where."""
 
     key: str
     answer: Callable[[Request], Answer]
-    quick: bool
-    draws: bool = False
+    lane: Lane
 
 
 def open_session(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Session:
@@ -101,17 +112,19 @@ _Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route], float]]
 
 
 class Bus:
-    """Everything the service declares in a session. Calls come from the daemon's threads."""
+    """Everything the service declares in a session. Calls come from the daemon's threads; `threads` answer what is not
+    answered at once."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._queryables: list[zenoh.Queryable[None]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
-        self._slow: _Waiting = queue.Queue(SLOW_QUERIES_WAITING)
-        self._drawing: _Waiting = queue.Queue(DRAWING_QUERIES_WAITING)
-        self.thread = ServiceThread("slow-queries", partial(_answer_from, self._slow, self._answer))
-        self.drawing_thread = ServiceThread("drawing-queries", partial(_answer_from, self._drawing, self._answer))
+        self._waiting: dict[Lane, _Waiting] = {lane: queue.Queue(most) for lane, most in WAITING.items()}
+        self.threads = tuple(
+            ServiceThread(f"{lane.value}-queries", partial(_answer_from, waiting, self._answer))
+            for lane, waiting in self._waiting.items()
+        )
 
     def subscribe(self, key: str, on_sample: Callable[[bytes, str], None]) -> None:
         """Call `on_sample(payload, encoding)` for every put on `key`, on Zenoh's thread."""
@@ -164,7 +177,7 @@ class Bus:
         for queryable in self._queryables:
             queryable.undeclare()
         self._queryables.clear()
-        for waiting in (self._slow, self._drawing):
+        for waiting in self._waiting.values():
             while not waiting.empty():
                 query, _, _ = waiting.get_nowait()
                 with query:
@@ -184,13 +197,13 @@ class Bus:
             with query:
                 _reply_error(query, error.reply_code, str(error))
             return
-        if all(route.quick for route in routes):
+        lanes = {route.lane for route in routes}
+        slowest = next((lane for lane in (Lane.DRAWING, Lane.FILES, Lane.COMMANDS) if lane in lanes), Lane.AT_ONCE)
+        if slowest is Lane.AT_ONCE:
             self._answer(query, routes, received_s)
             return
         try:
-            (self._drawing if any(route.draws for route in routes) else self._slow).put_nowait(
-                (query, routes, received_s)
-            )
+            self._waiting[slowest].put_nowait((query, routes, received_s))
         except queue.Full:
             with query:
                 _reply_error(query, "busy", "too many queries wait; ask again in a moment")

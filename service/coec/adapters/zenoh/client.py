@@ -7,12 +7,15 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import zenoh
 
 from coec.adapters.zenoh.endpoints import redacted
+from coec.adapters.zenoh.settings_file import read_settings
 from coec.errors import CoecError, DecodeError, NotFoundError, UsageError
 from coec.schemas.base import from_json, from_msgpack
+from coec.schemas.keys import Keys
 from coec.schemas.replies import ErrorReply
 
 JSON = "application/json"
@@ -46,33 +49,53 @@ class Reply:
     encoding: str
 
 
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How a router is reached: at the first of the endpoints that answers, in a session that is set up as a file says
+    (Zenoh configuration, JSON5; None: by default)."""
+
+    endpoints: tuple[str, ...]
+    file: Path | None = None
+
+
 @contextmanager
 def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session]:
+    """`connected_by` endpoints alone."""
+    with connected_by(Way(tuple(endpoints)), wait_s) as session:
+        yield session
+
+
+@contextmanager
+def connected_by(way: Way, wait_s: float) -> Iterator[zenoh.Session]:
     """A client session on the first of the routers that answers, closed at the end.
 
     Raises:
         UsageError: an endpoint is malformed.
+        ConfigError: the file cannot be used.
         ConnectionFailedError: none answered within `wait_s`.
     """
-    for endpoint in endpoints:
+    settings = zenoh.Config() if way.file is None else read_settings(way.file)
+    for endpoint in way.endpoints:
         if not ENDPOINT.fullmatch(endpoint):
             raise UsageError(
                 f"{redacted(endpoint)!r} is no endpoint of a router: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447"
             )
     zenoh.init_log_from_env_or("off")
-    settings = zenoh.Config()
     settings.insert_json5("mode", '"client"')
+    settings.insert_json5("listen/endpoints", "[]")
     settings.insert_json5("scouting/multicast/enabled", "false")
     settings.insert_json5("connect/timeout_ms", str(round(wait_s * 1000)))
     settings.insert_json5("connect/exit_on_failure", "true")
     try:
-        settings.insert_json5("connect/endpoints", json.dumps(list(endpoints)))
+        settings.insert_json5("connect/endpoints", json.dumps(way.endpoints))
         session = zenoh.open(settings)
     except (zenoh.ZError, ValueError) as error:
-        asked = ", ".join(redacted(endpoint) for endpoint in endpoints)
+        asked = ", ".join(redacted(endpoint) for endpoint in way.endpoints)
+        by_certificate = any(endpoint.startswith(("tls/", "quic/")) for endpoint in way.endpoints)
+        refused = ", or it refuses the certificate (`openssl x509 -in FILE -noout -subject -issuer -dates`)"
         raise ConnectionFailedError(
-            f"no Zenoh router answered at {asked} within {wait_s:g} s: start one, start `coec run --embedded-router`, "
-            "or name the endpoint with --connect"
+            f"no Zenoh router answered at {asked} within {wait_s:g} s{refused if by_certificate else ''}: start one, "
+            "start `coec run --embedded-router`, or name the endpoint with --connect"
         ) from error
     try:
         yield session
@@ -111,8 +134,15 @@ def _first_clause(text: str) -> str:
     return text.partition(" at /")[0].partition("`: ")[2] or text
 
 
-def ask(session: zenoh.Session, selector: str, timeout_s: float, payload: bytes | None = None) -> list[Reply]:
-    """Every answer to a query, in the order of their keys; none is an empty list.
+def ask(
+    session: zenoh.Session,
+    selector: str,
+    timeout_s: float,
+    payload: bytes | None = None,
+    attachment: bytes | None = None,
+) -> list[Reply]:
+    """Every answer to a query, in the order of their keys; none is an empty list. The attachment says who asks, for
+    the log of who answers.
 
     Raises:
         UsageError: the selector does not begin with a key expression.
@@ -124,7 +154,10 @@ def ask(session: zenoh.Session, selector: str, timeout_s: float, payload: bytes 
     encoding = JSON if payload is not None else None
     replies: list[Reply] = []
     timed_out = False
-    for reply in session.get(selector, target=target, timeout=timeout_s, payload=payload, encoding=encoding):
+    asked = session.get(
+        selector, target=target, timeout=timeout_s, payload=payload, encoding=encoding, attachment=attachment
+    )
+    for reply in asked:
         if reply.ok is not None:
             sample = reply.ok
             replies.append(Reply(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)))
@@ -151,12 +184,24 @@ def ask_one(session: zenoh.Session, selector: str, timeout_s: float, payload: by
     return replies[0]
 
 
-def nobody(selector: str) -> NotFoundError:
-    """The error of a query that nobody answered."""
+def is_alive(session: zenoh.Session, keys: Keys, timeout_s: float) -> bool:
+    """Whether somebody serves a pair of the vehicle, by its liveliness token."""
+    held = session.liveliness().get(keys.alive("*"), timeout=timeout_s)
+    return any(reply.ok is not None for reply in held)
+
+
+def nobody(selector: str, *, service_is_there: bool = False) -> NotFoundError:
+    """The error of a query that nobody answered: what a router's rules do not allow is not answered either, and neither
+    Zenoh nor this tells the two apart for certain."""
+    if service_is_there:
+        return NotFoundError(
+            f"no answer to {selector.partition('?')[0]}, though the service is there (its liveliness token is seen): "
+            "the router's rules may not allow it to you, or the pair is not one of the vehicle's (`coec query status`)"
+        )
     return NotFoundError(
         f"nobody answered {selector.partition('?')[0]}: check that `coec run` is up (it answers a second or two after "
         "its start) and connected to the same router, that vehicle, prefix and pair are right (`coec query status`), "
-        "and that access control lets you ask"
+        "and that the router's rules allow it to you"
     )
 
 

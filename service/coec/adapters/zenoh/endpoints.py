@@ -59,13 +59,23 @@ class Endpoint:
             raise ConfigError(f"{redacted(text)!r} is of no protocol that Zenoh knows: {known}")
         return endpoint
 
+    @property
+    def on_loopback(self) -> bool:
+        """Whether only programs on this computer are at it."""
+        return self.protocol in OF_THIS_COMPUTER or (self.protocol in WITH_PORT and _is_loopback(self.address))
+
+    @property
+    def port(self) -> int:
+        """Of a protocol that has ports."""
+        return int(self.address.rpartition(":")[2])
+
     def lets_in_whoever_comes(self, *, certificates_asked: bool) -> bool:
         """Whether a program on another computer gets in without a certificate, when this is listened on.
 
         Args:
             certificates_asked: what holds where the endpoint itself does not say whether a certificate is asked for.
         """
-        if self.protocol in OF_THIS_COMPUTER or (self.protocol in WITH_PORT and _is_loopback(self.address)):
+        if self.on_loopback:
             return False
         said = dict(item.partition("=")[::2] for item in self.settings.split(";")).get(MTLS)
         asked = certificates_asked if said is None else said == "true"

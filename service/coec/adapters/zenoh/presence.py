@@ -72,18 +72,25 @@ class Seen:
     """What the router holds of one vehicle.
 
     Attributes:
+        routed: whether a router is there to hold anything; not where the daemon is the router.
         own: whether the own claim is there.
         others: claims of other daemons.
         tokens: liveliness tokens of pairs, whoever holds them.
     """
 
+    routed: bool
     own: bool
     others: tuple[Claim, ...]
     tokens: tuple[str, ...]
 
 
 class Presence:
-    """That of one daemon. `thread` looks for others while it serves, and closes what it looks through."""
+    """That of one daemon. `thread` looks for others while it serves, and closes what it looks through.
+
+    Attributes:
+        rival: another daemon that this one leaves the vehicle to.
+        hidden: whether the router keeps the tokens to itself, so that no daemon sees another.
+    """
 
     def __init__(
         self, session: zenoh.Session, config: ZenohConfig, limits: LimitsConfig, keys: Keys, since_ns: int
@@ -96,6 +103,7 @@ class Presence:
         """
         self.thread = ServiceThread("look-out", self._watch)
         self.rival: Claim | None = None
+        self.hidden = False
         self._session = session
         self._config, self._limits = config, limits
         self._keys = keys
@@ -161,24 +169,28 @@ class Presence:
     # --- looking ----------------------------------------------------------------------------------------------------
 
     def _watch(self, thread: ServiceThread) -> None:
+        unseen = 0
         while not self._stop.wait(WATCH_S):
             thread.beat()
-            rival = outranking(self._daemon, self._look().others)
+            seen = self._look()
+            rival = outranking(self._daemon, seen.others)
             if rival is not None:
                 self.rival = rival
+            if seen.routed:
+                # A router that has just come back is told of the tokens within one look.
+                unseen = 0 if seen.own else unseen + 1
+                self.hidden = unseen > 1 or (self.hidden and not seen.own)
 
     def _look_until_seen(self, stop: threading.Event) -> Seen:
         """The first look in which the own claim is there, or the last of `SEEN_S`."""
         deadline_s = time.monotonic() + SEEN_S
         while not (seen := self._look()).own:
-            if self._through is None and not list(self._session.info.routers_zid()):
+            if not seen.routed and not list(self._session.info.routers_zid()):
                 _log.warning("no router answers yet: whether another daemon serves the vehicle is seen when one does")
                 break
             if time.monotonic() > deadline_s or stop.wait(POLL_S):
-                _log.warning(
-                    "the liveliness tokens of this vehicle cannot be seen: the router's access control must allow the "
-                    "service `liveliness_query` and `liveliness_token`, or two daemons may serve it"
-                )
+                self.hidden = seen.routed
+                _log.warning("the liveliness tokens of this vehicle cannot be seen: two daemons may serve it")
                 break
         return seen
 
@@ -187,9 +199,10 @@ class Presence:
         if self._through is None:
             self._through = self._looking_glass()
         if self._through is None:
-            return Seen(False, (), ())
+            return Seen(False, False, (), ())
         claims = {claim for key in _tokens(self._through, self._keys.claims) if (claim := self._claim_of(key))}
         return Seen(
+            routed=bool(list(self._through.info.routers_zid())),
             own=any(claim.daemon == self._daemon for claim in claims),
             others=tuple(claim for claim in claims if claim.daemon != self._daemon),
             tokens=tuple(_tokens(self._through, self._keys.alive("*"))),

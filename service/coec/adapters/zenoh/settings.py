@@ -8,10 +8,9 @@ from typing import Any
 import zenoh
 
 from coec.adapters.zenoh.endpoints import Endpoint, redacted, without_secrets
+from coec.adapters.zenoh.settings_file import TLS, read_settings
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
-
-TLS = "transport/link/tls"
 
 
 def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
@@ -32,7 +31,7 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
         "scouting/gossip/enabled": False,
     }
     try:
-        settings = zenoh.Config.from_file(config.file) if config.file else zenoh.Config()
+        settings = read_settings(config.file) if config.file else zenoh.Config()
         unsaid = zenoh.Config()
         for key, value in silent.items():
             # A peer listens on every interface by default, at any port.
@@ -43,7 +42,7 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
         settings.insert_json5("transport/link/rx/max_message_size", str(limits.max_message_bytes))
         # Queries and replies through shared memory can vanish under load.
         settings.insert_json5("transport/shared_memory/transport_optimization/messages", '["put"]')
-    except (zenoh.ZError, OSError, ValueError) as error:
+    except (zenoh.ZError, ValueError) as error:
         raise ConfigError(f"{where(config)}: {without_secrets(str(error), endpoints_of(config))}") from None
     doors = unguarded(settings)
     if doors and not config.insecure:
@@ -65,9 +64,19 @@ def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
     certificates_asked = bool(json.loads(settings.get_json(TLS)).get("enable_mtls"))
     return tuple(
         redacted(endpoint)
-        for endpoint in _of_mode(json.loads(settings.get_json("listen/endpoints")), mode_of(settings))
+        for endpoint in listened_of(settings)
         if Endpoint.parse(endpoint).lets_in_whoever_comes(certificates_asked=certificates_asked)
     )
+
+
+def listened_of(settings: zenoh.Config) -> tuple[str, ...]:
+    """Endpoints at which the session listens, as they are written."""
+    return _of_mode(json.loads(settings.get_json("listen/endpoints")), mode_of(settings))
+
+
+def connected_of(settings: zenoh.Config) -> tuple[str, ...]:
+    """Endpoints to which the session connects, as they are written."""
+    return _of_mode(json.loads(settings.get_json("connect/endpoints")), mode_of(settings))
 
 
 def mode_of(settings: zenoh.Config) -> str:
@@ -88,7 +97,7 @@ def where(config: ZenohConfig) -> str:
     return f"zenoh.listen {listen}, connect {[redacted(endpoint) for endpoint in config.connect]}"
 
 
-def _of_mode(value: Any, mode: str) -> list[str]:
+def _of_mode(value: Any, mode: str) -> tuple[str, ...]:
     """A list of endpoints, or one per mode; a list in the list is a choice of endpoints."""
     found = value.get(mode, []) if isinstance(value, dict) else value
-    return [one for item in found or [] for one in ([item] if isinstance(item, str) else item)]
+    return tuple(one for item in found or [] for one in ([item] if isinstance(item, str) else item))

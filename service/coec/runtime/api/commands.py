@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from coec.adapters.files.conversions import estimate_of, matrix_of
 from coec.calibration import lifecycle
 from coec.calibration.types import Rig
 from coec.config import PairConfig
-from coec.errors import NotFoundError
+from coec.errors import CoecError, NotFoundError
 from coec.runtime.api.rate_limit import PER_S, RateLimit
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.mailbox import Mailbox
@@ -27,6 +27,7 @@ from coec.runtime.ingest.chooser import Chooser
 from coec.runtime.ingest.stream import Stream
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
+from coec.schemas.commands import NAMES
 from coec.schemas.replies import Acknowledgement
 
 _log = logging.getLogger(__name__)
@@ -56,7 +57,9 @@ class Commands:
         recorder: Recorder,
         folder: WindowStore,
         questions: Questions,
+        proven: Iterable[str] = (),
     ) -> None:
+        """`proven` are the senders who can prove who they are, as `payloads.proven_sender` writes them."""
         self._pair = pair
         self._vehicle = vehicle
         self._rig = rig
@@ -69,13 +72,13 @@ class Commands:
         self._recorder = recorder
         self._folder = folder
         self._questions = questions
-        self._rate = RateLimit()
+        self._rate = RateLimit(proven)
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
 
     @property
     def counts(self) -> dict[str, int]:
-        """Commands since the start, by name and whether they were accepted."""
+        """Commands since the start, by name and whether they were accepted, refused, or not their sender's to give."""
         with self._lock:
             return dict(self._counts)
 
@@ -121,6 +124,17 @@ class Commands:
         with self._lock:
             self._counts[f"{name}_{'accepted' if acknowledged.accepted else 'refused'}"] += 1
         return acknowledged
+
+    def note_refused(self, name: str, sender: str, why: CoecError) -> None:
+        """Count a command that is not its sender's to give. The first is logged, and then every 2^n-th: who may do
+        nothing shall not fill the disk either."""
+        known = name if name in NAMES else "unknown"
+        with self._lock:
+            self._counts[f"{known}_not_allowed"] += 1
+            count = self._counts[f"{known}_not_allowed"]
+        if count & (count - 1) == 0:
+            fields = {"pair": self._pair.name, "command": known, "sender": sender, "code": why.reply_code}
+            _log.warning(f"a command was not allowed: {why}", extra={"fields": {**fields, "count": count}})
 
     # --- on the thread that decides ---------------------------------------------------------------------------------
 

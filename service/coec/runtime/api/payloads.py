@@ -10,9 +10,7 @@ from typing import Any, Final
 import msgpack
 
 from coec.errors import UsageError
-
-NAMES: Final = ("calibrate", "apply", "rollback", "reset", "commission", "hold")
-"""Of CONTRACT."""
+from coec.schemas.commands import NAMES
 
 ARGUMENTS: Final[Mapping[str, Mapping[str, type]]] = {"rollback": {"to": str}, "hold": {"release": bool}}
 """What a payload may hold, by command; the others take none."""
@@ -25,6 +23,9 @@ MAX_PAYLOAD: Final = 4096
 
 MAX_ATTACHMENT: Final = 4096
 """Bytes of an attachment that are looked at."""
+
+ANONYMOUS: Final = "anonymous"
+"""Who says nothing of himself."""
 
 _HARMLESS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789 ._:/@+-=,")
 
@@ -51,13 +52,18 @@ def parse(name: str, payload: bytes) -> dict[str, Any]:
 def sender_of(attachment: bytes | None) -> str:
     """The attachment of a query as one short harmless line; what is not readable text is told by its hash."""
     if not attachment:
-        return "anonymous"
+        return ANONYMOUS
     start = attachment[:MAX_ATTACHMENT]
     text = start.decode("ascii", errors="replace")
     cleaned = "".join(character if character in _HARMLESS else "_" for character in text)
     if 2 * cleaned.count("_") > len(cleaned):
         return f"{len(attachment)} bytes, sha256 {hashlib.sha256(start).hexdigest()[:16]}"
     return cleaned[:MAX_SENDER]
+
+
+def proven_sender(name: str) -> str:
+    """A sender whose certificate has this common name, as one short harmless line that no attachment can come to."""
+    return f"{sender_of(name.encode('ascii', errors='replace'))} (certificate)"
 
 
 def _document(payload: bytes) -> dict[str, Any]:

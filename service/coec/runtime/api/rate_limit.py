@@ -1,14 +1,15 @@
 """How often a sender may give commands: a bucket of tokens for each, filled at a constant rate.
 
-A sender is what the attachment of a query says, which anyone may write: so the number of buckets is bounded, and those
-for whom there is none share one. Whoever invents a name for each command is in that one with all others of his kind.
+Who has proven his name has a bucket that nobody else draws from. All others are what the attachments of their queries
+say, which anyone may write (a query tells nothing else of who asks): so the number of their buckets is bounded, and
+those for whom there is none share one. Whoever invents a name for each command is in that one with all of his kind.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 BURST = 20
@@ -31,10 +32,11 @@ class _Bucket:
 class RateLimit:
     """Of one pair. Safe to use from several threads."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock` tells seconds."""
+    def __init__(self, proven: Iterable[str] = (), clock: Callable[[], float] = time.monotonic) -> None:
+        """`proven` are senders whom nobody can pass himself off as; `clock` tells seconds."""
         self._clock = clock
         self._lock = threading.Lock()
+        self._reserved = {sender: _Bucket(BURST, clock()) for sender in proven}
         self._buckets: dict[str, _Bucket] = {}
         self._others = _Bucket(BURST, clock())
 
@@ -51,6 +53,8 @@ class RateLimit:
             return 0.0
 
     def _bucket_of(self, sender: str, now_s: float) -> _Bucket:
+        if sender in self._reserved:
+            return self._reserved[sender]
         if sender not in self._buckets and len(self._buckets) >= SENDERS:
             # Who has given none for so long that his bucket is full again is not told from one who is new.
             self._buckets = {name: held for name, held in self._buckets.items() if _filled(held, now_s) < BURST}

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import zenoh
 from pydantic import BaseModel
 
 from coec.adapters.exports import FORMATS
 from coec.adapters.exports.told import Frames
-from coec.adapters.zenoh.bus import Answer, Bus, Request, Route
+from coec.adapters.zenoh.bus import Answer, Bus, Lane, Request, Route
 from coec.errors import UsageError
 from coec.runtime.api import metrics as metrics_text
-from coec.runtime.api import payloads
-from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
+from coec.runtime.api.reception import Reception
 from coec.runtime.api.snapshots import Snapshot, answer_of
 from coec.schemas.keys import (
     Format,
     Keys,
-    parse_command_selector,
     parse_evidence_selector,
     parse_extrinsic_selector,
     parse_history_selector,
@@ -39,7 +38,7 @@ class VehicleAnswers:
         self,
         keys: Keys,
         pairs: Mapping[str, PairAnswers],
-        commands: Mapping[str, Commands],
+        reception: Reception,
         status: Callable[[], Snapshot],
         metrics: Callable[[], bytes],
         config: Snapshot,
@@ -47,11 +46,11 @@ class VehicleAnswers:
         """`status()` and `config` are serialised before; `metrics()` is rendered when asked."""
         self._keys = keys
         self._pairs = pairs
-        self._commands = commands
+        self._reception = reception
         self._vehicle_routes = {
-            keys.status: Route(keys.status, lambda request: status().answer(_format(request)), quick=True),
-            keys.config: Route(keys.config, lambda request: config.answer(_format(request)), quick=True),
-            keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), quick=False),
+            keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
+            keys.config: Route(keys.config, lambda request: config.answer(_format(request)), Lane.AT_ONCE),
+            keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), Lane.FILES),
         }
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
 
@@ -80,14 +79,18 @@ class VehicleAnswers:
             asked = zenoh.KeyExpr(key)
             matching = [route for known, route in readable.items() if asked.intersects(zenoh.KeyExpr(known))]
             # A picture is drawn for whoever asks for one, not for everything at once.
-            return matching if key.endswith("/overlay") else [route for route in matching if not route.draws]
+            return (
+                matching
+                if key.endswith("/overlay")
+                else [route for route in matching if route.lane is not Lane.DRAWING]
+            )
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
-            return [Route(key, self._window(self._pairs[pair], address.argument), quick=False)]
+            return [Route(key, self._window(self._pairs[pair], address.argument), Lane.FILES)]
         if address.resource == "command":
-            return [Route(key, self._command(self._commands[pair], str(address.argument)), quick=False)]
+            return [Route(key, partial(self._reception.take, pair, str(address.argument)), Lane.COMMANDS)]
         if address.resource == "evidence" and address.argument is not None:
-            return [Route(key, self._evidence(self._pairs[pair], address.argument), quick=False)]
+            return [Route(key, self._evidence(self._pairs[pair], address.argument), Lane.FILES)]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_unknown(self, key: str) -> Sequence[Route]:
@@ -104,12 +107,12 @@ class VehicleAnswers:
     def _readable(self, pair: PairAnswers) -> dict[str, Route]:
         keys, name = self._keys, pair.name
         routes = (
-            Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), quick=True),
-            Route(keys.health(name), lambda request: pair.health(_format(request)), quick=True),
-            Route(keys.history(name), lambda request: _history(pair, request), quick=False),
-            Route(keys.windows(name), lambda request: _in_format(request, pair.windows), quick=False),
-            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), quick=False),
-            Route(keys.overlay(name), lambda request: _overlay(pair, request), quick=False, draws=True),
+            Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), Lane.AT_ONCE),
+            Route(keys.health(name), lambda request: pair.health(_format(request)), Lane.AT_ONCE),
+            Route(keys.history(name), lambda request: _history(pair, request), Lane.FILES),
+            Route(keys.windows(name), lambda request: _in_format(request, pair.windows), Lane.FILES),
+            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), Lane.FILES),
+            Route(keys.overlay(name), lambda request: _overlay(pair, request), Lane.DRAWING),
         )
         return {route.key: route for route in routes}
 
@@ -126,15 +129,6 @@ class VehicleAnswers:
             if chosen.overlay is not None:
                 return Answer(pair.event_overlay(event_id, chosen.overlay), JPEG)
             return answer_of(pair.event(event_id), chosen.format)
-
-        return answer
-
-    def _command(self, commands: Commands, name: str) -> Callable[[Request], Answer]:
-        def answer(request: Request) -> Answer:
-            chosen = parse_command_selector(request.parameters)
-            arguments, sender = payloads.parse(name, request.payload), payloads.sender_of(request.attachment)
-            deadline_s = request.received_s + chosen.timeout_ms / 1e3
-            return answer_of(commands.carry_out(name, arguments, sender, deadline_s), chosen.format)
 
         return answer
 

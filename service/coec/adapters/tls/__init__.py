@@ -1,0 +1,1 @@
+"""TLS without a socket: who gives a command proves it inside queries."""

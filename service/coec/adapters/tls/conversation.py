@@ -1,0 +1,241 @@
+"""Two programs prove to each other who they are, in two questions and their answers, over any carrier.
+
+A conversation is TLS 1.3 with certificates on both sides, whose bytes travel as payloads of questions and answers::
+
+    speaker                              listener
+    hello()      --  ClientHello  -->    hear()
+    say(text)    <-- certificate, ... -- (bytes)
+                 --  certificate, ..., text -->  hear()
+    answer()     <-- sealed answer --    Heard
+
+Who carries the bytes can read, change, repeat and redirect nothing of what is said; he can only keep it back. Names are
+the common names of the certificates, both signed by one authority. (RFC 8446; `ssl.MemoryBIO`.)
+"""
+
+from __future__ import annotations
+
+import ssl
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from coec.config import AuthorityConfig
+from coec.errors import CoecError, ConfigError
+
+WAITED_S = 5.0
+"""For the second question: what comes later is not heard. A carrier that keeps it back gains no more than this."""
+
+CONVERSATIONS = 64
+"""Begun and not ended, some 50 kB each. The oldest makes room: whoever begins many without end can cut a conversation
+short that is longer under way than theirs, and no more."""
+
+MAX_SAID = 16_384
+"""Bytes of what is said: one record of TLS."""
+
+
+class NotProvenError(CoecError):
+    """Who speaks has not shown a certificate that is taken here."""
+
+    reply_code = "not_proven"
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """PEM files: a certificate with its private key, and the authority that others are held to."""
+
+    certificate: Path
+    private_key: Path
+    root_ca: Path
+
+
+def credentials_of(config: AuthorityConfig) -> Credentials | None:
+    """Those of the service; None: it has none."""
+    if config.certificate is None or config.private_key is None or config.root_ca is None:
+        return None
+    return Credentials(config.certificate, config.private_key, config.root_ca)
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """The end of a conversation: whose certificate it was (common name), what was said, and how to answer so that
+    only he can read it."""
+
+    name: str
+    said: bytes
+    sealed: Callable[[bytes], bytes]
+
+
+class _Line:
+    """One end of a connection that has no socket."""
+
+    def __init__(self, context: ssl.SSLContext, *, server_side: bool) -> None:
+        self._came, self._goes = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self._tls = context.wrap_bio(self._came, self._goes, server_side=server_side)
+
+    def shake_hands(self, came: bytes) -> bool:
+        """Whether the other one has proven himself; else his next bytes are needed.
+
+        Raises:
+            NotProvenError: he cannot.
+        """
+        self._came.write(came)
+        try:
+            self._tls.do_handshake()
+        except ssl.SSLWantReadError:
+            return False
+        except ssl.SSLError as error:
+            raise NotProvenError(f"the certificate was not taken: {_why(error)}") from None
+        return True
+
+    def peer(self) -> str:
+        """The common name in his certificate."""
+        subject: Any = (self._tls.getpeercert() or {}).get("subject", ())
+        names = [value for part in subject for kind, value in part if kind == "commonName"]
+        if len(names) != 1:
+            raise NotProvenError(f"the certificate has {len(names)} common names; it must have one")
+        return str(names[0])
+
+    def read(self, came: bytes = b"") -> bytes:
+        """What he said, in one record."""
+        self._came.write(came)
+        try:
+            return self._tls.read(MAX_SAID)
+        except ssl.SSLError as error:
+            raise NotProvenError(f"what was said cannot be read: {_why(error)}") from None
+
+    def write(self, text: bytes) -> None:
+        """Say something, in one record."""
+        if len(text) > MAX_SAID:
+            raise NotProvenError(f"more than {MAX_SAID} bytes cannot be said")
+        self._tls.write(text)
+
+    def goes(self) -> bytes:
+        """Bytes for the other end."""
+        return self._goes.read()
+
+
+class Listener:
+    """The end of the service: takes part in many conversations at once. One thread."""
+
+    def __init__(self, credentials: Credentials, clock: Callable[[], float] = time.monotonic) -> None:
+        """`clock` tells seconds.
+
+        Raises:
+            ConfigError: a file cannot be used; names it.
+        """
+        self._context = _context(credentials, ssl.PROTOCOL_TLS_SERVER)
+        self._context.verify_mode = ssl.CERT_REQUIRED
+        self._context.num_tickets = 0  # no conversation is taken up again
+        self._clock = clock
+        self._begun: OrderedDict[str, tuple[_Line, float]] = OrderedDict()
+
+    def hear(self, conversation: str, came: bytes) -> bytes | Heard:
+        """The next bytes of a conversation, which its speaker named: what to send back, or its end.
+
+        Raises:
+            NotProvenError: whoever speaks cannot prove who he is, or took too long.
+        """
+        now_s = self._clock()
+        while self._begun and next(iter(self._begun.values()))[1] < now_s:
+            self._begun.popitem(last=False)
+        line, _ = self._begun.pop(conversation, (None, 0.0))
+        if line is None:
+            return self._begin(conversation, came, now_s)
+        if not line.shake_hands(came):
+            raise NotProvenError("the conversation was broken off")
+        return Heard(line.peer(), line.read(), _sealing(line))
+
+    def _begin(self, conversation: str, came: bytes, now_s: float) -> bytes:
+        line = _Line(self._context, server_side=True)
+        line.shake_hands(came)
+        flight = line.goes()
+        if not flight:
+            raise NotProvenError("this is no beginning of a TLS conversation")
+        if len(self._begun) >= CONVERSATIONS:
+            self._begun.popitem(last=False)
+        self._begun[conversation] = line, now_s + WAITED_S
+        return flight
+
+
+class Speaker:
+    """The other end, of one conversation."""
+
+    def __init__(self, credentials: Credentials, to: str) -> None:
+        """`to` is the common name of whom is spoken to.
+
+        Raises:
+            ConfigError: as `Listener`.
+        """
+        context = _context(credentials, ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname = False  # what is named here is no host: `say` looks at the name
+        self._line = _Line(context, server_side=False)
+        self._to = to
+
+    def hello(self) -> bytes:
+        """The first bytes."""
+        self._line.shake_hands(b"")
+        return self._line.goes()
+
+    def say(self, came: bytes, text: bytes) -> bytes:
+        """The bytes that end the conversation, once the other one has proven that he is the one meant.
+
+        Raises:
+            NotProvenError: he is not; nothing of the text was sent.
+        """
+        if not self._line.shake_hands(came):
+            raise NotProvenError("the answer holds no certificate")
+        name = self._line.peer()
+        if name != self._to:
+            raise NotProvenError(f"who answered has the certificate of {name!a}, not that of {self._to!r}")
+        self._line.write(text)
+        return self._line.goes()
+
+    def answer(self, came: bytes) -> bytes:
+        """What the other one answered.
+
+        Raises:
+            NotProvenError: these are not his bytes.
+        """
+        return self._line.read(came)
+
+
+def _sealing(line: _Line) -> Callable[[bytes], bytes]:
+    def sealed(text: bytes) -> bytes:
+        line.write(text)
+        return line.goes()
+
+    return sealed
+
+
+def _context(credentials: Credentials, protocol: int) -> ssl.SSLContext:
+    context = ssl.SSLContext(protocol)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    try:
+        context.load_verify_locations(credentials.root_ca)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{credentials.root_ca} is no certificate of an authority: {_reason(error)}") from None
+    try:
+        context.load_cert_chain(credentials.certificate, credentials.private_key, password=_nobody_types)
+    except (OSError, ValueError) as error:
+        both = f"{credentials.certificate} and {credentials.private_key}"
+        raise ConfigError(f"{both} are no certificate and its unencrypted key in PEM: {_reason(error)}") from None
+    return context
+
+
+def _nobody_types() -> str:
+    """For an encrypted key: else OpenSSL asks at the terminal, and a service would wait for ever."""
+    return ""
+
+
+def _reason(error: Exception) -> str:
+    return _why(error) if isinstance(error, ssl.SSLError) else getattr(error, "strerror", None) or type(error).__name__
+
+
+def _why(error: ssl.SSLError) -> str:
+    """In OpenSSL's words, which hold nothing of what came."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return error.verify_message
+    return (error.reason or "malformed").lower().replace("_", " ")

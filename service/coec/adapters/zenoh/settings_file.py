@@ -1,0 +1,69 @@
+"""The Zenoh configuration (JSON5) that a configuration or a command names."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import zenoh
+
+from coec.adapters.tls.conversation import Credentials
+from coec.adapters.zenoh.endpoints import HIDDEN
+from coec.errors import ConfigError
+
+TLS = "transport/link/tls"
+
+MAX_BYTES = 2**18
+"""The shipped rules of a router have 8 kB."""
+
+MAX_BRACKETS = 1000
+"""Opening ones; the shipped rules have 90. Zenoh's reader calls itself for each that is inside another, and its stack
+overflows at some 3,000 in a thread of 512 kB."""
+
+_PLACE = re.compile(r"--> (\d+):(\d+)")
+_VALUE = re.compile(r"""(?<=variant )`[^`]*`|"[^"]*"?|'[^']*'?""")
+
+
+def read_settings(path: Path) -> zenoh.Config:
+    """The settings in a file.
+
+    Raises:
+        ConfigError: it cannot be read, or holds no settings. The message holds nothing of its values: they may be
+            keys and passwords.
+    """
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+        text = data.decode("utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path} is no text in UTF-8") from None
+    brackets = text.count("{") + text.count("[")
+    if len(data) > MAX_BYTES or brackets > MAX_BRACKETS:
+        raise ConfigError(
+            f"{path} is no configuration of Zenoh: it has more than {MAX_BYTES} bytes, or {MAX_BRACKETS} brackets"
+        )
+    try:
+        return zenoh.Config.from_json5(text)
+    except (zenoh.ZError, ValueError) as error:
+        raise ConfigError(f"{path} is no configuration of Zenoh (JSON5): {_harmless(str(error))}") from None
+
+
+def credentials_in(settings: zenoh.Config) -> Credentials | None:
+    """Files of the certificate that a session with these settings shows when it connects; None: it names none."""
+    tls = json.loads(settings.get_json(TLS))
+    files = [tls.get(name) for name in ("connect_certificate", "connect_private_key", "root_ca_certificate")]
+    if not all(isinstance(file, str) for file in files):
+        return None
+    certificate, private_key, root_ca = (Path(file) for file in files)
+    return Credentials(certificate, private_key, root_ca)
+
+
+def _harmless(text: str) -> str:
+    """What Zenoh says of a file, without what stands in it: either it quotes the line, or the value."""
+    place = _PLACE.search(text)
+    if place is not None:
+        return f"line {place[1]}, column {place[2]}"
+    return _VALUE.sub(f'"{HIDDEN}"', text.partition(" at /")[0])

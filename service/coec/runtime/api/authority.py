@@ -1,0 +1,53 @@
+"""Who may give which command: asked for each one, whatever the router let through (`config.AuthorityConfig`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from coec.config import AuthorityConfig
+from coec.errors import CoecError
+
+
+class NotAllowedError(CoecError):
+    """Its sender may not give this command."""
+
+    reply_code = "not_allowed"
+
+
+class Authority:
+    """That of a vehicle."""
+
+    def __init__(self, config: AuthorityConfig, reached_from_outside: Callable[[], str | None]) -> None:
+        """`reached_from_outside()` says in a clause why programs on other computers may reach the service; None: they
+        do not."""
+        self._config = config
+        self._allowed = {sender.name: frozenset(sender.commands) for sender in config.senders}
+        self._reached_from_outside = reached_from_outside
+
+    def require(self, name: str | None, command: str) -> None:
+        """That the sender with this name, which he has proven, may give the command; None: he has proven none.
+
+        Raises:
+            NotAllowedError: he may not.
+        """
+        if name is None:
+            self._require_anonymous(command)
+        elif name not in self._allowed:
+            raise NotAllowedError(f"{name!a} may give no commands: `authority.senders` does not name this certificate")
+        elif command not in self._allowed[name]:
+            may = ", ".join(sorted(self._allowed[name]))
+            raise NotAllowedError(f"{name!a} may not `{command}`, only {may} (`authority.senders`)")
+
+    def _require_anonymous(self, command: str) -> None:
+        if self._config.anonymous == "always":
+            return
+        why = "`authority.anonymous` is `never`"
+        if self._config.anonymous == "loopback":
+            outside = self._reached_from_outside()
+            if outside is None:
+                return
+            why = f"other computers may reach the service: {outside}"
+        raise NotAllowedError(
+            f"`{command}` needs a sender who proves his name: {why}. Give it with a certificate that "
+            "`authority.senders` names (`coec query --zenoh FILE`)"
+        )

@@ -1,0 +1,85 @@
+"""Commands as they come in: who gives them, whether he may, what they say. Then they are carried out. One thread."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pydantic import BaseModel
+
+from coec.adapters.tls.conversation import Heard, Listener, NotProvenError
+from coec.adapters.zenoh.bus import Answer, Request
+from coec.errors import UsageError
+from coec.runtime.api import payloads
+from coec.runtime.api.authority import Authority, NotAllowedError
+from coec.runtime.api.commands import Commands
+from coec.runtime.api.snapshots import answer_of
+from coec.schemas.base import from_json
+from coec.schemas.commands import ProvenCommand
+from coec.schemas.keys import CommandSelector, parse_command_selector
+
+SEALED = "application/octet-stream"
+"""Bytes of a TLS conversation."""
+
+
+class Reception:
+    """Of all pairs of a vehicle."""
+
+    def __init__(self, authority: Authority, listener: Listener | None, commands: Mapping[str, Commands]) -> None:
+        """`listener` is None where the service has no certificate; then nobody can prove who he is."""
+        self._authority = authority
+        self._listener = listener
+        self._commands = commands
+
+    def take(self, pair: str, name: str, request: Request) -> Answer:
+        """The answer to a query for `command/<name>`.
+
+        Raises:
+            UsageError: no such command, or it does not fit its grammar.
+            NotAllowedError: its sender may not give it.
+            NotProvenError: he has not shown who he is, though he meant to.
+        """
+        chosen = parse_command_selector(request.parameters)
+        if chosen.conversation is None:
+            claimed = payloads.sender_of(request.attachment)
+            done = self._done(pair, name, None, claimed, request.payload, request.received_s, chosen)
+            return answer_of(done, chosen.format)
+        if self._listener is None:
+            raise NotProvenError(
+                "this service has no certificate (`authority.certificate`), so that nobody can prove his name to it: "
+                "give the command as `--anonymous`, if that is allowed here"
+            )
+        try:
+            heard = self._listener.hear(chosen.conversation, request.payload)
+        except NotProvenError as error:
+            self._commands[pair].note_refused(name, payloads.sender_of(request.attachment), error)
+            raise
+        return Answer(heard, SEALED) if isinstance(heard, bytes) else self._proven(pair, name, heard, request)
+
+    def _proven(self, pair: str, name: str, heard: Heard, request: Request) -> Answer:
+        call = from_json(ProvenCommand, heard.said)
+        key, _, parameters = call.selector.partition("?")
+        if key != request.key:
+            raise UsageError("what was said in the conversation is not the command that was asked for")
+        chosen = parse_command_selector(parameters)
+        sender = payloads.proven_sender(heard.name)
+        done = self._done(pair, name, heard.name, sender, call.payload.encode(), request.received_s, chosen)
+        return Answer(heard.sealed(answer_of(done, chosen.format).payload), SEALED)
+
+    def _done(
+        self,
+        pair: str,
+        name: str,
+        proven: str | None,
+        sender: str,
+        payload: bytes,
+        received_s: float,
+        chosen: CommandSelector,
+    ) -> BaseModel:
+        commands = self._commands[pair]
+        arguments = payloads.parse(name, payload)
+        try:
+            self._authority.require(proven, name)
+        except NotAllowedError as error:
+            commands.note_refused(name, sender, error)
+            raise
+        return commands.carry_out(name, arguments, sender, received_s + chosen.timeout_ms / 1e3)

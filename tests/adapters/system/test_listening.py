@@ -1,0 +1,51 @@
+"""Who waits at a port, as the kernel's tables tell it."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from pathlib import Path
+
+import pytest
+
+from coec.adapters.system.listening import addresses_of_port
+
+HEAD = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode\n"
+
+
+@pytest.mark.parametrize(
+    ("family", "kind", "protocol", "address"),
+    [
+        (socket.AF_INET, socket.SOCK_STREAM, "tcp", "127.0.0.1"),
+        (socket.AF_INET, socket.SOCK_STREAM, "tcp", "0.0.0.0"),
+        (socket.AF_INET6, socket.SOCK_STREAM, "tcp", "::1"),
+        (socket.AF_INET6, socket.SOCK_STREAM, "tcp", "::"),
+        (socket.AF_INET, socket.SOCK_DGRAM, "udp", "127.0.0.1"),
+    ],
+)
+def test_a_socket_that_waits_is_found(family: int, kind: int, protocol: str, address: str) -> None:
+    with socket.socket(family, kind) as one:
+        try:
+            one.bind((address, 0))
+        except OSError:
+            pytest.skip(f"this computer has no {address}")
+        if kind == socket.SOCK_STREAM:
+            one.listen()
+        port = one.getsockname()[1]
+        found = addresses_of_port("udp" if protocol == "udp" else "tcp", port)
+        assert found == {ipaddress.ip_address(address)}
+    assert addresses_of_port("udp" if protocol == "udp" else "tcp", port) == set()
+
+
+def test_a_connection_is_nobody_who_waits(tmp_path: Path) -> None:
+    (tmp_path / "tcp").write_text(
+        HEAD
+        + "   0: 0100007F:1D17 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1 1 0 100 0 0\n"
+        + "   1: 0501A8C0:1D17 0601A8C0:9C40 01 00000000:00000000 00:00000000 00000000     0        0 2 1 0 100 0 0\n"
+    )
+    assert addresses_of_port("tcp", 7447, tmp_path) == {ipaddress.ip_address("127.0.0.1")}
+
+
+def test_a_system_without_tables_says_so(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="tcp"):
+        addresses_of_port("tcp", 7447, tmp_path)

@@ -1,0 +1,207 @@
+"""Two ends prove who they are to each other; whoever is in between, or comes along, learns and changes nothing."""
+
+from __future__ import annotations
+
+import random
+import ssl
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from certificates import TestAuthority, make_authority
+from coec.adapters.tls import conversation
+from coec.adapters.tls.conversation import (
+    CONVERSATIONS,
+    WAITED_S,
+    Credentials,
+    Heard,
+    Listener,
+    NotProvenError,
+    Speaker,
+)
+from coec.errors import ConfigError
+
+TEXT = b"hold everything"
+
+
+class Clock:
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def listener(authority: TestAuthority) -> Listener:
+    return Listener(authority.credentials("vehicle"))
+
+
+def flight(answer: bytes | Heard) -> bytes:
+    assert isinstance(answer, bytes)
+    return answer
+
+
+def end(answer: bytes | Heard) -> Heard:
+    assert isinstance(answer, Heard)
+    return answer
+
+
+def said(listener: Listener, credentials: Credentials, to: str = "vehicle") -> tuple[Heard, Speaker]:
+    """A whole conversation."""
+    speaker = Speaker(credentials, to)
+    last = speaker.say(flight(listener.hear("1", speaker.hello())), TEXT)
+    return end(listener.hear("1", last)), speaker
+
+
+def test_each_knows_the_other_and_what_was_said(authority: TestAuthority, listener: Listener) -> None:
+    heard, speaker = said(listener, authority.credentials("operator"))
+    assert (heard.name, heard.said) == ("operator", TEXT)
+    assert speaker.answer(heard.sealed(b"held")) == b"held"
+
+
+@pytest.fixture
+def foreign(tmp_path: Path) -> TestAuthority:
+    """An authority with the same names that nobody trusts."""
+    return make_authority(tmp_path / "foreign")
+
+
+@pytest.mark.fault(
+    "a command with a certificate that has expired, is foreign, is for servers only, or none", "it is not proven"
+)
+def test_a_certificate_that_is_not_to_be_trusted_proves_nothing(
+    authority: TestAuthority, listener: Listener, foreign: TestAuthority
+) -> None:
+    expired = authority.credentials(authority.sign("operator", "expired", days=-1))
+    servers = authority.credentials(authority.sign("operator", "servers", uses="extendedKeyUsage=serverAuth\n"))
+    other = foreign.credentials("operator")
+    stranger = Credentials(other.certificate, other.private_key, authority.root)
+    for credentials, why in ((expired, "expired"), (servers, "purpose"), (stranger, "issuer")):
+        with pytest.raises(NotProvenError, match=f"not taken: .*{why}"):
+            said(listener, credentials)
+
+
+def test_without_a_certificate_nothing_is_proven(
+    authority: TestAuthority, listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(ssl.SSLContext, "load_cert_chain", lambda *_, **__: None)
+        speaker = Speaker(authority.credentials("operator"), "vehicle")
+    last = speaker.say(flight(listener.hear("1", speaker.hello())), TEXT)
+    with pytest.raises(NotProvenError, match="did not return a certificate"):
+        listener.hear("1", last)
+
+
+def test_a_certificate_with_two_names_is_nobodys(authority: TestAuthority, listener: Listener) -> None:
+    both = authority.credentials(authority.sign("operator/CN=viewer", "both", uses="extendedKeyUsage=clientAuth\n"))
+    with pytest.raises(NotProvenError, match="2 common names"):
+        said(listener, both)
+
+
+@pytest.mark.fault("somebody else answers a proven command in the service's place", "its sender is told nothing of it")
+def test_who_is_not_the_service_learns_nothing(authority: TestAuthority, foreign: TestAuthority) -> None:
+    for pretender, why in (
+        (Listener(authority.credentials("router")), "certificate of 'router', not that of 'vehicle'"),
+        (Listener(authority.credentials("viewer")), "purpose"),
+        (Listener(foreign.credentials("vehicle")), "issuer|self-signed"),
+    ):
+        speaker = Speaker(authority.credentials("operator"), "vehicle")
+        answer = flight(pretender.hear("1", speaker.hello()))
+        with pytest.raises(NotProvenError, match=why):
+            speaker.say(answer, TEXT)
+
+
+@pytest.mark.fault("a proven command that is changed, cut or repeated on its way", "nothing is heard")
+def test_what_was_changed_cut_or_repeated_is_not_heard(authority: TestAuthority) -> None:
+    chance = random.Random(0)
+    heard = 0
+    for trial in range(60):
+        listener = Listener(authority.credentials("vehicle"))
+        speaker = Speaker(authority.credentials("operator"), "vehicle")
+        last = bytearray(speaker.say(flight(listener.hear("1", speaker.hello())), TEXT))
+        if trial % 3 == 0:
+            del last[chance.randrange(len(last)) :]
+        else:
+            last[chance.randrange(len(last))] ^= 1 << chance.randrange(8)
+        try:
+            heard += end(listener.hear("1", bytes(last))).said != TEXT
+        except NotProvenError:
+            continue
+        heard += 1
+    assert heard == 0
+
+
+def test_a_conversation_that_was_recorded_cannot_be_played_again(authority: TestAuthority, listener: Listener) -> None:
+    speaker = Speaker(authority.credentials("operator"), "vehicle")
+    hello = speaker.hello()
+    last = speaker.say(flight(listener.hear("1", hello)), TEXT)
+    assert end(listener.hear("1", last)).said == TEXT
+    for recorded in (last, hello + last):
+        with pytest.raises(NotProvenError):
+            end(listener.hear("1", recorded))
+    flight(listener.hear("2", hello))
+    with pytest.raises(NotProvenError):
+        listener.hear("2", last)
+
+
+def test_an_answer_that_is_not_the_services_is_not_taken(authority: TestAuthority, listener: Listener) -> None:
+    heard, speaker = said(listener, authority.credentials("operator"))
+    sealed = bytearray(heard.sealed(b"held"))
+    sealed[-1] ^= 1
+    with pytest.raises(NotProvenError):
+        speaker.answer(bytes(sealed))
+
+
+def test_rubbish_is_no_conversation(listener: Listener) -> None:
+    chance = random.Random(1)
+    for size in (0, 1, 5, 300, 20_000):
+        for head in (b"", b"\x16\x03\x01", b"\x16\x03\x01\x00\x05\x01\x00"):
+            with pytest.raises(NotProvenError):
+                listener.hear("1", head + chance.randbytes(size))
+
+
+def test_what_takes_too_long_is_not_heard(authority: TestAuthority) -> None:
+    clock = Clock()
+    listener = Listener(authority.credentials("vehicle"), clock)
+    speaker = Speaker(authority.credentials("operator"), "vehicle")
+    last = speaker.say(flight(listener.hear("1", speaker.hello())), TEXT)
+    clock.now_s = WAITED_S + 0.1
+    with pytest.raises(NotProvenError):
+        listener.hear("1", last)
+
+
+@pytest.mark.fault("conversations that are begun and never ended", "their number is bounded, and new ones are heard")
+def test_conversations_that_never_end_keep_nobody_out(authority: TestAuthority, listener: Listener) -> None:
+    credentials = authority.credentials("operator")
+    hello = Speaker(credentials, "vehicle").hello()
+    for number in range(CONVERSATIONS + 10):
+        flight(listener.hear(f"flood {number}", hello))
+    assert len(listener._begun) == CONVERSATIONS
+    assert said(listener, credentials)[0].said == TEXT
+
+
+def test_files_that_cannot_be_used_are_named_and_not_shown(authority: TestAuthority, tmp_path: Path) -> None:
+    own = authority.credentials("vehicle")
+    locked = tmp_path / "locked.pem"
+    command = ["openssl", "ec", "-in", str(own.private_key), "-aes256", "-passout", "pass:secret", "-out", str(locked)]
+    subprocess.run(command, check=True, capture_output=True)
+    absent, rubbish = tmp_path / "absent.pem", tmp_path / "rubbish.pem"
+    rubbish.write_text("c2VjcmV0")
+    for wrong, named in (
+        (Credentials(own.certificate, authority.credentials("viewer").private_key, own.root_ca), "mismatch"),
+        (Credentials(own.certificate, locked, own.root_ca), str(locked)),
+        (Credentials(absent, own.private_key, own.root_ca), str(absent)),
+        (Credentials(own.certificate, own.private_key, rubbish), str(rubbish)),
+        (Credentials(own.certificate, own.private_key, absent), "No such file"),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            Listener(wrong)
+        assert named in str(refused.value)
+        assert "c2VjcmV0" not in str(refused.value)
+
+
+def test_more_than_one_record_is_not_said(authority: TestAuthority, listener: Listener) -> None:
+    speaker = Speaker(authority.credentials("operator"), "vehicle")
+    came = flight(listener.hear("1", speaker.hello()))
+    with pytest.raises(NotProvenError, match="more than 16384 bytes"):
+        speaker.say(came, bytes(conversation.MAX_SAID + 1))

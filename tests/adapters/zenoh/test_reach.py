@@ -1,0 +1,75 @@
+"""Whether only programs on this computer reach a session: as far as it can be told, and never more than that."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from coec.adapters.system.listening import Address, Transport
+from coec.adapters.zenoh.reach import Reach
+from coec.adapters.zenoh.settings import settings_of
+from coec.config import LimitsConfig, ZenohConfig
+
+LIMITS = LimitsConfig()
+
+
+def outside(config: ZenohConfig, *waiting: tuple[Transport, int, str]) -> str | None:
+    """Why others reach a session, on a computer where these wait at ports."""
+
+    def addresses(protocol: Transport, port: int) -> set[Address]:
+        return {ipaddress.ip_address(address) for kind, at, address in waiting if (kind, at) == (protocol, port)}
+
+    return Reach(settings_of(config, LIMITS), addresses).outside()
+
+
+def to(*endpoints: str) -> ZenohConfig:
+    return ZenohConfig(connect=endpoints)
+
+
+@pytest.mark.parametrize(
+    ("config", "waiting"),
+    [
+        (to("tcp/127.0.0.1:7447"), ()),
+        (to("tcp/127.0.0.1:7447"), [("tcp", 7447, "127.0.0.1"), ("tcp", 7448, "0.0.0.0"), ("udp", 7447, "::")]),
+        (to("tcp/[::1]:7447", "unixsock-stream/run/zenoh.sock"), [("tcp", 7447, "::1")]),
+        (ZenohConfig(embedded_router=True), ()),
+    ],
+)
+def test_loopback_is_this_computer(config: ZenohConfig, waiting: Iterable[tuple[Transport, int, str]]) -> None:
+    assert outside(config, *waiting) is None
+
+
+@pytest.mark.parametrize(
+    ("config", "waiting", "why"),
+    [
+        (to("tcp/10.0.0.2:7447"), (), "it connects to tcp/10.0.0.2:7447"),
+        (to("tls/router:7448#password=secret"), (), "it connects to tls/router:7448#password=***"),
+        (to("tcp/127.0.0.1:7447"), [("tcp", 7447, "0.0.0.0")], "its router's port 7447 is open at 0.0.0.0, too"),
+        (to("quic/127.0.0.1:7447"), [("udp", 7447, "::")], "its router's port 7447 is open at ::, too"),
+        (to("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"), [("tcp", 2, "192.168.1.5")], "port 2 is open at 192.168.1.5"),
+        (
+            ZenohConfig(embedded_router=True, listen=("tcp/127.0.0.1:1", "tcp/[::]:7447"), insecure=True),
+            (),
+            "it listens at tcp/[::]:7447",
+        ),
+    ],
+)
+def test_whatever_else_is_not(config: ZenohConfig, waiting: Iterable[tuple[Transport, int, str]], why: str) -> None:
+    assert why in str(outside(config, *waiting))
+
+
+def test_gossip_may_tell_of_anybody(tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{ scouting: { gossip: { enabled: true } } }")
+    assert outside(ZenohConfig(file=file)) == "it connects to whom gossip tells it of"
+
+
+def test_what_cannot_be_told_is_not_this_computers_alone() -> None:
+    def untold(_: Transport, __: int) -> set[Address]:
+        raise FileNotFoundError
+
+    reach = Reach(settings_of(to("tcp/127.0.0.1:7447"), LIMITS), untold)
+    assert reach.outside() == "this system does not tell where its router listens"

@@ -1,0 +1,189 @@
+"""Commands over a router without rules: who may give them is for the service to say, and denied reads as denied."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from certificates import TestAuthority
+from coec.adapters.tls.conversation import NotProvenError, Speaker
+from coec.adapters.zenoh.bus import JSON, open_session
+from coec.adapters.zenoh.client import RemoteError, ask_one
+from coec.adapters.zenoh.proven import give
+from coec.config import AuthorityConfig, SenderConfig, ZenohConfig
+from coec.runtime.api.rate_limit import BURST
+from coec.schemas.base import to_json
+from coec.schemas.commands import ProvenCommand
+from fakes import wait_until
+from ports import free_port
+from vehicles import KEYS, LIMITS, PAIR, Vehicle, serving
+
+PATIENCE_S = 20.0
+HOLD = KEYS.command(PAIR, "hold")
+RELEASE = b'{"release":true}'
+OPERATOR = SenderConfig(name="operator", commands=("hold", "calibrate"))
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture(scope="module")
+def router(endpoint: str) -> Iterator[zenoh.Session]:
+    """One without rules; whoever holds it may do all that a router in between can."""
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LIMITS) as session:
+        yield session
+
+
+Served = Callable[..., Vehicle]
+
+
+@pytest.fixture
+def vehicle(router: zenoh.Session, endpoint: str, tmp_path: Path) -> Iterator[Callable[[AuthorityConfig], Vehicle]]:
+    """A vehicle on the router, once it is told who may give commands."""
+    with_end = []
+
+    def served(authority: AuthorityConfig) -> Vehicle:
+        context = serving(tmp_path / "state", ZenohConfig(connect=(endpoint,)), authority)
+        with_end.append(context)
+        made = context.__enter__()
+        wait_until(lambda: bool(list(router.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
+        return made
+
+    yield served
+    for context in with_end:
+        context.__exit__(None, None, None)
+
+
+def plainly(session: zenoh.Session, payload: bytes | None = None, key: str = HOLD) -> dict[str, object]:
+    told: dict[str, object] = json.loads(ask_one(session, f"{key}?format=json", PATIENCE_S, payload).payload)
+    return told
+
+
+def proven(
+    session: zenoh.Session, authority: TestAuthority, name: str, key: str = HOLD, payload: bytes | None = None
+) -> dict[str, object]:
+    speaker = Speaker(authority.credentials(name), "vehicle")
+    told: dict[str, object] = json.loads(
+        give(session, f"{key}?format=json", payload, PATIENCE_S, speaker, JSON).payload
+    )
+    return told
+
+
+def refusal(told: Callable[[], object]) -> tuple[str, str]:
+    with pytest.raises(RemoteError) as refused:
+        told()
+    return refused.value.reply_code, str(refused.value)
+
+
+@pytest.mark.fault("a command through a router that has no rules", "it is denied, reads as denied, and is counted")
+def test_who_proves_no_name_may_give_no_command(
+    authority: TestAuthority,
+    router: zenoh.Session,
+    vehicle: Served,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    there = vehicle(authority.of_service(OPERATOR))
+    for _ in range(5):
+        code, why = refusal(lambda: plainly(router))
+        assert code == "not_allowed"
+        assert "needs a sender who proves his name" in why
+    assert not there.is_held
+    assert there.commands == {"hold_not_allowed": 5}
+    lines = [record for record in caplog.records if "not allowed" in record.getMessage()]
+    assert [record.levelno for record in lines] == [logging.WARNING] * 3, "the first, the second, the fourth"
+    assert not there.bench.entries("command"), "who may do nothing writes nothing into the history either"
+
+
+def test_who_proves_his_name_may_give_the_commands_that_are_his(
+    authority: TestAuthority, router: zenoh.Session, vehicle: Served
+) -> None:
+    there = vehicle(authority.of_service(OPERATOR, SenderConfig(name="fleet")))
+    told = proven(router, authority, "operator")
+    assert (told["accepted"], told["code"]) == (True, "held")
+    assert there.is_held
+    assert proven(router, authority, "operator", payload=RELEASE)["code"] == "released"
+    code, why = refusal(lambda: proven(router, authority, "operator", KEYS.command(PAIR, "reset")))
+    assert (code, "only calibrate, hold" in why) == ("not_allowed", True)
+    assert refusal(lambda: proven(router, authority, "viewer"))[0] == "not_allowed"
+    assert proven(router, authority, authority.sign("fleet", "fleet"), KEYS.command(PAIR, "reset"))["code"] == "reset"
+    senders = [entry.sender for entry in there.bench.entries("command")]
+    assert senders == ["operator (certificate)", "operator (certificate)", "fleet (certificate)"]
+
+
+@pytest.mark.fault("a name that is only claimed", "it is not taken for one that is proven")
+def test_a_name_that_is_claimed_is_not_proven(authority: TestAuthority, router: zenoh.Session, vehicle: Served) -> None:
+    there = vehicle(authority.of_service(OPERATOR, anonymous="always"))
+    claim = b"operator (certificate)"
+    (reply,) = router.get(f"{HOLD}?format=json", attachment=claim, timeout=PATIENCE_S)
+    assert reply.ok is not None
+    (entry,) = there.bench.entries("command")
+    assert entry.sender == "operator _certificate_"
+
+
+def test_a_proven_sender_is_not_held_up_by_those_who_are_not(
+    authority: TestAuthority, router: zenoh.Session, vehicle: Served
+) -> None:
+    there = vehicle(authority.of_service(OPERATOR, anonymous="always"))
+    told = [plainly(router)["code"] for _ in range(BURST + 2)]
+    assert "too_many" in told
+    assert proven(router, authority, "operator", payload=RELEASE)["code"] == "released"
+    assert not there.is_held
+
+
+@pytest.mark.fault("a router in between turns a proven command into another one", "it is refused")
+def test_what_was_meant_for_one_command_is_no_other(
+    authority: TestAuthority, router: zenoh.Session, vehicle: Served
+) -> None:
+    there = vehicle(authority.of_service(SenderConfig(name="operator")))
+    speaker = Speaker(authority.credentials("operator"), "vehicle")
+    reset = f"{KEYS.command(PAIR, 'reset')}?tls={'0' * 32};format=json"
+    flight = ask_one(router, reset, PATIENCE_S, speaker.hello()).payload
+    said = speaker.say(flight, to_json(ProvenCommand(selector=f"{HOLD}?format=json")))
+    code, why = refusal(lambda: ask_one(router, reset, PATIENCE_S, said))
+    assert (code, "not the command that was asked for" in why) == ("bad_request", True)
+    assert not there.bench.entries("command")
+
+
+@pytest.mark.fault("a spoofed acknowledgement", "`coec query` does not take it for the service's")
+def test_an_acknowledgement_of_somebody_else_is_not_taken(authority: TestAuthority, router: zenoh.Session) -> None:
+    def pretend(query: zenoh.Query) -> None:
+        with query:
+            query.reply(HOLD, b'{"accepted":true,"code":"held"}', encoding=JSON)
+
+    handler = zenoh.handlers.Callback(pretend, indirect=False)
+    spoof = router.declare_queryable(HOLD, handler, complete=True)
+    with pytest.raises(NotProvenError):
+        proven(router, authority, "operator")
+    spoof.undeclare()
+
+
+def test_a_service_without_a_certificate_says_so(
+    authority: TestAuthority, router: zenoh.Session, vehicle: Served
+) -> None:
+    vehicle(AuthorityConfig())
+    code, why = refusal(lambda: proven(router, authority, "operator"))
+    assert (code, "this service has no certificate" in why) == ("not_proven", True)
+    assert plainly(router)["code"] == "held", "the session is loopback's alone"
+
+
+@pytest.mark.fault("an unproven command while the session or its router is open to other computers", "it is denied")
+@pytest.mark.parametrize("door", ["tcp/0.0.0.0", pytest.param("tcp/[::]", marks=pytest.mark.slow)])
+def test_what_comes_through_a_door_for_everybody_is_denied(tmp_path: Path, door: str) -> None:
+    port = free_port()
+    wide = ZenohConfig(embedded_router=True, listen=(f"{door}:{port}",), insecure=True)
+    beside = ZenohConfig(connect=(f"tcp/127.0.0.1:{port}",))
+    with open_session(wide, LIMITS) as open_router, serving(tmp_path / "beside", beside):
+        wait_until(lambda: bool(list(open_router.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
+        code, why = refusal(lambda: plainly(open_router))
+        assert (code, f"port {port} is open at" in why) == ("not_allowed", True)
+    with serving(tmp_path / "within", wide), open_session(beside, LIMITS) as client:
+        wait_until(lambda: bool(list(client.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
+        code, why = refusal(lambda: plainly(client))
+        assert (code, "it listens at" in why) == ("not_allowed", True)

@@ -1,0 +1,91 @@
+"""`deploy/make-test-ca`: certificates that OpenSSL and Zenoh take, and no surprise for what is there already."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import stat
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from certificates import MAKE, NAMES, TestAuthority
+from coec.adapters.tls.conversation import Listener, credentials_of
+from coec.adapters.zenoh.settings_file import credentials_in, read_settings
+from coec.config import AuthorityConfig, load_yaml
+from conftest import REPOSITORY
+
+pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
+
+
+def make(*arguments: object, path: str | None = None) -> subprocess.CompletedProcess[str]:
+    command = [str(MAKE), *(str(argument) for argument in arguments)]
+    environment = None if path is None else {"PATH": path}
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+
+
+def test_its_certificates_pass_the_strictest_look(authority: TestAuthority) -> None:
+    for name in NAMES:
+        purpose = "sslserver" if name in ("router", "vehicle") else "sslclient"
+        command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", "ca.pem", f"{name}.pem"]
+        subprocess.run(command, cwd=authority.folder, check=True, capture_output=True)
+
+
+def test_keys_are_their_owners_alone(authority: TestAuthority) -> None:
+    keys = list(authority.folder.glob("*-key.pem"))
+    assert {f"{name}-key.pem" for name in (*NAMES, "ca")} <= {key.name for key in keys}
+    assert {stat.S_IMODE((authority.folder / f"{name}-key.pem").stat().st_mode) for name in NAMES} == {0o600}
+
+
+def test_what_it_says_is_a_configuration_that_can_be_used(tmp_path: Path) -> None:
+    folder = tmp_path / "a folder"
+    told = make(folder, "vehicle-7.example", "10.0.0.7", "fd00::7")
+    assert told.returncode == 0, told.stderr
+    (section,) = re.findall(r"^ +authority:\n(?: {17}.*\n)+", told.stdout, re.MULTILINE)
+    file = tmp_path / "said.yaml"
+    file.write_text("\n".join(line[15:] for line in section.splitlines()))
+    credentials = credentials_of(AuthorityConfig.model_validate(load_yaml(file)["authority"]))
+    assert credentials is not None
+    Listener(credentials)
+    for name in ("vehicle", "sensors", "operator", "viewer"):
+        settings = read_settings(folder / f"{name}.json5")
+        assert settings.get_json("connect/endpoints") == '["tls/vehicle-7.example:7448"]'
+        assert settings.get_json("listen/endpoints") == "[]"
+        own = credentials_in(settings)
+        assert own is not None
+        assert own.certificate == folder / f"{name}.pem"
+    command = ["openssl", "x509", "-in", str(folder / "router.pem"), "-noout", "-ext", "subjectAltName"]
+    names = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    for name in ("DNS:vehicle-7.example", "IP Address:10.0.0.7", "IP Address:FD00:0:0:0:0:0:0:7", "DNS:localhost"):
+        assert name in names
+    assert "/etc/zenoh/tls/router-key.pem" in (REPOSITORY / "deploy" / "router.json5").read_text()
+
+
+def test_an_authority_that_is_there_stays(authority: TestAuthority) -> None:
+    before = authority.root.read_bytes()
+    refused = make(authority.folder)
+    assert (refused.returncode, "holds an authority already" in refused.stderr) == (1, True)
+    assert authority.root.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [((), "usage"), (("--help",), "usage"), (("x", "a b"), "no name or address"), (("x", "a,DNS:b"), "no name or")],
+)
+def test_what_is_no_host_makes_nothing(tmp_path: Path, arguments: tuple[str, ...], why: str) -> None:
+    typed = [tmp_path / word if word == "x" else word for word in arguments]
+    refused = make(*typed)
+    assert (refused.returncode, why in refused.stderr) == (1, True)
+    assert not list(tmp_path.rglob("*.pem"))
+
+
+def test_without_openssl_it_says_what_to_install(tmp_path: Path) -> None:
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    for name in ("bash", "env", "mkdir"):
+        found = shutil.which(name)
+        assert found is not None
+        (tools / name).symlink_to(found)
+    refused = make(tmp_path / "x", path=str(tools))
+    assert (refused.returncode, "apt-get install openssl" in refused.stderr) == (1, True)

@@ -1,0 +1,100 @@
+"""A vehicle that answers on a real session: one pair with the threads that it has in the service, and a worker that
+knows the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from coec.adapters.tls.conversation import Listener, credentials_of
+from coec.adapters.zenoh.bus import Bus, open_session
+from coec.adapters.zenoh.reach import Reach
+from coec.adapters.zenoh.settings import settings_of
+from coec.config import AuthorityConfig, LimitsConfig, ZenohConfig
+from coec.runtime.api.authority import Authority
+from coec.runtime.api.configuration import shown
+from coec.runtime.api.reception import Reception
+from coec.runtime.api.routes import VehicleAnswers
+from coec.runtime.api.snapshots import Snapshot
+from coec.schemas.keys import Keys
+from coec.schemas.replies import StatusReply, StorageStatus, WorkerStatus
+from pair_bench import Bench
+
+VEHICLE = "vehicle"
+PAIR = "front"
+KEYS = Keys("coec", VEHICLE)
+LIMITS = LimitsConfig()
+END_S = 20.0
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What answers, and what it is made of."""
+
+    bench: Bench
+    bus: Bus
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the last `hold` was one that held."""
+        return self.bench.store.state.frozen
+
+    @property
+    def commands(self) -> dict[str, int]:
+        """Counts, as `status` says them."""
+        return self.bench.answers.status().commands
+
+
+def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
+    """Declare all that a vehicle answers, as the daemon does."""
+    pair, authority = bench.pair, bench.config.authority
+    credentials = credentials_of(authority)
+    reception = Reception(
+        Authority(authority, Reach(settings_of(config, LIMITS)).outside),
+        None if credentials is None else Listener(credentials),
+        {pair.name: pair.commands},
+    )
+    document = Snapshot.of_document({"schema_version": 1, "config_hash": "0", "config": shown(bench.config)})
+
+    def status() -> Snapshot:
+        told = StatusReply(
+            version="0",
+            vehicle=VEHICLE,
+            state="running",
+            started_ns=0,
+            uptime_s=1.0,
+            config_hash="0",
+            pairs=(pair.answers.status(),),
+            worker=WorkerStatus(state="idle"),
+            storage=StorageStatus(bytes_used=0, bytes_free=0),
+        )
+        return Snapshot.of(told)
+
+    VehicleAnswers(KEYS, {pair.name: pair.answers}, reception, status, lambda: b"# EOF\n", document).declare(bus)
+    for name, answer in (("extrinsic", pair.answers.extrinsic), ("health", pair.answers.health)):
+        bus.publish(f"{KEYS.root}/{pair.name}/{name}", answer("msgpack"))
+    bus.declare_alive(KEYS.alive(pair.name))
+
+
+@contextmanager
+def serving(folder: Path, config: ZenohConfig, authority: AuthorityConfig | None = None) -> Iterator[Vehicle]:
+    """A vehicle in a session of its own, until the end of the block."""
+    bench = Bench(folder, vehicle=VEHICLE, authority=authority)
+    bus = Bus(open_session(config, LIMITS))
+    threads = (*bus.threads, bench.pair.stream.thread, bench.pair.decider.thread)
+    for thread in threads:
+        thread.start()
+    try:
+        serve(bench, config, bus)
+        yield Vehicle(bench, bus)
+    finally:
+        bus.undeclare_inputs()
+        bench.pair.stream.request_stop()
+        bench.pair.decider.request_stop()
+        for thread in threads:
+            thread.request_stop()
+        assert all(thread.join(END_S) for thread in threads)
+        bus.undeclare_queryables()
+        assert bus.close(END_S)
