@@ -23,7 +23,7 @@ RUN tools/bin/hatchling build --target wheel --directory dist \
 RUN /opt/coec/bin/coec sbom --lock requirements.lock --output /opt/coec/sbom
 
 FROM ${PYTHON}
-RUN useradd --system --uid 10001 --home-dir /var/lib/coec --shell /usr/sbin/nologin coec \
+RUN useradd --uid 10001 --no-create-home --home-dir /var/lib/coec --shell /usr/sbin/nologin coec \
     && install --directory --owner coec --group coec /var/lib/coec /var/cache/coec
 COPY --from=build /opt/coec /opt/coec
 # Compiled kernels are cached below XDG_CACHE_HOME/coec: keep that folder on a volume for quick restarts.

@@ -1,0 +1,168 @@
+"""The deployment as its files say, in a network namespace that watches: whom it speaks to, what it listens on, and what
+its commands come to. See `vehicle.py` for what is done.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coec.adapters.depth.model_cards import list_models
+from conftest import REPOSITORY
+from deploy.written import compose, shipped_configurations
+
+UNSHARE = ("unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc")
+PATIENCE_S = 580.0
+"""Kernels that are not compiled yet are compiled on the way."""
+
+SETTLED_S = 45.0
+"""Of a service that runs: left alone, onnxruntime 1.31 reports 11 s after the worker has started, and again."""
+
+Record = Callable[[str, object], None]
+"""pytest's `record_property`."""
+
+
+@cache
+def refusal() -> str | None:
+    """Why this machine cannot be made a vehicle of; None: it can."""
+    if sys.platform != "linux" or os.geteuid() != 0:
+        return "needs root on Linux: namespaces, mounts and another user"
+    tried = (
+        "mount -t tmpfs tmpfs /srv && mkdir /srv/changed /srv/work /srv/root && mount -t overlay overlay "
+        "-o lowerdir=/,upperdir=/srv/changed,workdir=/srv/work /srv/root && ip link set lo up && which openssl setpriv"
+    )
+    ended = subprocess.run([*UNSHARE, "sh", "-c", tried], capture_output=True, text=True)
+    return None if ended.returncode == 0 else f"this machine lets nobody make namespaces or overlays: {ended.stderr}"
+
+
+def lived(**story: object) -> Mapping[str, Any]:
+    """What a vehicle's life came to."""
+    why = refusal()
+    if why is not None:
+        pytest.skip(why)
+    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    path = os.pathsep.join(str(REPOSITORY / folder) for folder in ("service", "tests"))
+    command = [*UNSHARE, sys.executable, "-m", "deploy.vehicle", json.dumps(story)]
+    # For a group of its own there is nobody to be left behind: the namespace of processes ends with its first.
+    ended = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert ended.returncode == 0, ended.stderr[-20_000:]
+    report: Mapping[str, Any] = json.loads(ended.stdout.splitlines()[-1])
+    return report
+
+
+@pytest.fixture(scope="module")
+def short() -> Mapping[str, Any]:
+    """The router, the service with the network of the package, and the observer; this checkout in the image's place."""
+    return lived(build=False, configurations=[], networks=["street"], settle_s=0.0)
+
+
+def silent(report: Mapping[str, Any]) -> str:
+    """Checks that nobody but the router was spoken to, and that it would have been seen; the figure."""
+    assert report["strangers"] == {}
+    assert report["names asked"] == []
+    assert report["unseen"] == 0
+    seen, names, told = report["control"]
+    assert seen > 0, "the world does not see packets"
+    assert "vendor.example" in names
+    assert told > 0
+    return f"{sum(report['strangers'].values())} of {report['packets']} packets in {report['lived_s']:.0f} s"
+
+
+@pytest.mark.fault(
+    "a library in the image reports to its vendor",
+    "the service, its worker, its router and its observer speak to nobody but the router, nor ask for a name",
+)
+def test_nobody_but_the_router_is_spoken_to(short: Mapping[str, Any], record_property: Record) -> None:
+    record_property("figure", silent(short))
+    assert set(short["solved"]) == {"street"}
+    assert short["answers"] == 10
+
+
+@pytest.mark.fault(
+    "a port of the deployment that nobody knows of",
+    "the router listens on loopback and on the port that asks for certificates; service, worker and observer nowhere",
+)
+def test_listening_sockets_are_those_documented(short: Mapping[str, Any], record_property: Record) -> None:
+    assert short["router: sockets"] == ["tcp 127.0.0.1:7447", "tcp [::]:7448"]
+    assert short["coec: sockets"] == []
+    assert short["observer: sockets"] == []
+    record_property("figure", "2 of the router, 0 others")
+
+
+def test_health_checks_tell_well_from_unwell(short: Mapping[str, Any]) -> None:
+    assert short["coec: unwell before it runs"] == 1
+    assert [short[f"{name}: health"] for name in compose()] == [0, 0, 0]
+
+
+def test_every_service_ends_by_its_signal_within_its_grace(short: Mapping[str, Any]) -> None:
+    assert [short[f"{name}: exit"] for name in compose()] == [0, 0, 0]
+
+
+def test_programs_run_as_the_user_of_the_image_without_any_capability(short: Mapping[str, Any]) -> None:
+    assert short["users"] == ["coec"]
+    assert short["capabilities"] == ["CapPrm 0 CapEff 0 CapBnd 0 NoNewPrivs 1"]
+
+
+def test_memory_is_within_the_limit(short: Mapping[str, Any]) -> None:
+    limit = float(compose()["coec"]["mem_limit"].removesuffix("g")) * 2**30
+    assert 0 < short["memory"] < limit
+
+
+def test_the_observer_hears_of_health_and_of_the_end(short: Mapping[str, Any]) -> None:
+    heard = short["observer: heard"]
+    assert heard["alive"][0] == "True"
+    assert heard["alive"][-1] == "False"
+    assert "unknown" in heard["health"]
+    assert heard["extrinsic"]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
+    """The same from what the Dockerfile builds, and for longer than it takes a library to report."""
+    pip = (sys.executable, "-m", "pip", "download", "--no-deps", "--dest", str(tmp_path_factory.mktemp("fetched")))
+    fetched = subprocess.run([*pip, "editables"], capture_output=True, text=True)
+    if fetched.returncode != 0:
+        pytest.skip(f"no package index can be reached: {fetched.stderr.splitlines()[-1]}")
+    return lived(build=True, configurations=shipped_configurations(), networks=networks(), settle_s=SETTLED_S)
+
+
+def networks() -> list[str]:
+    """All that this machine has: that of the package, the maps that come with frames, and those of the samples."""
+    found = ["street", "stereo"]
+    data = os.environ.get("COEC_SAMPLE_DATA")
+    if data:
+        found += [f"{data}/depth/{card.file}" for card in list_models() if card.file and card.sha256]
+    return [name for name in found if not name.startswith("/") or Path(name).is_file()]
+
+
+@pytest.mark.slow
+@pytest.mark.fault(
+    "an image built from the Dockerfile, with every depth network at hand",
+    "it speaks to nobody but the router for three quarters of a minute, as an unprivileged user on a read-only root",
+)
+def test_what_the_dockerfile_builds_speaks_to_nobody_either(built: Mapping[str, Any], record_property: Record) -> None:
+    record_property("figure", silent(built))
+    assert set(built["solved"]) == set(networks())
+    assert built["installed"] == ["coec.cdx.json", "licences.md"]
+    assert [built[f"{name}: health"] for name in compose()] == [0, 0, 0]
+    assert [built[f"{name}: exit"] for name in compose()] == [0, 0, 0]
+    assert built["users"] == ["coec"]
+
+
+@pytest.mark.slow
+@pytest.mark.fault(
+    "a shipped configuration opens a port",
+    "with none of them does the service, or its worker, listen anywhere",
+)
+def test_no_shipped_configuration_opens_a_socket(built: Mapping[str, Any]) -> None:
+    assert built["sockets by configuration"] == {name: [] for name in shipped_configurations()}
