@@ -29,7 +29,7 @@ from coec.reports.commented_yaml import commented_yaml
 from conftest import REPOSITORY
 from deploy.certificates import sign
 from deploy.container import Container, enter_copy_of_root, forget, take_steps, use_interpreter_as_image_does
-from deploy.world import EVERYBODY, NAME_SERVER, make_all_addresses_local, open_sockets, watched
+from deploy.world import NAME_SERVER, leave_for_another, open_sockets, watched
 from deploy.written import DEPLOY, compose, stages
 from e2e.drives import SHORT, SHORT_PAIRS, rendered
 from e2e.processes import PATIENCE_S, Service, write_configuration
@@ -109,29 +109,50 @@ class Vehicle:
         self.said[f"{name}: exit"] = process.wait(grace_s)
 
 
-def main(*, build: bool, configurations: Sequence[str], networks: Sequence[str], settle_s: float) -> None:
+@dataclass(frozen=True, slots=True)
+class Story:
+    """What is done.
+
+    Attributes:
+        build: take the Dockerfile's steps; else this checkout's programs stand for what they build.
+        configurations: of the service, each of which it is started with to see its sockets; below the checkout.
+        networks: depth networks, each for a pair of its own.
+        commands: arguments of `coec` from this checkout.
+        chatter: a Python program that the world must notice.
+        settle_s: for so long the service runs at least.
+    """
+
+    build: bool
+    configurations: Sequence[str]
+    networks: Sequence[str]
+    commands: Sequence[Sequence[str]]
+    chatter: str
+    settle_s: float
+
+
+def main(story: Story) -> None:
     """Everything in its order; prints the report, as the last line."""
     enter_copy_of_root()
     forget("/build", "/etc/coec", "/etc/zenoh", "/opt/coec", "/var/cache/coec", "/var/lib/coec")
     use_interpreter_as_image_does()
-    vehicle = Vehicle(build)
-    if build:
+    vehicle = Vehicle(story.build)
+    if story.build:
         for stage in stages():
             take_steps(stage, built=stage is not stages()[0])
         vehicle.said["installed"] = sorted(path.name for path in Path("/opt/coec/sbom").iterdir())
     else:
         stand_in()
         take_steps(stages()[-1], built=True)
-    prepare(build=build)
-    make_all_addresses_local()
+    prepare(build=story.build)
+    leave_for_another()
     with watched() as world:
-        live(vehicle, configurations, networks, settle_s)
+        live(vehicle, story)
+        vehicle.said["commands"] = [ended(["coec", *words]) for words in story.commands]
         vehicle.said["strangers"] = world.strangers(ROUTER)
         vehicle.said["packets"] = sum(world.packets.values())
         vehicle.said["names asked"] = list(world.names_asked)
         before = sum(world.strangers(ROUTER).values())
-        chatter()
-        wait_until(lambda: bool(world.told), "the one who speaks")
+        subprocess.run([sys.executable, "-c", story.chatter], check=True)
         vehicle.said["control"] = [sum(world.strangers(ROUTER).values()) - before, world.names_asked, len(world.told)]
     vehicle.said["unseen"] = world.unseen
     print(json.dumps(vehicle.said))
@@ -172,7 +193,7 @@ def prepare(*, build: bool) -> None:
             shutil.chown(path, stages()[-1].last("USER").text)
 
 
-def live(vehicle: Vehicle, configurations: Sequence[str], networks: Sequence[str], settle_s: float) -> None:
+def live(vehicle: Vehicle, story: Story) -> None:
     """The router, the service as it is shipped, then with a drive, and the observer; each asked whether it is well."""
     said = vehicle.said
     with vehicle.running("router") as router:
@@ -180,9 +201,9 @@ def live(vehicle: Vehicle, configurations: Sequence[str], networks: Sequence[str
         said["router: health"] = vehicle.health("router")
         said["router: sockets"] = sockets_of(router)
         said["coec: unwell before it runs"] = vehicle.health("coec")
-        sockets_by_configuration(vehicle, configurations)
+        sockets_by_configuration(vehicle, story.configurations)
         drive = rendered(SHORT)
-        configure(drive.recording, networks)
+        configure(drive.recording, story.networks)
         with connected(["tcp/127.0.0.1:7447"], PATIENCE_S) as session, vehicle.running("coec") as process:
             service = Service(process, session, load_config(CONFIGURATION), Path("/var/log/coec.log"))
             with vehicle.running("observer") as observer:
@@ -199,7 +220,7 @@ def live(vehicle: Vehicle, configurations: Sequence[str], networks: Sequence[str
                 said["users"] = sorted({psutil.Process(pid).username() for pid in family(process)})
                 said["capabilities"] = sorted({capabilities(pid) for pid in family(process)})
                 said["memory"] = sum(psutil.Process(pid).memory_info().rss for pid in family(process))
-                time.sleep(max(0.0, settle_s - (time.monotonic() - begun_s)))
+                time.sleep(max(0.0, story.settle_s - (time.monotonic() - begun_s)))
                 said["lived_s"] = time.monotonic() - begun_s
                 vehicle.stop("coec", process)
                 wait_until(lambda: "alive" in Path("/var/log/observer.log").read_text(), "the observer's word")
@@ -254,15 +275,20 @@ def decision_of(service: Service, pair: str) -> str:
     return str(told["results"][0]["verdict"]["decision"])
 
 
-def questions(service: Service) -> int:
-    """Asks for everything that there is; the number of answers."""
+def questions(service: Service) -> dict[str, str]:
+    """Asks for everything that there is; what came of each."""
     keys, pair = service.keys, service.pair
     (window, *_) = service.windows()
     asked = [
         keys.status, keys.config, keys.metrics, keys.extrinsic(pair), keys.health(pair), keys.history(pair),
         keys.windows(pair), keys.window(pair, window["window_id"]), keys.overlay(pair), keys.evidence(pair),
     ]  # fmt: skip
-    return sum(reply.ok is not None for key in asked for reply in service.session.get(key, timeout=PATIENCE_S))
+    answers: dict[str, str] = {}
+    for key in asked:
+        for reply in service.session.get(key, timeout=PATIENCE_S):
+            told = "answered" if reply.ok is not None else reply.err and reply.err.payload.to_string()
+            answers[key.rpartition("/")[2] if key.count("/") < 5 else key.split("/")[4]] = str(told)
+    return answers
 
 
 def family(process: subprocess.Popen[bytes]) -> list[int]:
@@ -293,17 +319,11 @@ def heard(log: Path) -> dict[str, list[str]]:
     return found
 
 
-CHATTER = f"""
-import socket
-vendor = socket.create_connection(("vendor.example", 443))
-assert vendor.getpeername()[0] == "{EVERYBODY}"
-vendor.send(b"id")
-"""
-
-
-def chatter() -> None:
-    """What must not go unseen: a program that asks for a name, and speaks to whom it is told of."""
-    subprocess.run([sys.executable, "-c", CHATTER], check=True)
+def ended(command: Sequence[str]) -> int:
+    """Exit status of a command of this checkout, with its optional extras."""
+    path = os.pathsep.join(str(REPOSITORY / folder) for folder in ("service",))
+    whole = [sys.executable, "-m", *command]
+    return subprocess.run(whole, env={**os.environ, "PYTHONPATH": path}, stdout=sys.stderr, cwd="/tmp").returncode
 
 
 def told_all() -> None:
@@ -315,7 +335,7 @@ def told_all() -> None:
 
 if __name__ == "__main__":
     try:
-        main(**json.loads(sys.argv[1]))
+        main(Story(**json.loads(sys.argv[1])))
     except BaseException:
         told_all()
         raise

@@ -5,6 +5,7 @@ Every packet of the namespace passes by one socket, which tells those to the rou
 
 from __future__ import annotations
 
+import ctypes
 import ipaddress
 import socket
 import struct
@@ -23,8 +24,12 @@ EVERYBODY = "198.51.100.7"
 HTTPS = 443
 DNS = 53
 ETH_P_ALL, PACKET_OUTGOING, ETH_P_IP, ETH_P_IPV6 = 0x0003, 4, 0x0800, 0x86DD
+SO_RCVBUFFORCE = 33
+WAITING_BYTES = 2**30
+"""Of packets that wait to be looked at, as the kernel counts: whole, though it keeps no copy of them."""
 SOL_PACKET, PACKET_STATISTICS = 263, 6
 TCP_LISTEN = "0A"
+CLONE_NEWNET = 0x40000000
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -67,8 +72,12 @@ class World:
         return {str(flow): count for flow, count in sorted(self.packets.items()) if not flow.is_with(endpoints)}
 
 
-def make_all_addresses_local() -> None:
-    """For a fresh namespace: every address, of version 4 and 6, leads to loopback."""
+def leave_for_another() -> None:
+    """From here on this process, and what it starts, has a network of its own, in which every address, of version 4 and
+    6, leads to loopback. For a main thread that has started no session yet."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.unshare(CLONE_NEWNET) != 0:
+        raise OSError(ctypes.get_errno(), "unshare")
     for command in (
         "ip link set lo up",
         "ip route add local 0.0.0.0/0 dev lo",
@@ -82,7 +91,7 @@ def watched() -> Iterator[World]:
     """The world, with a name server and a listener, until the end."""
     world = World()
     sniffer = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(ETH_P_ALL))
-    sniffer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**26)
+    sniffer.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, WAITING_BYTES)
     names = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     names.bind((NAME_SERVER, DNS))
     listener = socket.create_server(("", HTTPS), family=socket.AF_INET6, dualstack_ipv6=True)
