@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -75,14 +76,21 @@ def _changes(session: zenoh.Session, options: Options) -> Iterator[queue.Queue[C
     """What is so now, and every change from then on."""
     keys = Keys(options.service.prefix, options.service.vehicle)
     waiting: queue.Queue[Change] = queue.Queue(WAITING)
+    changed: set[str] = set()
+    order = threading.Lock()
     lost = 0
 
-    def hear(sample: zenoh.Sample) -> None:
+    def take(sample: zenoh.Sample) -> None:
         nonlocal lost
         try:
             waiting.put_nowait(_change(sample))
         except (queue.Full, DecodeError):
             lost += 1
+
+    def hear(sample: zenoh.Sample) -> None:
+        with order:
+            changed.add(str(sample.key_expr))
+            take(sample)
 
     handler = zenoh.handlers.Callback(hear, indirect=False)
     with ExitStack() as stack:
@@ -92,8 +100,10 @@ def _changes(session: zenoh.Session, options: Options) -> Iterator[queue.Queue[C
         stack.callback(tokens.undeclare)
         for key in (keys.health("*"), keys.extrinsic("*")):
             for reply in session.get(key, target=zenoh.QueryTarget.ALL, timeout=options.timeout_s):
-                if reply.ok is not None:
-                    hear(reply.ok)
+                with order:
+                    # What has changed meanwhile is newer than this answer, or the same.
+                    if reply.ok is not None and str(reply.ok.key_expr) not in changed:
+                        take(reply.ok)
         yield waiting
     if lost:
         console.say(f"coec: {lost} messages were not shown: no document of ours, or more than could be written")
