@@ -18,7 +18,7 @@ import pytest
 from coec.adapters.depth.model_cards import CARDS, list_models
 from conftest import REPOSITORY
 from deploy.world import EVERYBODY
-from deploy.written import compose, shipped_configurations
+from deploy.written import compose, shipped_configurations, unit
 
 UNSHARE = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc")
 PATIENCE_S = 580.0
@@ -129,6 +129,21 @@ def test_health_checks_tell_well_from_unwell(short: Mapping[str, Any]) -> None:
     assert [short[f"{name}: health"] for name in compose()] == [0, 0, 0]
 
 
+@pytest.mark.fault(
+    "a command with the certificate of the observer",
+    "the router hands it to nobody, while the observer's questions are answered",
+)
+def test_the_observer_may_ask_and_not_command(short: Mapping[str, Any]) -> None:
+    assert short["viewer"] == {"health": "answered", "command": "nothing"}
+
+
+def test_the_manager_is_told_of_the_start_of_progress_and_of_the_end(short: Mapping[str, Any]) -> None:
+    told = short["manager: told"]
+    assert set(told) == {"READY=1", "WATCHDOG=1", "STOPPING=1"}
+    assert told[-1] == "STOPPING=1"
+    assert unit()["Type"] == ["notify"]
+
+
 def test_every_service_ends_by_its_signal_within_its_grace(short: Mapping[str, Any]) -> None:
     assert [short[f"{name}: exit"] for name in compose()] == [0, 0, 0]
 
@@ -192,12 +207,16 @@ def test_what_the_dockerfile_builds_speaks_to_nobody_either(built: Mapping[str, 
     assert [built[f"{name}: health"] for name in compose()] == [0, 0, 0]
     assert [built[f"{name}: exit"] for name in compose()] == [0, 0, 0]
     assert built["users"] == ["coec"]
+    given_up = built["unit: exit without a configuration"]
+    assert str(given_up) in unit()["RestartPreventExitStatus"], "what stays wrong is not tried again"
 
 
 @pytest.mark.slow
 @pytest.mark.fault(
     "a shipped configuration opens a port",
-    "with none of them does the service, or its worker, listen anywhere",
+    "with none of them does the service, or its worker, listen anywhere; with `--embedded-router` on loopback alone",
 )
-def test_no_shipped_configuration_opens_a_socket(built: Mapping[str, Any]) -> None:
-    assert built["sockets by configuration"] == {name: [] for name in shipped_configurations()}
+def test_no_shipped_configuration_opens_a_socket_but_that_of_an_embedded_router(built: Mapping[str, Any]) -> None:
+    plain: dict[str, list[str]] = {name: [] for name in shipped_configurations()}
+    routing = {f"{name} --embedded-router": ["tcp 127.0.0.1:7447"] for name in shipped_configurations()}
+    assert built["sockets by configuration"] == plain | routing

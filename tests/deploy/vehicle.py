@@ -22,15 +22,16 @@ from typing import Any
 import psutil
 
 from coec import geometry
-from coec.adapters.zenoh.client import connected
+from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected, connected_by
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig, load_config
 from coec.geometry.compiler import kernel_cache_directory
 from coec.reports.commented_yaml import commented_yaml
 from conftest import REPOSITORY
 from deploy.certificates import sign
 from deploy.container import Container, enter_copy_of_root, forget, take_steps, use_interpreter_as_image_does
+from deploy.manager import listening
 from deploy.world import NAME_SERVER, leave_for_another, open_sockets, watched
-from deploy.written import DEPLOY, compose, stages
+from deploy.written import DEPLOY, compose, exec_start, stages
 from e2e.drives import SHORT, SHORT_PAIRS, rendered
 from e2e.processes import PATIENCE_S, Service, write_configuration
 from fakes import wait_until
@@ -42,6 +43,12 @@ ROUTER = (("127.0.0.1", 7447), (GATEWAY, 7448))
 """The router's doors, as `deploy/router.json5` has them."""
 
 CONFIGURATION = Path("/etc/coec/coec.yaml")
+
+NOTIFY_SOCKET = Path("/run/notify")
+"""The manager's: nobody reads it but where that is looked at."""
+
+ASK_AGAIN = ("busy", "not_drawn")
+"""Refusals that say so: the worker is at work."""
 
 
 @dataclass
@@ -89,13 +96,13 @@ class Vehicle:
         return checked.returncode
 
     @contextmanager
-    def running(self, name: str) -> Iterator[subprocess.Popen[bytes]]:
-        """A service, until it has ended; what it says is in /var/log/NAME.log."""
+    def running(self, name: str, *more: str) -> Iterator[subprocess.Popen[bytes]]:
+        """A service, with further arguments, until it has ended; what it says is in /var/log/NAME.log."""
         container = self.container(name)
+        command = container.command([*self.command(name), *more])
+        environment = {**container.environment, "NOTIFY_SOCKET": str(NOTIFY_SOCKET)}
         with Path(f"/var/log/{name}.log").open("wb") as log:
-            process = subprocess.Popen(
-                container.command(self.command(name)), env=container.environment, stdout=log, stderr=log
-            )
+            process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
         try:
             yield process
         finally:
@@ -147,6 +154,8 @@ def main(story: Story) -> None:
     leave_for_another()
     with watched() as world:
         live(vehicle, story)
+        if story.build:
+            vehicle.said["unit: exit without a configuration"] = started_without_configuration(vehicle)
         vehicle.said["commands"] = [ended(["coec", *words]) for words in story.commands]
         vehicle.said["strangers"] = world.strangers(ROUTER)
         vehicle.said["packets"] = sum(world.packets.values())
@@ -196,23 +205,30 @@ def prepare(*, build: bool) -> None:
 def live(vehicle: Vehicle, story: Story) -> None:
     """The router, the service as it is shipped, then with a drive, and the observer; each asked whether it is well."""
     said = vehicle.said
+    for configuration in story.configurations:
+        note_sockets(vehicle, configuration, "--embedded-router")
     with vehicle.running("router") as router:
         wait_until(lambda: bool(sockets_of(router)), "the router")
         said["router: health"] = vehicle.health("router")
         said["router: sockets"] = sockets_of(router)
         said["coec: unwell before it runs"] = vehicle.health("coec")
-        sockets_by_configuration(vehicle, story.configurations)
+        for configuration in story.configurations:
+            note_sockets(vehicle, configuration)
         drive = rendered(SHORT)
         configure(drive.recording, story.networks)
-        with connected(["tcp/127.0.0.1:7447"], PATIENCE_S) as session, vehicle.running("coec") as process:
+        with (
+            connected(["tcp/127.0.0.1:7447"], PATIENCE_S) as session,
+            listening(NOTIFY_SOCKET) as told,
+            vehicle.running("coec") as process,
+        ):
             service = Service(process, session, load_config(CONFIGURATION), Path("/var/log/coec.log"))
             with vehicle.running("observer") as observer:
                 service.until(service.status, lambda status: status["state"] == "running", "a warm worker")
                 begun_s = time.monotonic()
                 service.send(drive.frames)
-                asked = calibrated(service)
-                said["solved"] = asked
+                said["solved"] = calibrated(service)
                 said["answers"] = questions(service)
+                said["viewer"] = rights_of_viewer(service)
                 said["coec: health"] = vehicle.health("coec")
                 said["observer: health"] = vehicle.health("observer")
                 said["observer: sockets"] = sockets_of(observer)
@@ -223,21 +239,28 @@ def live(vehicle: Vehicle, story: Story) -> None:
                 time.sleep(max(0.0, story.settle_s - (time.monotonic() - begun_s)))
                 said["lived_s"] = time.monotonic() - begun_s
                 vehicle.stop("coec", process)
-                wait_until(lambda: "alive" in Path("/var/log/observer.log").read_text(), "the observer's word")
+                wait_until(lambda: '"value":false' in Path("/var/log/observer.log").read_text(), "the observer's word")
                 vehicle.stop("observer", observer)
+            said["manager: told"] = list(dict.fromkeys(told))
         said["observer: heard"] = heard(Path("/var/log/observer.log"))
         vehicle.stop("router", router)
 
 
-def sockets_by_configuration(vehicle: Vehicle, names: Sequence[str]) -> None:
-    """Which sockets the service opens, with each configuration, that it answers with."""
-    table = vehicle.said.setdefault("sockets by configuration", {})
-    for name in names:
-        shutil.copy(REPOSITORY / name, CONFIGURATION)
-        with vehicle.running("coec") as process:
-            wait_until(lambda: vehicle.health("coec") == 0, f"the service of {name}", PATIENCE_S)
-            table[name] = sockets_of(process)
-            vehicle.stop("coec", process)
+def note_sockets(vehicle: Vehicle, configuration: str, *more: str) -> None:
+    """Which sockets the service opens, with a configuration and further arguments, that it answers with."""
+    shutil.copy(REPOSITORY / configuration, CONFIGURATION)
+    with vehicle.running("coec", *more) as process:
+        wait_until(lambda: vehicle.health("coec") == 0, f"the service of {configuration}", PATIENCE_S)
+        table = vehicle.said.setdefault("sockets by configuration", {})
+        table[" ".join((configuration, *more))] = sockets_of(process)
+        vehicle.stop("coec", process)
+
+
+def started_without_configuration(vehicle: Vehicle) -> int:
+    """Exit status of what the unit starts."""
+    CONFIGURATION.unlink()
+    container = vehicle.container("coec")
+    return subprocess.run(container.command(exec_start()), env=container.environment, stdout=sys.stderr).returncode
 
 
 def configure(recording: Any, networks: Sequence[str]) -> None:
@@ -285,10 +308,34 @@ def questions(service: Service) -> dict[str, str]:
     ]  # fmt: skip
     answers: dict[str, str] = {}
     for key in asked:
-        for reply in service.session.get(key, timeout=PATIENCE_S):
-            told = "answered" if reply.ok is not None else reply.err and reply.err.payload.to_string()
-            answers[key.rpartition("/")[2] if key.count("/") < 5 else key.split("/")[4]] = str(told)
+
+        def told(key: str = key) -> bool:
+            answers[key] = answer_of(service, key)
+            return answers[key] not in ASK_AGAIN
+
+        wait_until(told, f"an answer to {key}", PATIENCE_S)
     return answers
+
+
+def rights_of_viewer(service: Service) -> dict[str, str]:
+    """What comes of a question and of a command from whoever has the observer's certificate and key."""
+    keys, pair = service.keys, service.pair
+    (file,) = [Path(word) for word in compose()["observer"]["command"] if word.endswith(".json5")]
+    found = {}
+    with connected_by(file, PATIENCE_S) as viewer:
+        for name, key in (("health", keys.health(pair)), ("command", keys.command(pair, "hold"))):
+            replies = ask(viewer, key, PATIENCE_S)
+            found[name] = "answered" if replies else "nothing"
+    return found
+
+
+def answer_of(service: Service, key: str) -> str:
+    """`answered`, or the code of the refusal."""
+    try:
+        ask_one(service.session, key, PATIENCE_S)
+    except RemoteError as error:
+        return error.reply_code
+    return "answered"
 
 
 def family(process: subprocess.Popen[bytes]) -> list[int]:

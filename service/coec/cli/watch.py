@@ -57,14 +57,16 @@ def run(options: Options) -> int:
         ConnectionFailedError: no router answered.
     """
     heard = 0
-    end_s = None if options.seconds is None else time.monotonic() + options.seconds
     file, endpoints = options.file, options.service.connect
     connection = connected(endpoints, options.timeout_s) if file is None else connected_by(file, options.timeout_s)
     with until_signal() as stop, connection as session, _changes(session, options) as changes:
-        while not stop.is_set() and (end_s is None or time.monotonic() < end_s):
+        end_s = None if options.seconds is None else time.monotonic() + options.seconds
+        while not stop.is_set():
             try:
                 change = changes.get(timeout=POLL_S)
             except queue.Empty:
+                if end_s is not None and time.monotonic() >= end_s:
+                    break
                 continue
             heard += 1
             _write(change, as_json=options.as_json)
