@@ -4,7 +4,8 @@
 #   docker build -t coec .
 #   docker run --network host -v ./deploy/coec.yaml:/etc/coec/coec.yaml:ro -v coec-state:/var/lib/coec coec
 
-# The digest is what is fetched, the tag tells people what it is. `deploy/pin-images` renews both.
+# The digest is what is fetched (of the index: for every architecture), the tag tells people what it is: that of 19
+# September 2026 by the image's own record, docker-library/repo-info 40cdaf34. `deploy/pin-images` renews both.
 ARG PYTHON=python:3.11.16-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
 
 FROM ${PYTHON} AS build

@@ -36,6 +36,13 @@ def test_every_image_is_pinned_by_its_digest() -> None:
     assert {service.get("image") for service in compose().values()} == {"coec"}, "an image of another origin"
 
 
+def test_what_the_image_is_built_from_is_not_kept_from_it() -> None:
+    let_in = (REPOSITORY / ".dockerignore").read_text().splitlines()
+    copied = [step.words()[:-1] for step in stages()[0].steps if step.instruction == "COPY"]
+    assert copied
+    assert [source for sources in copied for source in sources if f"!{source}" not in let_in] == []
+
+
 def pin_images(folder: Path, told: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """`deploy/pin-images` in a copy of the checkout, where the registry tells something."""
     (folder / "deploy").mkdir()

@@ -22,7 +22,8 @@ from typing import Any
 import psutil
 
 from coec import geometry
-from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected, connected_by
+from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected
+from coec.adapters.zenoh.client_by_file import connected_by_file
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig, load_config
 from coec.geometry.compiler import kernel_cache_directory
 from coec.reports.commented_yaml import commented_yaml
@@ -208,7 +209,7 @@ def live(vehicle: Vehicle, story: Story) -> None:
     for configuration in story.configurations:
         note_sockets(vehicle, configuration, "--embedded-router")
     with vehicle.running("router") as router:
-        wait_until(lambda: bool(sockets_of(router)), "the router")
+        wait_until(lambda: bool(sockets_of(router)), "the router", PATIENCE_S)
         said["router: health"] = vehicle.health("router")
         said["router: sockets"] = sockets_of(router)
         said["coec: unwell before it runs"] = vehicle.health("coec")
@@ -235,11 +236,12 @@ def live(vehicle: Vehicle, story: Story) -> None:
                 said["coec: sockets"] = sockets_of(process)
                 said["users"] = sorted({psutil.Process(pid).username() for pid in family(process)})
                 said["capabilities"] = sorted({capabilities(pid) for pid in family(process)})
-                said["memory"] = sum(psutil.Process(pid).memory_info().rss for pid in family(process))
+                programs = {"router": router, "coec": process, "observer": observer}
+                said["memory"] = {name: resident(program) for name, program in programs.items()}
                 time.sleep(max(0.0, story.settle_s - (time.monotonic() - begun_s)))
                 said["lived_s"] = time.monotonic() - begun_s
                 vehicle.stop("coec", process)
-                wait_until(lambda: '"value":false' in Path("/var/log/observer.log").read_text(), "the observer's word")
+                wait_until(lambda: '"value":false' in Path("/var/log/observer.log").read_text(), "its word", PATIENCE_S)
                 vehicle.stop("observer", observer)
             said["manager: told"] = list(dict.fromkeys(told))
         said["observer: heard"] = heard(Path("/var/log/observer.log"))
@@ -322,7 +324,7 @@ def rights_of_viewer(service: Service) -> dict[str, str]:
     keys, pair = service.keys, service.pair
     (file,) = [Path(word) for word in compose()["observer"]["command"] if word.endswith(".json5")]
     found = {}
-    with connected_by(file, PATIENCE_S) as viewer:
+    with connected_by_file(file, PATIENCE_S) as viewer:
         for name, key in (("health", keys.health(pair)), ("command", keys.command(pair, "hold"))):
             replies = ask(viewer, key, PATIENCE_S)
             found[name] = "answered" if replies else "nothing"
@@ -341,6 +343,11 @@ def answer_of(service: Service, key: str) -> str:
 def family(process: subprocess.Popen[bytes]) -> list[int]:
     """A service and the processes that it has started."""
     return [process.pid, *(child.pid for child in psutil.Process(process.pid).children(recursive=True))]
+
+
+def resident(process: subprocess.Popen[bytes]) -> int:
+    """Bytes of memory that a service has in all its processes."""
+    return sum(psutil.Process(pid).memory_info().rss for pid in family(process))
 
 
 def sockets_of(process: subprocess.Popen[bytes]) -> list[str]:

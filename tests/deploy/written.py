@@ -106,3 +106,11 @@ def shipped_configurations() -> list[str]:
     """The service's, by their path below the root of the checkout."""
     found = [DEPLOY / "coec.yaml", *sorted((DEPLOY / "examples").glob("*.yaml"))]
     return [path.relative_to(REPOSITORY).as_posix() for path in found]
+
+
+def documented_sockets() -> dict[str, list[str]]:
+    """Who listens where, by the page of the deployment."""
+    text = (REPOSITORY / "docs" / "deployment.md").read_text()
+    (table,) = re.findall(r"\| program \| sockets \|\n\|[-|]+\|\n((?:\|.*\|\n)+)", text)
+    rows = [[cell.strip() for cell in row.strip("|").split(" | ")] for row in table.splitlines()]
+    return {program.replace("`", ""): re.findall(r"`([^`]+)`", sockets) for program, sockets in rows}

@@ -13,7 +13,8 @@ from typing import Any
 
 import zenoh
 
-from coec.adapters.zenoh.client import connected, connected_by
+from coec.adapters.zenoh.client import connected
+from coec.adapters.zenoh.client_by_file import connected_by_file
 from coec.cli.query import Asked
 from coec.cli.stopping import until_signal
 from coec.errors import DecodeError
@@ -58,7 +59,7 @@ def run(options: Options) -> int:
     """
     heard = 0
     file, endpoints = options.file, options.service.connect
-    connection = connected(endpoints, options.timeout_s) if file is None else connected_by(file, options.timeout_s)
+    connection = connected(endpoints, options.timeout_s) if file is None else connected_by_file(file, options.timeout_s)
     with until_signal() as stop, connection as session, _changes(session, options) as changes:
         end_s = None if options.seconds is None else time.monotonic() + options.seconds
         while not stop.is_set():

@@ -7,12 +7,11 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import zenoh
 
-from coec.adapters.zenoh.endpoints import redacted, without_secrets
-from coec.errors import CoecError, ConfigError, DecodeError, NotFoundError, UsageError
+from coec.adapters.zenoh.endpoints import redacted
+from coec.errors import CoecError, DecodeError, NotFoundError, UsageError
 from coec.schemas.base import from_json, from_msgpack
 from coec.schemas.replies import ErrorReply
 
@@ -60,10 +59,15 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
             raise UsageError(
                 f"{redacted(endpoint)!r} is no endpoint of a router: write PROTOCOL/ADDRESS, as tcp/127.0.0.1:7447"
             )
+    zenoh.init_log_from_env_or("off")
     settings = zenoh.Config()
+    settings.insert_json5("mode", '"client"')
+    settings.insert_json5("scouting/multicast/enabled", "false")
+    settings.insert_json5("connect/timeout_ms", str(round(wait_s * 1000)))
+    settings.insert_json5("connect/exit_on_failure", "true")
     try:
         settings.insert_json5("connect/endpoints", json.dumps(list(endpoints)))
-        session = _opened(settings, wait_s)
+        session = zenoh.open(settings)
     except (zenoh.ZError, ValueError) as error:
         asked = ", ".join(redacted(endpoint) for endpoint in endpoints)
         raise ConnectionFailedError(
@@ -74,41 +78,6 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
         yield session
     finally:
         session.close()
-
-
-@contextmanager
-def connected_by(file: Path, wait_s: float) -> Iterator[zenoh.Session]:
-    """A client session by a Zenoh configuration (JSON5): its endpoints, its certificate; closed at the end.
-
-    Raises:
-        ConfigError: the file is none.
-        ConnectionFailedError: no router that takes the certificate answered within `wait_s`.
-    """
-    try:
-        settings = zenoh.Config.from_file(file)
-    except (zenoh.ZError, OSError, ValueError) as error:
-        raise ConfigError(f"{file}: {without_secrets(str(error), ())}") from None
-    try:
-        session = _opened(settings, wait_s)
-    except zenoh.ZError as error:
-        raise ConnectionFailedError(
-            f"no Zenoh router let us in by {file} within {wait_s:g} s ({without_secrets(str(error), ())}): check that "
-            "it runs, its endpoint, and whether the certificate is one that it knows and is not expired"
-        ) from None
-    try:
-        yield session
-    finally:
-        session.close()
-
-
-def _opened(settings: zenoh.Config, wait_s: float) -> zenoh.Session:
-    """A client that looks for nobody but those whom it was told of."""
-    zenoh.init_log_from_env_or("off")
-    settings.insert_json5("mode", '"client"')
-    settings.insert_json5("scouting/multicast/enabled", "false")
-    settings.insert_json5("connect/timeout_ms", str(round(wait_s * 1000)))
-    settings.insert_json5("connect/exit_on_failure", "true")
-    return zenoh.open(settings)
 
 
 def key_expression(text: str) -> str:
