@@ -21,8 +21,8 @@ from deploy.world import EVERYBODY
 from deploy.written import compose, documented_sockets, shipped_configurations, unit
 
 UNSHARE = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc")
-PATIENCE_S = 580.0
-"""Kernels that are not compiled yet are compiled on the way."""
+PATIENCE_S = 1800.0
+"""The packages of an image are fetched, and kernels that are not compiled yet are compiled, on the way."""
 
 SETTLED_S = 45.0
 """Of a service that runs: left alone, onnxruntime 1.31 reports 11 s after the worker has started, and again."""

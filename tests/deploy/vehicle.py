@@ -209,7 +209,7 @@ def live(vehicle: Vehicle, story: Story) -> None:
     for configuration in story.configurations:
         note_sockets(vehicle, configuration, "--embedded-router")
     with vehicle.running("router") as router:
-        wait_until(lambda: bool(sockets_of(router)), "the router", PATIENCE_S)
+        wait_until(lambda: lives(router) and bool(sockets_of(router)), "the router", PATIENCE_S)
         said["router: health"] = vehicle.health("router")
         said["router: sockets"] = sockets_of(router)
         said["coec: unwell before it runs"] = vehicle.health("coec")
@@ -252,7 +252,9 @@ def note_sockets(vehicle: Vehicle, configuration: str, *more: str) -> None:
     """Which sockets the service opens, with a configuration and further arguments, that it answers with."""
     shutil.copy(REPOSITORY / configuration, CONFIGURATION)
     with vehicle.running("coec", *more) as process:
-        wait_until(lambda: vehicle.health("coec") == 0, f"the service of {configuration}", PATIENCE_S)
+        wait_until(
+            lambda: lives(process) and vehicle.health("coec") == 0, f"the service of {configuration}", PATIENCE_S
+        )
         table = vehicle.said.setdefault("sockets by configuration", {})
         table[" ".join((configuration, *more))] = sockets_of(process)
         vehicle.stop("coec", process)
@@ -338,6 +340,12 @@ def answer_of(service: Service, key: str) -> str:
     except RemoteError as error:
         return error.reply_code
     return "answered"
+
+
+def lives(process: subprocess.Popen[bytes]) -> bool:
+    """True; fails where what is waited for will never come."""
+    assert process.poll() is None, f"it has ended, with {process.returncode}"
+    return True
 
 
 def family(process: subprocess.Popen[bytes]) -> list[int]:
