@@ -4,7 +4,11 @@
 #   docker build -t coec .
 #   docker run --network host -v ./deploy/coec.yaml:/etc/coec/coec.yaml:ro -v coec-state:/var/lib/coec coec
 
-FROM python:3.11-slim-bookworm AS build
+# The digest is what is fetched (of the index: for every architecture), the tag tells people what it is: that of 19
+# September 2026 by the image's own record, docker-library/repo-info 40cdaf34. `deploy/pin-images` renews both.
+ARG PYTHON=python:3.11.16-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
+
+FROM ${PYTHON} AS build
 WORKDIR /build
 COPY requirements.lock ./
 RUN pip download --quiet --require-hashes --requirement requirements.lock --dest packages
@@ -14,10 +18,13 @@ COPY service service
 RUN tools/bin/hatchling build --target wheel --directory dist \
     && python -m venv /opt/coec \
     && /opt/coec/bin/pip install --quiet --no-index --find-links packages dist/coec-*.whl \
+    && /opt/coec/bin/python -m pip uninstall --quiet --yes setuptools pip \
     && /opt/coec/bin/python -m compileall -q /opt/coec/lib
+# What is in the image, under which licences: /opt/coec/sbom/coec.cdx.json (CycloneDX) and licences.md.
+RUN /opt/coec/bin/coec sbom --lock requirements.lock --output /opt/coec/sbom
 
-FROM python:3.11-slim-bookworm
-RUN useradd --system --uid 10001 --home-dir /var/lib/coec --shell /usr/sbin/nologin coec \
+FROM ${PYTHON}
+RUN useradd --uid 10001 --no-create-home --home-dir /var/lib/coec --shell /usr/sbin/nologin coec \
     && install --directory --owner coec --group coec /var/lib/coec /var/cache/coec
 COPY --from=build /opt/coec /opt/coec
 # Compiled kernels are cached below XDG_CACHE_HOME/coec: keep that folder on a volume for quick restarts.

@@ -485,6 +485,51 @@ def _query(
     raise typer.Exit(command.run(options))
 
 
+@app.command("watch")
+def _watch(
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Of the service: names the vehicle, the prefix and the router.", metavar="FILE"),
+    ] = None,
+    vehicle: Annotated[str | None, typer.Option(show_default="vehicle")] = None,
+    prefix: Annotated[str | None, typer.Option(show_default="coec")] = None,
+    connect: Connect = None,
+    zenoh: Annotated[
+        Path | None,
+        typer.Option(help="Zenoh configuration of the session (JSON5): endpoint, certificate.", metavar="FILE"),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="For so long: exit 1 if nothing was heard.", min=0.1, show_default="for ever")
+    ] = None,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait for the router.", min=0.01)] = 5.0,
+    as_json: Annotated[bool, typer.Option("--json", help="A JSON document a line on standard output.")] = False,
+) -> None:
+    """Show health, extrinsic and presence of every pair of a running service, as they change; gives no command."""
+    from coec.cli import query
+    from coec.cli import watch as command
+
+    options = command.Options(
+        service=query.asked_of(config, vehicle, prefix, connect),
+        file=zenoh,
+        seconds=seconds,
+        timeout_s=timeout,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
+
+
+@app.command("router")
+def _router(
+    config: Annotated[
+        Path, typer.Option(help="Zenoh configuration of a router (JSON5).", metavar="FILE", show_default=False)
+    ],
+) -> None:
+    """Be the Zenoh router of the vehicle, with the access control of its configuration (deploy/router.json5)."""
+    from coec.cli import router as command
+
+    raise typer.Exit(command.run(config))
+
+
 @app.command("replay")
 def _replay(
     window: Annotated[Path, typer.Argument(help="A recorded window with its result (.mcap).", show_default=False)],
@@ -703,6 +748,21 @@ def _sim_matrix(
         as_json=as_json,
     )
     raise typer.Exit(command.run(options))
+
+
+@app.command("sbom")
+def _sbom(
+    lock: Annotated[
+        Path | None,
+        typer.Option(help="The requirements.lock of the installation: hashes come from it.", metavar="FILE"),
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="Write coec.cdx.json and licences.md.", metavar="DIR")] = None,
+    as_json: Json = False,
+) -> None:
+    """Tell what this installation is made of: a table of licences, with --json a bill of materials (CycloneDX)."""
+    from coec.cli import sbom as command
+
+    raise typer.Exit(command.run(lock, output, as_json=as_json))
 
 
 @app.command("bench")

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Literal
 
 import numpy as np
@@ -17,6 +14,7 @@ import numpy as np
 from coec.adapters.zenoh.client import connected, single_key
 from coec.adapters.zenoh.player import Frame, Played, Player, Streams, repeated
 from coec.calibration.types import CameraFrame, LidarFrame
+from coec.cli.stopping import until_signal
 from coec.config import Config, PairConfig, ZenohConfig, load_config
 from coec.errors import SourceError, UsageError
 from coec.reports import console
@@ -58,7 +56,7 @@ def run(options: Options) -> int:
     single_key(streams.camera)
     _warn(recording, pair, options.encoding)
     shift_ns = time.time_ns() - _first_stamp_ns(recording) if options.start_now else 0
-    with _until_signal() as stop, connected(endpoints, CONNECT_S) as session:
+    with until_signal() as stop, connected(endpoints, CONNECT_S) as session:
         player = Player(session, streams, options.encoding)
         deaf = player.wait_for_listener(LISTENER_S)
         if deaf:
@@ -135,22 +133,6 @@ def _display(recording: Recording, options: Options) -> Iterator[Callable[[Frame
             bars.update(task, completed=played.frames["camera"], note=note)
 
         yield heard
-
-
-@contextmanager
-def _until_signal() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set: what was announced is withdrawn before the end."""
-    stop = threading.Event()
-
-    def receive(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, receive) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _report(options: Options, played: Played, elapsed_s: float, deaf: list[str]) -> None:

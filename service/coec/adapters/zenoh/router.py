@@ -1,0 +1,39 @@
+"""The router of a vehicle, from a configuration of Zenoh's own form (JSON5), as `zenohd` reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import zenoh
+
+from coec.adapters.zenoh.endpoints import without_secrets
+from coec.adapters.zenoh.settings import mode_of, unguarded
+from coec.errors import ConfigError, UnavailableError
+
+ROUTER = "router"
+
+
+def open_router(file: Path) -> zenoh.Session:
+    """A session that routes between all who connect, by the rules of the file, until it is closed.
+
+    Raises:
+        ConfigError: the file is none, is not a router's, or opens a door to everybody.
+        UnavailableError: a port is taken, an address is not there, or a certificate cannot be used.
+    """
+    zenoh.init_log_from_env_or("error")
+    try:
+        settings = zenoh.Config.from_file(file)
+    except (zenoh.ZError, OSError, ValueError) as error:
+        raise ConfigError(f"{file}: {without_secrets(str(error), ())}") from None
+    if mode_of(settings) != ROUTER:
+        raise ConfigError(f'{file}: its mode is {mode_of(settings)}: a router says `mode: "router"`')
+    doors = unguarded(settings)
+    if doors:
+        raise ConfigError(
+            f"{file}: whoever reaches {', '.join(doors)} would be let in, to read, to send frames and to command: "
+            "listen on loopback, or on tls with enable_mtls and a root_ca_certificate"
+        )
+    try:
+        return zenoh.open(settings)
+    except zenoh.ZError as error:
+        raise UnavailableError(f"cannot open the router of {file}: {without_secrets(str(error), ())}") from None

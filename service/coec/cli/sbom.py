@@ -1,0 +1,72 @@
+"""`coec sbom`: what this installation is made of, and under which licences."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from coec.adapters.depth.model_cards import CARDS, list_models
+from coec.adapters.depth.onnx_network import file_identity
+from coec.adapters.files.output import write
+from coec.adapters.system.installed import installed, pinned_hashes
+from coec.reports import bill_of_materials, console
+from coec.reports.bill_of_materials import Inventory, Network
+
+APPLICATION = "coec"
+DOCUMENT, TABLE = "coec.cdx.json", "licences.md"
+
+
+def run(lock: Path | None, output: Path | None, *, as_json: bool) -> int:
+    """Prints the table, or the document; writes both to a folder.
+
+    Raises:
+        NotFoundError: coec is not installed as a package, or something it needs is not.
+        UsageError: the lock file cannot be read.
+        OutputError: a file cannot be written.
+    """
+    inventory = inventory_here()
+    hashes = {} if lock is None else pinned_hashes(lock)
+    document = bill_of_materials.cyclonedx(inventory, hashes, datetime.now(UTC))
+    if output is not None:
+        text = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
+        written = [write(output / DOCUMENT, text.encode()), write(output / TABLE, table_of(inventory).encode())]
+        console.say(f"coec: wrote {', '.join(str(path) for path in written)}")
+    if as_json:
+        console.print_json(document)
+        return 0
+    listed = console.table("package", "version", "licence", "libraries of others packed in")
+    for package in (inventory.application, *inventory.packages.values()):
+        native = ", ".join(bill_of_materials.names_of(package.native))
+        listed.add_row(package.name, package.version, package.licence or bill_of_materials.NOT_STATED, native)
+    console.out.print(listed)
+    return 0
+
+
+def inventory_here() -> Inventory:
+    """Of the interpreter that runs this.
+
+    Raises:
+        NotFoundError: coec is not installed as a package, or something it needs is not.
+    """
+    packages = installed(APPLICATION)
+    application = packages.pop(APPLICATION)
+    return Inventory(application, packages, platform.python_version(), _networks())
+
+
+def table_of(inventory: Inventory) -> str:
+    """The licence table, as docs/licences.md."""
+    return bill_of_materials.licence_table(inventory)
+
+
+def _networks() -> Sequence[Network]:
+    """Those whose file comes with the package."""
+    found = []
+    for card in list_models():
+        file = CARDS / f"{card.name}.onnx"
+        if file.is_file():
+            digest, _ = file_identity(file)
+            found.append(Network(card.name, digest, card.licence))
+    return found
