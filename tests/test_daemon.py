@@ -285,7 +285,7 @@ def test_questions_about_the_whole_vehicle(idle: Service) -> None:
 
 def test_the_configuration_is_read_again_when_asked(idle: Service) -> None:
     idle.process.send_signal(signal.SIGHUP)
-    wait_until(lambda: "nothing has changed" in idle.log.read_text(), "the configuration read again")
+    wait_until(lambda: "it changes nothing that runs" in idle.log.read_text(), "the configuration read again")
 
 
 def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None:

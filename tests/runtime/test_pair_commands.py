@@ -159,7 +159,7 @@ def route_of(bench: Bench, command: str) -> Route:
     keys, pair, unasked = Keys("coec", "test"), bench.pair, Snapshot(b"", b"")
     bus = create_autospec(Bus, instance=True)
     VehicleAnswers(
-        keys, {pair.name: pair.answers}, {pair.name: pair.commands}, lambda: unasked, lambda: b"", unasked
+        keys, {pair.name: pair.answers}, {pair.name: pair.commands}, lambda: unasked, lambda: b"", lambda: unasked
     ).declare(bus)
     finders = {call.args[0]: call.args[1] for call in bus.serve.call_args_list}
     (route,) = finders[f"{keys.root}/{pair.name}/**"](keys.command(pair.name, command))

@@ -70,6 +70,18 @@ def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
     )
 
 
+def connected_to(settings: zenoh.Config) -> tuple[str, ...]:
+    """Endpoints that the session connects to, as they may be shown; none where it is the router."""
+    if mode_of(settings) == "router":
+        return ()
+    return tuple(redacted(endpoint) for endpoint in endpoints_in(settings))
+
+
+def endpoints_in(settings: zenoh.Config) -> tuple[str, ...]:
+    """Endpoints that the session connects to, with all that stands in them."""
+    return tuple(_of_mode(json.loads(settings.get_json("connect/endpoints")), mode_of(settings)))
+
+
 def mode_of(settings: zenoh.Config) -> str:
     """`router`, `peer` or `client`."""
     return str(json.loads(settings.get_json("mode")))
