@@ -118,10 +118,11 @@ class Daemon:
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
+        self._router = RouterWatch(connected_to(settings), self._bus.reaches_somebody)
+        self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
-        self._router = RouterWatch(connected_to(settings), self._bus.reaches_somebody)
         self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
         self._answers = VehicleAnswers(
             self._keys,
@@ -131,7 +132,6 @@ class Daemon:
             self._metrics,
             lambda: self._shown,
         )
-        self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
         self._shown = self._shown_now()
