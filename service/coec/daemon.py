@@ -25,8 +25,9 @@ from coec.adapters.system.memory import resident_bytes
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
+from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.presence import Presence, told
-from coec.adapters.zenoh.settings import connected_to, settings_of, unguarded
+from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
 from coec.errors import CoecError, UnavailableError
@@ -118,7 +119,8 @@ class Daemon:
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
-        self._router = RouterWatch(connected_to(settings), self._bus.reaches_somebody)
+        others = () if mode_of(settings) == "router" else connected_of(settings)
+        self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
         self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)

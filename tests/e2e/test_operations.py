@@ -16,6 +16,7 @@ from ruamel.yaml import YAML
 
 from coec.adapters.zenoh.bus import open_session
 from coec.cli.check_config import template
+from coec.cli.doctor import examine
 from coec.config import LimitsConfig, ZenohConfig, load_config
 from e2e.processes import COMMAND, PATIENCE_S, Service, environment
 from fakes import wait_until
@@ -116,6 +117,8 @@ def _reload(running: Service, path: Path, endpoint: str, port: int) -> None:
     assert json.loads(page(port, "/health")[1])["pairs"][PAIR]["state"] == "unknown"
     assert page(port, "/config")[0] == 404
 
+    _examined(path)
+
     path.write_text("pairs: []\n")
     running.process.send_signal(signal.SIGHUP)
     refused = running.until(running.status, lambda status: status["configuration"]["refused"], "the refusal")
@@ -123,3 +126,16 @@ def _reload(running: Service, path: Path, endpoint: str, port: int) -> None:
     assert refused["configuration"]["taken"] == status["configuration"]["taken"]
     assert "is refused, the old one stays" in running.log.read_text()
     assert page(port, "/metrics")[0] == 200
+
+
+def _examined(path: Path) -> None:
+    """What the doctor finds beside the service."""
+    found = list(examine(path, 0.5))
+    first = {one.check: one for one in reversed(found)}
+    assert first["service"].text.startswith("version ")
+    assert (first["reload"].level, first["reload"].text) == ("warn", "waits for a restart: worker.threads")
+    assert first["health"].level == "warn", "nobody has looked yet"
+    assert "10 more pairs" in first["next_window"].text
+    assert first["lock"].text.endswith("a service runs here")
+    assert first["rules"].level == "ok"
+    assert first["stream"].level == "fail", "no sensor sends"

@@ -376,7 +376,7 @@ def _run(
     ] = False,
     state_dir: Annotated[Path | None, typer.Option(help="Instead of `state.directory`.", metavar="DIR")] = None,
 ) -> None:
-    """Run the service until SIGTERM or SIGINT; logs are JSON lines on standard output."""
+    """Run the service until SIGTERM or SIGINT; SIGHUP reads the configuration again. Logs go to standard output."""
     from coec.cli import run as command
 
     raise typer.Exit(command.run(config, embedded_router=embedded_router, state_dir=state_dir))
@@ -392,6 +392,25 @@ def _check_config(
     from coec.cli import check_config as command
 
     raise typer.Exit(command.run(file, defaults=defaults, as_json=as_json))
+
+
+@app.command("doctor")
+def _doctor(
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Configuration of the daemon (YAML).", metavar="FILE", show_default="/etc/coec/coec.yaml"),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="How long to listen to the streams.", min=0.5, max=600)] = 5.0,
+    as_json: Json = False,
+) -> None:
+    """Find what stands between this computer and a calibration: exit 1 if something must be done first.
+
+    Looks at the configuration, disk, clock, certificates, router, its rules, streams and the running service, if there
+    is one; changes and disturbs nothing.
+    """
+    from coec.cli import doctor as command
+
+    raise typer.Exit(command.run(command.Options(config=config, seconds=seconds, as_json=as_json)))
 
 
 @app.command("play")

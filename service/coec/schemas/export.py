@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import evaluation, frames, matrix, replies
+from coec.schemas import doctor, evaluation, frames, matrix, replies
 from coec.schemas.base import Message
 
 FRAMES: tuple[type[Message], ...] = (frames.CameraFrame, frames.LidarFrame, frames.EgoMotion)
@@ -33,6 +33,7 @@ MESSAGES: tuple[type[Message], ...] = (
     evaluation.ClosureReport,
     evaluation.ModelAssessment,
     matrix.MatrixReport,
+    doctor.DoctorReport,
 )
 
 

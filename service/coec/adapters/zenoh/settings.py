@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import uuid
 from typing import Any
 
 import zenoh
@@ -65,21 +66,34 @@ def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
     certificates_asked = bool(json.loads(settings.get_json(TLS)).get("enable_mtls"))
     return tuple(
         redacted(endpoint)
-        for endpoint in _of_mode(json.loads(settings.get_json("listen/endpoints")), mode_of(settings))
+        for endpoint in listened_of(settings)
         if Endpoint.parse(endpoint).lets_in_whoever_comes(certificates_asked=certificates_asked)
     )
 
 
-def connected_to(settings: zenoh.Config) -> tuple[str, ...]:
-    """Endpoints that the session connects to, as they may be shown; none where it is the router."""
-    if mode_of(settings) == "router":
-        return ()
-    return tuple(redacted(endpoint) for endpoint in endpoints_in(settings))
+def beside(settings: zenoh.Config, connect_s: float) -> zenoh.Config:
+    """Make of a session's settings those of a client beside it, which sees what the router hands to others; it is
+    opened within `connect_s`, or not at all."""
+    own = {
+        "mode": "client",
+        "id": uuid.uuid4().hex.lstrip("0"),  # the file may name that of the service
+        "listen/endpoints": [],
+        "connect/timeout_ms": round(connect_s * 1000),
+        "connect/exit_on_failure": True,
+    }
+    for key, value in own.items():
+        settings.insert_json5(key, json.dumps(value))
+    return settings
 
 
-def endpoints_in(settings: zenoh.Config) -> tuple[str, ...]:
-    """Endpoints that the session connects to, with all that stands in them."""
-    return tuple(_of_mode(json.loads(settings.get_json("connect/endpoints")), mode_of(settings)))
+def listened_of(settings: zenoh.Config) -> tuple[str, ...]:
+    """Endpoints at which the session listens, as they are written."""
+    return _of_mode(json.loads(settings.get_json("listen/endpoints")), mode_of(settings))
+
+
+def connected_of(settings: zenoh.Config) -> tuple[str, ...]:
+    """Endpoints to which the session connects, as they are written."""
+    return _of_mode(json.loads(settings.get_json("connect/endpoints")), mode_of(settings))
 
 
 def mode_of(settings: zenoh.Config) -> str:
@@ -100,7 +114,7 @@ def where(config: ZenohConfig) -> str:
     return f"zenoh.listen {listen}, connect {[redacted(endpoint) for endpoint in config.connect]}"
 
 
-def _of_mode(value: Any, mode: str) -> list[str]:
+def _of_mode(value: Any, mode: str) -> tuple[str, ...]:
     """A list of endpoints, or one per mode; a list in the list is a choice of endpoints."""
     found = value.get(mode, []) if isinstance(value, dict) else value
-    return [one for item in found or [] for one in ([item] if isinstance(item, str) else item)]
+    return tuple(one for item in found or [] for one in ([item] if isinstance(item, str) else item))
