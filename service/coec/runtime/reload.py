@@ -59,7 +59,7 @@ def reload_of(running: Config, read: Config) -> Reload:
     settings_of(read.zenoh, read.limits)
     for pair in read.pairs:
         rig_of(pair)
-    old, new = _document(running), _document(read)
+    old, new = _by_name(running.model_dump()), _by_name(read.model_dump())
     taken: list[str] = []
     waiting: list[str] = []
     for names in _differences(old, new):
@@ -77,9 +77,13 @@ def settings_hash(pair: PairConfig) -> str:
     return config_hash(pair.window, pair.calibration, pair.monitor, pair.policy, pair.tracker)
 
 
-def _document(config: Config) -> dict[str, Any]:
-    """Nested mappings; pairs by their names."""
-    document = config.model_dump()
+def differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
+    """Places at which two configurations differ, both in JSON-like values."""
+    return tuple(".".join(names) for names in _differences(_by_name(old), _by_name(new)))
+
+
+def _by_name(document: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration with its pairs by their names."""
     return {**document, "pairs": {pair["name"]: pair for pair in document["pairs"]}}
 
 

@@ -93,7 +93,7 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
     """The configuration, if a service could start with it, and what there is to say of it."""
     advice = "correct it, or name another with --config; `coec check-config FILE` prints what a file comes to"
     try:
-        config = load_config(path)
+        config = load_config(path.resolve())  # as a service has it, whose paths are complete
         for pair in config.pairs:
             rig_of(pair)
         settings_of(config.zenoh, config.limits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 
 import zenoh
@@ -9,14 +10,22 @@ import zenoh
 from coec import __version__
 from coec.adapters.zenoh.client import Reply, ask, ask_one
 from coec.cli.doctor.found import fail, ok, warn
-from coec.config import Config, config_hash
+from coec.config import Config
 from coec.errors import CoecError, NotFoundError
+from coec.runtime.api.configuration import shown
+from coec.runtime.api.troubles import TROUBLES
+from coec.runtime.reload import differing
 from coec.schemas.base import from_json
 from coec.schemas.doctor import Finding, Level
 from coec.schemas.keys import Keys
 from coec.schemas.replies import HealthReply, StatusReply
 
 TIMEOUT_S = 3.0
+
+OF_THE_COMMAND_LINE = frozenset({"zenoh.embedded_router", "state.directory"})
+"""Places that options of `coec run` stand over."""
+
+PLACES_NAMED = 5
 
 LEVELS: dict[int, Level] = {0: "ok", 1: "warn", 2: "fail", 3: "warn"}
 """Of ROS to those of findings; not having looked yet is no failure."""
@@ -33,7 +42,8 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
     except CoecError as error:
         yield fail("service", keys.root, f"answers wrongly: {error}", "see to its log")
         return
-    yield from _status(status, config, keys)
+    yield from _status(status, keys)
+    yield _compared(session, config, keys)
     for reply in _healths(session, keys):
         yield from _health(from_json(HealthReply, reply.payload), keys)
 
@@ -45,7 +55,24 @@ def _healths(session: zenoh.Session, keys: Keys) -> list[Reply]:
         return []
 
 
-def _status(status: StatusReply, config: Config, keys: Keys) -> Iterator[Finding]:
+def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:
+    """Whether it runs with this file."""
+    try:
+        served = json.loads(ask_one(session, f"{keys.config}?format=json", TIMEOUT_S).payload)["config"]
+        places = [place for place in differing(served, shown(config)) if place not in OF_THE_COMMAND_LINE]
+    except (CoecError, ValueError, KeyError, TypeError) as error:
+        text = f"the service does not tell with which configuration it runs: {error}"
+        return warn("file", keys.config, text, "see to its version, and to the rules of the router")
+    if not places:
+        return ok("file", keys.config, "the service runs with this file")
+    more = f" and {len(places) - PLACES_NAMED} more" if len(places) > PLACES_NAMED else ""
+    text = f"this file is another than the service runs with, in {', '.join(places[:PLACES_NAMED])}{more}"
+    return warn(
+        "file", keys.config, text, "reload or restart the service, or name the file that it runs with (--config)"
+    )
+
+
+def _status(status: StatusReply, keys: Keys) -> Iterator[Finding]:
     runs = f"version {status.version}, {status.state} for {status.uptime_s:.0f} s"
     if status.state in ("failing", "stopping"):
         yield fail("service", keys.root, runs, "see to its log, and whether the service manager starts it again")
@@ -61,13 +88,10 @@ def _status(status: StatusReply, config: Config, keys: Keys) -> Iterator[Finding
     elif told is not None and told.waiting:
         waits = ", ".join(told.waiting)
         yield warn("reload", keys.root, f"waits for a restart: {waits}", "restart the service when it suits")
-    elif status.config_hash != config_hash(config):
-        advice = "`systemctl reload coec`, or name the file that it runs with (--config)"
-        yield warn("reload", keys.root, "the service runs with another configuration than this file", advice)
-    else:
-        yield ok("reload", keys.root, "the service runs with this file")
     for reason in status.reasons:
-        yield warn("service", keys.root, reason.text, f"reason {reason.code}; see docs/operations.md")
+        trouble = TROUBLES.get(reason.code)
+        advice = f"reason {reason.code}: see to its log" if trouble is None else trouble.advice
+        yield warn("service", keys.root, reason.text, advice)
 
 
 def _health(health: HealthReply, keys: Keys) -> Iterator[Finding]:

@@ -79,7 +79,7 @@ def _stream(pair: PairConfig, name: str, heard: Heard, config: Config, seconds: 
 def _rate(pair: PairConfig, name: str, heard: Heard, seconds: float) -> Finding:
     rate_hz = heard.rate_hz or len(heard.arrivals_s) / seconds
     rate = sum(heard.sizes) / seconds / 1e6
-    text = f"{name}: {rate_hz:.1f} Hz, {median(heard.sizes) / 1e3:.0f} kB each, {rate:.1f} MB/s"
+    text = f"{name}: {rate_hz:.1f} Hz, {median(heard.sizes) / 1e3:.1f} kB each, {rate:.1f} MB/s"
     monitor = pair.monitor
     if name == EGO:
         wanted_hz = least_hz = 0.5 / pair.pairing.motion_tolerance_s
