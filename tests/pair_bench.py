@@ -195,9 +195,10 @@ class InstantRecorder:
         on_lost: Callable[[str], None],
     ) -> None:
         del losses
-        self.configuration = plan.configuration
+        self.plan, self.configuration = plan, plan.configuration
         self.trouble = None
         self.has_room = True
+        self.waiting = 0
         self.recorded = 0
         self.loses = False
         self.latest: Path | None = None
@@ -205,6 +206,9 @@ class InstantRecorder:
         self._on_recorded = on_recorded
         self._on_lost = on_lost
         self._stamps: list[int] = []
+
+    def follow(self, plan: RecordingPlan) -> None:
+        self.plan = plan
 
     def use(self, configuration: CalibrationConfig) -> None:
         self.configuration = configuration

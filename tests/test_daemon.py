@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import queue
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -281,11 +280,6 @@ def test_questions_about_the_whole_vehicle(idle: Service) -> None:
     text = metrics.ok.payload.to_string()
     assert f'coec_health{{pair="{FRONT}",coec_health="unknown"}} 1' in text
     assert text.endswith("# EOF\n")
-
-
-def test_the_configuration_is_read_again_when_asked(idle: Service) -> None:
-    idle.process.send_signal(signal.SIGHUP)
-    wait_until(lambda: "nothing has changed" in idle.log.read_text(), "the configuration read again")
 
 
 def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None:

@@ -72,7 +72,9 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
         )
         return Snapshot.of(told)
 
-    VehicleAnswers(KEYS, {pair.name: pair.answers}, reception, status, lambda: b"# EOF\n", document).declare(bus)
+    VehicleAnswers(KEYS, {pair.name: pair.answers}, reception, status, lambda: b"# EOF\n", lambda: document).declare(
+        bus
+    )
     for name, answer in (("extrinsic", pair.answers.extrinsic), ("health", pair.answers.health)):
         bus.publish(f"{KEYS.root}/{pair.name}/{name}", answer("msgpack"))
     bus.declare_alive(KEYS.alive(pair.name))

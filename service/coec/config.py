@@ -7,7 +7,9 @@ serve the command line, so a default exists once.
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 import json
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -446,6 +448,53 @@ class AuthorityConfig(Stage):
         return self
 
 
+class LogConfig(Stage):
+    """The log, on standard output."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    format: Literal["auto", "json", "human"] = Field(
+        default="auto", description="auto: for people where it goes to a terminal, else JSON lines"
+    )
+
+
+class MetricsConfig(Stage):
+    """HTTP for a scraper on the same computer: `/metrics` (OpenMetrics) and `/health` (200, or 503 when a
+    calibration is not known to be right). Whoever reaches it reads; nobody changes anything."""
+
+    http: str | None = Field(default=None, description="HOST:PORT, as 127.0.0.1:9464; null: nobody listens")
+    insecure: bool = Field(default=False, description="listen on other addresses than loopback, too; health says so")
+
+    @property
+    def address(self) -> tuple[str, int] | None:
+        """Host, without brackets, and port; None: nobody listens."""
+        if self.http is None:
+            return None
+        host, _, port = self.http.rpartition(":")
+        return host.removeprefix("[").removesuffix("]"), int(port)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether other computers may get in."""
+        return self.address is not None and not is_loopback(self.address[0])
+
+    @model_validator(mode="after")
+    def _nobody_from_outside(self) -> MetricsConfig:
+        if self.http is None:
+            return self
+        if not re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]+):\d{1,5}", self.http) or not 0 < self._port < 65536:
+            raise ValueError(f"http: {self.http!r} is no HOST:PORT: write 127.0.0.1:9464")
+        if self.is_open and not self.insecure:
+            raise ValueError(
+                f"http: whoever reaches {self.http} would read the metrics, without a certificate: listen on loopback, "
+                "as 127.0.0.1:9464, or set `metrics.insecure: true`, and health will say so"
+            )
+        return self
+
+    @property
+    def _port(self) -> int:
+        return 0 if self.address is None else self.address[1]
+
+
 class Config(Stage):
     """The one configuration file of a daemon."""
 
@@ -459,7 +508,8 @@ class Config(Stage):
     stale_after_s: float = Field(
         default=600.0, gt=0, description="age of the last completed check at which a pair is called stale, s"
     )
-    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    log: LogConfig = LogConfig()
+    metrics: MetricsConfig = MetricsConfig()
     pairs: tuple[PairConfig, ...] = Field(min_length=1, max_length=32)
 
     @model_validator(mode="after")
@@ -468,6 +518,15 @@ class Config(Stage):
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
         return self
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer gets to an address, without brackets. A name but `localhost` does not count: who
+    answers to it is not for us to know."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def config_hash(*parts: BaseModel | str) -> str:

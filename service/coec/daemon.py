@@ -21,13 +21,15 @@ from typing import Literal
 
 from coec import __version__
 from coec.adapters.system import logs
+from coec.adapters.system.memory import resident_bytes
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.tls.conversation import Listener, credentials_of
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
+from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.presence import Presence, told
 from coec.adapters.zenoh.reach import Reach
-from coec.adapters.zenoh.settings import settings_of, unguarded
+from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
 from coec.errors import CoecError, UnavailableError
@@ -35,7 +37,11 @@ from coec.runtime.api import metrics
 from coec.runtime.api.authority import Authority
 from coec.runtime.api.configuration import shown
 from coec.runtime.api.health import reasons_of
+from coec.runtime.api.http_door import HttpDoor
+from coec.runtime.api.metrics import Took, View
+from coec.runtime.api.pages import pages
 from coec.runtime.api.reception import Reception
+from coec.runtime.api.router_watch import RouterWatch
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.api.status import worker_status_of
@@ -47,6 +53,7 @@ from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.reload import reload_of, settings_hash
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
@@ -71,12 +78,12 @@ STALLED_S = 20.0
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S = 2.0, 4.0, 2.0
-QUERIES_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 1.5, 3.0, 1.0
+QUERIES_STOP_S, HTTP_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 1.5, 3.0, 1.0
 
 
 def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit status. `reread` reads the configuration again on SIGHUP."""
-    logs.configure(config.log_level)
+    logs.configure(config.log.level, config.log.format)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     try:
         with _signals() as signals, _state_folder(config.state.directory):
@@ -124,13 +131,26 @@ class Daemon:
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
+        others = () if mode_of(settings) == "router" else connected_of(settings)
+        self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
+        self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
         store = StateStore(config.state.directory, config.vehicle)
         outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         commands = {name: pair.commands for name, pair in self._pairs.items()}
         self._reception = Reception(authority, listener, commands)
+        self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
+        self._answers = VehicleAnswers(
+            self._keys,
+            {name: pair.answers for name, pair in self._pairs.items()},
+            self._reception,
+            lambda: self._status,
+            self._metrics,
+            lambda: self._shown,
+        )
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
+        self._shown = self._shown_now()
 
     def serve(self, signals: Signals, reread: Callable[[], Config] | None) -> int:
         """Run until a signal or a fault; returns the exit status."""
@@ -142,7 +162,7 @@ class Daemon:
                 status = self._tick()
                 if signals.reread.is_set():
                     signals.reread.clear()
-                    self._compare(reread)
+                    self._reload(reread)
         except CoecError as error:
             _log.error(str(error), extra={"fields": {"code": error.reply_code}})
             status = error.exit_code
@@ -162,17 +182,8 @@ class Daemon:
         for thread in (self._presence.thread, *self._bus.threads, *deciding):
             thread.start()
         self._worker.start()
-        config = Snapshot.of_document(
-            {
-                "schema_version": 1,
-                "config_hash": self._status_reply.config_hash,
-                "config": shown(self._config),
-            }
-        )
-        answers = {name: pair.answers for name, pair in self._pairs.items()}
-        VehicleAnswers(self._keys, answers, self._reception, lambda: self._status, self._metrics, config).declare(
-            self._bus
-        )
+        self._answers.declare(self._bus)
+        self._door.use(self._config.metrics)
         for pair_config in self._config.pairs:
             pair = self._pairs[pair_config.name]
             pair.stream.thread.start()
@@ -203,6 +214,7 @@ class Daemon:
             _log.error(self._fault.text, extra={"fields": {"code": self._fault.code}})
             for pair in self._pairs.values():
                 pair.answers.fail(self._fault)
+        self._router.look()
         self._renew()
         if self._fault is not None:
             if dead:
@@ -228,6 +240,7 @@ class Daemon:
             ("end the worker", self._worker.request_stop),
             ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
             ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
+            ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
         )
         for name, step in steps:
@@ -250,20 +263,52 @@ class Daemon:
             if pair.stream.thread.join(0.0):
                 _attempt("finish a window", pair.finish_window)
 
-    def _compare(self, reread: Callable[[], Config] | None) -> None:
-        """SIGHUP: validate the configuration, say what differs; it takes effect with the next start."""
+    def _reload(self, reread: Callable[[], Config] | None) -> None:
+        """SIGHUP: read the configuration again and take what can be taken without a restart; a file that could not be
+        started with changes nothing."""
         if reread is None:
             _log.warning("no configuration file to read again")
             return
+        self._notifier.reloading()
+        told = replies.ConfigurationStatus(read_ns=time.time_ns(), reloads=self._configuration.reloads)
         try:
-            fresh = reread()
+            fresh = reload_of(self._config, reread())
         except CoecError as error:
+            self._configuration = self._configuration.model_copy(
+                update={"read_ns": told.read_ns, "refused": str(error)}
+            )
             _log.error(f"the configuration on the disk is refused, the old one stays: {error}")
+        else:
+            update = {"taken": fresh.taken, "waiting": fresh.waiting, "reloads": told.reloads + bool(fresh.taken)}
+            self._configuration = told.model_copy(update=update)
+            self._take(fresh.config)
+            fields = {
+                "taken": list(fresh.taken),
+                "waiting": list(fresh.waiting),
+                "config_hash": config_hash(self._config),
+            }
+            changed = "it is taken" if fresh.taken else "it changes nothing that runs"
+            waits = "; what differs besides waits for a restart" if fresh.waiting else ""
+            _log.info(f"the configuration on the disk is valid; {changed}{waits}", extra={"fields": fields})
+        self._renew()
+        if self._state == "running":
+            self._notifier.ready()
+
+    def _take(self, config: Config) -> None:
+        """Go on with another configuration, in which only what can be taken differs."""
+        before, self._config = self._config, config
+        if config == before:
             return
-        old, new = self._config.model_dump(), fresh.model_dump()
-        changed = [name for name in new if new[name] != old[name]]
-        text = f"changed: {', '.join(changed)}; restart to apply" if changed else "nothing has changed"
-        _log.info(f"the configuration on the disk is valid; {text}")
+        logs.configure(config.log.level, config.log.format)
+        self._door.use(config.metrics)
+        self._folder.use(config.state)
+        self._shown = self._shown_now()
+        for old, new in zip(before.pairs, config.pairs, strict=True):
+            if old == new and before.stale_after_s == config.stale_after_s:
+                continue
+            hashes = f"settings {settings_hash(old)}, now {settings_hash(new)}; service {config_hash(config)}"
+            told = f"The configuration was read again: {hashes}."
+            self._pairs[new.name].use(new, config.stale_after_s, told)
 
     # --- what the parts ask of the whole ----------------------------------------------------------------------------
 
@@ -275,14 +320,16 @@ class Daemon:
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
         hidden = TOKENS_HIDDEN if self._presence.hidden else None
-        return tuple(reason for reason in (self._fault, failing, self._insecure, hidden) if reason is not None)
+        ailing = (self._fault, failing, self._insecure, hidden, self._router.trouble, self._door.trouble)
+        return tuple(reason for reason in ailing if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
 
     def _threads(self) -> list[ServiceThread]:
         pairs = self._pairs.values()
         own = [thread for pair in pairs for thread in pair.threads]
-        return [self._presence.thread, *self._bus.threads, self._worker.thread, *own]
+        door = [] if self._door.server is None else [self._door.server.thread]
+        return [self._presence.thread, *self._bus.threads, self._worker.thread, *door, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()
@@ -298,6 +345,7 @@ class Daemon:
             started_ns=self._started_ns,
             uptime_s=time.monotonic() - self._started_s,
             config_hash=config_hash(self._config),
+            configuration=self._configuration,
             pairs=tuple(pair.answers.status() for pair in self._pairs.values()),
             worker=worker_status_of(self._worker),
             storage=replies.StorageStatus(
@@ -305,11 +353,30 @@ class Daemon:
                 bytes_free=usage.free,
                 losses={"windows_removed": self._folder.removed} if self._folder.removed else {},
             ),
+            queries_waiting=self._bus.waiting,
         )
 
+    def _shown_now(self) -> Snapshot:
+        """The configuration as it is served."""
+        return Snapshot.of_document(
+            {"schema_version": 1, "config_hash": config_hash(self._config), "config": shown(self._config)}
+        )
+
+    def _health(self) -> dict[str, replies.HealthReply]:
+        return {name: pair.answers.health_reply for name, pair in self._pairs.items()}
+
     def _metrics(self) -> bytes:
-        health = {name: pair.answers.health_reply for name, pair in self._pairs.items()}
-        return metrics.render(self._status_reply, health, self._worker.status().rss_bytes)
+        pairs = self._pairs.items()
+        took = {
+            metrics.QUERY: [Took((), self._answers.took)],
+            metrics.DECODE: [Took((name,), pair.stream.decoding_took) for name, pair in pairs],
+            metrics.PAIR_WAIT: [Took((name,), pair.stream.waiting_took) for name, pair in pairs],
+            metrics.WRITE: [Took((name,), pair.recorder.writing_took) for name, pair in pairs],
+            metrics.JOB: [Took((), self._worker.jobs_took)],
+            metrics.WORK: [Took((), self._worker.work_took)],
+        }
+        view = View(self._status_reply, self._health(), resident_bytes(), self._worker.status().rss_bytes, took)
+        return metrics.render(view)
 
 
 def _insecure(doors: Sequence[str]) -> Reason | None:

@@ -22,8 +22,8 @@ from typing import Any
 import psutil
 
 from coec import geometry
-from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected
-from coec.adapters.zenoh.client_by_file import connected_by_file
+from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected, connected_by
+from coec.cli.query import asked_of
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig, load_config
 from coec.geometry.compiler import kernel_cache_directory
 from coec.reports.commented_yaml import commented_yaml
@@ -326,7 +326,7 @@ def rights_of_viewer(service: Service) -> dict[str, str]:
     keys, pair = service.keys, service.pair
     (file,) = [Path(word) for word in compose()["observer"]["command"] if word.endswith(".json5")]
     found = {}
-    with connected_by_file(file, PATIENCE_S) as viewer:
+    with connected_by(asked_of(None, None, None, None, file).way, PATIENCE_S) as viewer:
         for name, key in (("health", keys.health(pair)), ("command", keys.command(pair, "hold"))):
             replies = ask(viewer, key, PATIENCE_S)
             found[name] = "answered" if replies else "nothing"

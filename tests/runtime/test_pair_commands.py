@@ -162,7 +162,9 @@ def route_of(bench: Bench, command: str) -> Route:
     keys, pair, unasked = Keys("coec", "test"), bench.pair, Snapshot(b"", b"")
     bus = create_autospec(Bus, instance=True)
     reception = Reception(Authority(AuthorityConfig(), lambda: None), None, {pair.name: pair.commands})
-    VehicleAnswers(keys, {pair.name: pair.answers}, reception, lambda: unasked, lambda: b"", unasked).declare(bus)
+    VehicleAnswers(keys, {pair.name: pair.answers}, reception, lambda: unasked, lambda: b"", lambda: unasked).declare(
+        bus
+    )
     finders = {call.args[0]: call.args[1] for call in bus.serve.call_args_list}
     (route,) = finders[f"{keys.root}/{pair.name}/**"](keys.command(pair.name, command))
     assert isinstance(route, Route)

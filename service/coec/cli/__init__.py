@@ -1,8 +1,7 @@
 """The command line: what every command takes. What it does is in the module of its name, imported when it is called.
 
-Exit codes (CONTRACT, "Command line"): 0 success, 1 the work failed or the verdict is negative, 2 usage, 70 a fault of
-coec itself, 75 what a start needs is taken or away and may be there later (a port, the state directory, the vehicle's
-place on the network), 78 bad configuration. With `--json`, standard output holds one JSON document and nothing else.
+Exit codes (CONTRACT, "Command line") are those of `exit_codes`. With `--json`, standard output holds one JSON document
+and nothing else.
 """
 
 from __future__ import annotations
@@ -14,13 +13,8 @@ from typing import Annotated
 
 import typer
 
+from coec.cli.exit_codes import BROKEN_PIPE, FAULT
 from coec.errors import CoecError, UsageError
-
-EXIT_USAGE = 2
-EXIT_FAULT = 70
-"""EX_SOFTWARE of sysexits.h."""
-EXIT_BROKEN_PIPE = 141
-"""As a shell reports a process that SIGPIPE ended."""
 
 SOURCE_HELP = (
     "a recorded window or ROS 2 bag (.mcap), kitti360:ROOT?camera=image_00, kitti-raw:ROOT?..., a folder or "
@@ -376,7 +370,7 @@ def _run(
     ] = False,
     state_dir: Annotated[Path | None, typer.Option(help="Instead of `state.directory`.", metavar="DIR")] = None,
 ) -> None:
-    """Run the service until SIGTERM or SIGINT; logs are JSON lines on standard output."""
+    """Run the service until SIGTERM or SIGINT; SIGHUP reads the configuration again. Logs go to standard output."""
     from coec.cli import run as command
 
     raise typer.Exit(command.run(config, embedded_router=embedded_router, state_dir=state_dir))
@@ -392,6 +386,25 @@ def _check_config(
     from coec.cli import check_config as command
 
     raise typer.Exit(command.run(file, defaults=defaults, as_json=as_json))
+
+
+@app.command("doctor")
+def _doctor(
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Configuration of the daemon (YAML).", metavar="FILE", show_default="/etc/coec/coec.yaml"),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="How long to listen to the streams.", min=0.5, max=600)] = 5.0,
+    as_json: Json = False,
+) -> None:
+    """Find what stands between this computer and a calibration: exit 1 if something must be done first.
+
+    Looks at the configuration, disk, clock, certificates, router, its rules, streams and the running service, if there
+    is one; changes and disturbs nothing.
+    """
+    from coec.cli import doctor as command
+
+    raise typer.Exit(command.run(command.Options(config=config, seconds=seconds, as_json=as_json)))
 
 
 @app.command("play")
@@ -509,8 +522,7 @@ def _watch(
     from coec.cli import watch as command
 
     options = command.Options(
-        service=query.asked_of(config, vehicle, prefix, connect),
-        file=zenoh,
+        service=query.asked_of(config, vehicle, prefix, connect, zenoh),
         seconds=seconds,
         timeout_s=timeout,
         as_json=as_json,
@@ -863,7 +875,7 @@ def main() -> int:
         app()
     except SystemExit as ended:
         status = ended.code if isinstance(ended.code, int) else 0
-        if status == EXIT_USAGE and as_json:
+        if status == UsageError.exit_code and as_json:
             _print_error("bad_request", "the command line does not fit; standard error says how")
         return status
     except CoecError as error:
@@ -874,14 +886,14 @@ def main() -> int:
     except BrokenPipeError:
         # Whoever read our output has gone; nobody is left to be told, also not by the interpreter at its exit.
         sys.stdout = None
-        return EXIT_BROKEN_PIPE
+        return BROKEN_PIPE
     except Exception as error:
         import traceback
 
         traceback.print_exc()
         if as_json:
             _print_error("internal", f"{type(error).__name__}: {error}")
-        return EXIT_FAULT
+        return FAULT
     return 0
 
 

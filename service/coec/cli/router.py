@@ -20,7 +20,7 @@ def run(file: Path) -> int:
         ConfigError: the configuration cannot be used.
         UnavailableError: a port is taken, or a certificate cannot be used.
     """
-    logs.configure("info")
+    logs.configure("info", "auto")
     notifier = Notifier.from_environment()
     with until_signal() as stop, open_router(file) as session:
         _log.info("routing", extra={"fields": {"router": str(session.info.zid()), "configuration": str(file)}})

@@ -8,13 +8,11 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.client_by_file import connected_by_file
+from coec.adapters.zenoh.client import connected_by
 from coec.cli.query import Asked
 from coec.cli.stopping import until_signal
 from coec.errors import DecodeError
@@ -32,10 +30,9 @@ POLL_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The arguments of the command. `file` is the session's own Zenoh configuration; None: a client of the router."""
+    """The arguments of the command."""
 
     service: Asked
-    file: Path | None
     seconds: float | None
     timeout_s: float
     as_json: bool
@@ -58,8 +55,7 @@ def run(options: Options) -> int:
         ConnectionFailedError: no router answered.
     """
     heard = 0
-    file, endpoints = options.file, options.service.connect
-    connection = connected(endpoints, options.timeout_s) if file is None else connected_by_file(file, options.timeout_s)
+    connection = connected_by(options.service.way, options.timeout_s)
     with until_signal() as stop, connection as session, _changes(session, options) as changes:
         end_s = None if options.seconds is None else time.monotonic() + options.seconds
         while not stop.is_set():

@@ -12,7 +12,7 @@ import logging
 from coec.adapters.files.rig import rig_of
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.system.threads import ServiceThread
-from coec.config import Config, PairConfig
+from coec.config import CalibrationConfig, Config, PairConfig
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.payloads import proven_sender
@@ -27,6 +27,7 @@ from coec.runtime.ingest.chooser import Chooser
 from coec.runtime.ingest.stream import Stream
 from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder, RecordingPlan
+from coec.runtime.reload import settings_hash
 
 _log = logging.getLogger(__name__)
 
@@ -47,9 +48,8 @@ class Pair:
         questions = Questions(pair, queue, outside.worker, mailbox, folder)
         store = PairStore(rig, config.vehicle, config.state, outside.store, folder, losses)
         baseline = RigBaseline(pair, rig, config.state.directory)
-        plan = RecordingPlan(
-            rig, baseline.calibration, pair.window.min_pairs, {"vehicle": config.vehicle, "pair": pair.name}
-        )
+        self._rig, self._vehicle = rig, config.vehicle
+        plan = self._plan(pair, baseline.calibration)
         self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost)
         chooser = Chooser(pair, config.limits, rig, store.served, questions, self.recorder, losses)
         self.stream = Stream(pair, config, chooser, lambda: self.recorder.has_room, losses)
@@ -86,8 +86,22 @@ class Pair:
             questions,
             [proven_sender(sender.name) for sender in config.authority.senders],
         )
-        self._chooser = chooser
+        self._chooser, self._questions, self._mailbox = chooser, questions, mailbox
         self.decider.tell_now()
+
+    def use(self, pair: PairConfig, stale_after_s: float, told: str) -> None:
+        """Go on with other settings, of which only what `reload.RELOADED` names differs; `told` goes into the history.
+        For the main thread. Each part takes its own where it owns it."""
+        self._questions.use(pair)
+        self.answers.use(pair)
+        self.commands.use(pair)
+        self.recorder.follow(self._plan(pair, pair.calibration))
+        self.stream.call(lambda: self._chooser.use(pair.window))
+        self._mailbox.post(lambda: self.decider.use(pair, stale_after_s, told))
+
+    def _plan(self, pair: PairConfig, calibration: CalibrationConfig) -> RecordingPlan:
+        metadata = {"vehicle": self._vehicle, "pair": pair.name, "settings_hash": settings_hash(pair)}
+        return RecordingPlan(self._rig, calibration, pair.window.min_pairs, metadata)
 
     @property
     def threads(self) -> tuple[ServiceThread, ...]:

@@ -378,6 +378,8 @@ class StreamStatus(Part):
 
     received: Count = 0
     accepted: Count = 0
+    waiting: Count = Field(default=0, description="samples that came and are not decoded yet")
+    age_s: float | None = Field(default=None, ge=0, description="since the last sample came, s; null before the first")
     losses: Counts = Field(default_factory=dict, description="by cause")
 
 
@@ -391,6 +393,7 @@ class PairStatus(Part):
     pairs: Count = Field(default=0, description="pairs formed")
     held: Count = Field(default=0, description="pairs that wait until what was seen before them is judged")
     selected: Count = Field(default=0, description="pairs chosen for the open window")
+    unwritten: Count = Field(default=0, description="chosen pairs that wait for the disk")
     rejections: Counts = Field(default_factory=dict, description="pairs not chosen, by cause")
     losses: Counts = Field(default_factory=dict, description="frames that found no partner, and windows lost, by cause")
     windows: Count = Field(default=0, description="windows recorded")
@@ -429,6 +432,18 @@ class StorageStatus(Part):
     losses: Counts = Field(default_factory=dict, description="by cause")
 
 
+class ConfigurationStatus(Part):
+    """What became of the configuration file when it was read last: at the start, or again on SIGHUP."""
+
+    read_ns: int = Field(description="wall clock, ns since 1970")
+    reloads: Count = Field(default=0, description="times that it was read again and taken, wholly or in part")
+    taken: tuple[str, ...] = Field(default=(), description="places of values that hold since then")
+    waiting: tuple[str, ...] = Field(default=(), description="places of values that wait for a restart")
+    refused: str | None = Field(
+        default=None, description="why the file on the disk was refused; what held before holds on"
+    )
+
+
 class StatusReply(Message):
     """The daemon."""
 
@@ -438,10 +453,12 @@ class StatusReply(Message):
     reasons: tuple[Reason, ...] = ()
     started_ns: int = Field(description="wall clock, ns since 1970")
     uptime_s: float
-    config_hash: str
+    config_hash: str = Field(description="of the effective configuration, after every reload")
+    configuration: ConfigurationStatus | None = Field(default=None, description="null from an older service")
     pairs: tuple[PairStatus, ...]
     worker: WorkerStatus
     storage: StorageStatus
+    queries_waiting: Counts = Field(default_factory=dict, description="queries that wait for an answer, by queue")
 
 
 class Acknowledgement(Message):

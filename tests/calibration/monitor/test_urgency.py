@@ -26,7 +26,7 @@ class Drive:
         self.street = street
         self.rate_hz = rate_hz
         self.cutter = WindowCutter(WINDOW, street.rig, Inspector())
-        self.urgency = Urgency(MONITOR, WINDOW)
+        self.urgency = Urgency(MONITOR)
         self.selected: list[float] = []
 
     def until(self, begin_s: float, end_s: float) -> list[tuple[float, SliceEnded]]:

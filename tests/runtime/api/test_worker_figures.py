@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from coec.config import WorkerConfig
+from coec.config import CalibrationConfig, WorkerConfig
 from coec.runtime.api import metrics
+from coec.runtime.api.metrics import View
 from coec.runtime.api.status import worker_status_of
 from coec.runtime.worker import jobs
 from coec.runtime.worker.queue import WAITING, Lane
@@ -27,13 +28,13 @@ def lines_of(worker: WorkerStatus) -> list[str]:
         worker=worker,
         storage=StorageStatus(bytes_used=0, bytes_free=0),
     )
-    return metrics.render(status, {}, 0).decode().splitlines()
+    return metrics.render(View(status, {})).decode().splitlines()
 
 
 def test_every_end_is_counted_by_fate_and_cause_and_what_waits_by_kind() -> None:
     worker = Worker(WorkerConfig(), "{}")
     for number in range(WAITING[Lane.CHECK] + 1):
-        worker.ask(jobs.check("front", np.eye(4), (), lambda _: None))
+        worker.ask(jobs.check("front", CalibrationConfig(), np.eye(4), (), lambda _: None))
         worker.ask(jobs.solve("front", Path(f"w{number}"), f"w{number}", lambda _: None, live=False))
     status = worker_status_of(worker)
     assert (status.state, status.queued, status.job, status.job_age_s) == ("starting", 9, None, None)

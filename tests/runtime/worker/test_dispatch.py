@@ -29,7 +29,7 @@ class FaultySolver:
         raise self._fault
 
 
-CHECK = {"id": 3, "kind": "check", "pair": "front", "pose": [], "frames": []}
+CHECK = {"id": 3, "kind": "check", "pair": "front", "configuration": {}, "pose": [], "frames": []}
 OVERLAY = {"id": 4, "kind": "overlay", "path": "w", "pose": [], "title": ""}
 SOLVE = {"id": 5, "kind": "solve", "pair": "front", "path": "w"}
 

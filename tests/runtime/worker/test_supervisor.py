@@ -19,7 +19,7 @@ import pytest
 from coec.adapters.files.conversions import result_of
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Reason
-from coec.config import WorkerConfig
+from coec.config import CalibrationConfig, WorkerConfig
 from coec.runtime.worker import jobs, link
 from coec.runtime.worker.child import Child, ChildError, Fault
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Fate, Job, JobOutcome, Kind, Solved
@@ -53,7 +53,7 @@ class Bench:
         self.worker.ask(jobs.solve(pair, Path("/windows") / name, name, self.done(name), live))
 
     def check(self, name: str, pairs: Sequence[FramePair] = ()) -> None:
-        self.worker.ask(jobs.check("front", POSE, pairs, self.done(name)))
+        self.worker.ask(jobs.check("front", CalibrationConfig(), POSE, pairs, self.done(name)))
 
     def overlay(self, name: str, deadline_s: float | None = None) -> None:
         self.worker.ask(jobs.overlay("front", Path("/windows/w"), POSE, name, self.done(name), deadline_s))
@@ -131,7 +131,7 @@ def test_each_kind_comes_back_with_its_answer(tmp_path: Path) -> None:
         assert checked.baseline_not_used == "0 pairs"
         it.overlay("picture")
         assert it.answer() == ("picture", Drawn(b"picture"))
-        it.worker.ask(jobs.commission("front", POSE, [Path("a"), Path("b")], it.done("rig")))
+        it.worker.ask(jobs.commission("front", CalibrationConfig(), POSE, [Path("a"), Path("b")], it.done("rig")))
         name, rig = it.answer()
         assert (name, type(rig), rig.windows, rig.pairs, rig.baseline_hash) == ("rig", Commissioned, 2, 7, "b" * 16)
         np.testing.assert_array_equal(rig.pose, POSE)

@@ -1,4 +1,4 @@
-"""Logs as JSON on standard output, one line each, and counters whose log lines cannot flood it."""
+"""Logs on standard output, one line each, as JSON or for people, and counters whose log lines cannot flood it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import sys
 import threading
 from collections import Counter
 from datetime import UTC, datetime
-from typing import TextIO
+from typing import Literal, TextIO
+
+Form = Literal["auto", "json", "human"]
 
 _LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
@@ -32,13 +34,35 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(document, ensure_ascii=False, default=str)
 
 
-def configure(level: str, stream: TextIO | None = None) -> None:
-    """Send every log record of the process to `stream` (standard output by default) as JSON lines.
+class HumanFormatter(logging.Formatter):
+    """For a person at a terminal: local time, level where it is not `info`, message, then the fields. What a sender may
+    have had a hand in moves no cursor and makes no second line."""
 
-    `level` is one of debug, info, warning, error.
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as one line, and the traceback below it where there is one."""
+        time = datetime.fromtimestamp(record.created, UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]
+        level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
+        fields = getattr(record, "fields", None)
+        told = "".join(f"  {key}={value}" for key, value in fields.items()) if isinstance(fields, dict) else ""
+        line = _printable(f"{time} {level}{record.getMessage()}{told}")
+        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
+
+
+def _printable(text: str) -> str:
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
+
+
+def configure(level: str, form: Form, stream: TextIO | None = None) -> None:
+    """Send every log record of the process to `stream` (standard output by default). Call again to change it.
+
+    Args:
+        level: one of debug, info, warning, error.
+        form: `auto` is for people where the stream is a terminal, else JSON lines.
     """
-    handler = logging.StreamHandler(stream if stream is not None else sys.stdout)
-    handler.setFormatter(JsonFormatter())
+    to = stream if stream is not None else sys.stdout
+    human = form == "human" or (form == "auto" and to.isatty())
+    handler = logging.StreamHandler(to)
+    handler.setFormatter(HumanFormatter() if human else JsonFormatter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(_LEVELS[level])

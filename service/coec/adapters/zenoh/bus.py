@@ -183,6 +183,16 @@ class Bus:
                 with query:
                     _reply_error(query, "stopping", "the service is stopping; ask again when it is back")
 
+    @property
+    def waiting(self) -> dict[str, int]:
+        """Queries that wait, by queue."""
+        return {lane.value: waiting.qsize() for lane, waiting in self._waiting.items()}
+
+    def reaches_somebody(self) -> bool:
+        """Whether a router, or whoever else the session connects to, is there now."""
+        info = self._session.info
+        return bool(list(info.routers_zid()) or list(info.peers_zid()))
+
     def close(self, deadline_s: float) -> bool:
         """Close the session; False when it did not close within `deadline_s`."""
         return closed(self._session, deadline_s)

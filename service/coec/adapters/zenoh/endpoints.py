@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from dataclasses import dataclass
 
+from coec.config import is_loopback
 from coec.errors import ConfigError
 
 WITH_PORT = frozenset({"tcp", "udp", "tls", "quic", "ws"})
@@ -116,10 +116,4 @@ def _without_user(address: str) -> str:
 
 
 def _is_loopback(address: str) -> bool:
-    host = address.rpartition(":")[0].removeprefix("[").removesuffix("]")
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:  # a name: who answers to it is not for us to know
-        return False
+    return is_loopback(address.rpartition(":")[0].removeprefix("[").removesuffix("]"))

@@ -13,11 +13,9 @@ one therefore sees the other:
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
-import uuid
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -27,7 +25,7 @@ import zenoh
 
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import closed
-from coec.adapters.zenoh.settings import mode_of, settings_of
+from coec.adapters.zenoh.settings import beside, mode_of, settings_of
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import UnavailableError, UsageError
 from coec.schemas.keys import Claim, Keys
@@ -213,17 +211,8 @@ class Presence:
         settings = settings_of(self._config, self._limits)
         if mode_of(settings) != "peer":
             return self._session
-        own = {
-            "mode": "client",
-            "id": uuid.uuid4().hex.lstrip("0"),  # the file may name that of the daemon
-            "listen/endpoints": [],
-            "connect/timeout_ms": round(CONNECT_S * 1000),
-            "connect/exit_on_failure": True,
-        }
-        for key, value in own.items():
-            settings.insert_json5(key, json.dumps(value))
         try:
-            return zenoh.open(settings)
+            return zenoh.open(beside(settings, CONNECT_S))
         except zenoh.ZError:
             return None
 

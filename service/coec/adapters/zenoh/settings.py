@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import uuid
 from typing import Any
 
 import zenoh
@@ -67,6 +68,21 @@ def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
         for endpoint in listened_of(settings)
         if Endpoint.parse(endpoint).lets_in_whoever_comes(certificates_asked=certificates_asked)
     )
+
+
+def beside(settings: zenoh.Config, connect_s: float) -> zenoh.Config:
+    """Make of a session's settings those of a client beside it, which sees what the router hands to others; it is
+    opened within `connect_s`, or not at all."""
+    own = {
+        "mode": "client",
+        "id": uuid.uuid4().hex.lstrip("0"),  # the file may name that of the service
+        "listen/endpoints": [],
+        "connect/timeout_ms": round(connect_s * 1000),
+        "connect/exit_on_failure": True,
+    }
+    for key, value in own.items():
+        settings.insert_json5(key, json.dumps(value))
+    return settings
 
 
 def listened_of(settings: zenoh.Config) -> tuple[str, ...]:

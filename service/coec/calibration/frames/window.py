@@ -69,10 +69,20 @@ class WindowCutter:
         self._rig = rig
         self._inspector = inspector
         self._in_view = _directions_in_view(rig.camera)
-        self._next_length_ns = round(config.slice_s * NS_PER_S)
+        self._next_config = config
+        self._hurried_ns: int | None = None
         self._open: _Slice | None = None
         self.rejections: Counter[str] = Counter()
         self.last_quality: ImageQuality | None = None
+
+    @property
+    def config(self) -> WindowConfig:
+        """By which the open slice is cut, or the next one when none is open."""
+        return self._config if self._open else self._next_config
+
+    def use(self, config: WindowConfig) -> None:
+        """The next slice is to be cut by this; the open one ends as it began."""
+        self._next_config = config
 
     @property
     def selected(self) -> int:
@@ -94,8 +104,10 @@ class WindowCutter:
         events: list[PairSelected | SliceEnded] = [*self._end_before(pair.stamp_ns)]
         if self._open is None:
             window_id = f"{self._rig.pair}-{pair.stamp_ns}"
-            self._open = _Slice(window_id, pair.stamp_ns, self._next_length_ns, set(), pair.stamp_ns)
-            self._next_length_ns = round(self._config.slice_s * NS_PER_S)
+            self._config = self._next_config
+            length_ns = self._hurried_ns or round(self._config.slice_s * NS_PER_S)
+            self._open = _Slice(window_id, pair.stamp_ns, length_ns, set(), pair.stamp_ns)
+            self._hurried_ns = None
         if self._select(self._open, pair, T_camera_lidar):
             events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
         return events
@@ -106,7 +118,7 @@ class WindowCutter:
 
     def hurry(self, slice_s: float) -> None:
         """The next slice is to be `slice_s` long: a window is wanted soon. The one after it is an ordinary one."""
-        self._next_length_ns = round(slice_s * NS_PER_S)
+        self._hurried_ns = round(slice_s * NS_PER_S)
 
     def finish(self) -> list[SliceEnded]:
         """Ends the open slice here and now."""

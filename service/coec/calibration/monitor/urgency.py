@@ -21,9 +21,8 @@ NS_PER_S = 1_000_000_000
 class Urgency:
     """Hurries the `WindowCutter` of one pair while there is an alarm. Sensor time alone decides."""
 
-    def __init__(self, monitor: MonitorConfig, window: WindowConfig) -> None:
+    def __init__(self, monitor: MonitorConfig) -> None:
         self._monitor = monitor
-        self._window = window
         self._since_ns: int | None = None
         self._tries = 0
         self._hurried = False
@@ -46,7 +45,7 @@ class Urgency:
         """
         if self._since_ns is None:
             return []
-        start_ns, enough = cutter.slice_start_ns, cutter.selected >= self._window.min_pairs
+        start_ns, enough = cutter.slice_start_ns, cutter.selected >= cutter.config.min_pairs
         if start_ns is None:
             return self._hurry(cutter, rate_hz)
         if start_ns < self._since_ns:
@@ -56,9 +55,9 @@ class Urgency:
         if enough:
             self._since_ns = None
             return cutter.finish()
-        lacking = self._window.min_pairs - cutter.selected
-        waits_s = lacking * self._window.slice_s / self._window.pairs
-        return [] if waits_s <= self._length_s(rate_hz) else self._hurry(cutter, rate_hz)
+        lacking = cutter.config.min_pairs - cutter.selected
+        waits_s = lacking * cutter.config.slice_s / cutter.config.pairs
+        return [] if waits_s <= self._length_s(cutter.config, rate_hz) else self._hurry(cutter, rate_hz)
 
     def ended(self, event: SliceEnded, cutter: WindowCutter, rate_hz: float | None) -> None:
         """A slice ended by itself: with enough pairs it is the window that was wanted, else the next one is."""
@@ -67,15 +66,15 @@ class Urgency:
         if event.complete:
             self._since_ns = None
         else:
-            cutter.hurry(self._length_s(rate_hz))
+            cutter.hurry(self._length_s(cutter.config, rate_hz))
 
     def _hurry(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
         ended = cutter.finish()
-        cutter.hurry(self._length_s(rate_hz))
+        cutter.hurry(self._length_s(cutter.config, rate_hz))
         self._hurried = True
         return ended
 
-    def _length_s(self, rate_hz: float | None) -> float:
+    def _length_s(self, window: WindowConfig, rate_hz: float | None) -> float:
         """Of an urgent slice: as configured, or longer where pairs come slowly, but no longer than any other."""
-        needed_s = MARGIN * self._window.pairs / rate_hz if rate_hz else 0.0
-        return min(max(self._monitor.urgent_slice_s, needed_s), self._window.slice_s)
+        needed_s = MARGIN * window.pairs / rate_hz if rate_hz else 0.0
+        return min(max(self._monitor.urgent_slice_s, needed_s), window.slice_s)

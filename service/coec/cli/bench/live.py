@@ -28,6 +28,7 @@ from coec.config import (
     Config,
     EgoConfig,
     LidarConfig,
+    LogConfig,
     PairConfig,
     SearchConfig,
     StateConfig,
@@ -176,7 +177,7 @@ def _configuration(endpoint: str, state: Path) -> Config:
         vehicle=VEHICLE,
         zenoh=ZenohConfig(embedded_router=True, listen=(endpoint,), connect=()),
         state=StateConfig(directory=state, min_free_bytes=0),
-        log_level="error",
+        log=LogConfig(level="error"),
         pairs=(pair,),
     )
 

@@ -19,6 +19,7 @@ from coec.config import (
     CameraConfig,
     Config,
     LidarConfig,
+    LogConfig,
     ObjectiveConfig,
     PairConfig,
     SearchConfig,
@@ -98,10 +99,12 @@ def _solve(name: str, window: Path, config: Config) -> dict[str, Any]:
 
 def _first_result_s(name: str, window: Path, config: Config) -> float:
     outcomes: Outcomes = queue.SimpleQueue()
-    pairs = read_window(window)[0].pairs[: config.pairs[0].monitor.pairs]
+    (pair,) = config.pairs
+    pairs = read_window(window)[0].pairs[: pair.monitor.pairs]
     with _worker(config) as worker:
         begin = time.perf_counter()
-        worker.ask(replace(jobs.check(name, scene.T_TRUE, pairs, outcomes.put), deadline_s=TIMEOUT_S))
+        check = jobs.check(name, pair.calibration, scene.T_TRUE, pairs, outcomes.put)
+        worker.ask(replace(check, deadline_s=TIMEOUT_S))
         worker.start()
         _await_result(outcomes)
         return time.perf_counter() - begin
@@ -133,4 +136,4 @@ def _configuration(folder: Path, name: str) -> Config:
         T_camera_lidar=scene.T_TRUE.tolist(),
         calibration=SOLVES[name],
     )
-    return Config(log_level="error", state=StateConfig(directory=folder), pairs=(pair,))
+    return Config(log=LogConfig(level="error"), state=StateConfig(directory=folder), pairs=(pair,))

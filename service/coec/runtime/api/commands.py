@@ -76,6 +76,10 @@ class Commands:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
 
+    def use(self, pair: PairConfig) -> None:
+        """Carry out by these settings from now on."""
+        self._pair, self._rules = pair, lifecycle.Rules(pair.policy, pair.tracker, pair.monitor)
+
     @property
     def counts(self) -> dict[str, int]:
         """Commands since the start, by name and whether they were accepted, refused, or not their sender's to give."""

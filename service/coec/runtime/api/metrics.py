@@ -1,167 +1,198 @@
-"""The state of the daemon as OpenMetrics text: base units, `_total` for counters, one help line each."""
+"""The state of the daemon as OpenMetrics text: base units, `_total` for counters, one help line each.
+
+Every family is declared once, in `FAMILIES`: the text and the page of the documentation (`docs/metrics.md`) are made of
+the same declarations.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Literal
 
 from coec.calibration.lifecycle import HealthState
 from coec.runtime.api.extrinsic import AXES, UNITS
-from coec.schemas.replies import HealthReply, Maybe6, PairStatus, StatusReply, WorkerStatus
+from coec.runtime.timings import Histogram
+from coec.schemas.replies import CheckReply, HealthReply, Maybe6, PairStatus, StatusReply, StreamStatus
 
 ENCODING = "application/openmetrics-text"
 
-Labels = Mapping[str, str]
-Sample = tuple[Labels, float]
+Sample = tuple[tuple[str, ...], float]
+"""Values of the labels of a family, in their order, and of the sample."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Family:
+class Took:
+    """Durations: `label` is that of the part whose they are, in front of the histogram's own labels; empty for none."""
+
+    label: tuple[str, ...]
+    histogram: Histogram
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What there is to tell at one moment.
+
+    Attributes:
+        status: of the service.
+        health: of each pair.
+        memory_bytes, worker_memory_bytes: resident, of the service and of its worker.
+        took: durations, by the name of their family.
+    """
+
+    status: StatusReply
+    health: Mapping[str, HealthReply]
+    memory_bytes: int = 0
+    worker_memory_bytes: int = 0
+    took: Mapping[str, Sequence[Took]] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """One metric family. `samples` is empty for histograms, whose figures are in `View.took`."""
+
     name: str
-    kind: Literal["counter", "gauge", "info", "stateset"]
+    kind: Literal["counter", "gauge", "histogram", "info", "stateset"]
     help: str
-    samples: tuple[Sample, ...]
+    labels: tuple[str, ...] = ()
+    samples: Callable[[View], Iterable[Sample]] = lambda _: ()
 
-    def lines(self) -> Iterable[str]:
-        suffix = {"counter": "_total", "info": "_info"}.get(self.kind, "")
+    @property
+    def unit(self) -> str:
+        """Base unit; empty for what has none, or another for each sample."""
+        return next((unit for unit in ("seconds", "bytes") if self.name.endswith(f"_{unit}")), "")
+
+    def lines(self, view: View) -> Iterable[str]:
+        """As OpenMetrics writes them."""
         yield f"# TYPE {self.name} {self.kind}"
+        if self.unit:
+            yield f"# UNIT {self.name} {self.unit}"
         yield f"# HELP {self.name} {self.help}"
-        for labels, value in self.samples:
-            text = ",".join(f'{name}="{_escaped(label)}"' for name, label in labels.items())
-            yield f"{self.name}{suffix}{{{text}}} {value:.17g}" if text else f"{self.name}{suffix} {value:.17g}"
+        if self.kind == "histogram":
+            yield from self._buckets(view)
+            return
+        suffix = {"counter": "_total", "info": "_info"}.get(self.kind, "")
+        for values, value in self.samples(view):
+            yield f"{self.name}{suffix}{_braces(self.labels, values)} {_number(value)}"
+
+    def _buckets(self, view: View) -> Iterable[str]:
+        for took in (view.took or {}).get(self.name, ()):
+            bounds = (*took.histogram.bounds_s, math.inf)
+            for values, counted in sorted(took.histogram.counted().items()):
+                own = (*took.label, *values)
+                sums = list(accumulate(counted.counts))
+                for bound_s, count in zip(bounds, sums, strict=True):
+                    labels = _braces((*self.labels, "le"), (*own, _number(bound_s)))
+                    yield f"{self.name}_bucket{labels} {count}"
+                yield f"{self.name}_count{_braces(self.labels, own)} {sums[-1]}"
+                yield f"{self.name}_sum{_braces(self.labels, own)} {_number(counted.sum_s)}"
 
 
-def render(status: StatusReply, health: Mapping[str, HealthReply], worker_rss_bytes: int) -> bytes:
-    """OpenMetrics text, UTF-8. `health` maps each pair to its health; the worker's memory is in bytes."""
-    pairs = status.pairs
-    families = (
-        _Family("coec_build", "info", "Version of the service.", (({"version": status.version}, 1.0),)),
-        _Family("coec_uptime_seconds", "gauge", "Time since the start.", (({}, status.uptime_s),)),
-        _Family(
-            "coec_health",
-            "stateset",
-            "State of each pair.",
-            tuple(
-                ({"pair": pair, "coec_health": state.value}, float(state == current.state))
-                for pair, current in health.items()
-                for state in HealthState
-            ),
-        ),
-        _Family("coec_check_age_seconds", "gauge", "Since data were last judged.", tuple(_ages(health))),
-        *_diagnosis(health),
-        _Family("coec_samples_received", "counter", "Samples that came.", tuple(_streams(pairs, "received"))),
-        _Family("coec_frames_accepted", "counter", "Frames made of samples.", tuple(_streams(pairs, "accepted"))),
-        _Family("coec_losses", "counter", "What was lost, by cause.", tuple(_losses(status))),
-        _Family("coec_pairs", "counter", "Camera-LiDAR pairs formed.", _per_pair(pairs, "pairs")),
-        _Family("coec_window_pairs", "gauge", "Pairs in the open window.", _per_pair(pairs, "selected")),
-        _Family("coec_windows_recorded", "counter", "Windows recorded.", _per_pair(pairs, "windows")),
-        _Family("coec_windows_evaluated", "counter", "Windows evaluated.", _per_pair(pairs, "solved")),
-        _Family("coec_checks", "counter", "Checks of the monitor.", _per_pair(pairs, "checks")),
-        _Family("coec_health_changes", "counter", "States entered.", tuple(_counts(pairs, "transitions", "to"))),
-        _Family("coec_commands", "counter", "Commands, by outcome.", tuple(_counts(pairs, "commands", "command"))),
-        _Family("coec_worker_restarts", "counter", "Workers replaced.", (({}, status.worker.restarts),)),
-        *_worker(status.worker),
-        _Family("coec_worker_memory_bytes", "gauge", "Resident memory.", (({}, float(worker_rss_bytes)),)),
-        _Family("coec_storage_used_bytes", "gauge", "Bytes of all windows.", (({}, status.storage.bytes_used),)),
-        _Family("coec_storage_free_bytes", "gauge", "Bytes free on the disk.", (({}, status.storage.bytes_free),)),
-    )
-    lines = [line for family in families for line in family.lines()]
+def render(view: View) -> bytes:
+    """OpenMetrics text, UTF-8."""
+    lines = [line for family in FAMILIES for line in family.lines(view)]
     return "\n".join([*lines, "# EOF", ""]).encode()
 
 
-def _worker(worker: WorkerStatus) -> Iterable[_Family]:
-    """Every question to the worker ends, and is counted here."""
+# --- samples --------------------------------------------------------------------------------------------------------
 
-    def by(label: str, counts: Mapping[str, int]) -> tuple[Sample, ...]:
-        return tuple(({label: name}, float(count)) for name, count in counts.items())
 
-    age = () if worker.job_age_s is None else (({"kind": worker.job or ""}, worker.job_age_s),)
-    return (
-        _Family("coec_worker_jobs", "counter", "Jobs that have ended, by fate.", by("fate", worker.outcomes)),
-        _Family("coec_worker_losses", "counter", "Jobs without a result, by cause.", by("cause", worker.losses)),
-        _Family("coec_worker_faults", "counter", "Processes replaced, by cause.", by("cause", worker.faults)),
-        _Family("coec_worker_waiting", "gauge", "Jobs that wait, by kind.", by("kind", worker.waiting)),
-        _Family("coec_worker_job_age_seconds", "gauge", "Of what is with the worker.", age),
+def _one(value: Callable[[View], float | None]) -> Callable[[View], Iterable[Sample]]:
+    def samples(view: View) -> Iterable[Sample]:
+        told = value(view)
+        return () if told is None else (((), float(told)),)
+
+    return samples
+
+
+def _per_pair(value: Callable[[PairStatus], float]) -> Callable[[View], Iterable[Sample]]:
+    return lambda view: (((pair.name,), float(value(pair))) for pair in view.status.pairs)
+
+
+def _counts(counts: Callable[[PairStatus], Mapping[str, int]]) -> Callable[[View], Iterable[Sample]]:
+    return lambda view: (
+        ((pair.name, name), float(count)) for pair in view.status.pairs for name, count in counts(pair).items()
     )
 
 
-def _diagnosis(health: Mapping[str, HealthReply]) -> Iterable[_Family]:
-    """The figures of self-diagnosis: those with a limit by name, those of the six axes by axis and unit."""
-    figures = [(pair, name, one) for pair, reply in health.items() for name, one in sorted(reply.metrics.items())]
-
-    def told(values: Iterable[tuple[str, str, float | None]]) -> tuple[Sample, ...]:
-        return tuple(({"pair": pair, "metric": name}, value) for pair, name, value in values if value is not None)
-
-    def by_axis(choose: Callable[[HealthReply], Maybe6 | None]) -> tuple[Sample, ...]:
-        return tuple(
-            ({"pair": pair, "axis": axis, "unit": unit}, value)
-            for pair, reply in health.items()
-            for axis, unit, value in zip(AXES, UNITS, choose(reply) or (), strict=False)
-            if value is not None
-        )
-
-    def of_check(name: str) -> Callable[[HealthReply], Maybe6 | None]:
-        return lambda reply: getattr(reply.check, name, None)
-
-    values = told((pair, name, one.value) for pair, name, one in figures)
-    limits = told((pair, name, one.limit) for pair, name, one in figures)
-    return (
-        _Family("coec_diagnosis", "gauge", "Figures of self-diagnosis.", values),
-        _Family("coec_diagnosis_limit", "gauge", "Their limits.", limits),
-        _Family("coec_check_offset", "gauge", "From the pose to the local optimum.", by_axis(of_check("offset"))),
-        _Family("coec_check_offset_sigma", "gauge", "Its standard deviation.", by_axis(of_check("sigma"))),
-        _Family("coec_check_drift", "gauge", "Local optimum from commissioned.", by_axis(of_check("drift"))),
-        _Family("coec_check_drift_sigma", "gauge", "Its standard deviation.", by_axis(of_check("drift_sigma"))),
-        _Family("coec_drift", "gauge", "Served from commissioned.", by_axis(lambda reply: reply.drift)),
-        _Family("coec_drift_sigma", "gauge", "Its standard deviation.", by_axis(lambda reply: reply.drift_sigma)),
-        _Family("coec_result_drift", "gauge", "Last window from commissioned.", by_axis(lambda r: r.result_drift)),
-        _Family("coec_result_drift_sigma", "gauge", "Its deviation.", by_axis(lambda r: r.result_drift_sigma)),
-        _Family(
-            "coec_mi_first_derivative",
-            "gauge",
-            "Nats per rad or m, at what is served.",
-            _without_unit(by_axis(of_check("first_derivative"))),
-        ),
-        _Family(
-            "coec_mi_second_derivative",
-            "gauge",
-            "Negative, nats per rad2 or m2, at what is served.",
-            _without_unit(by_axis(of_check("second_derivative"))),
-        ),
-    )
+def _of_worker(counts: Callable[[View], Mapping[str, int]]) -> Callable[[View], Iterable[Sample]]:
+    return lambda view: (((name,), float(count)) for name, count in counts(view).items())
 
 
-def _without_unit(samples: tuple[Sample, ...]) -> tuple[Sample, ...]:
-    """Derivatives: the help line names their units."""
-    return tuple(({"pair": labels["pair"], "axis": labels["axis"]}, value) for labels, value in samples)
+def _streams(value: Callable[[StreamStatus], float | None]) -> Callable[[View], Iterable[Sample]]:
+    def samples(view: View) -> Iterable[Sample]:
+        for pair in view.status.pairs:
+            for name, stream in (("camera", pair.camera), ("lidar", pair.lidar), ("ego", pair.ego)):
+                told = None if stream is None else value(stream)
+                if told is not None:
+                    yield (pair.name, name), float(told)
+
+    return samples
 
 
-def _ages(health: Mapping[str, HealthReply]) -> Iterable[Sample]:
-    for pair, reply in health.items():
-        if reply.age_s is not None:
-            yield {"pair": pair}, reply.age_s
+def _version(view: View) -> Iterable[Sample]:
+    yield (view.status.version,), 1.0
 
 
-def _per_pair(pairs: Iterable[PairStatus], name: str) -> tuple[Sample, ...]:
-    return tuple(({"pair": pair.name}, float(getattr(pair, name))) for pair in pairs)
+def _states(view: View) -> Iterable[Sample]:
+    for pair, reply in view.health.items():
+        for state in HealthState:
+            yield (pair, state.value), float(state == reply.state)
 
 
-def _counts(pairs: Iterable[PairStatus], name: str, label: str) -> Iterable[Sample]:
-    for pair in pairs:
-        for key, count in getattr(pair, name).items():
-            yield {"pair": pair.name, label: key}, float(count)
+def _reasons(view: View) -> Iterable[Sample]:
+    for pair, reply in view.health.items():
+        for code in sorted({reason.code for reason in reply.reasons}):
+            yield (pair, code), 1.0
 
 
-def _streams(pairs: Iterable[PairStatus], name: str) -> Iterable[Sample]:
-    for pair in pairs:
-        for stream, counts in (("camera", pair.camera), ("lidar", pair.lidar), ("ego", pair.ego)):
-            if counts is not None:
-                yield {"pair": pair.name, "stream": stream}, float(getattr(counts, name))
+def _of_health(value: Callable[[HealthReply], float | None]) -> Callable[[View], Iterable[Sample]]:
+    def samples(view: View) -> Iterable[Sample]:
+        for pair, reply in view.health.items():
+            told = value(reply)
+            if told is not None:
+                yield (pair,), told
+
+    return samples
 
 
-def _losses(status: StatusReply) -> Iterable[Sample]:
-    for pair in status.pairs:
+def _figures(which: Literal["value", "limit"]) -> Callable[[View], Iterable[Sample]]:
+    def samples(view: View) -> Iterable[Sample]:
+        for pair, reply in view.health.items():
+            for name, metric in sorted(reply.metrics.items()):
+                told = metric.value if which == "value" else metric.limit
+                if told is not None:
+                    yield (pair, name), told
+
+    return samples
+
+
+def _axes(choose: Callable[[HealthReply], Maybe6 | None]) -> Callable[[View], Iterable[Sample]]:
+    """By pair, axis and unit; without those that are not known."""
+
+    def samples(view: View) -> Iterable[Sample]:
+        for pair, reply in view.health.items():
+            for axis, unit, value in zip(AXES, UNITS, choose(reply) or (), strict=False):
+                if value is not None:
+                    yield (pair, axis, unit), value
+
+    return samples
+
+
+def _check_axes(choose: Callable[[CheckReply], Maybe6 | None]) -> Callable[[View], Iterable[Sample]]:
+    return _axes(lambda reply: None if reply.check is None else choose(reply.check))
+
+
+def _derivatives(choose: Callable[[CheckReply], Maybe6]) -> Callable[[View], Iterable[Sample]]:
+    """By pair and axis: the help line names the units."""
+    by_unit = _check_axes(choose)
+    return lambda view: (((pair, axis), value) for (pair, axis, _), value in by_unit(view))
+
+
+def _losses(view: View) -> Iterable[Sample]:
+    for pair in view.status.pairs:
         places = {
             "camera": pair.camera.losses,
             "lidar": pair.lidar.losses,
@@ -171,8 +202,172 @@ def _losses(status: StatusReply) -> Iterable[Sample]:
         }
         for place, causes in places.items():
             for cause, count in causes.items():
-                yield {"pair": pair.name, "place": place, "cause": cause}, float(count)
+                yield (pair.name, place, cause), float(count)
+
+
+def _job_age(view: View) -> Iterable[Sample]:
+    worker = view.status.worker
+    return () if worker.job_age_s is None else (((worker.job or "",), worker.job_age_s),)
+
+
+# --- text -----------------------------------------------------------------------------------------------------------
+
+
+def _braces(names: Sequence[str], values: Sequence[str]) -> str:
+    text = ",".join(f'{name}="{_escaped(value)}"' for name, value in zip(names, values, strict=True))
+    return f"{{{text}}}" if text else ""
+
+
+def _number(value: float) -> str:
+    """The shortest form that reads back; infinity as OpenMetrics writes it."""
+    return "+Inf" if value == math.inf else f"{value:.17g}" if value.is_integer() else repr(float(value))
 
 
 def _escaped(label: str) -> str:
     return label.replace("\\", r"\\").replace("\n", r"\n").replace('"', r"\"")
+
+
+# --- what there is --------------------------------------------------------------------------------------------------
+
+QUERY, DECODE, PAIR_WAIT = "coec_query_seconds", "coec_decode_seconds", "coec_pair_wait_seconds"
+WRITE, JOB, WORK = "coec_write_seconds", "coec_worker_job_seconds", "coec_worker_work_seconds"
+"""Names of the histograms, by which `View.took` tells of them."""
+
+_PAIR, _STREAM, _AXIS = ("pair",), ("pair", "stream"), ("pair", "axis", "unit")
+
+FAMILIES: tuple[Family, ...] = (
+    Family(
+        "coec_build", "info", "Version of the service.", ("version",), lambda view: (((view.status.version,), 1.0),)
+    ),
+    Family("coec_uptime_seconds", "gauge", "Time since the start.", (), _one(lambda view: view.status.uptime_s)),
+    Family("coec_memory_bytes", "gauge", "Resident memory of the service.", (), _one(lambda view: view.memory_bytes)),
+    Family("coec_health", "stateset", "State of each pair.", ("pair", "coec_health"), _states),
+    Family("coec_reason", "gauge", "1 for each reason that health gives, by its code.", ("pair", "code"), _reasons),
+    Family("coec_check_age_seconds", "gauge", "Since data were last judged.", _PAIR, _of_health(lambda one: one.age_s)),
+    Family("coec_diagnosis", "gauge", "Figures of self-diagnosis.", ("pair", "metric"), _figures("value")),
+    Family("coec_diagnosis_limit", "gauge", "Their limits.", ("pair", "metric"), _figures("limit")),
+    Family(
+        "coec_check_offset",
+        "gauge",
+        "From the pose to the local optimum.",
+        _AXIS,
+        _check_axes(lambda check: check.offset),
+    ),
+    Family(
+        "coec_check_offset_sigma",
+        "gauge",
+        "Its standard deviation.",
+        _AXIS,
+        _check_axes(lambda check: check.sigma),
+    ),
+    Family(
+        "coec_check_drift",
+        "gauge",
+        "Local optimum from commissioned.",
+        _AXIS,
+        _check_axes(lambda check: check.drift),
+    ),
+    Family(
+        "coec_check_drift_sigma",
+        "gauge",
+        "Its standard deviation.",
+        _AXIS,
+        _check_axes(lambda check: check.drift_sigma),
+    ),
+    Family("coec_drift", "gauge", "Served from commissioned.", _AXIS, _axes(lambda one: one.drift)),
+    Family("coec_drift_sigma", "gauge", "Its standard deviation.", _AXIS, _axes(lambda one: one.drift_sigma)),
+    Family("coec_result_drift", "gauge", "Last window from commissioned.", _AXIS, _axes(lambda one: one.result_drift)),
+    Family("coec_result_drift_sigma", "gauge", "Its deviation.", _AXIS, _axes(lambda one: one.result_drift_sigma)),
+    Family(
+        "coec_mi_first_derivative",
+        "gauge",
+        "Nats per rad or m, at what is served.",
+        ("pair", "axis"),
+        _derivatives(lambda check: check.first_derivative),
+    ),
+    Family(
+        "coec_mi_second_derivative",
+        "gauge",
+        "Negative, nats per rad2 or m2, at what is served.",
+        ("pair", "axis"),
+        _derivatives(lambda check: check.second_derivative),
+    ),
+    Family("coec_samples_received", "counter", "Samples that came.", _STREAM, _streams(lambda one: one.received)),
+    Family("coec_samples_waiting", "gauge", "Samples not decoded yet.", _STREAM, _streams(lambda one: one.waiting)),
+    Family("coec_sample_age_seconds", "gauge", "Since the last sample came.", _STREAM, _streams(lambda one: one.age_s)),
+    Family("coec_frames_accepted", "counter", "Frames made of samples.", _STREAM, _streams(lambda one: one.accepted)),
+    Family("coec_losses", "counter", "What was lost, by cause.", ("pair", "place", "cause"), _losses),
+    Family("coec_pairs", "counter", "Camera-LiDAR pairs formed.", _PAIR, _per_pair(lambda one: one.pairs)),
+    Family("coec_pairs_held", "gauge", "Pairs that wait for an answer.", _PAIR, _per_pair(lambda one: one.held)),
+    Family("coec_window_pairs", "gauge", "Pairs in the open window.", _PAIR, _per_pair(lambda one: one.selected)),
+    Family(
+        "coec_pairs_unwritten", "gauge", "Pairs that wait for the disk.", _PAIR, _per_pair(lambda one: one.unwritten)
+    ),
+    Family("coec_windows_recorded", "counter", "Windows recorded.", _PAIR, _per_pair(lambda one: one.windows)),
+    Family("coec_windows_evaluated", "counter", "Windows evaluated.", _PAIR, _per_pair(lambda one: one.solved)),
+    Family("coec_checks", "counter", "Checks of the monitor.", _PAIR, _per_pair(lambda one: one.checks)),
+    Family("coec_health_changes", "counter", "States entered.", ("pair", "to"), _counts(lambda one: one.transitions)),
+    Family("coec_commands", "counter", "Commands, by outcome.", ("pair", "command"), _counts(lambda one: one.commands)),
+    Family(QUERY, "histogram", "From a query to its answer or refusal, by what was asked for.", ("resource",)),
+    Family(
+        "coec_queries_waiting",
+        "gauge",
+        "Queries that wait: `slow` for the disk or a decision, `drawing` for a picture.",
+        ("queue",),
+        _of_worker(lambda view: view.status.queries_waiting),
+    ),
+    Family(DECODE, "histogram", "Decoding of a sample.", _STREAM),
+    Family(PAIR_WAIT, "histogram", "From a pair's last frame until it is looked at.", _PAIR),
+    Family(WRITE, "histogram", "Writing of a pair into its window.", _PAIR),
+    Family(JOB, "histogram", "From a question to the worker to its result, by kind: check, solve, ...", ("kind",)),
+    Family(WORK, "histogram", "What of that the worker itself needed.", ("kind",)),
+    Family(
+        "coec_worker_jobs",
+        "counter",
+        "Jobs that have ended, by fate.",
+        ("fate",),
+        _of_worker(lambda view: view.status.worker.outcomes),
+    ),
+    Family(
+        "coec_worker_losses",
+        "counter",
+        "Jobs without a result, by cause.",
+        ("cause",),
+        _of_worker(lambda view: view.status.worker.losses),
+    ),
+    Family(
+        "coec_worker_faults",
+        "counter",
+        "Processes replaced, by cause.",
+        ("cause",),
+        _of_worker(lambda view: view.status.worker.faults),
+    ),
+    Family(
+        "coec_worker_waiting",
+        "gauge",
+        "Jobs that wait, by kind.",
+        ("kind",),
+        _of_worker(lambda view: view.status.worker.waiting),
+    ),
+    Family("coec_worker_job_age_seconds", "gauge", "Of what is with the worker.", ("kind",), _job_age),
+    Family("coec_worker_restarts", "counter", "Workers replaced.", (), _one(lambda view: view.status.worker.restarts)),
+    Family(
+        "coec_worker_memory_bytes",
+        "gauge",
+        "Resident memory of the worker.",
+        (),
+        _one(lambda view: view.worker_memory_bytes),
+    ),
+    Family("coec_storage_used_bytes", "gauge", "All windows.", (), _one(lambda view: view.status.storage.bytes_used)),
+    Family(
+        "coec_storage_free_bytes", "gauge", "Free on the disk.", (), _one(lambda view: view.status.storage.bytes_free)
+    ),
+    Family(
+        "coec_storage_losses",
+        "counter",
+        "What the state directory had to give up, by cause.",
+        ("cause",),
+        _of_worker(lambda view: view.status.storage.losses),
+    ),
+)
+"""All of them, in the order in which they are told."""

@@ -66,6 +66,10 @@ class PairAnswers:
         self._snapshots: dict[str, Snapshot] = {}
         self._published: dict[str, object] = {}
 
+    def use(self, pair: PairConfig) -> None:
+        """Tell of these settings from now on. Any thread."""
+        self._pair, self._config_hash = pair, config_hash(pair.calibration)
+
     # --- on the thread that decides; `fail` on the main thread --------------------------------------------------------
 
     def hear(self, known: Known) -> None:
@@ -211,5 +215,7 @@ class PairAnswers:
             self._losses.snapshot(),
             self._recorder.recorded,
             self._commands(),
+            self._stream.inbox.arrivals(time.monotonic()),
+            self._recorder.waiting,
             has_ego=self._pair.ego is not None,
         )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import zenoh
@@ -16,6 +18,7 @@ from coec.runtime.api import metrics as metrics_text
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception
 from coec.runtime.api.snapshots import Snapshot, answer_of
+from coec.runtime.timings import QUICK_S, Histogram
 from coec.schemas.keys import (
     Format,
     Keys,
@@ -32,7 +35,11 @@ JPEG = "image/jpeg"
 
 
 class VehicleAnswers:
-    """Routes of the vehicle and of each of its pairs."""
+    """Routes of the vehicle and of each of its pairs.
+
+    Attributes:
+        took: from the arrival of a query to its answer or refusal, by what was asked for.
+    """
 
     def __init__(
         self,
@@ -41,15 +48,16 @@ class VehicleAnswers:
         reception: Reception,
         status: Callable[[], Snapshot],
         metrics: Callable[[], bytes],
-        config: Snapshot,
+        config: Callable[[], Snapshot],
     ) -> None:
-        """`status()` and `config` are serialised before; `metrics()` is rendered when asked."""
+        """`status()` and `config()` are serialised before; `metrics()` is rendered when asked."""
+        self.took = Histogram(QUICK_S)
         self._keys = keys
         self._pairs = pairs
         self._reception = reception
         self._vehicle_routes = {
             keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
-            keys.config: Route(keys.config, lambda request: config.answer(_format(request)), Lane.AT_ONCE),
+            keys.config: Route(keys.config, lambda request: config().answer(_format(request)), Lane.AT_ONCE),
             keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), Lane.FILES),
         }
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
@@ -58,13 +66,27 @@ class VehicleAnswers:
         """Serve everything on the bus. The last queryable is there for the keys of pairs that are not: it does not
         claim to be `complete`, so that it takes no query from another service of the vehicle."""
         for key, route in self._vehicle_routes.items():
-            bus.serve(key, _always(route))
+            bus.serve(key, _always(self._timed(route, key.rpartition("/")[2])))
         for name in self._pairs:
             bus.serve(f"{self._keys.root}/{name}/**", self._finder(name))
         bus.serve(f"{self._keys.root}/**", self._find_unknown, complete=False)
 
     def _finder(self, pair: str) -> Callable[[str], Sequence[Route]]:
-        return lambda key: self._find(pair, key)
+        """Who answers, on the clock."""
+
+        def find(key: str) -> Sequence[Route]:
+            return [self._timed(route, self._keys.parse(route.key).resource) for route in self._find(pair, key)]
+
+        return find
+
+    def _timed(self, route: Route, resource: str) -> Route:
+        def answer(request: Request) -> Answer:
+            try:
+                return route.answer(request)
+            finally:
+                self.took.add(time.monotonic() - request.received_s, resource)
+
+        return replace(route, answer=answer)
 
     def _find(self, pair: str, key: str) -> Sequence[Route]:
         """Who answers a key, or a key expression, of the pair.

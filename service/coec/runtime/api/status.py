@@ -8,6 +8,7 @@ from typing import Literal
 from coec.runtime.api.health import drops_of
 from coec.runtime.decisions.decider import Known
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, StreamCounts
+from coec.runtime.ingest.inbox import Arrivals
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.worker.jobs import Fate
 from coec.runtime.worker.supervisor import Worker, WorkerState
@@ -21,15 +22,25 @@ def pair_status_of(
     losses: Mapping[tuple[str, str], int],
     recorded: int,
     commands: dict[str, int],
+    arrivals: Mapping[str, Arrivals],
+    unwritten: int,
     *,
     has_ego: bool,
 ) -> replies.PairStatus:
-    """`losses` are those of the pair by place and cause, `recorded` its windows on the disk."""
+    """`losses` are those of the pair by place and cause, `recorded` its windows on the disk, `unwritten` the pairs that
+    wait for it."""
     drops, chosen = drops_of(losses, report.unpaired), report.chosen
 
     def stream(name: str) -> replies.StreamStatus:
         counts = report.streams.get(name, StreamCounts(0, 0))
-        return replies.StreamStatus(received=counts.received, accepted=counts.accepted, losses=drops.get(name, {}))
+        came = arrivals[name]
+        return replies.StreamStatus(
+            received=counts.received,
+            accepted=counts.accepted,
+            waiting=came.waiting,
+            age_s=came.age_s,
+            losses=drops.get(name, {}),
+        )
 
     return replies.PairStatus(
         name=name,
@@ -39,6 +50,7 @@ def pair_status_of(
         pairs=report.pairs,
         held=report.held,
         selected=chosen.selected,
+        unwritten=unwritten,
         rejections=dict(chosen.rejections),
         losses={**drops.get("window", {}), **drops.get("storage", {}), **drops.get("monitor", {})},
         windows=recorded,

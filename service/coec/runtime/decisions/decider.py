@@ -198,6 +198,15 @@ class Decider:
         self._store.age(self._overdue, self._progress.silent_s(monotonic_s), self._stale_after_s)
         self._tell(self.known())
 
+    def use(self, pair: PairConfig, stale_after_s: float, told: str) -> None:
+        """Judge what comes by other settings from now on; `told` goes into the history."""
+        self._rules = Rules(pair.policy, pair.tracker, pair.monitor)
+        self._stale_after_s = stale_after_s
+        self._baseline.use(pair)
+        self._calibrate_with(self._baseline.calibration)
+        self._store.note_command("reload", "reloaded", told, "SIGHUP", accepted=True)
+        self._store.save()
+
     # --- answers ----------------------------------------------------------------------------------------------------
 
     def checked(self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:

@@ -66,6 +66,11 @@ class Questions:
         """Who takes the answers; to be called once, before anything is asked."""
         self._decides = decides
 
+    def use(self, pair: PairConfig) -> None:
+        """Ask by these settings from now on. The period of the monitor is that of the start: other questions are
+        waiting by it."""
+        self._pair = pair
+
     # --- for the stream ---------------------------------------------------------------------------------------------
 
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
@@ -73,7 +78,8 @@ class Questions:
         standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
         question = self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.CHECK))
         ended = partial(self._decides.checked, question, served.epoch, standing)
-        self._worker.ask(jobs.check(self._pair.name, served.T_camera_lidar, pairs, self._post(ended)))
+        pair = self._pair
+        self._worker.ask(jobs.check(pair.name, pair.calibration, served.T_camera_lidar, pairs, self._post(ended)))
 
     def window(self, window_id: str, stamp_ns: int) -> int:
         """What does a window say that ends at a sensor time? It is on its way to the disk. From when on its answer
@@ -125,7 +131,7 @@ class Questions:
 
     def commission(self, pose: Matrix4, paths: list[Path], done: Callable[[JobOutcome], None]) -> None:
         """Learn the baseline of the rig at an extrinsic (4, 4) from windows."""
-        self._worker.ask(jobs.commission(self._pair.name, pose, paths, self._post(done)))
+        self._worker.ask(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, self._post(done)))
 
     def _post(self, ended: Callable[[JobOutcome], None]) -> Callable[[JobOutcome], None]:
         return lambda outcome: self._mailbox.post(partial(ended, outcome))

@@ -47,6 +47,11 @@ class RigBaseline:
         else:
             self.trouble = _mismatched(wrong)
 
+    def use(self, pair: PairConfig) -> None:
+        """The rig is calibrated by these settings from now on, which the baseline may not fit."""
+        self._pair = pair
+        self.load()
+
     def refuse(self, why: str) -> bool:
         """It does not fit after all; whether it was in use until now."""
         if self._baseline is None:

@@ -19,7 +19,7 @@ from coec.calibration.frames.sampling import CheckSampler
 from coec.calibration.frames.window import PairSelected, SliceEnded, WindowCutter
 from coec.calibration.monitor.urgency import Urgency
 from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
-from coec.config import LimitsConfig, PairConfig
+from coec.config import LimitsConfig, PairConfig, WindowConfig
 from coec.runtime.ingest.sensor_clock import SensorClock
 
 _log = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ class Chooser:
         self._infers = pair.calibration.depth.model != STEREO
         self._cutter = WindowCutter(pair.window, rig, Inspector(limits))
         self._sampler = CheckSampler(pair.monitor)
-        self._urgency = Urgency(pair.monitor, pair.window)
+        self._urgency = Urgency(pair.monitor)
         self._pace = SensorClock()
         self._last_ns: int | None = None
         self._unasked: deque[tuple[FramePair, ...]] = deque(maxlen=CHECKS_WAITING)
@@ -194,6 +194,10 @@ class Chooser:
             self._end(event, self._last_ns or 0)
             return event
         return None
+
+    def use(self, window: WindowConfig) -> None:
+        """The next slice is to be cut by this."""
+        self._cutter.use(window)
 
     # --- effects of answers -----------------------------------------------------------------------------------------
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +27,14 @@ class Call:
     run: Callable[[], None]
 
 
+@dataclass(frozen=True, slots=True)
+class Arrivals:
+    """What came on a stream: samples that wait, and how long ago the last one came; None before the first."""
+
+    waiting: int
+    age_s: float | None
+
+
 class Inbox:
     """The streams of one pair. `put` takes microseconds and never blocks on the reader; one thread takes."""
 
@@ -33,6 +42,7 @@ class Inbox:
         """`depths` maps each stream to the number of samples that may wait; `on_overrun(stream)` is called for each
         that had to go."""
         self._queues: dict[str, deque[Parcel]] = {stream: deque(maxlen=depth) for stream, depth in depths.items()}
+        self._came_s: dict[str, float] = {}
         self._calls: deque[Call] = deque()
         self._on_overrun = on_overrun
         self._order = itertools.count()
@@ -43,6 +53,7 @@ class Inbox:
         with self._condition:
             queue = self._queues[stream]
             overrun = len(queue) == queue.maxlen
+            self._came_s[stream] = time.monotonic()
             queue.append(Parcel(next(self._order), stream, payload, encoding))
             self._condition.notify()
         if overrun:
@@ -53,6 +64,15 @@ class Inbox:
         with self._condition:
             self._calls.append(Call(run))
             self._condition.notify()
+
+    def arrivals(self, monotonic_s: float) -> dict[str, Arrivals]:
+        """By stream, at this time of the steady clock."""
+        with self._condition:
+            return {
+                stream: Arrivals(len(queue), None if came_s is None else max(monotonic_s - came_s, 0.0))
+                for stream, queue in self._queues.items()
+                for came_s in (self._came_s.get(stream),)
+            }
 
     def wake(self) -> None:
         """Let a waiting `take` return."""

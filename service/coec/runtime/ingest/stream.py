@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -18,6 +19,7 @@ from coec.runtime.ingest.inbox import Call, Inbox
 from coec.runtime.ingest.pair_buffer import PairBuffer
 from coec.runtime.ingest.sensor_clock import NS_PER_S, SensorClock
 from coec.runtime.ingest.stream_statistics import StreamStatistics
+from coec.runtime.timings import QUICK_S, Histogram
 
 T = TypeVar("T")
 
@@ -35,7 +37,12 @@ IDLE_S = 0.25
 
 
 class Stream:
-    """Takes the samples of one pair. `inbox` is for any thread, `report` is what the thread last told of itself."""
+    """Takes the samples of one pair. `inbox` is for any thread, `report` is what the thread last told of itself.
+
+    Attributes:
+        decoding_took: of each sample, by stream.
+        waiting_took: of each pair, from when it was certain until it was looked at.
+    """
 
     def __init__(
         self, pair: PairConfig, config: Config, chooser: Chooser, has_room: Callable[[], bool], losses: LossCounter
@@ -45,12 +52,15 @@ class Stream:
         self.inbox = Inbox(depths, lambda stream: losses.add(stream, "overrun"))
         self.thread = ServiceThread(f"ingest-{pair.name}", self._run)
         self.report = StreamStatistics()
+        self.decoding_took = Histogram(QUICK_S)
+        self.waiting_took = Histogram(QUICK_S)
         self._chooser = chooser
         self._has_room = has_room
         self._decoder = Decoder(pair, config.limits, losses)
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._clock = SensorClock()
         self._held = PairBuffer(config.limits.max_held_bytes, config.worker.timeout_s)
+        self._came_s: deque[float] = deque()
         self._pairs = 0
         self._sync_error_s: float | None = None
 
@@ -96,7 +106,7 @@ class Stream:
         """Look at every pair that has come, whatever it waits for. For the stream's thread, or after its end."""
         self._hold(self._pairer.flush())
         while self._held:
-            self._chooser.choose(self._held.take())
+            self._choose()
 
     def take(self, pairs: list[FramePair]) -> None:
         """Pairs came: they tell the time, and wait their turn."""
@@ -104,8 +114,13 @@ class Stream:
             self._clock.observe(pair.stamp_ns, time.monotonic())
         self._hold(pairs)
 
+    def _choose(self) -> None:
+        self.waiting_took.add(time.monotonic() - self._came_s.popleft())
+        self._chooser.choose(self._held.take())
+
     def _hold(self, pairs: list[FramePair]) -> None:
         for pair in pairs:
+            self._came_s.append(time.monotonic())
             self._pairs += 1
             self._sync_error_s = (pair.camera.stamp_ns - pair.lidar.stamp_ns) / NS_PER_S
             self._held.add(pair)
@@ -114,7 +129,7 @@ class Stream:
         """Look at the pair whose turn it is, if it may be looked at; whether one was."""
         if not self._may_choose():
             return False
-        self._chooser.choose(self._held.take())
+        self._choose()
         return True
 
     def _run(self, thread: ServiceThread) -> None:
@@ -124,7 +139,9 @@ class Stream:
             if isinstance(item, Call):
                 item.run()
             elif item is not None:
+                begun_s = time.monotonic()
                 frame = self._decoder.frame(item)
+                self.decoding_took.add(time.monotonic() - begun_s, item.stream)
                 if frame is not None:
                     self.take(self._pairer.push(frame))
             self.choose_next()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from coec.config import CalibrationConfig
 from coec.errors import CoecError, RecordingError
 from coec.runtime.recording.digests import DigestReader
 from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.timings import QUICK_S, Histogram
 
 _log = logging.getLogger(__name__)
 
@@ -54,7 +56,8 @@ class _Open:
 
     window_id: str
     writer: WindowWriter
-    pairs: int
+    min_pairs: int
+    pairs: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +71,12 @@ class RecordingPlan:
 
 
 class Recorder:
-    """Writes the windows of one pair on a thread of its own, and looks after what earlier runs left."""
+    """Writes the windows of one pair on a thread of its own, and looks after what earlier runs left.
+
+    Attributes:
+        recorded: windows that got to the disk.
+        writing_took: of each pair into its window.
+    """
 
     def __init__(
         self,
@@ -95,6 +103,7 @@ class Recorder:
         self._lost: str | None = None
         self._latest: Path | None = None
         self.recorded = 0
+        self.writing_took = Histogram(QUICK_S)
         self._trouble: Reason | None = None
         self.thread = ServiceThread(f"recorder-{plan.rig.pair}", self._run)
 
@@ -113,6 +122,11 @@ class Recorder:
         return self._latest
 
     @property
+    def waiting(self) -> int:
+        """Chosen pairs that wait for the disk."""
+        return self._adds
+
+    @property
     def has_room(self) -> bool:
         """Whether a chosen pair would be taken now."""
         return self._adds < PAIRS_WAITING
@@ -120,6 +134,10 @@ class Recorder:
     def use(self, configuration: CalibrationConfig) -> None:
         """The next window is to be calibrated with this: the limits of the rig were learned anew."""
         self._configuration = configuration
+
+    def follow(self, plan: RecordingPlan) -> None:
+        """The next window is to be recorded by this; how it is to be calibrated is for `use` to say."""
+        self._plan = plan
 
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
         """Queue a chosen pair; never waits for the disk. `T_camera_lidar` (4, 4) is where a search will start if this
@@ -160,7 +178,9 @@ class Recorder:
                 item = self._queue.popleft() if self._queue else None
                 self._adds -= isinstance(item, _Add)
             if isinstance(item, _Add):
+                begun_s = time.monotonic()
                 self._write(item)
+                self.writing_took.add(time.monotonic() - begun_s)
             elif isinstance(item, SliceEnded):
                 self._end(item.window_id)
             elif thread.stopping:
@@ -233,14 +253,14 @@ class Recorder:
             self._configuration,
             self._plan.metadata,
         )
-        return _Open(item.window_id, writer, 0)
+        return _Open(item.window_id, writer, self._plan.min_pairs)
 
     def _end(self, window_id: str) -> None:
         if self._open is None or self._open.window_id != window_id:
             self._on_lost(window_id)
             return
         opened = self._open
-        if opened.pairs < self._plan.min_pairs:
+        if opened.pairs < opened.min_pairs:
             self._close_stray()
             self._on_lost(window_id)
             return

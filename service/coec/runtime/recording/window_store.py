@@ -101,6 +101,10 @@ class WindowStore:
         except OSError as error:
             raise RecordingError(f"the folder {folder} cannot be made or read: {error.strerror}") from error
 
+    def use(self, config: StateConfig) -> None:
+        """Keep these limits from the next window on."""
+        self._config = config
+
     # --- what is there ----------------------------------------------------------------------------------------------
 
     def path(self, window_id: str) -> Path:

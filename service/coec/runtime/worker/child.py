@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import subprocess
@@ -11,6 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from coec.adapters.system.memory import resident_bytes
 from coec.config import WorkerConfig
 from coec.runtime.worker.link import Link, NoMessageError
 
@@ -153,10 +153,7 @@ class Child:
 
     def _resident_bytes(self) -> int:
         """0 when the process is gone."""
-        with contextlib.suppress(OSError, IndexError, ValueError):
-            pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
-            return pages * os.sysconf("SC_PAGE_SIZE")
-        return 0
+        return resident_bytes(self.pid)
 
 
 def _environment(threads: int) -> dict[str, str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.calibration.types import Reason
+from coec.config import CalibrationConfig
 from coec.errors import CoecError
 from coec.runtime.worker import jobs
 from coec.runtime.worker.answers import pack_answer, pack_refusal
@@ -41,12 +42,12 @@ def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
     try:
         match message["kind"]:
             case Kind.CHECK:
-                return solver.observe(message["pair"], message["pose"], message["frames"])
+                return solver.observe(message["pair"], _configuration(message), message["pose"], message["frames"])
             case Kind.OVERLAY:
                 return solver.overlay(Path(message["path"]), message["pose"], message["title"])
             case Kind.COMMISSION:
                 paths = [Path(path) for path in message["paths"]]
-                return solver.commission(message["pair"], message["pose"], paths)
+                return solver.commission(_configuration(message), message["pose"], paths)
             case jobs.PREFETCH:
                 solver.prefetch(message["pair"], message["frame"])
                 return None
@@ -57,3 +58,7 @@ def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
         _log.exception("the work failed", extra={"fields": {"kind": message["kind"], "pair": message.get("pair")}})
         text = f"The program failed ({type(error).__name__}: {error}); the log has the traceback."
         return Reason(INTERNAL_ERROR, text)
+
+
+def _configuration(message: dict[str, Any]) -> CalibrationConfig:
+    return CalibrationConfig.model_validate(message["configuration"])

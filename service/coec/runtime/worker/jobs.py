@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.types import FramePair, Matrix4, Reason
+from coec.config import CalibrationConfig
 from coec.runtime.worker.messages import pack_pairs, pack_pose
 
 if TYPE_CHECKING:
@@ -188,9 +189,11 @@ def solve(pair: str, path: Path, window_id: str, done: Done, live: bool = True) 
     return Job(Kind.SOLVE, pair, window_id, {"path": str(path)}, done, live)
 
 
-def check(pair: str, pose: Matrix4, pairs: Sequence[FramePair], done: Done) -> Job:
-    """Have the monitor look at pairs at an extrinsic (4, 4); answered with `Checked`."""
-    return Job(Kind.CHECK, pair, "check", {"pose": pack_pose(pose), "frames": pack_pairs(pairs)}, done)
+def check(pair: str, configuration: CalibrationConfig, pose: Matrix4, pairs: Sequence[FramePair], done: Done) -> Job:
+    """Have the monitor look at pairs at an extrinsic (4, 4); answered with `Checked`. The question says how the pair is
+    calibrated at the moment it is asked, whatever the worker was started with."""
+    body = {"configuration": _packed(configuration), "pose": pack_pose(pose), "frames": pack_pairs(pairs)}
+    return Job(Kind.CHECK, pair, "check", body, done)
 
 
 def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadline_s: float | None = None) -> Job:
@@ -199,7 +202,11 @@ def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadli
     return Job(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
 
 
-def commission(pair: str, pose: Matrix4, paths: Sequence[Path], done: Done) -> Job:
+def commission(pair: str, configuration: CalibrationConfig, pose: Matrix4, paths: Sequence[Path], done: Done) -> Job:
     """Learn the rig's baseline at an extrinsic (4, 4) from windows' files; answered with `Commissioned`."""
-    body = {"pose": pack_pose(pose), "paths": [str(path) for path in paths]}
+    body = {"configuration": _packed(configuration), "pose": pack_pose(pose), "paths": [str(path) for path in paths]}
     return Job(Kind.COMMISSION, pair, "commissioning", body, done, timeout_s=COMMISSIONING_TIMEOUT_S)
+
+
+def _packed(configuration: CalibrationConfig) -> dict[str, Any]:
+    return configuration.model_dump(mode="json")

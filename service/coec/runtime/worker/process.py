@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> int:
     link = Link(descriptor)
     with contextlib.suppress(EOFError, OSError):
         config = Config.model_validate_json(link.receive()["settings"])
-        logs.configure(config.log_level)
+        logs.configure(config.log.level, config.log.format)
         os.nice(config.worker.niceness)
         allocator.return_large()
         _serve(link, config)

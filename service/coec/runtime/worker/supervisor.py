@@ -22,6 +22,7 @@ from typing import Any
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration.types import Reason
 from coec.config import WorkerConfig
+from coec.runtime.timings import LONG_S, Histogram
 from coec.runtime.worker.answers import MalformedAnswerError, number_of, read_answer
 from coec.runtime.worker.child import Child, ChildError, Fault
 from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, Kind, Prefetch
@@ -90,6 +91,8 @@ class Worker:
 
     Attributes:
         thread: the supervisor's, on which most outcomes are told, one at a time.
+        jobs_took: from a question to its result, by kind.
+        work_took: what of that the process needed for it.
     """
 
     def __init__(
@@ -117,6 +120,8 @@ class Worker:
         self._faults: Counter[Fault] = Counter()
         self._done_raised = 0
         self.thread = ServiceThread("worker-supervisor", self._supervise)
+        self.jobs_took = Histogram(LONG_S)
+        self.work_took = Histogram(LONG_S)
 
     def start(self) -> None:
         """Start the supervisor, which starts the process."""
@@ -178,6 +183,8 @@ class Worker:
             yield self._queue
             ended = self._queue.drain()
         for job, outcome in ended:
+            if outcome.fate is Fate.RESULT:
+                self.jobs_took.add(outcome.elapsed_s, job.kind.value)
             try:
                 job.done(outcome)
             except Exception:
@@ -257,9 +264,11 @@ class Worker:
         kind = ticket.work.kind if isinstance(ticket.work, Job) else None
         timeout_s = ticket.work.timeout_s if isinstance(ticket.work, Job) else None
         self._send(child, ticket)
+        sent_s = time.monotonic()
         message = self._next_message(child, timeout_s or self._config.timeout_s)
         if message is None:
             return False
+        self.work_took.add(time.monotonic() - sent_s, PREFETCH if kind is None else kind.value)
         answer = _checked_answer(message, ticket.number, kind)
         with self._held() as queue:
             queue.answered(answer, time.monotonic())

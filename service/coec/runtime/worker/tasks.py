@@ -33,7 +33,7 @@ from coec.calibration.types import (
     Rig,
     Window,
 )
-from coec.config import Config, DepthConfig
+from coec.config import CalibrationConfig, Config, DepthConfig
 from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.cameras import scaled
 from coec.geometry.projection import project
@@ -119,14 +119,19 @@ class Solver:
             return Solved(result, Reason(code, f"The window file does not hold the result: {error}"))
         return Solved(result, None, WrittenFile(file.bytes, file.modified_ns, file.sha256, file.pairs))
 
-    def observe(self, pair: str, pose: Sequence[Sequence[float]], frames: Sequence[Sequence[bytes | None]]) -> Checked:
+    def observe(
+        self,
+        pair: str,
+        configuration: CalibrationConfig,
+        pose: Sequence[Sequence[float]],
+        frames: Sequence[Sequence[bytes | None]],
+    ) -> Checked:
         """A check of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs
         them.
 
         Raises:
             CalibrationError, DecodeError, ModelError: there is no answer.
         """
-        configuration = self._pairs[pair].calibration
         window = Window(
             f"{pair}-check",
             self._rigs[pair],
@@ -134,7 +139,7 @@ class Solver:
             unpack_pairs(frames, self._config.limits),
         )
         network = self._network(configuration.depth)
-        baseline, not_used = self._baseline(pair, network.identity)
+        baseline, not_used = self._baseline(pair, configuration, network.identity)
         images = CachedGreys(self._images, len(window.pairs))
         with DepthAhead(network, (each.camera for each in window.pairs)) as depth:
             observation = observe(window, depth, images, configuration, baseline)
@@ -156,7 +161,9 @@ class Solver:
         picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title)
         return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
 
-    def commission(self, pair: str, pose: Sequence[Sequence[float]], paths: Sequence[Path]) -> Commissioned:
+    def commission(
+        self, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
+    ) -> Commissioned:
         """Learn the baseline of a rig at an extrinsic (rows of the (4, 4) matrix) from recorded windows; write it.
 
         Raises:
@@ -164,7 +171,6 @@ class Solver:
         """
         from coec.adapters.mcap.windows import read_window
 
-        configuration = self._pairs[pair].calibration
         start = np.array(pose, dtype=np.float64)
         windows = [replace(read_window(path)[0], T_camera_lidar_start=start) for path in paths]
         baseline = commission(
@@ -178,7 +184,9 @@ class Solver:
         saved = save_baseline(self._config.state.directory / BASELINES, baseline)
         return Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
 
-    def _baseline(self, pair: str, depth_identity: str) -> tuple[Baseline | None, str | None]:
+    def _baseline(
+        self, pair: str, configuration: CalibrationConfig, depth_identity: str
+    ) -> tuple[Baseline | None, str | None]:
         """What was learned of the rig, if it holds for this configuration and network; else why it does not."""
         try:
             learned = load_baseline(self._config.state.directory / BASELINES, pair)
@@ -186,7 +194,7 @@ class Solver:
             return None, str(error)
         if learned is None:
             return None, None
-        configured = learned_hash(self._pairs[pair].calibration)
+        configured = learned_hash(configuration)
         against = mismatch(learned, self._rigs[pair], depth_identity, configured)
         return (learned, None) if against is None else (None, against)
 

@@ -1,0 +1,41 @@
+"""Whether somebody keeps the clock of this computer right."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+TIME_ERROR = 5
+"""State of the kernel's clock that nobody keeps; adjtimex(2)."""
+
+
+class _Timex(ctypes.Structure):
+    """Its beginning; the rest is for the kernel to fill."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_char * 256),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ClockState:
+    """What the kernel knows: whether a daemon (NTP, PTP) steers the clock, and how far it may be off at most, s."""
+
+    synchronised: bool
+    max_error_s: float
+
+
+def clock_state() -> ClockState | None:
+    """Now; None where the system does not tell."""
+    adjtimex = getattr(ctypes.CDLL(None), "adjtimex", None)
+    if adjtimex is None:
+        return None
+    told = _Timex()
+    state = adjtimex(ctypes.byref(told))  # no mode is set: nothing is adjusted
+    return None if state < 0 else ClockState(state != TIME_ERROR, told.maxerror / 1e6)

@@ -1,0 +1,181 @@
+"""A few pages over HTTP, for a scraper on the same computer: GET, one answer, the end of the connection.
+
+One thread looks after all connections and waits for none of them: whoever sends or reads slowly has a deadline, and
+when there are too many the oldest goes. Nothing of a request is kept, and of what was asked only the path is looked at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import selectors
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from coec.adapters.system.threads import ServiceThread
+from coec.errors import UnavailableError
+
+_log = logging.getLogger(__name__)
+
+MAX_CONNECTIONS = 16
+"""At once; a scraper has one, and it lasts for milliseconds."""
+
+MAX_REQUEST_BYTES = 4096
+"""Request line and headers; those of a scraper have 200 to 400."""
+
+DEADLINE_S = 3.0
+"""Of a connection, from its first byte or none to its last: on the same computer it takes milliseconds."""
+
+POLL_S = 0.2
+
+REASONS = {200: "OK", 400: "Bad Request", 404: "Not Found", 500: "Internal Server Error", 503: "Service Unavailable"}
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """An answer."""
+
+    status: int
+    body: bytes
+    content_type: str
+
+
+@dataclass(slots=True, eq=False)
+class _Connection:
+    socket: socket.socket
+    since_s: float
+    received: bytearray = field(default_factory=bytearray)
+    unsent: memoryview | None = None
+
+
+class HttpServer:
+    """Listens from its making until `close`; answers while `thread` runs."""
+
+    def __init__(self, host: str, port: int, find: Callable[[str], Page | None]) -> None:
+        """`find(path)` is called on the thread; None is answered 404.
+
+        Raises:
+            UnavailableError: nobody can listen there.
+        """
+        self._find = find
+        self._listener = _listening(host, port)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._connections: list[_Connection] = []
+        self.thread = ServiceThread("http", self._run)
+
+    def close(self, deadline_s: float) -> bool:
+        """Stop listening and drop who is there; False when the thread did not end within the deadline."""
+        self.thread.request_stop()
+        ended = self.thread.join(deadline_s)
+        if ended:
+            self._close_all()
+        return ended
+
+    # --- on the thread ----------------------------------------------------------------------------------------------
+
+    def _run(self, thread: ServiceThread) -> None:
+        while not thread.stopping:
+            thread.beat()
+            for key, _ in self._selector.select(POLL_S):
+                if key.data is None:
+                    self._accept()
+                elif key.data.socket.fileno() >= 0:  # not dropped meanwhile, to make room
+                    self._serve(key.data)
+            now_s = time.monotonic()
+            for late in [one for one in self._connections if now_s - one.since_s > DEADLINE_S]:
+                self._drop(late)
+
+    def _accept(self) -> None:
+        try:
+            accepted, _ = self._listener.accept()
+        except OSError:  # it has gone already, or the process has no descriptor left: there is time for others
+            return
+        accepted.setblocking(False)
+        if len(self._connections) >= MAX_CONNECTIONS:
+            self._drop(self._connections[0])
+        connection = _Connection(accepted, time.monotonic())
+        self._connections.append(connection)
+        self._selector.register(accepted, selectors.EVENT_READ, connection)
+
+    def _serve(self, connection: _Connection) -> None:
+        try:
+            if connection.unsent is None:
+                self._receive(connection)
+            if connection.unsent is not None:
+                self._send(connection)
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop(connection)
+
+    def _receive(self, connection: _Connection) -> None:
+        received = connection.socket.recv(MAX_REQUEST_BYTES)
+        if not received:
+            self._drop(connection)
+            return
+        connection.received += received
+        complete = b"\r\n\r\n" in connection.received
+        if not complete and len(connection.received) < MAX_REQUEST_BYTES:
+            return
+        page = self._answer(bytes(connection.received)) if complete else _plain(400, "The request is too long.\n")
+        connection.unsent = memoryview(_response(page))
+        self._selector.modify(connection.socket, selectors.EVENT_WRITE, connection)
+
+    def _answer(self, request: bytes) -> Page:
+        words = request.partition(b"\r\n")[0].split(b" ")
+        if len(words) != 3 or not words[2].startswith(b"HTTP/1."):
+            return _plain(400, "This is no request.\n")
+        path = words[1].partition(b"?")[0].decode("latin-1")
+        try:
+            page = self._find(path) if words[0] == b"GET" else None
+        except Exception:
+            _log.exception("a page could not be made", extra={"fields": {"path": path[:64]}})
+            return _plain(500, "The service failed on this page; its log says why.\n")
+        return _plain(404, "There is no such page.\n") if page is None else page
+
+    def _send(self, connection: _Connection) -> None:
+        assert connection.unsent is not None
+        sent = connection.socket.send(connection.unsent)
+        connection.unsent = connection.unsent[sent:]
+        if not connection.unsent:
+            with contextlib.suppress(OSError):
+                connection.socket.shutdown(socket.SHUT_WR)
+            self._drop(connection)
+
+    def _drop(self, connection: _Connection) -> None:
+        self._connections.remove(connection)
+        self._selector.unregister(connection.socket)
+        connection.socket.close()
+
+    def _close_all(self) -> None:
+        for connection in list(self._connections):
+            self._drop(connection)
+        self._selector.close()
+        self._listener.close()
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        made = socket.create_server((host, port), family=family, backlog=MAX_CONNECTIONS)
+    except OSError as error:
+        raise UnavailableError(f"nobody can listen on {host}:{port}: {error.strerror or error}") from error
+    made.setblocking(False)
+    return made
+
+
+def _plain(status: int, text: str) -> Page:
+    return Page(status, text.encode(), "text/plain; charset=utf-8")
+
+
+def _response(page: Page) -> bytes:
+    head = (
+        f"HTTP/1.1 {page.status} {REASONS[page.status]}\r\n"
+        f"Content-Type: {page.content_type}\r\n"
+        f"Content-Length: {len(page.body)}\r\n"
+        "Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nConnection: close\r\n\r\n"
+    )
+    return head.encode() + page.body

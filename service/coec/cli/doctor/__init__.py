@@ -1,0 +1,123 @@
+"""`coec doctor`: what stands between this computer and a calibration, for the engineer who is with the vehicle.
+
+One thing after another, in the order in which they depend on each other: the configuration, this computer, the way to
+the router, the streams, the service. It changes nothing that runs, and works with and without a service beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.text import Text
+
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.files.rig import rig_of
+from coec.adapters.zenoh.bus import closed
+from coec.adapters.zenoh.settings import settings_of
+from coec.cli.doctor import machine, router, service, streams
+from coec.cli.doctor.found import fail, ok
+from coec.cli.doctor.listening import listen
+from coec.config import Config, load_config
+from coec.errors import ConfigError, ModelError
+from coec.reports import console
+from coec.schemas.doctor import DoctorReport, Finding, Level
+
+USUAL_FILE = Path("/etc/coec/coec.yaml")
+"""As the unit of systemd names it."""
+
+STYLES: dict[Level, str] = {"ok": "green", "warn": "bold yellow", "fail": "bold red"}
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command. `config` None: the usual file."""
+
+    config: Path | None
+    seconds: float
+    as_json: bool
+
+
+def run(options: Options) -> int:
+    """Look at everything and tell it; 1 if something failed."""
+    findings: list[Finding] = []
+    for finding in examine(options.config or USUAL_FILE, options.seconds):
+        findings.append(finding)
+        if not options.as_json:
+            _show(finding)
+    report = DoctorReport(healthy=all(one.level != "fail" for one in findings), findings=tuple(findings))
+    if options.as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        counts = {level: sum(one.level == level for one in findings) for level in STYLES}
+        console.show(", ".join(f"{count} {level}" for level, count in counts.items()), "bold")
+    return 0 if report.healthy else 1
+
+
+def examine(path: Path, seconds: float) -> Iterator[Finding]:
+    """Everything, one finding after the other; the streams are listened to for so many seconds.
+
+    What a broken configuration keeps from being looked at is left out.
+    """
+    config, complaint = _configuration(path)
+    yield complaint
+    yield machine.clock_finding()
+    yield machine.kernels_finding()
+    if config is None:
+        return
+    yield from _networks(config)
+    yield from machine.state_findings(config.state)
+    yield from router.certificate_findings(config)
+    reached = list(router.router_findings(config))
+    yield from reached
+    if not any(one.check == "router" and one.level == "ok" for one in reached):
+        return
+    session = router.session_beside(config)
+    yield router.session_finding(config, session)
+    if session is None:
+        return
+    try:
+        yield router.rules_finding(config, session)
+        with console.progress(counted=False) as progress:
+            task = progress.add_task("listening", total=seconds, note=f"{len(config.pairs)} pairs")
+            heard = listen(session, config, seconds, lambda passed_s: progress.update(task, completed=passed_s))
+        for pair, streams_heard in zip(config.pairs, heard, strict=True):
+            yield from streams.stream_findings(pair, streams_heard, config, seconds)
+        yield from service.service_findings(session, config)
+    finally:
+        closed(session, router.CLOSE_S)
+
+
+def _configuration(path: Path) -> tuple[Config | None, Finding]:
+    """The configuration, if a service could start with it, and what there is to say of it."""
+    advice = "correct it, or name another with --config; `coec check-config FILE` prints what a file comes to"
+    try:
+        config = load_config(path.resolve())  # as a service has it, whose paths are complete
+        for pair in config.pairs:
+            rig_of(pair)
+        settings_of(config.zenoh, config.limits)
+    except ConfigError as error:
+        return None, fail("configuration", str(path), str(error), advice)
+    names = ", ".join(pair.name for pair in config.pairs)
+    return config, ok("configuration", str(path), f"valid; vehicle {config.vehicle}, pairs {names}")
+
+
+def _networks(config: Config) -> Iterator[Finding]:
+    """The depth networks, each once."""
+    for depth in dict.fromkeys(pair.calibration.depth for pair in config.pairs):
+        try:
+            opened = open_depth(depth, config.limits)
+        except ModelError as error:
+            yield fail("network", depth.model, str(error), "copy the file there, or name another (`coec models`)")
+        else:
+            yield ok("network", depth.model, f"loads; identity {opened.identity[:16]}")
+
+
+def _show(finding: Finding) -> None:
+    line = Text(f"{finding.level:<5}", STYLES[finding.level])
+    line.append(f"{finding.check:<14}", "")
+    line.append(finding.text if not finding.where else f"{finding.where}: {finding.text}", "")
+    console.out.print(line, soft_wrap=True)
+    if finding.advice is not None:
+        console.show(f"     → {finding.advice}", "dim")

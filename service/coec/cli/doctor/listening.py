@@ -1,0 +1,130 @@
+"""Samples of the streams for some seconds: what came, when, and the frames that were made of it.
+
+The service is not disturbed: it gets the same samples, and what is heard here comes over a session of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import zenoh
+
+from coec.adapters.system.logs import LossCounter
+from coec.config import Config, PairConfig
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame
+from coec.runtime.ingest.inbox import Parcel
+
+SAMPLES_WAITING = 8
+"""Of a stream; more are counted and not looked into."""
+
+MOTIONS_WAITING = 512
+
+POLL_S = 0.01
+
+_SILENT = logging.Logger("doctor")
+_SILENT.addHandler(logging.NullHandler())
+
+
+@dataclass(slots=True)
+class Heard:
+    """What came on one stream.
+
+    Attributes:
+        arrivals_s: when (steady clock) each sample came.
+        sizes: bytes of each.
+        stamps: of the frames: sensor time, and the wall clock when the sample came, ns, in the order of coming.
+        refused: samples of which no frame could be made, by reason.
+        latest: the last frame.
+    """
+
+    key: str
+    arrivals_s: list[float] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    stamps: list[tuple[int, int]] = field(default_factory=list)
+    refused: Counter[str] = field(default_factory=Counter)
+    latest: Frame | None = None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Samples per second; None before the second."""
+        if len(self.arrivals_s) < 2:
+            return None
+        spread_s = self.arrivals_s[-1] - self.arrivals_s[0]
+        return (len(self.arrivals_s) - 1) / spread_s if spread_s > 0 else None
+
+
+def listen(
+    session: zenoh.Session, config: Config, seconds: float, heard: Callable[[float], None]
+) -> list[dict[str, Heard]]:
+    """What comes on the streams of each pair; `heard` is told the seconds that have passed, now and then."""
+    ears = [_Ear(session, pair, config) for pair in config.pairs]
+    begun_s = time.monotonic()
+    try:
+        while (passed_s := time.monotonic() - begun_s) < seconds:
+            if sum(ear.take() for ear in ears) == 0:
+                time.sleep(POLL_S)
+            heard(passed_s)
+    finally:
+        for ear in ears:
+            ear.close()
+    return [ear.heard for ear in ears]
+
+
+class _Ear:
+    """Of one pair."""
+
+    def __init__(self, session: zenoh.Session, pair: PairConfig, config: Config) -> None:
+        streams = {CAMERA: pair.camera, LIDAR: pair.lidar, EGO: pair.ego}
+        self.heard = {name: Heard(stream.key) for name, stream in streams.items() if stream is not None}
+        self._waiting: dict[str, deque[tuple[int, bytes, str]]] = {
+            name: deque(maxlen=MOTIONS_WAITING if name == EGO else SAMPLES_WAITING) for name in self.heard
+        }
+        self._losses = LossCounter(_SILENT, pair.name)
+        self._decoder = Decoder(pair, config.limits, self._losses)
+        self._subscribers = [self._subscribe(session, name, heard) for name, heard in self.heard.items()]
+
+    def close(self) -> None:
+        """Hear no more, and look into what waits."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        while self.take():
+            pass
+
+    def take(self) -> bool:
+        """Look into the next sample of each stream; whether there was one."""
+        found = False
+        for name, waiting in self._waiting.items():
+            if not waiting:
+                continue
+            found = True
+            wall_ns, payload, encoding = waiting.popleft()
+            frame = self._decoder.frame(Parcel(0, name, payload, encoding))
+            heard = self.heard[name]
+            if frame is not None:
+                heard.latest = frame
+                heard.stamps.append((frame.stamp_ns, wall_ns))
+            heard.refused = Counter(
+                {
+                    reason: count
+                    for (place, reason), count in self._losses.snapshot().items()
+                    if place == name and reason != "sequence_gap"  # what is not looked into leaves gaps, too
+                }
+            )
+        return found
+
+    def _subscribe(self, session: zenoh.Session, name: str, heard: Heard) -> zenoh.Subscriber[None]:
+        waiting = self._waiting[name]
+
+        def receive(sample: zenoh.Sample) -> None:
+            if sample.kind != zenoh.SampleKind.PUT:
+                return
+            heard.arrivals_s.append(time.monotonic())
+            payload = sample.payload.to_bytes()
+            heard.sizes.append(len(payload))
+            waiting.append((time.time_ns(), payload, str(sample.encoding)))
+
+        return session.declare_subscriber(heard.key, zenoh.handlers.Callback(receive, indirect=False))

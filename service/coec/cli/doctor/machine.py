@@ -1,0 +1,146 @@
+"""The computer: its disk, its clock, what is compiled."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from coec.adapters.system.clock import clock_state
+from coec.adapters.system.locks import holder_of
+from coec.cli.doctor.found import fail, ok, warn
+from coec.config import StateConfig
+from coec.schemas.doctor import Finding
+
+MIB = 2**20
+
+PROBE_BYTES = 16 * MIB
+"""Written to measure the disk, and removed: four camera-LiDAR pairs of full size."""
+
+SLOW_MIB_PER_S = 10.0
+"""Three times what an urgent window takes: a pair of 4 MB every 1.2 s."""
+
+CLOCK_LIMIT_S = 1.0
+"""By how much the kernel may think its clock wrong."""
+
+
+def state_findings(state: StateConfig) -> Iterator[Finding]:
+    """Whether the state directory is there, ours, free, large and fast enough."""
+    folder, where = state.directory, str(state.directory)
+    if not folder.exists():
+        above = next(parent for parent in folder.resolve().parents if parent.exists())
+        if os.access(above, os.W_OK | os.X_OK):
+            yield ok("state", where, "is not there yet; the service makes it")
+        else:
+            advice = f"make it, and give it to the user of the service; {above} belongs to somebody else"
+            yield fail("state", where, "is not there, and cannot be made by this user", advice)
+        return
+    yield _ownership(folder)
+    holder = holder_of(folder / "lock")
+    if holder is not None:
+        who = f"process {holder}" if holder else "a process"
+        yield ok("lock", where, f"{who} has it: a service runs here")
+    else:
+        yield ok("lock", where, "nobody has it: no service runs here")
+    yield from _disk(folder, state.min_free_bytes)
+
+
+def clock_finding() -> Finding:
+    """Whether the computer's clock is kept right."""
+    clock = clock_state()
+    if clock is None:
+        return warn("clock", "", "the system does not say whether its clock is kept right", "ask its NTP or PTP daemon")
+    if not clock.synchronised or clock.max_error_s > CLOCK_LIMIT_S:
+        return warn(
+            "clock",
+            "",
+            f"nobody keeps the clock of this computer right; it may be off by {clock.max_error_s:.1f} s or more",
+            "set up PTP, chrony or systemd-timesyncd; sensors on other clocks than this one count for themselves",
+        )
+    return ok("clock", "", f"kept right within {1e3 * clock.max_error_s:.1f} ms")
+
+
+def kernels_finding() -> Finding:
+    """Whether the first start has to compile."""
+    from numba import config as numba_config
+
+    import coec.geometry.compiler  # noqa: F401  says where the cache is
+
+    folder = Path(numba_config.CACHE_DIR)  # type: ignore[attr-defined]
+    compiled = sum(1 for _ in folder.rglob("*.nbi"))
+    if compiled:
+        return ok("kernels", str(folder), f"{compiled} kernels are compiled, for this user")
+    return warn(
+        "kernels",
+        str(folder),
+        "no kernel is compiled for this user: the first start takes a minute or two longer",
+        "nothing, or start the service once before the vehicle needs it; its own user has its own cache "
+        "($XDG_CACHE_HOME)",
+    )
+
+
+def _ownership(folder: Path) -> Finding:
+    where = str(folder)
+    try:
+        status = folder.stat()
+    except OSError as error:
+        return fail("state", where, f"cannot be looked at: {error.strerror}", "see to its owner and disk")
+    if not stat.S_ISDIR(status.st_mode):
+        return fail("state", where, "is no folder", "name another in state.directory")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        advice = f"give it to the user of the service (its owner is {status.st_uid}, this is {os.geteuid()})"
+        return fail("state", where, "this user may not write there", advice)
+    if status.st_uid != os.geteuid():
+        text = f"belongs to user {status.st_uid}; this is {os.geteuid()}"
+        return warn("state", where, text, "run the doctor as the user of the service to be sure")
+    if status.st_mode & stat.S_IWOTH:
+        advice = f"chmod o-w {where}: what is read back from there is trusted"
+        return warn("state", where, "everybody may write there", advice)
+    return ok("state", where, "is there, and this user's")
+
+
+def _disk(folder: Path, min_free_bytes: int) -> Iterator[Finding]:
+    where = str(folder)
+    try:
+        status = os.statvfs(folder)
+    except OSError as error:
+        yield fail("disk", where, f"does not answer: {error.strerror}", "see to the disk")
+        return
+    free = status.f_bavail * status.f_frsize
+    text = f"{free / MIB:.0f} MiB are free, {min_free_bytes / MIB:.0f} MiB are to stay free (state.min_free_bytes)"
+    if free < min_free_bytes:
+        yield fail("disk", where, f"{text}: no window is recorded", "make room, or lower the limit")
+    elif free < 2 * min_free_bytes:
+        yield warn("disk", where, text, "make room soon: the oldest windows go first")
+    else:
+        yield ok("disk", where, text)
+    yield _speed(folder)
+
+
+def _speed(folder: Path) -> Finding:
+    where = str(folder)
+    data = os.urandom(MIB)
+    begun_s = time.monotonic()
+    try:
+        descriptor, name = tempfile.mkstemp(prefix=".doctor-", dir=folder)
+        try:
+            for at in range(0, PROBE_BYTES, MIB):
+                os.pwrite(descriptor, data, at)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+            Path(name).unlink(missing_ok=True)
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        advice = "make room: windows and history cannot be written" if full else "see to the disk, and who may write"
+        return fail("writing", where, f"cannot be written: {error.strerror}", advice)
+    speed = PROBE_BYTES / MIB / max(time.monotonic() - begun_s, 1e-6)
+    text = f"{speed:.0f} MiB/s, safely on the disk"
+    if speed < SLOW_MIB_PER_S:
+        advice = "a faster disk, or smaller frames: pairs are lost when they come faster than they are written"
+        return warn("writing", where, f"slow: {text}", advice)
+    return ok("writing", where, text)

@@ -1,0 +1,201 @@
+"""The way to the router, step by step: somebody there, certificates, Zenoh, rules."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import UTC, datetime
+from typing import Literal
+
+import zenoh
+
+from coec.adapters.zenoh.bus import closed
+from coec.adapters.zenoh.endpoints import CERTIFIED, WITH_PORT, Endpoint, redacted
+from coec.adapters.zenoh.settings import beside, connected_of, listened_of, mode_of, settings_of
+from coec.adapters.zenoh.tls import (
+    Certificate,
+    CertificateError,
+    host_and_port,
+    material_of,
+    read_certificate,
+    shake_hands,
+)
+from coec.cli.doctor.found import fail, ok, warn
+from coec.config import Config
+from coec.schemas.doctor import Finding
+from coec.schemas.keys import Keys
+
+CONNECT_S = 3.0
+"""For each step; a router on the same network answers in milliseconds."""
+
+CLOSE_S = 3.0
+
+SEEN_S = 3.0
+"""For the own liveliness token to come back from the router."""
+
+EXPIRES_SOON_DAYS = 30.0
+
+OVER_TCP = frozenset({"tcp", "tls", "ws"})
+
+DAY_S = 86_400.0
+
+
+def certificate_findings(config: Config) -> Iterator[Finding]:
+    """The certificates that the service shows, on the disk."""
+    settings = settings_of(config.zenoh, config.limits)
+    seen: set[str] = set()
+    ways: tuple[tuple[Literal["connect", "listen"], tuple[str, ...]], ...] = (
+        ("connect", connected_of(settings)),
+        ("listen", listened_of(settings)),
+    )
+    for role, endpoints in ways:
+        for endpoint in (Endpoint.parse(text) for text in endpoints):
+            material = material_of(settings, endpoint, role)
+            where = str(material.certificate)
+            if endpoint.protocol not in CERTIFIED or material.certificate is None or where in seen:
+                continue
+            seen.add(where)
+            try:
+                yield _dated("certificate", where, read_certificate(material, role))
+            except CertificateError as error:
+                advice = "have it made anew by the authority that the router trusts; `deploy/` shows how"
+                yield fail("certificate", where, str(error), advice)
+
+
+def router_findings(config: Config) -> Iterator[Finding]:
+    """Every endpoint of the router, as far as somebody answers."""
+    settings = settings_of(config.zenoh, config.limits)
+    for text in _endpoints(settings, config):
+        endpoint = Endpoint.parse(text)
+        if endpoint.protocol in WITH_PORT and endpoint.protocol in OVER_TCP:
+            yield from _reached(settings, endpoint, redacted(text))
+        else:
+            yield ok("router", redacted(text), "only Zenoh itself can tell whether somebody is there")
+
+
+def session_beside(config: Config) -> zenoh.Session | None:
+    """A client of the router with the certificate of the service; None when Zenoh does not come about."""
+    zenoh.init_log_from_env_or("off")
+    settings = settings_of(config.zenoh, config.limits)
+    endpoints = _endpoints(settings, config)
+    settings = beside(settings, CONNECT_S)
+    settings.insert_json5("connect/endpoints", json.dumps(endpoints))
+    try:
+        return zenoh.open(settings)
+    except zenoh.ZError:
+        return None
+
+
+def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
+    """Whether what answers is a Zenoh router that takes this session."""
+    where = ", ".join(redacted(text) for text in _endpoints(settings_of(config.zenoh, config.limits), config))
+    if session is None:
+        return fail(
+            "session",
+            where,
+            "no Zenoh session comes about",
+            "start the router; where somebody answers all the same, it is another program (a wrong port?), or the "
+            "router takes no more sessions (`max_sessions`)",
+        )
+    routers = [str(one) for one in session.info.routers_zid()]
+    return ok("session", where, f"a session with router {', '.join(routers) or 'none, but a peer'}")
+
+
+def rules_finding(config: Config, session: zenoh.Session) -> Finding:
+    """Whether the router lets this session, which has the certificate of the service, say what the service must say: a
+    liveliness token, which nobody else reads, has to come back."""
+    keys = Keys(config.prefix, config.vehicle)
+    token_key = f"{keys.root}/alive/doctor/{session.info.zid()}/{time.time_ns()}"
+    other = session_beside(config)
+    if other is None:
+        return warn("rules", keys.root, "the router takes one session, not two", "raise its `max_sessions`")
+    try:
+        token = session.liveliness().declare_token(token_key)
+        deadline_s = time.monotonic() + SEEN_S
+        try:
+            while time.monotonic() < deadline_s:
+                if any(reply.ok is not None for reply in other.liveliness().get(token_key, timeout=1.0)):
+                    return ok("rules", keys.root, "the router hands on what is said there")
+                time.sleep(0.05)
+        finally:
+            token.undeclare()
+    finally:
+        closed(other, CLOSE_S)
+    return fail(
+        "rules",
+        keys.root,
+        "the router takes the session, but hands nothing on: its access control refuses",
+        "compare prefix and vehicle with its rules, and the certificate's name with its subjects: the service needs "
+        "`liveliness_token`, `liveliness_query` and `declare_queryable` below its keys, `declare_subscriber` on frames",
+    )
+
+
+def _endpoints(settings: zenoh.Config, config: Config) -> tuple[str, ...]:
+    """Where a client reaches the router that the service uses, or is."""
+    if mode_of(settings) != "router":
+        return connected_of(settings)
+    return tuple(text.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for text in config.zenoh.router)
+
+
+def _reached(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Iterator[Finding]:
+    host, port = host_and_port(endpoint)
+    try:
+        with closing(socket.create_connection((host, port), CONNECT_S)):
+            pass
+    except socket.gaierror as error:
+        yield fail("router", where, f"nobody knows the host {host}: {error.strerror}", "see to its name, or to DNS")
+        return
+    except TimeoutError:
+        text = f"no answer within {CONNECT_S:g} s: the computer is off, or a firewall is silent"
+        yield fail("router", where, text, "see to the network between here and there")
+        return
+    except ConnectionRefusedError:
+        advice = "start the router (or `coec run --embedded-router`), or correct the port in zenoh.connect"
+        yield fail("router", where, "nobody listens at this port; the computer is there", advice)
+        return
+    except OSError as error:
+        yield fail("router", where, f"cannot be reached: {error.strerror or error}", "see to the network")
+        return
+    yield ok("router", where, "somebody listens")
+    if endpoint.protocol in CERTIFIED:
+        yield _handshake(settings, endpoint, where)
+
+
+def _handshake(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Finding:
+    try:
+        seen = shake_hands(endpoint, material_of(settings, endpoint, "connect"), CONNECT_S)
+    except CertificateError as error:
+        advice = (
+            "compare the authority here (root_ca_certificate) with who signed the router's certificate, the host with "
+            "its names, and the other way round"
+        )
+        return fail("tls", where, str(error), advice)
+    except OSError as error:
+        return fail(
+            "tls", where, f"the link broke: {error.strerror or error}", "see to the files of transport/link/tls"
+        )
+    return _dated("tls", where, seen)
+
+
+def _dated(check: str, where: str, seen: Certificate) -> Finding:
+    """Whether a certificate is good today, and for how long."""
+    now_s = time.time()
+    text = f"{seen.name!r}, good until {_day(seen.not_after_s)}"
+    if seen.names:
+        text += f", for {', '.join(seen.names)}"
+    renew = "have the authority make a new one"
+    if seen.not_after_s < now_s:
+        return fail(check, where, f"{seen.name!r} has expired on {_day(seen.not_after_s)}", renew)
+    if seen.not_before_s > now_s:
+        advice = "see to the clock of this computer"
+        return fail(check, where, f"{seen.name!r} is not good before {_day(seen.not_before_s)}", advice)
+    if seen.not_after_s < now_s + EXPIRES_SOON_DAYS * DAY_S:
+        return warn(check, where, text, f"{renew}, soon")
+    return ok(check, where, text)
+
+
+def _day(seconds: float) -> str:
+    return "for ever" if seconds == float("inf") else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")

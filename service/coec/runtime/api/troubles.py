@@ -1,0 +1,106 @@
+"""What may ail the service itself: reasons that health and status give beside the state of the calibration.
+
+One table: `docs/operations.md` and the advice of `coec doctor` are made of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """What it means, and what to do about it."""
+
+    meaning: str
+    advice: str
+
+
+TROUBLES: Mapping[str, Trouble] = {
+    "no_router": Trouble(
+        "There is no router: no frames come in, and nobody is answered.",
+        "Start it, or see to the network; `coec doctor` tells how far one gets. The service connects by itself.",
+    ),
+    "insecure": Trouble(
+        "The service listens where whoever comes is let in without a certificate.",
+        "Listen on loopback or on TLS with client certificates, and take `zenoh.insecure` out.",
+    ),
+    "http_unavailable": Trouble(
+        "Metrics are not served over HTTP: the address cannot be had.",
+        "Free the port or name another in `metrics.http`, and reload.",
+    ),
+    "http_insecure": Trouble(
+        "Other computers can read the metrics over HTTP.",
+        "Listen on loopback, and take `metrics.insecure` out.",
+    ),
+    "worker_failed": Trouble(
+        "The process that infers and solves has ended and is being replaced.",
+        "Nothing, once; if it goes on, see to its memory (`worker.max_memory_bytes`) and to the log.",
+    ),
+    "recording_failed": Trouble(
+        "The last window could not be written; the next one is tried.",
+        "See to the disk of `state.directory`: room, owner, errors.",
+    ),
+    "recording_stuck": Trouble(
+        "The disk does not answer: no window can be written.",
+        "See to the disk of `state.directory`; `coec doctor` measures it.",
+    ),
+    "state_damaged": Trouble(
+        "What was remembered cannot be used and is kept beside; nominal is served.",
+        "Calibrate, or restore the file from a backup; look into the disk.",
+    ),
+    "history_damaged": Trouble(
+        "The chain of the history is broken; what there was is kept beside.",
+        "Look into who may write the state directory, and into the disk.",
+    ),
+    "baseline_damaged": Trouble(
+        "The baseline of the rig cannot be read; limits are those of the configuration.",
+        "Commission the rig again, or restore the file.",
+    ),
+    "baseline_mismatch": Trouble(
+        "The baseline of the rig was learned with another rig, network or configuration, and is not used.",
+        "Commission the rig again, or go back to what it was learned with.",
+    ),
+    "monitor_blind": Trouble(
+        "Check after check comes to nothing.",
+        "Read the reason: it names what fails; see to frames and network.",
+    ),
+    "windows_in_vain": Trouble(
+        "Window after window comes to nothing.",
+        "Read the reason: it names what fails; see to frames and network.",
+    ),
+    "overdue_worker": Trouble(
+        "No check has been completed for three periods: the worker has not answered.",
+        "Nothing while it starts; else see to its load and to the log.",
+    ),
+    "overdue_depth": Trouble(
+        "No check has been completed for three periods: no depth comes.",
+        "See to the depth network, or to the depth maps that come with the frames.",
+    ),
+    "overdue_pairing": Trouble(
+        "No check has been completed for three periods: frames come and make no pairs.",
+        "See to the clocks of camera and LiDAR: `coec doctor` tells how far they are apart.",
+    ),
+    "overdue_data": Trouble(
+        "No check has been completed for three periods: frames do not come, are refused, or are too few.",
+        "See to the sensors, their keys and the router's rules: `coec doctor` listens.",
+    ),
+    "service_stuck": Trouble(
+        "What is known of the pair is not renewed: a disk or a thread is stuck.",
+        "The service manager restarts the service if it stays so; see to the disk.",
+    ),
+    "thread_died": Trouble(
+        "A thread of the service has died; the service ends with exit code 70.",
+        "The service manager starts it again; report the traceback in the log.",
+    ),
+    "two_daemons": Trouble(
+        "Another daemon serves the vehicle; this one ends with exit code 75.",
+        "End one of the two, or give them different vehicles.",
+    ),
+    "held": Trouble(
+        "A person holds the extrinsic as it is; nothing ails the service.",
+        "`coec query command/hold --payload '{\"release\": true}'` releases it.",
+    ),
+}
+"""By the code of the reason."""

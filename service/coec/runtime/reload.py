@@ -1,0 +1,112 @@
+"""What of a changed configuration a running service takes, and what waits for its next start.
+
+A value is taken only where everything that depends on it can go on without a break: limits, rules, the length of
+windows. What streams, files, networks or sessions were opened with stays until they are opened anew.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from coec.adapters.files.rig import rig_of
+from coec.adapters.zenoh.settings import settings_of
+from coec.config import Config, PairConfig, config_hash
+
+RELOADED: Mapping[str, str] = {
+    "log.*": "at once in the service; its worker logs as it was started until the next start",
+    "metrics.*": "at once; where the new address cannot be had, nobody listens, and status says so",
+    "stale_after_s": "with the next look at the clocks, within a second",
+    "state.max_bytes": "with the next window",
+    "state.max_age_days": "with the next window",
+    "state.min_free_bytes": "with the next window",
+    "pairs.*.window.*": "with the next slice; the open one ends as it began",
+    "pairs.*.calibration.objective.*": "with the next check and the next window",
+    "pairs.*.calibration.search.*": "with the next check and the next window",
+    "pairs.*.calibration.verdict.*": "with the next check and the next window",
+    "pairs.*.calibration.time_offset.*": "with the next check and the next window",
+    "pairs.*.calibration.motion_compensation": "with the next check and the next window",
+    "pairs.*.monitor.hours_between_*": "with the next answer that is judged",
+    "pairs.*.policy.*": "with the next answer that is judged",
+    "pairs.*.tracker.*": "with the next answer that is judged",
+}
+"""Values that are taken, as patterns of their places, and when. All others wait for a restart."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reload:
+    """What a configuration that was read again comes to.
+
+    Attributes:
+        config: what holds from now on.
+        taken, waiting: places of values that differ from before, as `pairs.front.policy.apply`: those that hold now,
+            and those that wait for a restart.
+    """
+
+    config: Config
+    taken: tuple[str, ...]
+    waiting: tuple[str, ...]
+
+
+def reload_of(running: Config, read: Config) -> Reload:
+    """What of `read` a service with `running` takes.
+
+    Raises:
+        ConfigError: `read` could not be started with: nothing of it is to be taken.
+    """
+    settings_of(read.zenoh, read.limits)
+    for pair in read.pairs:
+        rig_of(pair)
+    old, new = _by_name(running.model_dump()), _by_name(read.model_dump())
+    taken: list[str] = []
+    waiting: list[str] = []
+    for names in _differences(old, new):
+        if _is_reloaded(names):
+            taken.append(".".join(names))
+            _put(old, new, names)
+        else:
+            waiting.append(".".join(names))
+    pairs = list(old["pairs"].values())
+    return Reload(Config.model_validate({**old, "pairs": pairs}), tuple(taken), tuple(waiting))
+
+
+def settings_hash(pair: PairConfig) -> str:
+    """Of everything that decides about a pair: stands in its windows, and in its history where it changed."""
+    return config_hash(pair.window, pair.calibration, pair.monitor, pair.policy, pair.tracker)
+
+
+def differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
+    """Places at which two configurations differ, both in JSON-like values."""
+    return tuple(".".join(names) for names in _differences(_by_name(old), _by_name(new)))
+
+
+def _by_name(document: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration with its pairs by their names."""
+    return {**document, "pairs": {pair["name"]: pair for pair in document["pairs"]}}
+
+
+def _differences(old: Any, new: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Places at which two documents differ; what only one of them has is one place."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in dict.fromkeys((*old, *new)):
+            yield from _differences(old.get(name), new.get(name), (*names, name))
+    elif old != new:
+        yield names
+
+
+def _is_reloaded(names: tuple[str, ...]) -> bool:
+    """Chunk by chunk: the name of a pair may hold dots."""
+    for pattern in RELOADED:
+        chunks = pattern.split(".")
+        if len(chunks) == len(names) and all(map(fnmatch.fnmatchcase, names, chunks)):
+            return True
+    return False
+
+
+def _put(old: dict[str, Any], new: dict[str, Any], names: tuple[str, ...]) -> None:
+    """Take one value over."""
+    for name in names[:-1]:
+        old, new = old[name], new[name]
+    old[names[-1]] = new[names[-1]]

@@ -1,0 +1,144 @@
+"""The pages over HTTP: right requests are answered whatever the others do."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import socket
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from coec.adapters.system import http as served
+from coec.adapters.system.http import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpServer, Page
+from coec.errors import UnavailableError
+from fakes import wait_until
+from ports import free_port
+
+BODY = b"x" * 3_000_000
+"""Larger than what the system takes at once."""
+
+ENDLESS = b"x" * 32_000_000
+"""Larger than what it takes at all, while nobody reads."""
+
+PATIENCE_S = 20.0
+
+
+def find(path: str) -> Page | None:
+    if path == "/broken":
+        raise RuntimeError("of the test")
+    body = {"/page": BODY, "/endless": ENDLESS}.get(path)
+    return None if body is None else Page(200, body, "text/plain")
+
+
+@pytest.fixture
+def server() -> Iterator[HttpServer]:
+    made = HttpServer("127.0.0.1", free_port(), find)
+    made.thread.start()
+    yield made
+    assert made.close(PATIENCE_S)
+    assert made.thread.failure is None
+
+
+def port_of(server: HttpServer) -> int:
+    return int(server._listener.getsockname()[1])
+
+
+def get(server: HttpServer, path: str, method: str = "GET") -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port_of(server), timeout=PATIENCE_S)
+    connection.request(method, path)
+    answer = connection.getresponse()
+    told = answer.status, answer.read()
+    connection.close()
+    return told
+
+
+def opened(server: HttpServer, sent: bytes = b"") -> socket.socket:
+    made = socket.create_connection(("127.0.0.1", port_of(server)), PATIENCE_S)
+    made.sendall(sent)
+    return made
+
+
+def test_a_page_is_answered_and_everything_else_is_not_found(server: HttpServer) -> None:
+    assert get(server, "/page") == (200, BODY)
+    assert get(server, "/page?from=a-scraper") == (200, BODY)
+    assert get(server, "/")[0] == get(server, "/page/")[0] == get(server, "/../page")[0] == 404
+    assert get(server, "/page", "POST")[0] == 404
+    assert get(server, "/broken")[0] == 500, "and the server goes on"
+    assert get(server, "/page")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        b"\r\n\r\n",
+        b"GET /page\r\n\r\n",
+        b"GET /page SMTP/1.0\r\n\r\n",
+        bytes(range(256)) + b"\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\r\n\r\n",
+    ],
+)
+def test_what_is_no_request_is_told_so(server: HttpServer, request_: bytes) -> None:
+    with opened(server, request_) as client:
+        assert client.recv(100).startswith(b"HTTP/1.1 400 ")
+
+
+def test_a_request_that_has_no_end_is_cut_short(server: HttpServer) -> None:
+    with opened(server, b"GET /page HTTP/1.1\r\nX: " + b"a" * MAX_REQUEST_BYTES) as client:
+        assert client.recv(100).startswith(b"HTTP/1.1 400 ")
+
+
+@pytest.mark.fault(
+    "clients of the HTTP page that send a byte now and then, and more of them than it takes",
+    "a scraper is answered all the same, and they are dropped",
+)
+def test_slow_clients_keep_nobody_waiting(
+    server: HttpServer, monkeypatch: pytest.MonkeyPatch, record_property: Callable[[str, object], None]
+) -> None:
+    monkeypatch.setattr(served, "DEADLINE_S", 0.5)
+    slow = [opened(server, b"GET /page HT") for _ in range(3 * MAX_CONNECTIONS)]
+    begun_s = time.monotonic()
+    assert get(server, "/page") == (200, BODY)
+    record_property("figure", f"{1e3 * (time.monotonic() - begun_s):.0f} ms")
+    assert len(server._connections) <= MAX_CONNECTIONS
+    for client in slow:
+        assert _ends(client)
+        client.close()
+    assert server._connections == []
+
+
+def test_who_reads_nothing_is_dropped(server: HttpServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(served, "DEADLINE_S", 0.3)
+    with opened(server, b"GET /endless HTTP/1.1\r\n\r\n") as client:
+        assert client.recv(15) == b"HTTP/1.1 200 OK"
+        wait_until(lambda: server._connections == [], "the end of a connection that is not read", PATIENCE_S)
+        assert _received(client) < len(ENDLESS)
+
+
+def test_many_at_once_are_all_answered(server: HttpServer) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        told = list(pool.map(lambda _: get(server, "/page")[0], range(40)))
+    assert told == [200] * 40
+
+
+def test_a_port_that_is_taken_is_told() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(UnavailableError, match="nobody can listen"):
+        HttpServer("127.0.0.1", other.getsockname()[1], find)
+
+
+def _ends(client: socket.socket) -> bool:
+    try:
+        return client.recv(1) == b""
+    except ConnectionError:
+        return True
+
+
+def _received(client: socket.socket) -> int:
+    """Bytes until the connection ends, in whatever way."""
+    received = 0
+    with contextlib.suppress(ConnectionError):
+        while part := client.recv(2**16):
+            received += len(part)
+    return received

@@ -1,0 +1,74 @@
+"""The log: one line a record, as JSON or for people, whatever a sender had a hand in."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import re
+from collections.abc import Iterator
+from typing import TextIO
+
+import pytest
+
+from coec.adapters.system import logs
+from coec.adapters.system.logs import Form
+
+NASTY = "two\nlines \x1b[31mred\x1b[0m\r and a \u202ebackwards"
+
+
+@pytest.fixture(autouse=True)
+def _root() -> Iterator[None]:
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+
+
+def logged(form: Form, stream: TextIO) -> None:
+    logs.configure("info", form, stream)
+    logging.getLogger("test").warning(NASTY, extra={"fields": {"pair": "front", "level": "forged"}})
+    logging.getLogger("test").debug("not at this level")
+
+
+def test_a_record_is_one_line_of_json() -> None:
+    stream = io.StringIO()
+    logged("auto", stream)  # it goes to no terminal
+    (line,) = stream.getvalue().splitlines()
+    document = json.loads(line)
+    assert (document["message"], document["pair"], document["level"]) == (NASTY, "front", "warning")
+
+
+def test_for_people_it_is_one_line_that_moves_no_cursor() -> None:
+    stream = io.StringIO()
+    logged("human", stream)
+    (line,) = stream.getvalue().splitlines()
+    assert re.match(r"\d\d:\d\d:\d\d\.\d{3} warning: two\\nlines ", line), line
+    assert line.isprintable()
+    assert "pair=front" in line
+
+
+def test_where_it_goes_to_a_terminal_it_is_for_people() -> None:
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs, "w") as terminal:
+        logged("auto", terminal)
+        terminal.flush()
+        assert b" warning: two" in os.read(ours, 4096)
+        logged("json", terminal)
+        terminal.flush()
+        assert json.loads(os.read(ours, 4096))["pair"] == "front"
+    os.close(ours)
+
+
+def test_a_traceback_follows_its_line() -> None:
+    stream = io.StringIO()
+    logs.configure("info", "human", stream)
+    try:
+        raise ValueError("of the test")
+    except ValueError:
+        logging.getLogger("test").exception("it failed")
+    line, *traceback = stream.getvalue().splitlines()
+    assert line.endswith("error: it failed")
+    assert traceback[-1] == "ValueError: of the test"

@@ -1,0 +1,123 @@
+"""What is told over HTTP: a calibration that may be used is 200, one that is not known to be right is 503."""
+
+from __future__ import annotations
+
+import json
+import logging
+import socket
+from collections.abc import Iterator
+
+import pytest
+from pydantic import ValidationError
+
+from coec.adapters.system.http import Page
+from coec.config import MetricsConfig
+from coec.runtime.api.http_door import HttpDoor
+from coec.runtime.api.pages import pages
+from coec.runtime.api.router_watch import RouterWatch
+from ports import free_port
+from runtime.api.test_metrics import a_health, a_status
+
+
+def health_page(state: str, **healths: tuple[str, int]) -> Page:
+    known = {name: a_health(*health) for name, health in healths.items()}
+    page = pages(lambda: b"", lambda: a_status(state), lambda: known)("/health")
+    assert page is not None
+    return page
+
+
+def test_health_is_good_when_every_pair_may_be_used() -> None:
+    assert health_page("running", front=("healthy", 0), rear=("suspect", 1)).status == 200
+    for state, level in (("miscalibrated", 2), ("stale", 3), ("unknown", 3)):
+        page = health_page("running", front=("healthy", 0), rear=(state, level))
+        assert page.status == 503
+        assert json.loads(page.body)["pairs"]["rear"]["state"] == state
+    assert health_page("starting", front=("healthy", 0)).status == 503
+
+
+def test_there_are_two_pages() -> None:
+    find = pages(lambda: b"figures", a_status, dict)
+    metrics = find("/metrics")
+    assert metrics is not None
+    assert (metrics.body, metrics.content_type.partition(";")[0]) == (b"figures", "application/openmetrics-text")
+    assert [find(path) for path in ("/", "/metrics/", "/config", "")] == [None] * 4
+
+
+@pytest.mark.parametrize("http", ["127.0.0.1:9464", "localhost:9464", "[::1]:9464", "127.8.8.8:1"])
+def test_loopback_is_nobody_elses(http: str) -> None:
+    assert not MetricsConfig(http=http).is_open
+
+
+@pytest.mark.parametrize("http", ["0.0.0.0:9464", "[::]:9464", "10.0.0.1:9464", "vehicle:9464"])
+@pytest.mark.fault("metrics over HTTP that other computers reach", "refused unless `metrics.insecure` spells it out")
+def test_an_open_door_is_refused_unless_spelled_out(http: str) -> None:
+    with pytest.raises(ValidationError, match=r"metrics\.insecure"):
+        MetricsConfig(http=http)
+    assert MetricsConfig(http=http, insecure=True).is_open
+
+
+@pytest.mark.parametrize("http", ["9464", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:70000", "::1:9464", "a b:1", ":9464"])
+def test_what_is_no_address_is_refused(http: str) -> None:
+    with pytest.raises(ValidationError, match="HOST:PORT"):
+        MetricsConfig(http=http, insecure=True)
+
+
+@pytest.fixture
+def door() -> Iterator[HttpDoor]:
+    made = HttpDoor(lambda _: Page(200, b"", "text/plain"))
+    yield made
+    assert made.close(20.0)
+
+
+def answers(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), 1.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def test_the_door_follows_the_configuration(door: HttpDoor) -> None:
+    first, second = free_port(), free_port()
+    door.use(MetricsConfig(http=f"127.0.0.1:{first}"))
+    assert answers(first)
+    door.use(MetricsConfig(http=f"127.0.0.1:{second}"))
+    assert (answers(first), answers(second)) == (False, True)
+    door.use(MetricsConfig())
+    assert not answers(second)
+    assert door.trouble is None
+
+
+def test_a_taken_port_is_a_trouble_and_no_end(door: HttpDoor) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        door.use(MetricsConfig(http=f"127.0.0.1:{port}"))
+        assert door.server is None
+        assert door.trouble is not None
+        assert door.trouble.code == "http_unavailable"
+    door.use(MetricsConfig(http=f"127.0.0.1:{port}"))  # asked again, it is tried again
+    assert door.trouble is None
+    assert answers(port)
+
+
+def test_a_router_that_is_away_is_told_once_each_time(caplog: pytest.LogCaptureFixture) -> None:
+    there = iter([False, False, True, True, False, True])
+    watch = RouterWatch(("tcp/10.0.0.1:7447",), lambda: next(there))
+    codes = []
+    with caplog.at_level(logging.INFO):
+        for _ in range(6):
+            watch.look()
+            codes.append(watch.trouble and watch.trouble.code)
+    assert codes == ["no_router", "no_router", None, None, "no_router", None]
+    assert caplog.messages == [
+        "no router at tcp/10.0.0.1:7447, trying again",
+        "the router at tcp/10.0.0.1:7447 is there",
+        "the router has gone: none at tcp/10.0.0.1:7447, trying again",
+        "the router at tcp/10.0.0.1:7447 is there",
+    ]
+
+
+def test_who_is_the_router_itself_misses_none() -> None:
+    watch = RouterWatch((), lambda: False)
+    watch.look()
+    assert watch.trouble is None
