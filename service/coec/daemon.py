@@ -20,7 +20,7 @@ from types import FrameType
 from typing import Literal
 
 from coec import __version__
-from coec.adapters.system import logs
+from coec.adapters.system import allocator, logs
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
@@ -169,7 +169,9 @@ class Daemon:
         _log.info("serving", extra={"fields": {**fields, "pairs": list(self._pairs)}})
 
     def _tick(self) -> int:
-        """Once a second: look at every thread, renew what is served. Returns an exit status, 0 to go on."""
+        """Once a second: look at every thread, renew what is served, keep no memory that nobody uses. Returns an exit
+        status, 0 to go on."""
+        allocator.give_back()
         threads = self._threads()
         dead = [thread for thread in threads if thread.dead]
         if dead:

@@ -14,7 +14,8 @@ from coec.config import Config, PairConfig
 from coec.runtime.handover import Handover
 from coec.runtime.ingest.chooser import Chooser, Served
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
-from coec.runtime.ingest.inbox import Call, Inbox
+from coec.runtime.ingest.frame_budget import FrameBudget
+from coec.runtime.ingest.inbox import Call, Inbox, Parcel
 from coec.runtime.ingest.pair_buffer import PairBuffer
 from coec.runtime.ingest.sensor_clock import NS_PER_S, SensorClock
 from coec.runtime.ingest.stream_statistics import StreamStatistics
@@ -22,10 +23,14 @@ from coec.runtime.ingest.stream_statistics import StreamStatistics
 T = TypeVar("T")
 
 FRAMES_WAITING = 16
-"""Samples of camera or LiDAR that may wait for the ingest thread: 1.6 s at 10 Hz, some 40 MB in all."""
+"""Samples of camera or LiDAR that may wait for the ingest thread: 1.6 s at 10 Hz."""
 
 MOTIONS_WAITING = 512
 """Ego-motion samples that may wait: 2.5 s at 200 Hz."""
+
+ALL_FRAMES = 1.5
+"""Bytes of all frames that a pair may have in memory, in those that may be held: the others wait for their partner, the
+disk or the worker, 25 pairs of 2.5 MB."""
 
 GRACE_NS = NS_PER_S
 """Sensor time after the end of a slice before silence ends it: late pairs may still be on their way."""
@@ -42,7 +47,7 @@ class Stream:
     ) -> None:
         """`has_room()` says whether the recorder would take a chosen pair now."""
         depths = {CAMERA: FRAMES_WAITING, LIDAR: FRAMES_WAITING, EGO: MOTIONS_WAITING}
-        self.inbox = Inbox(depths, lambda stream: losses.add(stream, "overrun"))
+        self.inbox = Inbox(depths, config.limits.max_waiting_bytes, lambda stream: losses.add(stream, "overrun"))
         self.thread = ServiceThread(f"ingest-{pair.name}", self._run)
         self.report = StreamStatistics()
         self._chooser = chooser
@@ -51,6 +56,8 @@ class Stream:
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._clock = SensorClock()
         self._held = PairBuffer(config.limits.max_held_bytes, config.worker.timeout_s)
+        self._budget = FrameBudget(round(ALL_FRAMES * config.limits.max_held_bytes))
+        self._losses = losses
         self._pairs = 0
         self._sync_error_s: float | None = None
 
@@ -124,13 +131,20 @@ class Stream:
             if isinstance(item, Call):
                 item.run()
             elif item is not None:
-                frame = self._decoder.frame(item)
-                if frame is not None:
-                    self.take(self._pairer.push(frame))
+                self._take_frame(item)
             self.choose_next()
             if item is None:
                 self._end_in_silence()
             self.tell()
+
+    def _take_frame(self, parcel: Parcel) -> None:
+        frame = self._decoder.frame(parcel)
+        if frame is None:
+            return
+        if not self._budget.admit(frame):
+            self._losses.add(parcel.stream, "memory_full")
+            return
+        self.take(self._pairer.push(frame))
 
     def _may_choose(self) -> bool:
         """Whether the next pair has come, and all is judged that has to be before it is looked at; or it has waited for
