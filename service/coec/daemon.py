@@ -20,6 +20,7 @@ from types import FrameType
 from typing import Literal
 
 from coec import __version__
+from coec.adapters.files.scribe import Scribe
 from coec.adapters.system import allocator, logs
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
@@ -60,7 +61,7 @@ STALLED_S = 20.0
 """A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed."""
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
-INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S = 2.0, 4.0, 2.0
+INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 1.5
 QUERIES_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 1.5, 3.0, 1.0
 
 
@@ -112,7 +113,8 @@ class Daemon:
         self._bus = Bus(session)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         store = StateStore(config.state.directory, config.vehicle)
-        outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
+        self._scribe = Scribe(config.state.directory)
+        outside = Outside(self._keys, store, self._scribe, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
@@ -144,7 +146,8 @@ class Daemon:
 
     def _start(self) -> None:
         deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
-        for thread in (self._presence.thread, self._bus.thread, self._bus.drawing_thread, *deciding):
+        answering = (self._presence.thread, self._bus.thread, self._bus.drawing_thread)
+        for thread in (self._scribe.thread, *answering, *deciding):
             thread.start()
         self._worker.start()
         config = Snapshot.of_document(
@@ -194,7 +197,7 @@ class Daemon:
             if dead:
                 return EXIT_THREAD_DIED
             return CoecError.exit_code if self._presence.rival is None else UnavailableError.exit_code
-        if all(thread.silence_s < STALLED_S for thread in threads):
+        if all(thread.silence_s < STALLED_S for thread in self._prompt_threads()):
             self._notifier.watchdog()
         return 0
 
@@ -214,6 +217,7 @@ class Daemon:
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
             ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
+            ("write all books", self._end_scribe),
             ("end the answers", lambda: _stopped(answering, QUERIES_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
         )
@@ -230,6 +234,10 @@ class Daemon:
         for pair in pairs:
             part(pair).request_stop()
         _joined([part(pair).thread for pair in pairs], within_s)
+
+    def _end_scribe(self) -> None:
+        self._scribe.request_stop()
+        _joined([self._scribe.thread], SCRIBE_STOP_S)
 
     def _finish_windows(self) -> None:
         """Of the pairs whose stream has ended: nobody else may touch its open window."""
@@ -261,14 +269,21 @@ class Daemon:
         """What ails every pair alike."""
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
-        return tuple(reason for reason in (self._fault, failing, self._insecure) if reason is not None)
+        reasons = (self._fault, failing, self._scribe.trouble, self._insecure)
+        return tuple(reason for reason in reasons if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
 
     def _threads(self) -> list[ServiceThread]:
-        pairs = self._pairs.values()
-        own = [thread for pair in pairs for thread in pair.threads]
-        return [self._presence.thread, self._bus.thread, self._bus.drawing_thread, self._worker.thread, *own]
+        """All of them."""
+        recorders = [pair.recorder.thread for pair in self._pairs.values()]
+        return [*self._prompt_threads(), self._scribe.thread, self._bus.drawing_thread, *recorders]
+
+    def _prompt_threads(self) -> list[ServiceThread]:
+        """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
+        restart would make it quicker, and none is asked for."""
+        own = [thread for pair in self._pairs.values() for thread in pair.threads]
+        return [self._presence.thread, self._bus.thread, self._worker.thread, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()

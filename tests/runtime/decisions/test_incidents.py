@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coec.adapters.files.conversions import transform_of
-from coec.errors import NotFoundError
+from coec.errors import NotFoundError, StateError
 from coec.runtime.decisions.incidents import POINTS_AFTER, POINTS_KEPT, Incidents
 from coec.schemas.replies import EvidenceEvent, MetricsPoint, Reason
 from disks import EVERYTHING, Disk
@@ -55,6 +55,8 @@ def test_windows_pictures_and_the_end_are_added_and_survive_a_restart(tmp_path: 
     evidence.add_overlay("front-1000", "after", b"jpeg")
     evidence.resolve(2000, "healthy: corrected")
     evidence.resolve(3000, "again")
+    assert evidence.overlay("front-1000", "after") == b"jpeg"
+    evidence.flush()
     again = Incidents(tmp_path, "front", 3)
     kept = again.event("front-1000")
     assert (kept.window_before, kept.window_after, kept.overlays) == ("front-1", "front-2", ("after",))
@@ -71,13 +73,16 @@ def test_the_oldest_goes_when_there_are_too_many(tmp_path: Path) -> None:
     evidence = Incidents(tmp_path, "front", 2)
     for stamp in (1000, 900, 30_000):
         evidence.begin(event(stamp, f"front-{stamp - 1}"))
+        evidence.flush()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["front-30000", "front-900"]
     assert evidence.window_ids == {"front-899", "front-29999"}
     assert [e.event_id for e in Incidents(tmp_path, "front", 2).listing("test").events] == ["front-900", "front-30000"]
 
 
 def test_damaged_and_foreign_folders_are_passed_over(tmp_path: Path) -> None:
-    Incidents(tmp_path, "front", 2).begin(event(1000))
+    evidence = Incidents(tmp_path, "front", 2)
+    evidence.begin(event(1000))
+    evidence.flush()
     (tmp_path / "front-2000").mkdir()
     (tmp_path / "front-2000" / "event.json").write_text("{")
     (tmp_path / "front-1000").rename(tmp_path / "front-3000")
@@ -88,14 +93,16 @@ def test_a_disk_that_cannot_be_written_costs_evidence_only(tmp_path: Path) -> No
     (tmp_path / "evidence").write_text("a file")
     evidence = Incidents(tmp_path / "evidence", "front", 2)
     evidence.begin(event(1000))
-    assert evidence.lost == 1
+    with pytest.raises(StateError, match="evidence"):
+        evidence.flush()
     assert evidence.event("front-1000").window_before == "front-1"
     (tmp_path / "evidence").unlink()
     evidence.note(point(1001))
+    evidence.flush()
     assert Incidents(tmp_path / "evidence", "front", 2).event("front-1000").metrics == (point(1001),)
 
 
-def test_an_event_that_could_not_be_written_is_written_with_the_next_check_however_late(
+def test_an_event_that_could_not_be_written_is_written_later_however_late(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = Disk(tmp_path, monkeypatch)
@@ -104,9 +111,10 @@ def test_an_event_that_could_not_be_written_is_written_with_the_next_check_howev
     evidence.begin(event(1000))
     for stamp in range(POINTS_AFTER):
         evidence.note(point(stamp))
-    assert evidence.lost == 1 + POINTS_AFTER
+        with pytest.raises(StateError, match="No space"):
+            evidence.flush()
     disk.refuses = ()
-    evidence.note(point(9000))
+    evidence.flush()
     assert len(Incidents(tmp_path, "front", 2).event("front-1000").metrics) == POINTS_AFTER
 
 
@@ -114,6 +122,7 @@ def test_half_an_event_of_a_power_cut_is_removed_and_too_many_are_bounded_at_the
     evidence = Incidents(tmp_path, "front", 3)
     for stamp in (1000, 2000, 3000):
         evidence.begin(event(stamp))
+    evidence.flush()
     for name in ("front-4000", "front-left-5000", "front-notes"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "before.jpg").write_bytes(b"jpeg")
@@ -144,7 +153,7 @@ def test_a_power_cut_at_any_byte_takes_no_evidence_that_was_written(
         evidence = Incidents(tmp_path / "disk", "front", 2)
         for number, step in enumerate(steps):
             step(evidence)
-            assert evidence.lost == 0
+            evidence.flush()
             disk.acknowledge(number)
     count = 0
     for count, cut in enumerate(disk.power_cuts()):

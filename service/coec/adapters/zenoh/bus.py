@@ -65,7 +65,7 @@ class Answer:
 @dataclass(frozen=True, slots=True)
 class Route:
     """Who answers a key. `quick` answers take microseconds and are given on Zenoh's thread. Those that `draws` may wait
-    for the worker, and keep nobody waiting but each other."""
+    for the worker or for a file, and keep nobody waiting but each other."""
 
     key: str
     answer: Callable[[Request], Answer]

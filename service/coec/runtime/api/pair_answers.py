@@ -123,6 +123,7 @@ class PairAnswers:
     def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
         """Past results and other entries with a sensor stamp in the bounds, the newest `limit` of each; entries that
         have none are dated by the wall clock."""
+        self._store.is_on_disk()  # what is told is what a restart knows, where the disk allows it
         entries, results = self._store.history.entries(), self._store.history.results()
 
         def inside(kept: replies.HistoryEntry) -> bool:
@@ -160,6 +161,7 @@ class PairAnswers:
         Raises:
             NotFoundError: no such event.
         """
+        self._store.is_on_disk()
         return self._store.incidents.event(event_id)
 
     def event_overlay(self, event_id: str, side: Side) -> bytes:

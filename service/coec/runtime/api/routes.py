@@ -80,11 +80,11 @@ class VehicleAnswers:
             return matching if key.endswith("/overlay") else [route for route in matching if not route.draws]
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
-            return [Route(key, self._window(self._pairs[pair], address.argument), quick=False)]
+            return [Route(key, self._window(self._pairs[pair], address.argument), quick=False, draws=True)]
         if address.resource == "command":
             return [Route(key, self._command(self._commands[pair], str(address.argument)), quick=False)]
         if address.resource == "evidence" and address.argument is not None:
-            return [Route(key, self._evidence(self._pairs[pair], address.argument), quick=False)]
+            return [Route(key, self._evidence(self._pairs[pair], address.argument), quick=False, draws=True)]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_unknown(self, key: str) -> Sequence[Route]:

@@ -33,7 +33,7 @@ from coec.runtime.decisions.rig_baseline import RigBaseline
 from coec.runtime.ingest.chooser import Served
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.recording.window_index import WindowVersion
-from coec.runtime.recording.window_store import WindowStore, start_ns_of
+from coec.runtime.recording.window_store import start_ns_of
 from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved, WrittenFile
 from coec.runtime.worker.queue import STOPPING
 from coec.schemas.replies import CalibrationResult, CheckReply
@@ -105,7 +105,6 @@ class Decider:
         baseline: RigBaseline,
         queue: DecisionQueue,
         pictures: IncidentPictures,
-        windows: WindowStore,
         stream: StreamSide,
         mailbox: Mailbox,
         losses: LossCounter,
@@ -121,7 +120,6 @@ class Decider:
         self._baseline = baseline
         self._queue = queue
         self._pictures = pictures
-        self._windows = windows
         self._stream = stream
         self._mailbox = mailbox
         self._losses = losses
@@ -185,7 +183,8 @@ class Decider:
         return item is not None
 
     def tell_now(self) -> None:
-        """Tell what is known, without waiting for the clock."""
+        """Tell what is known, without waiting for the clock; once it is on the disk, if that takes it."""
+        self._store.is_on_disk()
         self._tell(self.known())
 
     def look_at_clocks(self, monotonic_s: float) -> None:
@@ -196,7 +195,7 @@ class Decider:
             self._losses.add("monitor", "unanswered", lost)
         self._overdue = self._progress.overdue(self._stream.report, monotonic_s)
         self._store.age(self._overdue, self._progress.silent_s(monotonic_s), self._stale_after_s)
-        self._tell(self.known())
+        self.tell_now()
 
     # --- answers ----------------------------------------------------------------------------------------------------
 
@@ -324,7 +323,7 @@ class Decider:
             pairs=file.pairs,
             decision=result.verdict.decision,
         )
-        self._windows.note(result.window_id, version)
+        self._store.note_window(result.window_id, version)
 
     def _judge(self, result: CalibrationResult) -> Effect | None:
         estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)
