@@ -34,7 +34,7 @@ class Ledger(Generic[T]):
         self._writing = threading.Lock()
         self._content: tuple[T, ...] = ()
         self._log = Log(path, limit, lambda: map(line_of, self._content))
-        self._durable: T | None = None
+        self._on_disk: tuple[T, ...] = ()
 
     def load(self) -> list[bytes]:
         """The whole lines of the file; see `Log.load`. To be called before the ledger is used by several threads, as
@@ -48,7 +48,7 @@ class Ledger(Generic[T]):
     def found(self, item: T) -> None:
         """An item was in the file."""
         self._kept.append(item)
-        self._durable = item
+        self._on_disk = tuple(self._kept)
 
     def renew(self) -> None:
         """The file is not what it shall be: the next `flush` writes it anew."""
@@ -58,7 +58,11 @@ class Ledger(Generic[T]):
     @property
     def durable(self) -> T | None:
         """The newest item that is on the disk; None before the first."""
-        return self._durable
+        return self._on_disk[-1] if self._on_disk else None
+
+    def on_disk(self) -> tuple[T, ...]:
+        """All that are on the disk, oldest first."""
+        return self._on_disk
 
     def items(self) -> tuple[T, ...]:
         """All that are kept, oldest first."""
@@ -92,5 +96,4 @@ class Ledger(Generic[T]):
             for item in waiting:
                 self._log.add(self._line_of(item))
             self._log.flush()
-            if self._content:
-                self._durable = self._content[-1]
+            self._on_disk = self._content

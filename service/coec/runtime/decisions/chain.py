@@ -78,6 +78,10 @@ class Chain:
         """All that are kept."""
         return self._ledger.items()
 
+    def on_disk(self) -> tuple[Kept, ...]:
+        """All that are on the disk."""
+        return self._ledger.on_disk()
+
     def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
         """Keep one more; its place in the chain is filled in, its number is its own or, where that is taken, the next.
         On the disk with the next `flush`."""

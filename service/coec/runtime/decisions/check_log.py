@@ -29,6 +29,10 @@ class CheckLog:
         """All that are kept."""
         return self._ledger.items()
 
+    def on_disk(self) -> tuple[CheckReply, ...]:
+        """All that are on the disk."""
+        return self._ledger.on_disk()
+
     def append(self, check: CheckReply) -> None:
         """Keep one more; on the disk with the next `flush`."""
         self._ledger.add(lambda _: check)

@@ -40,6 +40,9 @@ from coec.schemas.replies import CalibrationResult, CheckReply
 
 _log = logging.getLogger(__name__)
 
+UNTOLD_S = 0.02
+"""Between two attempts to tell what the disk is about to take."""
+
 TICK_S = 1.0
 """Longest time between two looks at the clocks; health is never older than that while the thread lives."""
 
@@ -133,6 +136,7 @@ class Decider:
         self._check_attempts = Attempts("checks", "monitor_blind")
         self._window_attempts = Attempts("windows", "windows_in_vain")
         self._overdue: Reason | None = None
+        self._untold = False
 
     def request_stop(self) -> None:
         """Take what has come, and end the thread."""
@@ -174,17 +178,17 @@ class Decider:
 
     def work(self, timeout_s: float) -> bool:
         """Do the next piece of work, or look at the clocks when there is none for so long; whether there was one."""
-        item = self._mailbox.take(timeout_s)
+        item = self._mailbox.take(UNTOLD_S if self._untold else timeout_s)
         if item is not None:
             item()
         now_s = time.monotonic()
-        if item is not None or now_s - self._looked_s >= TICK_S:
+        if item is not None or self._untold or now_s - self._looked_s >= TICK_S:
             self.look_at_clocks(now_s)
         return item is not None
 
     def tell_now(self) -> None:
-        """Tell what is known, without waiting for the clock; once it is on the disk, if that takes it."""
-        self._store.is_on_disk()
+        """Tell what is known, whatever waits."""
+        self._untold = False
         self._tell(self.known())
 
     def look_at_clocks(self, monotonic_s: float) -> None:
@@ -195,7 +199,10 @@ class Decider:
             self._losses.add("monitor", "unanswered", lost)
         self._overdue = self._progress.overdue(self._stream.report, monotonic_s)
         self._store.age(self._overdue, self._progress.silent_s(monotonic_s), self._stale_after_s)
-        self.tell_now()
+        # What a restart would not know is not told, while the disk is only busy.
+        self._untold = not self._store.may_be_told()
+        if not self._untold:
+            self.tell_now()
 
     # --- answers ----------------------------------------------------------------------------------------------------
 

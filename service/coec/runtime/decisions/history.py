@@ -12,7 +12,7 @@ came.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -58,8 +58,11 @@ class History:
 
     def entries(self) -> tuple[Kept, ...]:
         """All that are kept, oldest first."""
-        every = (kept for chain in self._books.values() for kept in chain.entries())
-        return tuple(sorted(every, key=lambda kept: kept.entry.sequence))
+        return _in_order(chain.entries() for chain in self._books.values())
+
+    def on_disk(self) -> tuple[Kept, ...]:
+        """All that are on the disk, oldest first."""
+        return _in_order(chain.on_disk() for chain in self._books.values())
 
     def results(self) -> tuple[CalibrationResult, ...]:
         """Results of windows, oldest first."""
@@ -102,3 +105,7 @@ class History:
         """Whether the window of an entry has one of its kind there already."""
         kept = (kept.entry for kept in self._books["results"].entries())
         return any((one.kind, one.window_id) == (entry.kind, entry.window_id) for one in kept)
+
+
+def _in_order(books: Iterable[Sequence[Kept]]) -> tuple[Kept, ...]:
+    return tuple(sorted((kept for book in books for kept in book), key=lambda kept: kept.entry.sequence))

@@ -15,7 +15,7 @@ from typing import Literal
 from coec.adapters.files import durable
 from coec.errors import DecodeError, NotFoundError, StateError
 from coec.schemas.base import from_json, to_json
-from coec.schemas.replies import EvidenceEvent, EvidenceReply, MetricsPoint
+from coec.schemas.replies import EvidenceEvent, MetricsPoint
 
 POINTS_KEPT = 240
 """Checks of the monitor whose figures are remembered: 20 minutes at one in 5 s."""
@@ -25,6 +25,8 @@ POINTS_AFTER = 60
 
 EVENT = "event.json"
 """In the folder of each event."""
+
+NO_EVENT = "no such event is kept; the list is in `evidence`"
 
 Side = Literal["before", "after"]
 
@@ -41,7 +43,8 @@ class Incidents:
         self._writing = threading.Lock()
         self._points: deque[MetricsPoint] = deque(maxlen=POINTS_KEPT)
         self._events: dict[str, EvidenceEvent] = {}
-        # What is not on the disk yet, and what is still there.
+        # What is on the disk, what is not yet, and what is still there.
+        self._on_disk: dict[str, EvidenceEvent] = {}
         self._unsaved: set[str] = set()
         self._pictures: dict[tuple[str, Side], bytes] = {}
         self._dropped: set[str] = set()
@@ -111,22 +114,15 @@ class Incidents:
             if newest is not None and newest.resolution is None:
                 self._keep(newest.model_copy(update={"resolved_stamp_ns": stamp_ns, "resolution": text}))
 
-    def listing(self, vehicle: str) -> EvidenceReply:
-        """All events, without their figures."""
+    def events(self) -> tuple[EvidenceEvent, ...]:
+        """All that are kept, with their figures."""
         with self._lock:
-            bare = tuple(event.model_copy(update={"metrics": ()}) for event in self._events.values())
-            return EvidenceReply(vehicle=vehicle, pair=self._pair, events=bare)
+            return tuple(self._events.values())
 
-    def event(self, event_id: str) -> EvidenceEvent:
-        """One event with its figures.
-
-        Raises:
-            NotFoundError: no such event.
-        """
+    def on_disk(self) -> tuple[EvidenceEvent, ...]:
+        """All that are on the disk, as they are there."""
         with self._lock:
-            if event_id not in self._events:
-                raise NotFoundError("no such event is kept; the list is in `evidence`")
-            return self._events[event_id]
+            return tuple(self._on_disk.values())
 
     def overlay(self, event_id: str, side: Side) -> bytes:
         """JPEG of the window before or after an event.
@@ -134,13 +130,14 @@ class Incidents:
         Raises:
             NotFoundError: no such event, or it has no such picture.
         """
-        event = self.event(event_id)
         with self._lock:
-            waiting = self._pictures.get((event.event_id, side))
+            if event_id not in self._events:
+                raise NotFoundError(NO_EVENT)
+            waiting = self._pictures.get((event_id, side))
         if waiting is not None:
             return waiting
         try:
-            return (self._folder / event.event_id / f"{side}.jpg").read_bytes()
+            return (self._folder / event_id / f"{side}.jpg").read_bytes()
         except OSError as error:
             raise NotFoundError(f"the event has no picture of the window {side} it") from error
 
@@ -154,7 +151,7 @@ class Incidents:
                     continue
                 event = from_json(EvidenceEvent, (folder / EVENT).read_bytes())
                 if event.pair == self._pair and event.event_id == folder.name:
-                    self._events[event.event_id] = event
+                    self._events[event.event_id] = self._on_disk[event.event_id] = event
         self._drop_oldest()
         with contextlib.suppress(StateError):
             self.flush()
@@ -163,6 +160,7 @@ class Incidents:
         while len(self._events) > self._limit:
             oldest = next(iter(self._events))
             del self._events[oldest]
+            self._on_disk.pop(oldest, None)
             self._unsaved.discard(oldest)
             self._pictures = {key: jpeg for key, jpeg in self._pictures.items() if key[0] != oldest}
             self._dropped.add(oldest)
@@ -193,6 +191,8 @@ class Incidents:
                 for event_id, event in events.items():
                     self._write(self._folder / event_id / EVENT, to_json(event))
                     with self._lock:
+                        if event_id in self._events:
+                            self._on_disk[event_id] = event
                         if self._events.get(event_id) is event:
                             self._unsaved.discard(event_id)
                 for event_id in dropped:

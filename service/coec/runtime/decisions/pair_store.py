@@ -58,6 +58,20 @@ class Taken:
     served: Served
 
 
+@dataclass(frozen=True, slots=True)
+class Books:
+    """The books as others see them, oldest first."""
+
+    entries: tuple[Kept, ...]
+    checks: tuple[CheckReply, ...]
+    events: tuple[EvidenceEvent, ...]
+
+    @property
+    def results(self) -> tuple[CalibrationResult, ...]:
+        """Of windows."""
+        return tuple(kept.result for kept in self.entries if kept.result is not None)
+
+
 class PairStore:
     """Keeps the books of one pair.
 
@@ -174,9 +188,12 @@ class PairStore:
         self._checks.append(check)
         self._scribe.write(self._checks, self.incidents)
 
-    def checks(self) -> tuple[CheckReply, ...]:
-        """The checks of the monitor that are kept, oldest first."""
-        return self._checks.checks()
+    def told(self) -> Books:
+        """What may be told: what a restart knows as well, unless the disk has refused it for so long that `health` says
+        so."""
+        if self._scribe.trouble is None:
+            return Books(self.history.on_disk(), self._checks.on_disk(), self.incidents.on_disk())
+        return Books(self.history.entries(), self._checks.checks(), self.incidents.events())
 
     def note_command(self, name: str, code: str, text: str, sender: str, *, accepted: bool) -> None:
         """A command was carried out or refused. Of equal refusals in a row only the first is written down."""
@@ -240,6 +257,10 @@ class PairStore:
     def is_on_disk(self) -> bool:
         """Whether all that was noted and saved before this call is on the disk; see `Scribe.has_written`."""
         return self._scribe.has_written()
+
+    def may_be_told(self) -> bool:
+        """Whether the state is on the disk, or `health` says why not."""
+        return self._scribe.has_written() or self._scribe.trouble is not None
 
     def age(self, why_overdue: Reason | None, silent_s: float, stale_after_s: float) -> None:
         """Time has passed: no check has been completed in time, for a reason, or for `silent_s` at all."""

@@ -47,12 +47,12 @@ class Stream:
     ) -> None:
         """`has_room()` says whether the recorder would take a chosen pair now."""
         depths = {CAMERA: FRAMES_WAITING, LIDAR: FRAMES_WAITING, EGO: MOTIONS_WAITING}
-        self.inbox = Inbox(depths, config.limits.max_waiting_bytes, lambda stream: losses.add(stream, "overrun"))
+        self._decoder = Decoder(pair, config.limits, losses)
+        self.inbox = Inbox(depths, config.limits.max_waiting_bytes, self._decoder.overrun)
         self.thread = ServiceThread(f"ingest-{pair.name}", self._run)
         self.report = StreamStatistics()
         self._chooser = chooser
         self._has_room = has_room
-        self._decoder = Decoder(pair, config.limits, losses)
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._clock = SensorClock()
         self._held = PairBuffer(config.limits.max_held_bytes, config.worker.timeout_s)
