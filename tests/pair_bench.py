@@ -13,6 +13,7 @@ import pytest
 
 from coec.adapters.files.conversions import result_of
 from coec.adapters.files.rig import rig_of
+from coec.adapters.files.scribe import Book, Scribe
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.window import SliceEnded
 from coec.calibration.monitor.change_detector import Observation
@@ -241,6 +242,14 @@ class InstantRecorder:
         self._on_recorded(ended.window_id, self.latest, True)
 
 
+class InstantScribe(Scribe):
+    """Writes on the thread that asks."""
+
+    def write(self, *books: Book) -> None:
+        super().write(*books)
+        self.write_due()
+
+
 class Bench:
     """A pair without threads, driven pair by pair; `restart` replaces it by one that reads the same folder."""
 
@@ -267,6 +276,7 @@ class Bench:
         outside = Outside(
             Keys("coec", self.config.vehicle),
             store,
+            InstantScribe(self.folder),
             windows,
             cast("Worker", self.worker),
             lambda key, _: self.published.append(key),

@@ -360,6 +360,11 @@ class LimitsConfig(Stage):
     max_message_bytes: int = Field(default=32 * 2**20, ge=2**16, le=2**30, description="as Zenoh's max_message_size")
     max_image_pixels: int = Field(default=33_000_000, ge=2**12, description="8K UHD")
     max_points: int = Field(default=1_000_000, ge=2**10)
+    max_waiting_bytes: int = Field(
+        default=64 * 2**20,
+        ge=2**20,
+        description="per pair, messages that have come and wait to be decoded; beyond, the oldest are lost",
+    )
     max_held_bytes: int = Field(
         default=256 * 2**20,
         ge=2**20,

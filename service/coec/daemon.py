@@ -20,7 +20,8 @@ from types import FrameType
 from typing import Literal
 
 from coec import __version__
-from coec.adapters.system import logs
+from coec.adapters.files.scribe import Scribe
+from coec.adapters.system import allocator, logs
 from coec.adapters.system.memory import resident_bytes
 from coec.adapters.system.notify import Notifier
 from coec.adapters.system.threads import ServiceThread
@@ -77,7 +78,7 @@ STALLED_S = 20.0
 """A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed."""
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
-INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S = 2.0, 4.0, 2.0
+INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 1.5
 QUERIES_STOP_S, HTTP_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 1.5, 3.0, 1.0
 
 
@@ -135,7 +136,8 @@ class Daemon:
         self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
         self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
         store = StateStore(config.state.directory, config.vehicle)
-        outside = Outside(self._keys, store, self._folder, self._worker, self._publish, self._troubles)
+        self._scribe = Scribe(config.state.directory)
+        outside = Outside(self._keys, store, self._scribe, self._folder, self._worker, self._publish, self._troubles)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         commands = {name: pair.commands for name, pair in self._pairs.items()}
         self._reception = Reception(authority, listener, commands)
@@ -179,7 +181,7 @@ class Daemon:
 
     def _start(self) -> None:
         deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
-        for thread in (self._presence.thread, *self._bus.threads, *deciding):
+        for thread in (self._scribe.thread, self._presence.thread, *self._bus.threads, *deciding):
             thread.start()
         self._worker.start()
         self._answers.declare(self._bus)
@@ -196,7 +198,9 @@ class Daemon:
         _log.info("serving", extra={"fields": {**fields, "pairs": list(self._pairs)}})
 
     def _tick(self) -> int:
-        """Once a second: look at every thread, renew what is served. Returns an exit status, 0 to go on."""
+        """Once a second: look at every thread, renew what is served, keep no memory that nobody uses. Returns an exit
+        status, 0 to go on."""
+        allocator.give_back()
         threads = self._threads()
         dead = [thread for thread in threads if thread.dead]
         if dead:
@@ -220,7 +224,7 @@ class Daemon:
             if dead:
                 return EXIT_THREAD_DIED
             return CoecError.exit_code if self._presence.rival is None else UnavailableError.exit_code
-        if all(thread.silence_s < STALLED_S for thread in threads):
+        if all(thread.silence_s < STALLED_S for thread in self._prompt_threads()):
             self._notifier.watchdog()
         return 0
 
@@ -239,6 +243,7 @@ class Daemon:
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
             ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
+            ("write all books", self._end_scribe),
             ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
             ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
@@ -256,6 +261,10 @@ class Daemon:
         for pair in pairs:
             part(pair).request_stop()
         _joined([part(pair).thread for pair in pairs], within_s)
+
+    def _end_scribe(self) -> None:
+        self._scribe.request_stop()
+        _joined([self._scribe.thread], SCRIBE_STOP_S)
 
     def _finish_windows(self) -> None:
         """Of the pairs whose stream has ended: nobody else may touch its open window."""
@@ -320,16 +329,23 @@ class Daemon:
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
         hidden = TOKENS_HIDDEN if self._presence.hidden else None
-        ailing = (self._fault, failing, self._insecure, hidden, self._router.trouble, self._door.trouble)
-        return tuple(reason for reason in ailing if reason is not None)
+        own = (self._scribe.trouble, self._insecure, hidden, self._router.trouble, self._door.trouble)
+        return tuple(reason for reason in (self._fault, failing, *own) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
 
     def _threads(self) -> list[ServiceThread]:
-        pairs = self._pairs.values()
-        own = [thread for pair in pairs for thread in pair.threads]
+        """All of them."""
+        recorders = [pair.recorder.thread for pair in self._pairs.values()]
         door = [] if self._door.server is None else [self._door.server.thread]
-        return [self._presence.thread, *self._bus.threads, self._worker.thread, *door, *own]
+        waiting = [thread for thread in self._bus.threads if thread not in self._bus.prompt_threads]
+        return [*self._prompt_threads(), self._scribe.thread, *waiting, *door, *recorders]
+
+    def _prompt_threads(self) -> list[ServiceThread]:
+        """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
+        restart would make it quicker, and none is asked for."""
+        own = [thread for pair in self._pairs.values() for thread in pair.threads]
+        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()

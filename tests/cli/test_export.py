@@ -36,7 +36,7 @@ def result(tmp_path: Path) -> Path:
 def state(tmp_path: Path) -> Path:
     folder = tmp_path / "state"
     folder.mkdir()
-    StateStore(folder, "v7").remember(RIG, SERVED, CLOCKS, {})
+    StateStore(folder, "v7").remember(RIG, SERVED, CLOCKS, dict)
     return folder
 
 
@@ -93,7 +93,7 @@ def test_what_is_not_accepted_is_refused_and_forced(coec: Coec, tmp_path: Path) 
 
 
 def test_a_nominal_state_is_refused(coec: Coec, tmp_path: Path) -> None:
-    StateStore(tmp_path, "v7").remember(RIG, initial_state(RIG), CLOCKS, {})
+    StateStore(tmp_path, "v7").remember(RIG, initial_state(RIG), CLOCKS, dict)
     outcome = coec("export", tmp_path, "--format", "tf")
     assert outcome.status == 2
     assert "nothing was accepted yet" in outcome.err

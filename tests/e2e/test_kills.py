@@ -40,7 +40,8 @@ DAMAGE = {"state_damaged", "history_damaged"}
 
 @dataclass
 class Told:
-    """What the service has told a client: of each question the last answer, and the last acknowledged `hold`."""
+    """What the service has told a client: of each question the last answer; and whether it is held, as far as the last
+    acknowledgement says that this is on the disk."""
 
     answers: dict[str, Any] = field(default_factory=dict)
     held: bool | None = None
@@ -58,7 +59,8 @@ class Told:
         """Has the extrinsic held, or released."""
         acknowledged = running.command("hold", b'{"release":true}' if release else b"{}")
         assert acknowledged["accepted"], acknowledged
-        self.held = not release
+        # Not on the disk, and said to be so, it may be done or not.
+        self.held = not release if acknowledged["durable"] else None
 
 
 @contextmanager

@@ -45,7 +45,7 @@ class EncodedImage:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, weakref_slot=True)
 class CameraFrame:
     """One exposure.
 
@@ -77,7 +77,7 @@ class ImageQuality:
     digest: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class LidarFrame:
     """One sweep, in the LiDAR frame, not motion-compensated. Every array has the same length N, every point is finite.
 
@@ -97,7 +97,7 @@ class LidarFrame:
     sequence: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, weakref_slot=True)
 class EgoMotion:
     """Velocity of the vehicle at `stamp_ns`, expressed in the ego frame `frame_id` (x forward, y left, z up)."""
 

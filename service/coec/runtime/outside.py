@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from coec.adapters.files.scribe import Scribe
 from coec.adapters.zenoh.bus import Answer
 from coec.calibration.types import Reason
 from coec.runtime.decisions.state_store import StateStore
@@ -19,6 +20,7 @@ class Outside:
 
     keys: Keys
     store: StateStore
+    scribe: Scribe
     folder: WindowStore
     worker: Worker
     publish: Callable[[str, Answer], None]

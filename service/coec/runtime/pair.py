@@ -46,7 +46,7 @@ class Pair:
         losses = LossCounter(_log, pair.name)
         mailbox, queue = Mailbox(), DecisionQueue()
         questions = Questions(pair, queue, outside.worker, mailbox, folder)
-        store = PairStore(rig, config.vehicle, config.state, outside.store, folder, losses)
+        store = PairStore(rig, config.vehicle, config.state, outside.store, outside.scribe, folder, losses)
         baseline = RigBaseline(pair, rig, config.state.directory)
         self._rig, self._vehicle = rig, config.vehicle
         plan = self._plan(pair, baseline.calibration)
@@ -56,7 +56,7 @@ class Pair:
         self.answers = PairAnswers(
             pair, config, rig, store, folder, self.recorder, self.stream, losses, outside, lambda: self.commands.counts
         )
-        pictures = IncidentPictures(store.incidents, folder, questions, losses)
+        pictures = IncidentPictures(store.add_picture, folder, questions, losses)
         self.decider = Decider(
             pair,
             config.stale_after_s,
@@ -64,7 +64,6 @@ class Pair:
             baseline,
             queue,
             pictures,
-            folder,
             self.stream,
             mailbox,
             losses,
@@ -105,8 +104,8 @@ class Pair:
 
     @property
     def threads(self) -> tuple[ServiceThread, ...]:
-        """All of them."""
-        return self.stream.thread, self.recorder.thread, self.decider.thread
+        """Those that wait for nothing outside the process."""
+        return self.stream.thread, self.decider.thread
 
     def take_sample(self, stream: str, payload: bytes, encoding: str) -> None:
         """A sample came: microseconds, on the network's thread."""

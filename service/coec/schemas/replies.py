@@ -471,6 +471,11 @@ class Acknowledgement(Message):
     code: str = Field(description="machine-readable outcome")
     text: str = Field(description="one sentence")
     window_id: str | None = Field(default=None, description="the window it acts on")
+    durable: bool | None = Field(
+        default=None,
+        description="whether what was done is on the disk, and outlives a power cut; false: not yet, `health` says "
+        "what ails the disk; null where nothing was done",
+    )
 
 
 class ErrorReply(Message):

@@ -39,9 +39,11 @@ def test_a_restart_finds_the_same_checks_and_goes_on(tmp_path: Path) -> None:
     log = CheckLog(tmp_path / "checks", 10)
     for stamp_ns in range(3):
         log.append(check(stamp_ns))
+        log.flush()
     again = CheckLog(tmp_path / "checks", 10)
     assert again.checks() == log.checks() == tuple(check(stamp_ns) for stamp_ns in range(3))
     again.append(check(3))
+    again.flush()
     assert CheckLog(tmp_path / "checks", 10).checks() == again.checks()
 
 
@@ -49,6 +51,7 @@ def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
     log = CheckLog(tmp_path / "checks", 3)
     for stamp_ns in range(20):
         log.append(check(stamp_ns))
+        log.flush()
     assert [one.stamp_ns for one in log.checks()] == [17, 18, 19]
     assert len((tmp_path / "checks").read_bytes().splitlines()) <= 6
     assert CheckLog(tmp_path / "checks", 3).checks() == log.checks()
@@ -58,10 +61,12 @@ def test_what_cannot_be_read_is_left_out(tmp_path: Path) -> None:
     log = CheckLog(tmp_path / "checks", 10)
     for stamp_ns in range(3):
         log.append(check(stamp_ns))
+        log.flush()
     first, second, third = (tmp_path / "checks").read_bytes().splitlines(keepends=True)
     (tmp_path / "checks").write_bytes(first + b"\xff{\n" + second + third[:40])
     again = CheckLog(tmp_path / "checks", 10)
     again.append(check(7))
+    again.flush()
     assert [one.stamp_ns for one in CheckLog(tmp_path / "checks", 10).checks()] == [0, 1, 7]
 
 
@@ -71,11 +76,14 @@ def test_a_full_disk_costs_no_check_but_those_that_a_restart_comes_before(
     disk = Disk(tmp_path, monkeypatch)
     log = CheckLog(tmp_path / "checks", 10)
     log.append(check(0))
+    log.flush()
     disk.refuses = EVERYTHING
+    log.append(check(1))
     with pytest.raises(StateError, match="No space"):
-        log.append(check(1))
+        log.flush()
     assert [one.stamp_ns for one in log.checks()] == [0, 1]
     assert [one.stamp_ns for one in CheckLog(tmp_path / "checks", 10).checks()] == [0]
     disk.refuses = ()
     log.append(check(2))
+    log.flush()
     assert [one.stamp_ns for one in CheckLog(tmp_path / "checks", 10).checks()] == [0, 1, 2]

@@ -10,6 +10,7 @@ import pytest
 
 from coec.adapters.files.conversions import result_of, transform_of
 from coec.adapters.files.state_file import StateFile
+from coec.errors import StateError
 from coec.runtime.decisions.history import History
 from coec.schemas.replies import CalibrationResult, HistoryEntry
 from disks import EVERYTHING, Disk
@@ -36,6 +37,7 @@ def filled(folder: Path) -> tuple[History, CalibrationResult]:
     history.append(
         entry("extrinsic", "estimated", window_id=result.window_id, camera_from_lidar=result.camera_from_lidar)
     )
+    history.flush()
     return history, result
 
 
@@ -54,6 +56,7 @@ def test_no_flood_pushes_a_result_or_what_it_put_in_place_out(tmp_path: Path, fl
     history, result = filled(tmp_path)
     for _ in range(5 * LIMIT):
         history.append(flood)
+    history.flush()
     for one in (history, History(tmp_path, "front", LIMIT, history.durable_heads)):
         assert one.damage is None
         assert one.results() == (result,)
@@ -76,6 +79,7 @@ def test_entries_are_numbered_together_in_the_order_in_which_they_came(tmp_path:
     history, _ = filled(tmp_path)
     for kind in kinds[:3]:
         history.append(entry(kind))
+    history.flush()
     history = History(tmp_path, "front", LIMIT, history.durable_heads)
     for kind in kinds[3:]:
         history.append(entry(kind))
@@ -88,6 +92,7 @@ def test_a_book_that_was_cut_or_removed_is_noticed(tmp_path: Path, book: str) ->
     history, _ = filled(tmp_path)
     for kind in ("state", "command"):
         history.append(entry(kind))
+    history.flush()
     (tmp_path / f"{book}-front.jsonl").unlink()
     assert "cut off" in str(History(tmp_path, "front", LIMIT, history.durable_heads).damage)
 
@@ -96,6 +101,7 @@ def test_a_forged_pose_in_a_book_is_damage_whatever_its_hash(tmp_path: Path) -> 
     history, result = filled(tmp_path)
     zero = transform_of(np.eye(4)).model_copy(update={"matrix": ((0.0,) * 4,) * 4})
     history.append(entry("extrinsic", "estimated", window_id=result.window_id, camera_from_lidar=zero))
+    history.flush()
     again = History(tmp_path, "front", LIMIT, {})
     assert again.damage is not None
     assert [kept.entry.code for kept in again.entries()] == ["accepted", "estimated"]
@@ -106,9 +112,8 @@ def test_every_book_waits_for_a_full_disk_and_is_written_then(tmp_path: Path, mo
     history, _ = filled(tmp_path)
     disk.refuses = EVERYTHING
     for kind in ("state", "command"):
-        with pytest.raises(Exception, match="No space"):
-            history.append(entry(kind))
-    with pytest.raises(Exception, match=r"commands-front\.jsonl"):
+        history.append(entry(kind))
+    with pytest.raises(StateError, match=r"No space.*commands-front\.jsonl: No space"):
         history.flush()
     disk.refuses = ()
     history.flush()

@@ -37,6 +37,11 @@ CLOCKS = Clocks(77, 88, 99)
 HEADS = {"results": "3 abc", "commands": "4 def"}
 
 
+def saved(store: StateStore, rig: Rig, state: PairState, heads: dict[str, str]) -> None:
+    store.remember(rig, state, CLOCKS, lambda: heads)
+    store.flush()
+
+
 def restarted(folder: Path, rig: Rig = RIG) -> PairState | None:
     remembered = StateStore(folder, "test").recall(rig)
     return remembered.state if remembered else None
@@ -45,7 +50,7 @@ def restarted(folder: Path, rig: Rig = RIG) -> PairState | None:
 def test_a_state_comes_back_bit_for_bit(tmp_path: Path) -> None:
     state = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
     state = after_estimate(state, estimate(2, Decision.FAILED), 0, RULES)
-    StateStore(tmp_path, "test").remember(RIG, after_failure(state, Reason("worker_failed", "crash")), CLOCKS, HEADS)
+    saved(StateStore(tmp_path, "test"), RIG, after_failure(state, Reason("worker_failed", "crash")), HEADS)
     remembered = StateStore(tmp_path, "test").recall(RIG)
     assert remembered is not None
     assert (remembered.clocks, remembered.history_heads) == (CLOCKS, HEADS)
@@ -67,7 +72,7 @@ def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> N
     tests = Hypotheses(belief, (Hypothesis(1, 2.5, 1 / 7, belief, belief),), (0.1, 0.2, 0.3))
     monitor = MonitorState(Finding.SUSPECT, tests, Hypotheses(), {"dark": 0.1}, {"40": 2.5}, 0.5, (5, 6), stood=True)
     state = replace(state, monitor=monitor, flagged_since_ns=4, changes=(Change(3, (0.1,) * 6),))
-    StateStore(tmp_path, "test").remember(RIG, state, CLOCKS, {})
+    saved(StateStore(tmp_path, "test"), RIG, state, {})
     first = (tmp_path / "state.json").read_bytes()
     back = restarted(tmp_path)
     assert back is not None
@@ -75,15 +80,15 @@ def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> N
     assert back.pending is not None
     assert back.pending.contradicts
     assert np.array_equal(back.pending.T_camera_lidar, estimate(1).optimum.T_camera_lidar)
-    StateStore(tmp_path, "test").remember(RIG, back, CLOCKS, {})
+    saved(StateStore(tmp_path, "test"), RIG, back, {})
     assert (tmp_path / "state.json").read_bytes() == first
 
 
 def test_pairs_do_not_touch_each_other(tmp_path: Path) -> None:
     rear = replace(RIG, pair="rear")
     store = StateStore(tmp_path, "test")
-    store.remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS, {})
-    store.remember(rear, initial_state(rear), CLOCKS, {})
+    saved(store, RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), {})
+    saved(store, rear, initial_state(rear), {})
     front, back = restarted(tmp_path), restarted(tmp_path, rear)
     assert front is not None
     assert front.status is Status.ACCEPTED
@@ -92,7 +97,7 @@ def test_pairs_do_not_touch_each_other(tmp_path: Path) -> None:
 
 
 def test_the_state_of_another_rig_is_not_used(tmp_path: Path) -> None:
-    StateStore(tmp_path, "test").remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS, {})
+    saved(StateStore(tmp_path, "test"), RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), {})
     assert restarted(tmp_path, replace(RIG, T_camera_lidar_nominal=np.eye(4))) is None
     assert restarted(tmp_path, replace(RIG, pair="other")) is None
 
@@ -113,7 +118,7 @@ SHEARED = [[1.0, 0.1, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.
 def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: str, rows: list[list[float]]) -> None:
     served = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
     waiting = after_estimate(initial_state(RIG), estimate(1), 0, NEVER)
-    StateStore(tmp_path, "test").remember(RIG, waiting if where == "pending" else served, CLOCKS, {})
+    saved(StateStore(tmp_path, "test"), RIG, waiting if where == "pending" else served, {})
     file = StateFile(tmp_path / "state.json")
     body = file.load().body
     assert body is not None
@@ -132,7 +137,7 @@ def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: 
     store = StateStore(tmp_path, "test")
     with pytest.raises(StateError, match="no rigid transform"):
         store.recall(RIG)
-    store.remember(RIG, initial_state(RIG), CLOCKS, {})
+    saved(store, RIG, initial_state(RIG), {})
     assert (tmp_path / "state.json.broken").read_bytes() == forged
     assert restarted(tmp_path) is not None
 
@@ -149,7 +154,7 @@ def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: 
     ],
 )
 def test_numbers_and_shapes_that_nobody_wrote_are_an_error_of_ours(tmp_path: Path, name: str, value: object) -> None:
-    StateStore(tmp_path, "test").remember(RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), CLOCKS, {})
+    saved(StateStore(tmp_path, "test"), RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), {})
     file = StateFile(tmp_path / "state.json")
     body = file.load().body
     assert body is not None

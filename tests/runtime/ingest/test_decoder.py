@@ -171,7 +171,7 @@ def test_losses_are_logged_first_and_then_ever_more_rarely(caplog: pytest.LogCap
 
 def test_samples_are_taken_in_the_order_of_arrival_and_the_oldest_go_first() -> None:
     overruns: list[str] = []
-    inbox = Inbox({CAMERA: 2, EGO: 8}, overruns.append)
+    inbox = Inbox({CAMERA: 2, EGO: 8}, 100, overruns.append)
     for number, stream in enumerate([CAMERA, EGO, CAMERA, EGO, CAMERA]):
         inbox.put(stream, bytes([number]), "")
     taken = [inbox.take(0.0) for _ in range(5)]
@@ -180,8 +180,36 @@ def test_samples_are_taken_in_the_order_of_arrival_and_the_oldest_go_first() -> 
     assert overruns == [CAMERA]
 
 
+def test_too_many_bytes_take_from_the_stream_that_holds_most() -> None:
+    overruns: list[str] = []
+    inbox = Inbox({CAMERA: 16, LIDAR: 16, EGO: 16}, 100, overruns.append)
+    for number in range(3):
+        inbox.put(LIDAR, bytes([number]) * 20, "")
+    inbox.put(EGO, b"e", "")
+    for number in range(4):
+        inbox.put(CAMERA, bytes([number]) * 30, "")
+    # One camera frame fits beside the three sweeps; of the others each makes room for itself.
+    assert overruns == [CAMERA] * 3
+    taken = [inbox.take(0.0) for _ in range(6)]
+    payloads = [item.payload for item in taken if isinstance(item, Parcel)]
+    assert payloads == [b"\0" * 20, b"\1" * 20, b"\2" * 20, b"e", b"\3" * 30]
+
+
+def test_a_sample_larger_than_all_that_may_wait_is_taken_alone() -> None:
+    overruns: list[str] = []
+    inbox = Inbox({CAMERA: 16, LIDAR: 16}, 100, overruns.append)
+    inbox.put(LIDAR, b"sweep", "")
+    inbox.put(CAMERA, bytes(200), "")
+    assert overruns == [LIDAR]
+    inbox.put(CAMERA, b"next", "")
+    assert overruns == [LIDAR, CAMERA]
+    taken = inbox.take(0.0)
+    assert isinstance(taken, Parcel)
+    assert taken.payload == b"next"
+
+
 def test_a_call_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
-    inbox = Inbox({CAMERA: 2}, lambda _: None)
+    inbox = Inbox({CAMERA: 2}, 100, lambda _: None)
     inbox.put(CAMERA, b"", "")
     inbox.call(lambda: None)
     assert isinstance(inbox.take(0.0), Call)

@@ -196,6 +196,7 @@ def test_a_folder_that_somebody_removed_is_made_again(tmp_path: Path) -> None:
     store = store_of(tmp_path)
     record(store, at(0)).unlink()
     (tmp_path / "windows").rmdir()
+    store.look()
     assert store.usage().used == 0
     assert store.listing("front") == ()
     make_room(store)
@@ -259,6 +260,7 @@ def test_a_restart_lists_what_was_known_without_opening_a_window(
     for day in range(3):
         record(store, at(day), b"window %d" % day)
     store.note(at(1), version_of(store.path(at(1)), decision="accepted"))
+    store.flush()
 
     real = Path.open
 
@@ -281,6 +283,7 @@ def test_a_window_that_was_written_again_has_no_digest_until_it_is_noted(tmp_pat
     with_result = path.with_suffix(".tmp")
     with_result.write_bytes(b"window with result")
     with_result.replace(path)
+    store.look()
     (info,) = store.listing("front")
     assert (info.sha256, info.size_bytes, info.pairs) == (None, 18, 3)
     assert store.unread("front") == (path,)
@@ -342,10 +345,12 @@ def test_a_list_of_thousands_reads_the_folder_once_and_no_file(tmp_path: Path, m
 
     monkeypatch.setattr(os, "scandir", counted)
     for _ in range(50):
+        store.look()
         assert len(store.listing("front")) == 2000
         store.usage()
     assert scans <= 1
     (tmp_path / "windows" / "front-7.mcap").unlink()
+    store.look()
     assert len(store.listing("front")) == 1999
     assert scans <= 2
 

@@ -126,6 +126,11 @@ class Bus:
             for lane, waiting in self._waiting.items()
         )
 
+    @property
+    def prompt_threads(self) -> tuple[ServiceThread, ...]:
+        """Those of `threads` that wait neither for a disk nor for the worker."""
+        return tuple(thread for lane, thread in zip(self._waiting, self.threads, strict=True) if lane is Lane.COMMANDS)
+
     def subscribe(self, key: str, on_sample: Callable[[bytes, str], None]) -> None:
         """Call `on_sample(payload, encoding)` for every put on `key`, on Zenoh's thread."""
 

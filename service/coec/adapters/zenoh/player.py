@@ -73,7 +73,7 @@ class Player:
         try:
             while True:
                 changed.clear()
-                deaf = [str(p.key_expr) for p in self._publishers.values() if not _is_heard(p)]
+                deaf = [str(p.key_expr) for p in self._publishers.values() if not is_heard(p)]
                 if not deaf or not changed.wait(max(deadline_s - time.monotonic(), 0.0)):
                     return deaf
         finally:
@@ -154,7 +154,8 @@ def repeated(passes: Callable[[], Iterable[Frame]], shift_ns: int, pause_ns: int
         shift_ns += last_ns - first_ns + pause_ns
 
 
-def _is_heard(publisher: zenoh.Publisher) -> bool:
+def is_heard(publisher: zenoh.Publisher) -> bool:
+    """Whether somebody subscribes to what it publishes."""
     # The stubs of eclipse-zenoh 1.10 call it a bool; it is a `MatchingStatus`, which is always true.
     return cast("zenoh.MatchingStatus", publisher.matching_status).matching
 

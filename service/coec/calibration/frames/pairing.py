@@ -123,7 +123,9 @@ class Pairer:
                 self._lose("lidar", 1)
                 continue
             while self._cameras and self._cameras[0].stamp_ns <= camera.stamp_ns:
-                self._cameras.popleft()
+                # A camera that is faster than the LiDAR has frames between two sweeps: not one frame goes uncounted.
+                if self._cameras.popleft() is not camera:
+                    self.losses["camera_surplus"] += 1
             self._waiting.append(FramePair(camera, sweep))
 
     def _release(self, *, final: bool) -> list[FramePair]:

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 from coec.adapters.files.conversions import estimate_of, matrix_of
+from coec.adapters.files.scribe import PATIENCE_S
 from coec.calibration import lifecycle
 from coec.calibration.types import Rig
 from coec.config import PairConfig
@@ -113,12 +114,10 @@ class Commands:
                 text = f"You give commands faster than {PER_S:g} per second; nothing was done. Wait {wait_s:.1f} s."
                 acknowledged = self._acknowledge(name, "too_many", text, accepted=False)
             elif name == "calibrate":
-                acknowledged = self._stream.ask(partial(in_time, self._calibrate), within_s)
-                # It is done: what cannot be waited for any more is written down all the same.
-                self._mailbox.post(partial(self._write_down, acknowledged, sender))
+                acknowledged = self._noted(self._stream.ask(partial(in_time, self._calibrate), within_s), sender)
             else:
                 decide = partial(self._decide, name, decided[name], sender)
-                acknowledged = self._mailbox.ask(partial(in_time, decide), within_s)
+                acknowledged = self._with_durability(self._mailbox.ask(partial(in_time, decide), within_s))
         except BusyError as error:
             late = time.monotonic() >= deadline_s and not begun.is_set()
             code, text = ("expired", EXPIRED) if late else (error.reply_code, str(error))
@@ -139,6 +138,22 @@ class Commands:
         if count & (count - 1) == 0:
             fields = {"pair": self._pair.name, "command": known, "sender": sender, "code": why.reply_code}
             _log.warning(f"a command was not allowed: {why}", extra={"fields": {**fields, "count": count}})
+
+    def _noted(self, done: Acknowledgement, sender: str) -> Acknowledgement:
+        """What is done has to be written down, and is, whether that can be waited for or not."""
+        noted = threading.Event()
+
+        def note() -> None:
+            self._write_down(done, sender)
+            noted.set()
+
+        self._mailbox.post(note)
+        return self._with_durability(done, noted=noted.wait(PATIENCE_S))
+
+    def _with_durability(self, done: Acknowledgement, *, noted: bool = True) -> Acknowledgement:
+        if not done.accepted:
+            return done
+        return done.model_copy(update={"durable": noted and self._store.is_on_disk()})
 
     # --- on the thread that decides ---------------------------------------------------------------------------------
 

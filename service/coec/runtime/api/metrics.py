@@ -312,7 +312,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "coec_queries_waiting",
         "gauge",
-        "Queries that wait: `slow` for the disk or a decision, `drawing` for a picture.",
+        "Queries that wait: `commands`, `files` for the disk, `drawing` for a picture.",
         ("queue",),
         _of_worker(lambda view: view.status.queries_waiting),
     ),

@@ -21,7 +21,7 @@ from coec.runtime.api.overlays import Overlays
 from coec.runtime.api.snapshots import Snapshot, answer_of
 from coec.runtime.api.status import pair_status_of
 from coec.runtime.decisions.decider import Known
-from coec.runtime.decisions.incidents import Side
+from coec.runtime.decisions.incidents import NO_EVENT, Side
 from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.ingest.stream import Stream
 from coec.runtime.outside import Outside
@@ -145,7 +145,8 @@ class PairAnswers:
     def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
         """Past results and other entries with a sensor stamp in the bounds, the newest `limit` of each; entries that
         have none are dated by the wall clock."""
-        entries, results = self._store.history.entries(), self._store.history.results()
+        told = self._store.told()
+        results = told.results
 
         def inside(kept: replies.HistoryEntry) -> bool:
             return since_ns <= (kept.wall_ns if kept.stamp_ns is None else kept.stamp_ns) <= until_ns
@@ -155,8 +156,8 @@ class PairAnswers:
             pair=self.name,
             total=len(results),
             results=tuple(result for result in results if since_ns <= result.data_stamp_ns <= until_ns)[-limit:],
-            entries=tuple(kept.chained for kept in entries if inside(kept.entry))[-limit:],
-            checks=tuple(check for check in self._store.checks() if since_ns <= check.stamp_ns <= until_ns)[-limit:],
+            entries=tuple(kept.chained for kept in told.entries if inside(kept.entry))[-limit:],
+            checks=tuple(check for check in told.checks if since_ns <= check.stamp_ns <= until_ns)[-limit:],
         )
 
     def windows(self) -> replies.WindowsReply:
@@ -174,7 +175,8 @@ class PairAnswers:
 
     def events(self) -> replies.EvidenceReply:
         """Red events that are kept."""
-        return self._store.incidents.listing(self._vehicle)
+        bare = tuple(event.model_copy(update={"metrics": ()}) for event in self._store.told().events)
+        return replies.EvidenceReply(vehicle=self._vehicle, pair=self.name, events=bare)
 
     def event(self, event_id: str) -> replies.EvidenceEvent:
         """One of them, with its figures.
@@ -182,7 +184,10 @@ class PairAnswers:
         Raises:
             NotFoundError: no such event.
         """
-        return self._store.incidents.event(event_id)
+        found = next((event for event in self._store.told().events if event.event_id == event_id), None)
+        if found is None:
+            raise NotFoundError(NO_EVENT)
+        return found
 
     def event_overlay(self, event_id: str, side: Side) -> bytes:
         """JPEG of the window before or after an event.

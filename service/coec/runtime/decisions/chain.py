@@ -13,13 +13,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import threading
-from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from coec.adapters.files import durable
 from coec.adapters.files.conversions import matrix_of
-from coec.adapters.files.durable import Log
+from coec.adapters.files.ledger import Ledger
 from coec.adapters.files.state_file import BROKEN
 from coec.errors import DecodeError, StateError
 from coec.geometry.se3 import is_rigid
@@ -50,10 +50,9 @@ class Kept:
 
 
 class Chain:
-    """All that is kept in one book, oldest first. Safe to use from several threads.
+    """All that is kept in one book, oldest first. Safe to use from several threads; only `flush` waits for the disk.
 
-    An entry that could not be put on the disk is kept, and goes there with the next one, in order: the chain on the
-    disk holds at any time.
+    Entries go to the disk in order: the chain on the disk holds at any time.
 
     Attributes:
         damage: what was wrong with the chain that was found, one sentence; None when it held.
@@ -62,10 +61,8 @@ class Chain:
     def __init__(self, path: Path, limit: int, head: str | None = None) -> None:
         """`head` is the `durable_head` that the state file knows of: the chain must reach it, or it was cut off."""
         self._path = path
-        self._lock = threading.Lock()
-        self._kept: deque[Kept] = deque(maxlen=limit)
-        self._log = Log(path, limit, lambda: [kept.line for kept in self._kept])
-        self._durable_head: str | None = None
+        self._ledger: Ledger[Kept] = Ledger(path, limit, lambda kept: kept.line)
+        self._writing = threading.Lock()
         self._to_keep_aside = False
         self.damage: str | None = None
         self._load(head)
@@ -74,23 +71,22 @@ class Chain:
     def durable_head(self) -> str | None:
         """Place and hash of the newest entry that is on the disk, in the words of this module; None before the first.
         This, and nothing newer, is for the state file to remember."""
-        with self._lock:
-            return self._durable_head
+        durable = self._ledger.durable
+        return None if durable is None else f"{durable.entry.sequence} {durable.sha256}"
 
     def entries(self) -> tuple[Kept, ...]:
         """All that are kept."""
-        with self._lock:
-            return tuple(self._kept)
+        return self._ledger.items()
+
+    def on_disk(self) -> tuple[Kept, ...]:
+        """All that are on the disk."""
+        return self._ledger.on_disk()
 
     def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
         """Keep one more; its place in the chain is filled in, its number is its own or, where that is taken, the next.
-        On the disk, with all before it, when this returns.
+        On the disk with the next `flush`."""
 
-        Raises:
-            StateError: it is kept in memory, but not on the disk; the next append or `flush` tries again.
-        """
-        with self._lock:
-            last = self._kept[-1] if self._kept else None
+        def placed_behind(last: Kept | None) -> Kept:
             placed = entry.model_copy(
                 update={
                     "sequence": max(entry.sequence, last.entry.sequence + 1 if last else 0),
@@ -101,60 +97,49 @@ class Chain:
             document = to_json(placed)
             sha256 = _sha256(document)
             body = document + b"\t" + (to_json(result) if result else b"null")
-            kept = Kept(sha256, placed, result, sha256.encode() + b" " + body)
-            self._kept.append(kept)
-            self._log.add(kept.line)
-            self._flush()
-            return kept
+            return Kept(sha256, placed, result, sha256.encode() + b" " + body)
+
+        return self._ledger.add(placed_behind)
 
     def flush(self) -> None:
-        """Put on the disk what an append could not.
+        """Put on the disk what is not there yet.
 
         Raises:
-            StateError: it is still not possible.
+            StateError: it is not possible; the next call tries again.
         """
-        with self._lock:
-            self._flush()
-
-    def _flush(self) -> None:
-        try:
-            if self._to_keep_aside:
-                self._keep_aside()
-            self._log.flush()
-        except OSError as error:
-            raise StateError(f"cannot write {self._path}: {error.strerror}") from error
-        if self._kept:
-            self._durable_head = _head_of(self._kept[-1])
+        with self._writing:
+            try:
+                if self._to_keep_aside:
+                    durable.set_aside(self._path, BROKEN)
+                    self._to_keep_aside = False
+                self._ledger.flush()
+            except OSError as error:
+                raise StateError(f"cannot write {self._path}: {error.strerror}") from error
 
     def _load(self, head: str | None) -> None:
         lines = self._read()
+        chain: list[Kept] = []
         for number, line in enumerate(lines, start=1):
             kept = _parsed(line)
-            last = self._kept[-1] if self._kept else None
-            if kept is None or (last is not None and kept.entry.previous_sha256 != last.sha256):
+            if kept is None or (chain and kept.entry.previous_sha256 != chain[-1].sha256):
                 self.damage = f"line {number} of {len(lines)} is not what its hash, or the one before it, says"
                 break
-            self._kept.append(kept)
-        if self.damage is None and not _reaches(self._kept, head):
+            chain.append(kept)
+            self._ledger.found(kept)
+        if self.damage is None and not _reaches(self._ledger.items(), head):
             self.damage = "its end was cut off: it lacks an entry that the state file knows of"
-        if self._kept:
-            self._durable_head = _head_of(self._kept[-1])
         if self.damage is not None:
             self._to_keep_aside = True
-            self._log.renew()
+            self._ledger.renew()
             with contextlib.suppress(StateError):
-                self._flush()
+                self.flush()
 
     def _read(self) -> list[bytes]:
         try:
-            return self._log.load()
+            return self._ledger.load()
         except OSError as error:
             self.damage = f"it cannot be read: {error.strerror}"
             return []
-
-    def _keep_aside(self) -> None:
-        durable.set_aside(self._path, BROKEN)
-        self._to_keep_aside = False
 
 
 def _parsed(line: bytes) -> Kept | None:
@@ -175,11 +160,7 @@ def _parsed(line: bytes) -> Kept | None:
     return Kept(sha256.decode(), entry, told, line)
 
 
-def _head_of(kept: Kept) -> str:
-    return f"{kept.entry.sequence} {kept.sha256}"
-
-
-def _reaches(chain: deque[Kept], head: str | None) -> bool:
+def _reaches(chain: Sequence[Kept], head: str | None) -> bool:
     """Whether a sound chain holds the entry that `head` names, or only ones after it: the oldest are dropped."""
     if head is None:
         return True

@@ -6,53 +6,53 @@ Only the newest are kept. Nothing is decided by them: a line that cannot be read
 from __future__ import annotations
 
 import contextlib
-import threading
-from collections import deque
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from coec.adapters.files.durable import Log
+from coec.adapters.files.ledger import Ledger
 from coec.errors import StateError
 from coec.schemas.base import to_json
 from coec.schemas.replies import CheckReply
 
 
 class CheckLog:
-    """All that is kept, oldest first. Safe to use from several threads."""
+    """All that is kept, oldest first. Safe to use from several threads; only `flush` waits for the disk."""
 
     def __init__(self, path: Path, limit: int) -> None:
         """`path` holds the checks of earlier runs; the newest `limit` are kept."""
         self._path = path
-        self._lock = threading.Lock()
-        self._kept: deque[CheckReply] = deque(maxlen=limit)
-        self._log = Log(path, limit, lambda: map(to_json, self._kept))
+        self._ledger: Ledger[CheckReply] = Ledger(path, limit, to_json)
         self._load()
 
     def checks(self) -> tuple[CheckReply, ...]:
         """All that are kept."""
-        with self._lock:
-            return tuple(self._kept)
+        return self._ledger.items()
+
+    def on_disk(self) -> tuple[CheckReply, ...]:
+        """All that are on the disk."""
+        return self._ledger.on_disk()
 
     def append(self, check: CheckReply) -> None:
-        """Keep one more.
+        """Keep one more; on the disk with the next `flush`."""
+        self._ledger.add(lambda _: check)
+
+    def flush(self) -> None:
+        """Put on the disk what is not there yet.
 
         Raises:
-            StateError: it is kept in memory, but not on the disk; it goes there with the next.
+            StateError: it is not possible; the next call tries again.
         """
-        with self._lock:
-            self._kept.append(check)
-            self._log.add(to_json(check))
-            try:
-                self._log.flush()
-            except OSError as error:
-                raise StateError(f"cannot write {self._path}: {error.strerror}") from error
+        try:
+            self._ledger.flush()
+        except OSError as error:
+            raise StateError(f"cannot write {self._path}: {error.strerror}") from error
 
     def _load(self) -> None:
         try:
-            lines = self._log.load()
+            lines = self._ledger.load()
         except OSError:  # then it begins anew
             return
         for line in lines:
             with contextlib.suppress(ValidationError):
-                self._kept.append(CheckReply.model_validate_json(line))
+                self._ledger.found(CheckReply.model_validate_json(line))

@@ -33,12 +33,15 @@ from coec.runtime.decisions.rig_baseline import RigBaseline
 from coec.runtime.ingest.chooser import Served
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.recording.window_index import WindowVersion
-from coec.runtime.recording.window_store import WindowStore, start_ns_of
+from coec.runtime.recording.window_store import start_ns_of
 from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved, WrittenFile
 from coec.runtime.worker.queue import STOPPING
 from coec.schemas.replies import CalibrationResult, CheckReply
 
 _log = logging.getLogger(__name__)
+
+UNTOLD_S = 0.02
+"""Between two attempts to tell what the disk is about to take."""
 
 TICK_S = 1.0
 """Longest time between two looks at the clocks; health is never older than that while the thread lives."""
@@ -105,7 +108,6 @@ class Decider:
         baseline: RigBaseline,
         queue: DecisionQueue,
         pictures: IncidentPictures,
-        windows: WindowStore,
         stream: StreamSide,
         mailbox: Mailbox,
         losses: LossCounter,
@@ -121,7 +123,6 @@ class Decider:
         self._baseline = baseline
         self._queue = queue
         self._pictures = pictures
-        self._windows = windows
         self._stream = stream
         self._mailbox = mailbox
         self._losses = losses
@@ -135,6 +136,7 @@ class Decider:
         self._check_attempts = Attempts("checks", "monitor_blind")
         self._window_attempts = Attempts("windows", "windows_in_vain")
         self._overdue: Reason | None = None
+        self._untold = False
 
     def request_stop(self) -> None:
         """Take what has come, and end the thread."""
@@ -176,16 +178,17 @@ class Decider:
 
     def work(self, timeout_s: float) -> bool:
         """Do the next piece of work, or look at the clocks when there is none for so long; whether there was one."""
-        item = self._mailbox.take(timeout_s)
+        item = self._mailbox.take(UNTOLD_S if self._untold else timeout_s)
         if item is not None:
             item()
         now_s = time.monotonic()
-        if item is not None or now_s - self._looked_s >= TICK_S:
+        if item is not None or self._untold or now_s - self._looked_s >= TICK_S:
             self.look_at_clocks(now_s)
         return item is not None
 
     def tell_now(self) -> None:
-        """Tell what is known, without waiting for the clock."""
+        """Tell what is known, whatever waits."""
+        self._untold = False
         self._tell(self.known())
 
     def look_at_clocks(self, monotonic_s: float) -> None:
@@ -196,7 +199,10 @@ class Decider:
             self._losses.add("monitor", "unanswered", lost)
         self._overdue = self._progress.overdue(self._stream.report, monotonic_s)
         self._store.age(self._overdue, self._progress.silent_s(monotonic_s), self._stale_after_s)
-        self._tell(self.known())
+        # What a restart would not know is not told, while the disk is only busy.
+        self._untold = not self._store.may_be_told()
+        if not self._untold:
+            self.tell_now()
 
     def use(self, pair: PairConfig, stale_after_s: float, told: str) -> None:
         """Judge what comes by other settings from now on; `told` goes into the history."""
@@ -333,7 +339,7 @@ class Decider:
             pairs=file.pairs,
             decision=result.verdict.decision,
         )
-        self._windows.note(result.window_id, version)
+        self._store.note_window(result.window_id, version)
 
     def _judge(self, result: CalibrationResult) -> Effect | None:
         estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)

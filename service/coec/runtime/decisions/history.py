@@ -12,7 +12,7 @@ came.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -28,8 +28,8 @@ FILES: Final[Mapping[Book, str]] = {"results": "history", "states": "states", "c
 class History:
     """All that is kept of one pair. Safe to use from several threads.
 
-    An entry that could not be put on the disk is kept, and goes there with the next one of its book, in order: the
-    chains on the disk hold at any time.
+    Only `flush` waits for the disk, and nobody waits for it. Entries of a book go there in order: the chains on the
+    disk hold at any time.
 
     Attributes:
         damage: what was wrong with the chains that were found, one sentence; None when they held.
@@ -58,39 +58,37 @@ class History:
 
     def entries(self) -> tuple[Kept, ...]:
         """All that are kept, oldest first."""
-        every = (kept for chain in self._books.values() for kept in chain.entries())
-        return tuple(sorted(every, key=lambda kept: kept.entry.sequence))
+        return _in_order(chain.entries() for chain in self._books.values())
+
+    def on_disk(self) -> tuple[Kept, ...]:
+        """All that are on the disk, oldest first."""
+        return _in_order(chain.on_disk() for chain in self._books.values())
 
     def results(self) -> tuple[CalibrationResult, ...]:
         """Results of windows, oldest first."""
         return tuple(kept.result for kept in self.entries() if kept.result is not None)
 
     def append(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> Kept:
-        """Keep one more, in its book; its place is filled in. On the disk when this returns.
-
-        Raises:
-            StateError: it is kept in memory, but not on the disk; the next append or `flush` tries again.
-        """
+        """Keep one more, in its book; its place is filled in. On the disk with the next `flush`."""
         with self._lock:
             book = self._book_of(entry)
             number, self._next = self._next, self._next + 1
             return self._books[book].append(entry.model_copy(update={"sequence": number, "book": book}), result)
 
     def flush(self) -> None:
-        """Put on the disk what an append could not.
+        """Put on the disk what is not there yet.
 
         Raises:
-            StateError: it is still not possible.
+            StateError: it is not possible; the next call tries again.
         """
-        with self._lock:
-            failed = []
-            for chain in self._books.values():
-                try:
-                    chain.flush()
-                except StateError as error:
-                    failed.append(str(error))
-            if failed:
-                raise StateError("; ".join(failed))
+        failed = []
+        for chain in self._books.values():
+            try:
+                chain.flush()
+            except StateError as error:
+                failed.append(str(error))
+        if failed:
+            raise StateError("; ".join(failed))
 
     def _book_of(self, entry: HistoryEntry) -> Book:
         match entry.kind:
@@ -107,3 +105,7 @@ class History:
         """Whether the window of an entry has one of its kind there already."""
         kept = (kept.entry for kept in self._books["results"].entries())
         return any((one.kind, one.window_id) == (entry.kind, entry.window_id) for one in kept)
+
+
+def _in_order(books: Iterable[Sequence[Kept]]) -> tuple[Kept, ...]:
+    return tuple(sorted((kept for book in books for kept in book), key=lambda kept: kept.entry.sequence))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 from coec.adapters.files.conversions import matrix_of
 from coec.adapters.system.logs import LossCounter
-from coec.runtime.decisions.incidents import Incidents, Side
+from coec.runtime.decisions.incidents import Side
 from coec.runtime.decisions.questions import Questions
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.jobs import Drawn, JobOutcome
@@ -16,8 +17,15 @@ from coec.schemas.replies import EvidenceEvent
 class IncidentPictures:
     """Belongs to the thread that decides about the pair."""
 
-    def __init__(self, incidents: Incidents, folder: WindowStore, questions: Questions, losses: LossCounter) -> None:
-        self._incidents = incidents
+    def __init__(
+        self,
+        keep: Callable[[str, Side, bytes], None],
+        folder: WindowStore,
+        questions: Questions,
+        losses: LossCounter,
+    ) -> None:
+        """`keep(event_id, side, jpeg)` adds a picture to an event."""
+        self._keep = keep
         self._folder = folder
         self._questions = questions
         self._losses = losses
@@ -37,6 +45,6 @@ class IncidentPictures:
 
     def _drawn(self, event_id: str, side: Side, outcome: JobOutcome) -> None:
         if isinstance(outcome.answer, Drawn):
-            self._incidents.add_overlay(event_id, side, outcome.answer.jpeg)
+            self._keep(event_id, side, outcome.answer.jpeg)
         elif outcome.reason is not None:
             self._losses.add("storage", "overlay_not_drawn", detail=outcome.reason.text)

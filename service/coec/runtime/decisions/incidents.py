@@ -7,18 +7,15 @@ to remove them. Bounded: the oldest event goes when there are too many, and its 
 from __future__ import annotations
 
 import contextlib
-import logging
 import threading
 from collections import deque
 from pathlib import Path
 from typing import Literal
 
 from coec.adapters.files import durable
-from coec.errors import DecodeError, NotFoundError
+from coec.errors import DecodeError, NotFoundError, StateError
 from coec.schemas.base import from_json, to_json
-from coec.schemas.replies import EvidenceEvent, EvidenceReply, MetricsPoint
-
-_log = logging.getLogger(__name__)
+from coec.schemas.replies import EvidenceEvent, MetricsPoint
 
 POINTS_KEPT = 240
 """Checks of the monitor whose figures are remembered: 20 minutes at one in 5 s."""
@@ -29,27 +26,29 @@ POINTS_AFTER = 60
 EVENT = "event.json"
 """In the folder of each event."""
 
+NO_EVENT = "no such event is kept; the list is in `evidence`"
+
 Side = Literal["before", "after"]
 
 
 class Incidents:
-    """Red events of one pair. Safe to use from several threads. A fault of the disk never costs the service: an event
-    that could not be written is tried again with the next check.
-
-    Attributes:
-        lost: writes that failed.
-    """
+    """Red events of one pair. Safe to use from several threads; only `flush` waits for the disk, and what it could not
+    write is in memory until it can."""
 
     def __init__(self, folder: Path, pair: str, limit: int) -> None:
         self._folder = folder
         self._pair = pair
         self._limit = limit
         self._lock = threading.RLock()
+        self._writing = threading.Lock()
         self._points: deque[MetricsPoint] = deque(maxlen=POINTS_KEPT)
         self._events: dict[str, EvidenceEvent] = {}
+        # What is on the disk, what is not yet, and what is still there.
+        self._on_disk: dict[str, EvidenceEvent] = {}
         self._unsaved: set[str] = set()
+        self._pictures: dict[tuple[str, Side], bytes] = {}
+        self._dropped: set[str] = set()
         self._after = 0
-        self.lost = 0
         self._load()
 
     @property
@@ -80,8 +79,6 @@ class Incidents:
             if newest is not None and self._after > 0:
                 self._after -= 1
                 self._keep(newest.model_copy(update={"metrics": (*newest.metrics, point)}))
-            elif self._unsaved:
-                self._save()
 
     def begin(self, event: EvidenceEvent) -> EvidenceEvent:
         """A red event begins; the figures so far are added to it."""
@@ -104,8 +101,9 @@ class Incidents:
         """A picture of one of the windows, at the extrinsic that was served when the event began."""
         with self._lock:
             event = self._events.get(event_id)
-            if event is None or not self._write(self._folder / event_id / f"{side}.jpg", jpeg):
+            if event is None:
                 return
+            self._pictures[event_id, side] = jpeg
             sides = tuple(s for s in ("before", "after") if s == side or s in event.overlays)
             self._keep(event.model_copy(update={"overlays": sides}))
 
@@ -116,22 +114,15 @@ class Incidents:
             if newest is not None and newest.resolution is None:
                 self._keep(newest.model_copy(update={"resolved_stamp_ns": stamp_ns, "resolution": text}))
 
-    def listing(self, vehicle: str) -> EvidenceReply:
-        """All events, without their figures."""
+    def events(self) -> tuple[EvidenceEvent, ...]:
+        """All that are kept, with their figures."""
         with self._lock:
-            bare = tuple(event.model_copy(update={"metrics": ()}) for event in self._events.values())
-            return EvidenceReply(vehicle=vehicle, pair=self._pair, events=bare)
+            return tuple(self._events.values())
 
-    def event(self, event_id: str) -> EvidenceEvent:
-        """One event with its figures.
-
-        Raises:
-            NotFoundError: no such event.
-        """
+    def on_disk(self) -> tuple[EvidenceEvent, ...]:
+        """All that are on the disk, as they are there."""
         with self._lock:
-            if event_id not in self._events:
-                raise NotFoundError("no such event is kept; the list is in `evidence`")
-            return self._events[event_id]
+            return tuple(self._on_disk.values())
 
     def overlay(self, event_id: str, side: Side) -> bytes:
         """JPEG of the window before or after an event.
@@ -139,9 +130,14 @@ class Incidents:
         Raises:
             NotFoundError: no such event, or it has no such picture.
         """
-        event = self.event(event_id)
+        with self._lock:
+            if event_id not in self._events:
+                raise NotFoundError(NO_EVENT)
+            waiting = self._pictures.get((event_id, side))
+        if waiting is not None:
+            return waiting
         try:
-            return (self._folder / event.event_id / f"{side}.jpg").read_bytes()
+            return (self._folder / event_id / f"{side}.jpg").read_bytes()
         except OSError as error:
             raise NotFoundError(f"the event has no picture of the window {side} it") from error
 
@@ -155,43 +151,61 @@ class Incidents:
                     continue
                 event = from_json(EvidenceEvent, (folder / EVENT).read_bytes())
                 if event.pair == self._pair and event.event_id == folder.name:
-                    self._events[event.event_id] = event
+                    self._events[event.event_id] = self._on_disk[event.event_id] = event
         self._drop_oldest()
+        with contextlib.suppress(StateError):
+            self.flush()
 
     def _drop_oldest(self) -> None:
         while len(self._events) > self._limit:
             oldest = next(iter(self._events))
             del self._events[oldest]
+            self._on_disk.pop(oldest, None)
             self._unsaved.discard(oldest)
-            try:
-                durable.remove_folder(self._folder / oldest)
-            except OSError as error:  # it is found and removed at the next start
-                self._note_failure("removed", error)
+            self._pictures = {key: jpeg for key, jpeg in self._pictures.items() if key[0] != oldest}
+            self._dropped.add(oldest)
 
     def _keep(self, event: EvidenceEvent) -> EvidenceEvent:
         self._events[event.event_id] = event
         self._unsaved.add(event.event_id)
-        self._save()
         return event
 
-    def _save(self) -> None:
-        """Write what is not on the disk: the event that has just changed, and those that could not be written then."""
-        for event_id in sorted(self._unsaved):
-            if self._write(self._folder / event_id / EVENT, to_json(self._events[event_id])):
-                self._unsaved.discard(event_id)
+    def flush(self) -> None:
+        """Put on the disk what is not there yet: pictures before the events that name them; and remove what is kept no
+        more.
 
-    def _write(self, path: Path, data: bytes) -> bool:
-        try:
-            durable.make_folder(path.parent)
-            durable.replace(path, data)
-        except OSError as error:
-            self._note_failure("written", error)
-            return False
-        return True
+        Raises:
+            StateError: it is not possible; the next call tries again.
+        """
+        with self._writing:
+            with self._lock:
+                pictures = dict(self._pictures)
+                events = {event_id: self._events[event_id] for event_id in sorted(self._unsaved)}
+                dropped = tuple(self._dropped)
+            try:
+                for (event_id, side), jpeg in pictures.items():
+                    self._write(self._folder / event_id / f"{side}.jpg", jpeg)
+                    with self._lock:
+                        if self._pictures.get((event_id, side)) is jpeg:
+                            del self._pictures[event_id, side]
+                for event_id, event in events.items():
+                    self._write(self._folder / event_id / EVENT, to_json(event))
+                    with self._lock:
+                        if event_id in self._events:
+                            self._on_disk[event_id] = event
+                        if self._events.get(event_id) is event:
+                            self._unsaved.discard(event_id)
+                for event_id in dropped:
+                    durable.remove_folder(self._folder / event_id)
+                    with self._lock:
+                        self._dropped.discard(event_id)
+            except OSError as error:
+                raise StateError(f"cannot write the evidence in {self._folder}: {error.strerror}") from error
 
-    def _note_failure(self, what: str, error: OSError) -> None:
-        self.lost += 1
-        _log.error(f"evidence could not be {what}: {error.strerror}", extra={"fields": {"pair": self._pair}})
+    @staticmethod
+    def _write(path: Path, data: bytes) -> None:
+        durable.make_folder(path.parent)
+        durable.replace(path, data)
 
 
 def _is_event_of(pair: str, name: str) -> bool:

@@ -7,7 +7,6 @@ is all put on the disk. One thread changes it, the one that decides about the pa
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import time
 from collections import Counter
@@ -18,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from coec.adapters.files.conversions import transform_of
+from coec.adapters.files.scribe import Scribe
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.lifecycle import HealthState, PairState, Provenance, aged, initial_state, overdue, restored
 from coec.calibration.types import Reason, Rig
@@ -26,10 +26,11 @@ from coec.errors import NotFoundError, StateError
 from coec.runtime.decisions.chain import GENESIS, Kept
 from coec.runtime.decisions.check_log import CheckLog
 from coec.runtime.decisions.history import History
-from coec.runtime.decisions.incidents import Incidents
+from coec.runtime.decisions.incidents import Incidents, Side
 from coec.runtime.decisions.state_store import Clocks, StateStore
 from coec.runtime.ingest.chooser import Served
 from coec.runtime.ingest.sensor_clock import NS_PER_S
+from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
 from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, MetricsPoint
@@ -57,6 +58,20 @@ class Taken:
     served: Served
 
 
+@dataclass(frozen=True, slots=True)
+class Books:
+    """The books as others see them, oldest first."""
+
+    entries: tuple[Kept, ...]
+    checks: tuple[CheckReply, ...]
+    events: tuple[EvidenceEvent, ...]
+
+    @property
+    def results(self) -> tuple[CalibrationResult, ...]:
+        """Of windows."""
+        return tuple(kept.result for kept in self.entries if kept.result is not None)
+
+
 class PairStore:
     """Keeps the books of one pair.
 
@@ -72,10 +87,12 @@ class PairStore:
         vehicle: str,
         config: StateConfig,
         store: StateStore,
+        scribe: Scribe,
         folder: WindowStore,
         losses: LossCounter,
     ) -> None:
         self._rig = rig
+        self._scribe = scribe
         self._vehicle = vehicle
         self._store = store
         self._folder = folder
@@ -96,7 +113,7 @@ class PairStore:
             losses.add("storage", "history_damaged", detail=self.history.damage)
             text = f"The chain of the history is broken: {self.history.damage}. It is kept aside."
             self.damage = self.damage or Reason("history_damaged", text)
-            self._write(_entry("chain", "broken", text))
+            self.history.append(_entry("chain", "broken", text))
             self.save()
         elif self.damage is not None:
             self.save()
@@ -162,20 +179,21 @@ class PairStore:
         reasons = "; ".join(reason.text for reason in result.verdict.reasons)
         text = reasons or f"A window of {result.pairs} pairs was accepted."
         entry = _entry("estimate", result.verdict.decision, text, result.data_stamp_ns)
-        self._write(entry.model_copy(update={"window_id": result.window_id}), result)
+        self.history.append(entry.model_copy(update={"window_id": result.window_id}), result)
 
     def note_check(self, check: CheckReply) -> None:
         """The monitor made a check."""
         values = {name: metric.value for name, metric in check.metrics.items()}
         self.incidents.note(MetricsPoint(stamp_ns=check.stamp_ns, state=check.state, metrics=values))
-        try:
-            self._checks.append(check)
-        except StateError as error:
-            self._losses.add("storage", "check_not_saved", detail=str(error))
+        self._checks.append(check)
+        self._scribe.write(self._checks, self.incidents)
 
-    def checks(self) -> tuple[CheckReply, ...]:
-        """The checks of the monitor that are kept, oldest first."""
-        return self._checks.checks()
+    def told(self) -> Books:
+        """What may be told: what a restart knows as well, unless the disk has refused it for so long that `health` says
+        so."""
+        if self._scribe.trouble is None:
+            return Books(self.history.on_disk(), self._checks.on_disk(), self.incidents.on_disk())
+        return Books(self.history.entries(), self._checks.checks(), self.incidents.events())
 
     def note_command(self, name: str, code: str, text: str, sender: str, *, accepted: bool) -> None:
         """A command was carried out or refused. Of equal refusals in a row only the first is written down."""
@@ -185,11 +203,11 @@ class PairStore:
             entry = last.entry
             if (entry.kind, entry.code, entry.text) == ("command", code, told):
                 return
-        self._write(_entry("command", code, told).model_copy(update={"sender": sender}))
+        self.history.append(_entry("command", code, told).model_copy(update={"sender": sender}))
 
     def note_commissioned(self, text: str) -> None:
         """The rig has a baseline."""
-        self._write(_entry("commissioned", "commissioned", text))
+        self.history.append(_entry("commissioned", "commissioned", text))
 
     def served_before(self, name: str | None) -> tuple[Kept, CalibrationResult]:
         """A calibration that was served, as the history holds it, and the accepted result that it rested on.
@@ -229,16 +247,20 @@ class PairStore:
         return line, results[str(line.entry.window_id)]
 
     def save(self) -> None:
-        """Put the state on the disk; a failure is counted."""
+        """Have all books put on the disk: those of the history before the state, which names their ends."""
         age_s = self.age_s
         completed_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
         clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
-        with contextlib.suppress(StateError):  # counted when it was appended
-            self.history.flush()
-        try:
-            self._store.remember(self._rig, self._state, clocks, self.history.durable_heads)
-        except StateError as error:
-            self._losses.add("storage", "state_not_saved", detail=str(error))
+        self._store.remember(self._rig, self._state, clocks, lambda: self.history.durable_heads)
+        self._scribe.write(self.history, self.incidents, self._store)
+
+    def is_on_disk(self) -> bool:
+        """Whether all that was noted and saved before this call is on the disk; see `Scribe.has_written`."""
+        return self._scribe.has_written()
+
+    def may_be_told(self) -> bool:
+        """Whether the state is on the disk, or `health` says why not."""
+        return self._scribe.has_written() or self._scribe.trouble is not None
 
     def age(self, why_overdue: Reason | None, silent_s: float, stale_after_s: float) -> None:
         """Time has passed: no check has been completed in time, for a reason, or for `silent_s` at all."""
@@ -282,7 +304,7 @@ class PairStore:
             self._epoch += moved
             entry = _entry("extrinsic", after.provenance.value, _ORIGIN[after.provenance], stamp_ns)
             served = {"camera_from_lidar": transform_of(after.T_camera_lidar), "window_id": window_id}
-            self._write(entry.model_copy(update=served))
+            self.history.append(entry.model_copy(update=served))
         if before.health is not after.health:
             self._since_ns = time.time_ns()
             self._note_health(before, after, stamp_ns)
@@ -290,7 +312,7 @@ class PairStore:
     def _note_health(self, before: PairState, after: PairState, stamp_ns: int | None) -> None:
         self.transitions[after.health.value] += 1
         text = "; ".join(reason.text for reason in after.reasons) or WORDS.get(after.health, "")
-        self._write(_entry("state", after.health.value, text, stamp_ns))
+        self.history.append(_entry("state", after.health.value, text, stamp_ns))
         fields = {"pair": self._rig.pair, "from": before.health.value, "to": after.health.value, "why": text}
         _log.info("the health of a pair changed", extra={"fields": fields})
         if after.health is HealthState.MISCALIBRATED:
@@ -327,15 +349,19 @@ class PairStore:
         )
         self.protect()
 
+    def add_picture(self, event_id: str, side: Side, jpeg: bytes) -> None:
+        """Add a picture to an event."""
+        self.incidents.add_overlay(event_id, side, jpeg)
+        self._scribe.write(self.incidents)
+
+    def note_window(self, window_id: str, version: WindowVersion) -> None:
+        """The file of a window was written again: this is what it was then."""
+        self._folder.note(window_id, version)
+        self._scribe.write(self._folder)
+
     def protect(self) -> None:
         """Tell the window folder what is evidence."""
         self._folder.protect(self._rig.pair, self.incidents.window_ids)
-
-    def _write(self, entry: HistoryEntry, result: CalibrationResult | None = None) -> None:
-        try:
-            self.history.append(entry, result)
-        except StateError as error:
-            self._losses.add("storage", "history_not_saved", detail=str(error))
 
 
 def _is_named(kept: Kept, name: str | None) -> bool:

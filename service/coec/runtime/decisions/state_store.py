@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -103,7 +103,7 @@ class Remembered:
 
 
 class StateStore:
-    """Keeps the state file; safe to use from several threads.
+    """Keeps the state file; safe to use from several threads. Only `flush` waits for the disk.
 
     Attributes:
         damage: what was wrong with the copies found at the start, one sentence each.
@@ -113,6 +113,8 @@ class StateStore:
         self._file = StateFile(folder / STATE_FILE)
         self._vehicle = vehicle
         self._lock = threading.Lock()
+        self._writing = threading.Lock()
+        self._heads: dict[str, Callable[[], Mapping[str, str]]] = {}
         loaded = self._file.load()
         self.damage = loaded.damage
         pairs = loaded.body.get("pairs") if loaded.body else None
@@ -143,12 +145,10 @@ class StateStore:
             why = "a pose in it is no rigid transform" if isinstance(error, _NoPoseError) else "it has another form"
             raise StateError(f"the state of pair {rig.pair} cannot be used: {why}") from error
 
-    def remember(self, rig: Rig, state: PairState, clocks: Clocks, history_heads: Mapping[str, str]) -> None:
-        """Put the pair's state on the disk.
-
-        Raises:
-            StateError: it could not be written; it is tried again with the next change.
-        """
+    def remember(
+        self, rig: Rig, state: PairState, clocks: Clocks, history_heads: Callable[[], Mapping[str, str]]
+    ) -> None:
+        """Keep the pair's state; on the disk with the next `flush`, together with what `history_heads()` says then."""
         stored = StoredPair(
             rig_sha256=_rig_sha256(rig),
             T_camera_lidar=_rows(state.T_camera_lidar.tolist()),
@@ -171,11 +171,22 @@ class StateStore:
             changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
             since_wall_ns=clocks.since_wall_ns,
             completed_stamp_ns=clocks.completed_stamp_ns,
-            history_heads=dict(history_heads),
         )
         with self._lock:
             self._pairs[rig.pair] = stored.model_dump(mode="json")
-            self._file.save({"pairs": self._pairs})
+            self._heads[rig.pair] = history_heads
+
+    def flush(self) -> None:
+        """Put what is kept on the disk.
+
+        Raises:
+            StateError: it is not possible; the next call tries again.
+        """
+        with self._writing:
+            with self._lock:
+                pairs, heads = dict(self._pairs), dict(self._heads)
+            told = {pair: {"history_heads": dict(of_pair())} for pair, of_pair in heads.items()}
+            self._file.save({"pairs": {pair: {**stored, **told.get(pair, {})} for pair, stored in pairs.items()}})
 
     def _candidate(self, pending: Candidate, rig: Rig) -> StoredCandidate:
         return StoredCandidate(

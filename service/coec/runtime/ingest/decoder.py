@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
+from collections import Counter, defaultdict, deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +44,8 @@ class Decoder:
         self._pair = pair
         self._limits = limits
         self._losses = losses
-        self._numbers: dict[str, SequenceNumbers] = {}
+        self._numbers: defaultdict[str, SequenceNumbers] = defaultdict(SequenceNumbers)
+        self._overruns: deque[str] = deque()
         self._received: Counter[str] = Counter()
         self._accepted: Counter[str] = Counter()
         self._T_cloud_lidar = np.array(pair.lidar.T_cloud_lidar, dtype=np.float64)
@@ -54,14 +55,24 @@ class Decoder:
         """Counters of a stream since the start."""
         return StreamCounts(self._received[stream], self._accepted[stream])
 
+    def overrun(self, stream: str) -> None:
+        """A sample went before it was decoded. Any thread."""
+        self._losses.add(stream, "overrun")
+        self._overruns.append(stream)
+
     def frame(self, parcel: Parcel) -> Frame | None:
         """The frame in a sample, or None when it was refused (and counted). Never raises for what a sender sent."""
         stream = parcel.stream
         self._received[stream] += 1
+        while self._overruns:
+            self._numbers[self._overruns.popleft()].counted()
         try:
             if len(parcel.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
-            frame = self._checked(stream, self._decode(parcel))
+            frame = self._decode(parcel)
+            if frame.sequence is not None and (lost := self._numbers[stream].lost_by(frame.sequence)):
+                self._losses.add(stream, "sequence_gap", lost)
+            frame = self._checked(stream, frame)
         except DecodeError as error:
             self._losses.add(stream, error.reason, detail=str(error) if error.reason == CLOUD_ORIGIN else "")
             return None
@@ -70,10 +81,6 @@ class Decoder:
             _log.exception("a decoder failed", extra={"fields": {"pair": self._pair.name, "stream": stream}})
             self._losses.add(stream, "decoder_fault")
             return None
-        if frame.sequence is not None:
-            numbers = self._numbers.setdefault(stream, SequenceNumbers())
-            if lost := numbers.lost_by(frame.sequence):
-                self._losses.add(stream, "sequence_gap", lost)
         self._accepted[stream] += 1
         return frame
 

@@ -1,4 +1,4 @@
-"""Where samples wait between the network's thread and the ingest thread of a pair: bounded, oldest out first."""
+"""Where samples wait between the network's thread and the ingest thread of a pair: bounded in number and in bytes."""
 
 from __future__ import annotations
 
@@ -35,13 +35,40 @@ class Arrivals:
     age_s: float | None
 
 
-class Inbox:
-    """The streams of one pair. `put` takes microseconds and never blocks on the reader; one thread takes."""
+class _Waiting:
+    """The samples of one stream, oldest first."""
 
-    def __init__(self, depths: dict[str, int], on_overrun: Callable[[str], None]) -> None:
-        """`depths` maps each stream to the number of samples that may wait; `on_overrun(stream)` is called for each
-        that had to go."""
-        self._queues: dict[str, deque[Parcel]] = {stream: deque(maxlen=depth) for stream, depth in depths.items()}
+    def __init__(self, depth: int) -> None:
+        self.parcels: deque[Parcel] = deque()
+        self.depth = depth
+        self.bytes = 0
+
+    def add(self, parcel: Parcel) -> None:
+        self.parcels.append(parcel)
+        self.bytes += len(parcel.payload)
+
+    def take(self) -> Parcel:
+        parcel = self.parcels.popleft()
+        self.bytes -= len(parcel.payload)
+        return parcel
+
+
+class Inbox:
+    """The streams of one pair. `put` takes microseconds and never blocks on the reader; one thread takes.
+
+    What is too much goes: of a stream with too many samples its oldest; of too many bytes in all the oldest of the
+    stream that holds most, so that large messages on one stream push nothing out of another.
+    """
+
+    def __init__(self, depths: dict[str, int], max_bytes: int, on_overrun: Callable[[str], None]) -> None:
+        """
+        Args:
+            depths: by stream, how many samples may wait.
+            max_bytes: of all samples that wait. The latest sample of all is taken whatever its size.
+            on_overrun: called with the stream for each sample that had to go.
+        """
+        self._waiting = {stream: _Waiting(depth) for stream, depth in depths.items()}
+        self._max_bytes = max_bytes
         self._came_s: dict[str, float] = {}
         self._calls: deque[Call] = deque()
         self._on_overrun = on_overrun
@@ -51,13 +78,12 @@ class Inbox:
     def put(self, stream: str, payload: bytes, encoding: str) -> None:
         """A sample came."""
         with self._condition:
-            queue = self._queues[stream]
-            overrun = len(queue) == queue.maxlen
+            gone = self._make_room(stream, len(payload))
+            self._waiting[stream].add(Parcel(next(self._order), stream, payload, encoding))
             self._came_s[stream] = time.monotonic()
-            queue.append(Parcel(next(self._order), stream, payload, encoding))
             self._condition.notify()
-        if overrun:
-            self._on_overrun(stream)
+        for overrun in gone:
+            self._on_overrun(overrun)
 
     def call(self, run: Callable[[], None]) -> None:
         """Have `run` called by the reader, before the samples that wait."""
@@ -69,8 +95,8 @@ class Inbox:
         """By stream, at this time of the steady clock."""
         with self._condition:
             return {
-                stream: Arrivals(len(queue), None if came_s is None else max(monotonic_s - came_s, 0.0))
-                for stream, queue in self._queues.items()
+                stream: Arrivals(len(waiting.parcels), None if came_s is None else max(monotonic_s - came_s, 0.0))
+                for stream, waiting in self._waiting.items()
                 for came_s in (self._came_s.get(stream),)
             }
 
@@ -88,8 +114,26 @@ class Inbox:
                 taken = self._pop()
             return taken
 
+    def _make_room(self, stream: str, size: int) -> list[str]:
+        """Take out what has to go for a sample of `size` bytes; the streams whose it was."""
+        gone = []
+        own = self._waiting[stream]
+        if len(own.parcels) == own.depth:
+            own.take()
+            gone.append(stream)
+        while sum(waiting.bytes for waiting in self._waiting.values()) + size > self._max_bytes:
+            # The new sample counts as its stream's: who sends the large ones makes room for them.
+            held = {name: waiting.bytes + size * (name == stream) for name, waiting in self._waiting.items()}
+            full = [name for name, waiting in self._waiting.items() if waiting.parcels]
+            if not full:
+                break
+            fullest = max(full, key=lambda name: held[name])
+            self._waiting[fullest].take()
+            gone.append(fullest)
+        return gone
+
     def _pop(self) -> Parcel | Call | None:
         if self._calls:
             return self._calls.popleft()
-        waiting = [queue for queue in self._queues.values() if queue]
-        return min(waiting, key=lambda queue: queue[0].order).popleft() if waiting else None
+        waiting = [waiting for waiting in self._waiting.values() if waiting.parcels]
+        return min(waiting, key=lambda one: one.parcels[0].order).take() if waiting else None

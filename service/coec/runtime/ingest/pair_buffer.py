@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from coec.calibration.types import FramePair
+from coec.runtime.ingest.frame_budget import frame_bytes
 
 
 class PairBuffer:
@@ -47,8 +48,5 @@ class PairBuffer:
 
 
 def bytes_of(pair: FramePair) -> int:
-    """Of its images and its points: all that matters."""
-    camera, lidar = pair.camera, pair.lidar
-    arrays = (lidar.xyz_m, lidar.intensity, lidar.ring, lidar.time_offset_s)
-    images = (camera.image, camera.depth)
-    return sum(a.nbytes for a in arrays if a is not None) + sum(len(i.data) for i in images if i is not None)
+    """Of its images and its points."""
+    return frame_bytes(pair.camera) + frame_bytes(pair.lidar)

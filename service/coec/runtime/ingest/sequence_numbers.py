@@ -19,9 +19,24 @@ class SequenceNumbers:
     def __init__(self) -> None:
         self._newest: int | None = None
         self._awaited: set[int] = set()
+        self._counted = 0
+        self._since_counted = 0
+
+    def counted(self) -> None:
+        """A frame that had come was lost here, and was counted then: its number is left out, too. Whoever sent it may
+        not have numbered it, so that no gap of much later is taken for its."""
+        self._counted += 1
+        self._since_counted = 0
 
     def lost_by(self, number: int) -> int:
-        """How many frames are known to be lost now that the one of this number has come."""
+        """How many frames are known to be lost on their way now that the one of this number has come."""
+        lost = self._left_out_by(number)
+        known = min(lost, self._counted)
+        self._since_counted += 1
+        self._counted = 0 if self._since_counted > 2 * LATE_FRAMES else self._counted - known
+        return lost - known
+
+    def _left_out_by(self, number: int) -> int:
         newest = self._newest
         if newest is not None and newest - LATE_FRAMES <= number <= newest:  # late, or for the second time
             self._awaited.discard(number)

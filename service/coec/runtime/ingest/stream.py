@@ -15,7 +15,8 @@ from coec.config import Config, PairConfig
 from coec.runtime.handover import Handover
 from coec.runtime.ingest.chooser import Chooser, Served
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
-from coec.runtime.ingest.inbox import Call, Inbox
+from coec.runtime.ingest.frame_budget import FrameBudget
+from coec.runtime.ingest.inbox import Call, Inbox, Parcel
 from coec.runtime.ingest.pair_buffer import PairBuffer
 from coec.runtime.ingest.sensor_clock import NS_PER_S, SensorClock
 from coec.runtime.ingest.stream_statistics import StreamStatistics
@@ -24,10 +25,14 @@ from coec.runtime.timings import QUICK_S, Histogram
 T = TypeVar("T")
 
 FRAMES_WAITING = 16
-"""Samples of camera or LiDAR that may wait for the ingest thread: 1.6 s at 10 Hz, some 40 MB in all."""
+"""Samples of camera or LiDAR that may wait for the ingest thread: 1.6 s at 10 Hz."""
 
 MOTIONS_WAITING = 512
 """Ego-motion samples that may wait: 2.5 s at 200 Hz."""
+
+ALL_FRAMES = 1.5
+"""Bytes of all frames that a pair may have in memory, in those that may be held: the others wait for their partner, the
+disk or the worker, 25 pairs of 2.5 MB."""
 
 GRACE_NS = NS_PER_S
 """Sensor time after the end of a slice before silence ends it: late pairs may still be on their way."""
@@ -49,18 +54,20 @@ class Stream:
     ) -> None:
         """`has_room()` says whether the recorder would take a chosen pair now."""
         depths = {CAMERA: FRAMES_WAITING, LIDAR: FRAMES_WAITING, EGO: MOTIONS_WAITING}
-        self.inbox = Inbox(depths, lambda stream: losses.add(stream, "overrun"))
+        self._decoder = Decoder(pair, config.limits, losses)
+        self.inbox = Inbox(depths, config.limits.max_waiting_bytes, self._decoder.overrun)
         self.thread = ServiceThread(f"ingest-{pair.name}", self._run)
         self.report = StreamStatistics()
         self.decoding_took = Histogram(QUICK_S)
         self.waiting_took = Histogram(QUICK_S)
         self._chooser = chooser
         self._has_room = has_room
-        self._decoder = Decoder(pair, config.limits, losses)
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._clock = SensorClock()
         self._held = PairBuffer(config.limits.max_held_bytes, config.worker.timeout_s)
         self._came_s: deque[float] = deque()
+        self._budget = FrameBudget(round(ALL_FRAMES * config.limits.max_held_bytes))
+        self._losses = losses
         self._pairs = 0
         self._sync_error_s: float | None = None
 
@@ -139,15 +146,22 @@ class Stream:
             if isinstance(item, Call):
                 item.run()
             elif item is not None:
-                begun_s = time.monotonic()
-                frame = self._decoder.frame(item)
-                self.decoding_took.add(time.monotonic() - begun_s, item.stream)
-                if frame is not None:
-                    self.take(self._pairer.push(frame))
+                self._take_frame(item)
             self.choose_next()
             if item is None:
                 self._end_in_silence()
             self.tell()
+
+    def _take_frame(self, parcel: Parcel) -> None:
+        begun_s = time.monotonic()
+        frame = self._decoder.frame(parcel)
+        self.decoding_took.add(time.monotonic() - begun_s, parcel.stream)
+        if frame is None:
+            return
+        if not self._budget.admit(frame):
+            self._losses.add(parcel.stream, "memory_full")
+            return
+        self.take(self._pairer.push(frame))
 
     def _may_choose(self) -> bool:
         """Whether the next pair has come, and all is judged that has to be before it is looked at; or it has waited for

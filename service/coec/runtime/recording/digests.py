@@ -115,6 +115,7 @@ class DigestReader:
             decision=reading.result.verdict.decision if reading.result else None,
         )
         self._store.note(reading.path.stem, version)
+        self._store.flush()
 
 
 def _result_in(path: Path) -> CalibrationResult | None:

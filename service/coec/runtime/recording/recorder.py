@@ -32,8 +32,9 @@ UNSOLVED_RESUMED = 4
 """Windows of earlier runs that are still solved after a start, newest first."""
 
 POLL_S = 0.2
+"""Between two looks at the folder: so late is what the list says of files that others put there."""
 
-STUCK_S = 10.0
+STUCK_S = 3.0
 """Without a sign of life of the thread: it gives one several times a second, and between two writes."""
 
 DIGEST_BYTES = 4 * 2**20
@@ -186,10 +187,19 @@ class Recorder:
             elif thread.stopping:
                 break
             else:
-                unread = self._digests.read(DIGEST_BYTES)
+                unread = self._read()
         self._digests.close()
         if self._open is not None:
             self._end(self._open.window_id)
+
+    def _read(self) -> bool:
+        """Go on with windows of which nothing is known, and see by that what others have done in the folder; False when
+        there is nothing to read."""
+        try:
+            return self._digests.read(DIGEST_BYTES)
+        except OSError as error:
+            self._losses.add("storage", "windows_not_listed", detail=f"the folder of windows: {error.strerror}")
+            return False
 
     def _resume(self) -> None:
         pair = self._plan.rig.pair

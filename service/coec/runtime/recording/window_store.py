@@ -1,5 +1,8 @@
 """The folder of recorded windows: what is there, what has to go, bytes of a file.
 
+Whoever asks what is there is told from memory, and waits for no disk: threads that may wait for one, those of the
+recorders, look at the folder several times a second, write and remove.
+
 No clock is trusted alone with a file. Which window is older is told by the order in which they were recorded; one is
 too old only when the wall clock says so and the sensor time of a newer window of its pair as well. And as both may
 jump together, age takes few at a time.
@@ -70,7 +73,8 @@ class _View:
 
 
 class WindowStore:
-    """All windows of all pairs. Safe to use from several threads.
+    """All windows of all pairs. Safe to use from several threads. What a recorder does, and `read`, waits for the disk;
+    `listing`, `usage`, `note`, `hold` and the like wait for nobody.
 
     Attributes:
         removed: windows that had to go.
@@ -84,6 +88,7 @@ class WindowStore:
         """
         self._folder = folder
         self._config = config
+        self._disk = threading.Lock()  # before the other, where both are needed
         self._lock = threading.Lock()
         self._found: dict[str, _Found] = {}
         self._views: dict[str, _View] = {}
@@ -91,13 +96,14 @@ class WindowStore:
         self._held: Counter[str] = Counter()
         self._changed_ns: int | None = None
         self._changed_s = self._looked_s = 0.0
+        self._free = 0
         self.removed = 0
         try:
             durable.make_folder(folder)
             for leftover in folder.glob(f"*{SUFFIX}{REWRITE_SUFFIX}"):  # the original is still there
                 leftover.unlink(missing_ok=True)
             self._index = WindowIndex(folder.with_name(f"{folder.name}.jsonl"))
-            self._look()
+            self.look()
         except OSError as error:
             raise RecordingError(f"the folder {folder} cannot be made or read: {error.strerror}") from error
 
@@ -124,6 +130,7 @@ class WindowStore:
 
     def windows(self, pair: str) -> list[Path]:
         """Files of the pair's windows, in the order in which they were recorded."""
+        self.look()
         with self._lock:
             return [self.path(info.window_id) for info in self._view(pair).infos]
 
@@ -140,9 +147,7 @@ class WindowStore:
     def usage(self) -> Usage:
         """How full it is."""
         with self._lock:
-            self._look()
-            used = sum(found.size_bytes for found in self._found.values())
-        return Usage(used, _free_bytes(self._folder))
+            return Usage(sum(found.size_bytes for found in self._found.values()), self._free)
 
     def listing(self, pair: str) -> tuple[WindowInfo, ...]:
         """Every window of the pair, oldest first. Opens no file: what has not been read yet is null."""
@@ -177,33 +182,38 @@ class WindowStore:
             pairs=recorded.pairs,
             decision=None,
         )
+        self.look()
         with self._lock:
-            self._look()
             found = self._found.get(recorded.window_id)
             if found is not None:
                 found = self._found[recorded.window_id] = replace(found, order=self._index.next_order())
                 self._put(recorded.window_id, found.order, version)
-        self._index.flush()  # without the lock: a disk may take seconds, and whoever asks for the list does not wait
+        self.flush()
 
     def note(self, window_id: str, version: WindowVersion) -> None:
         """The file of a window was read or written again: this is what it was then. If it is another by now, nothing
-        is lost: what is noted counts for a file of this size and time only."""
+        is lost: what is noted counts for a file of this size and time only. Kept with the next `flush`."""
         with self._lock:
-            self._look()
             found = self._found.get(window_id)
             if found is not None:
+                if version.modified_ns > found.modified_ns:  # written since the folder was looked at
+                    size_bytes, modified_ns = version.size_bytes, version.modified_ns
+                    self._found[window_id] = replace(found, size_bytes=size_bytes, modified_ns=modified_ns)
                 self._put(window_id, found.order, version)
+
+    def flush(self) -> None:
+        """Put on the disk what was noted."""
         self._index.flush()
 
     def version(self, window_id: str) -> WindowVersion | None:
         """What was read of a window as it is now; None: not read yet, or no such window."""
         with self._lock:
-            self._look()
             found = self._found.get(window_id)
             return None if found is None else self._version(window_id, found)
 
     def unread(self, pair: str) -> tuple[Path, ...]:
         """The pair's windows of which not everything is known, the latest first."""
+        self.look()
         with self._lock:
             return self._view(pair).unread
 
@@ -244,10 +254,9 @@ class WindowStore:
             raise RecordingError(f"no room can be made in {self._folder}: {error.strerror}") from error
 
     def _make_room(self, progress: Callable[[], None]) -> None:
-        """The lock is held for one window at a time, and not while the disk is waited for."""
         durable.make_folder(self._folder)
+        self.look()
         with self._lock:
-            self._look()
             latest = {found.pair: window_id for window_id, found in self._in_order()}
             newest = {pair: self._found[window_id] for pair, window_id in latest.items()}
             removable = [item for item in self._in_order() if item[0] != latest[item[1].pair]]
@@ -279,14 +288,16 @@ class WindowStore:
 
     def _remove(self, window_id: str, *, spare_evidence: bool) -> bool:
         """Remove a window, unless something is under way with it by now, it has gone, or it is to be spared."""
-        with self._lock:
-            spared = spare_evidence and window_id in self._evidence()
-            if spared or window_id in self._held or window_id not in self._found:
-                return False
+        with self._disk:
+            with self._lock:
+                spared = spare_evidence and window_id in self._evidence()
+                if spared or window_id in self._held or window_id not in self._found:
+                    return False
+                del self._found[window_id]
+                self._views.clear()
+            self._changed_ns = None  # it is found again where it cannot be removed
             self.path(window_id).unlink(missing_ok=True)
             self.removed += 1
-            del self._found[window_id]
-            self._views.clear()
             return True
 
     def _is_too_old(self, found: _Found, newest: _Found) -> bool:
@@ -295,6 +306,31 @@ class WindowStore:
         by_wall_clock = time.time_ns() - found.modified_ns > oldest_ns
         return by_wall_clock and newest.start_ns - found.start_ns > oldest_ns
 
+    # --- on threads that may wait for the disk ----------------------------------------------------------------------
+
+    def look(self) -> None:
+        """Read the folder if it has changed. No file in it is written in place: a window that changes is replaced, and
+        the folder changes with it.
+
+        Raises:
+            OSError: the disk does not say.
+        """
+        with self._disk:
+            now_s = time.monotonic()
+            try:
+                self._free = _free_bytes(self._folder)
+                changed_ns = self._folder.stat().st_mtime_ns
+                if changed_ns != self._changed_ns:
+                    self._changed_ns, self._changed_s = changed_ns, now_s
+                elif self._looked_s > self._changed_s + SETTLED_S:
+                    return
+                self._looked_s = now_s
+                statuses = _statuses(self._folder)
+            except FileNotFoundError:  # somebody has removed the folder
+                self._changed_ns, statuses = None, {}
+            with self._lock:
+                self._compare(statuses)
+
     # --- inside; the lock is held -----------------------------------------------------------------------------------
 
     def _evidence(self) -> frozenset[str]:
@@ -302,22 +338,6 @@ class WindowStore:
 
     def _in_order(self) -> list[tuple[str, _Found]]:
         return sorted(self._found.items(), key=lambda item: item[1].order)
-
-    def _look(self) -> None:
-        """Read the folder if it has changed. No file in it is written in place: a window that changes is replaced, and
-        the folder changes with it."""
-        now_s = time.monotonic()
-        try:
-            changed_ns = self._folder.stat().st_mtime_ns
-            if changed_ns != self._changed_ns:
-                self._changed_ns, self._changed_s = changed_ns, now_s
-            elif self._looked_s > self._changed_s + SETTLED_S:
-                return
-            self._looked_s = now_s
-            statuses = _statuses(self._folder)
-        except FileNotFoundError:  # somebody has removed the folder
-            self._changed_ns, statuses = None, {}
-        self._compare(statuses)
 
     def _compare(self, statuses: Mapping[str, os.stat_result]) -> None:
         """Take over what is there now. A window that nobody has reported counts as the latest; of several of them their
@@ -357,7 +377,6 @@ class WindowStore:
         return indexed.version if same else None
 
     def _view(self, pair: str) -> _View:
-        self._look()
         view = self._views.get(pair)
         if view is None:
             ours = [(window_id, found) for window_id, found in self._in_order() if found.pair == pair]

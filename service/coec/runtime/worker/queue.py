@@ -31,8 +31,8 @@ these are for a worker that does not answer), pictures and commissionings, unsol
 SUPERSEDING = frozenset({Lane.CHECK, Lane.LIVE})
 """Where the newest is worth most."""
 
-PREFETCHES_WAITING = 8
-"""Images that may wait for early inference, some MB each; beyond, the solve infers them itself."""
+PREFETCHES_WAITING, PREFETCH_BYTES_WAITING = 8, 32 * 2**20
+"""Images that may wait for early inference, and their bytes; beyond, the solve infers them itself."""
 
 SUPERSEDED = Reason("superseded", "A newer one of the pair came before the worker was free.")
 BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
@@ -121,10 +121,12 @@ class JobQueue:
         """An image comes in; the oldest makes room for it."""
         if self._stopped:
             return
-        if len(self._prefetches) == PREFETCHES_WAITING:
+        self._prefetches.append(prefetch)
+        while len(self._prefetches) > PREFETCHES_WAITING or (
+            len(self._prefetches) > 1 and sum(len(one.frame) for one in self._prefetches) > PREFETCH_BYTES_WAITING
+        ):
             self._prefetches.popleft()
             self._causes["prefetch_dropped"] += 1
-        self._prefetches.append(prefetch)
 
     # --- from the worker's side -------------------------------------------------------------------------------------
 

@@ -1,0 +1,147 @@
+"""The thread that waits for the disk, so that nobody else does: it writes what others have put down in memory.
+
+Whoever has put something down says so and goes on. A disk that is full, read-only or slow keeps it waiting, and costs
+nothing else: it is tried again every second, and what was put down meanwhile goes with it. Whoever has to know asks
+whether all is on the disk, and waits for no longer than a disk that is well needs.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Protocol
+
+from coec.adapters.system.threads import ServiceThread
+from coec.calibration.types import Reason
+from coec.errors import StateError
+
+_log = logging.getLogger(__name__)
+
+PATIENCE_S = 0.05
+"""A disk that is well takes the lines and the state of a command, five fsyncs, within 20 ms; commands are answered
+within 100 ms whatever the disk does."""
+
+RETRY_S = 1.0
+"""Between two attempts, and between two looks at how full the disk is."""
+
+SLOW_S = 1.0
+"""A disk that takes longer for some kB is said to be slow."""
+
+FULL_BYTES = 2**20
+"""Free space below which no entry is sure to find room."""
+
+
+class Book(Protocol):
+    """What can be written."""
+
+    def flush(self) -> None:
+        """Write what was put down since the last time; may take as long as the disk does.
+
+        Raises:
+            StateError: it could not be written; the next call tries again.
+        """
+
+
+class Scribe:
+    """Of all books in one folder. `thread` writes, everything else is for any thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.thread = ServiceThread("scribe", self._run)
+        self._folder = folder
+        self._condition = threading.Condition()
+        self._due: dict[Book, None] = {}
+        self._asked = self._written = 0
+        self._begun_s: float | None = None
+        self._failure: Reason | None = None
+        self._space: Reason | None = None
+
+    def write(self, *books: Book) -> None:
+        """Something was put down in these books; it is written soon, in this order."""
+        with self._condition:
+            self._due.update(dict.fromkeys(books))
+            self._asked += 1
+            self._condition.notify_all()
+
+    def has_written(self) -> bool:
+        """Whether all that was put down before this call is on the disk. Waits for `PATIENCE_S` at most, and not at all
+        for a disk that refuses, or has kept others waiting for so long."""
+        with self._condition:
+            wanted, end_s = self._asked, time.monotonic() + PATIENCE_S
+            while self._written < wanted:
+                now_s = time.monotonic()
+                patience_s = min(end_s, (now_s if self._begun_s is None else self._begun_s) + PATIENCE_S) - now_s
+                if self._failure is not None or patience_s <= 0.0:
+                    return False
+                self._condition.wait(patience_s)
+            return True
+
+    @property
+    def trouble(self) -> Reason | None:
+        """What ails the disk; None while it is well."""
+        begun_s, failure = self._begun_s, self._failure
+        silent_s = 0.0 if begun_s is None else time.monotonic() - begun_s
+        if silent_s > SLOW_S:
+            text = f"The disk of {self._folder} has been busy for {silent_s:.0f} s: what is decided is not on it yet."
+            return Reason("disk_slow", text)
+        return failure or self._space
+
+    def write_due(self) -> None:
+        """Write what is due. For the scribe's own thread, or where there is none."""
+        with self._condition:
+            books, number = tuple(self._due), self._asked
+            self._due.clear()
+            self._begun_s = time.monotonic()
+        failed: dict[Book, StateError] = {}
+        for book in books:
+            try:
+                book.flush()
+            except StateError as error:
+                failed[book] = error
+        with self._condition:
+            self._begun_s = None
+            self._due = {**dict.fromkeys(failed), **self._due}
+            if failed:
+                text = f"{next(iter(failed.values()))}: it is kept in memory, and tried again every second."
+                self._failure = Reason("disk_failing", text)
+            else:
+                self._failure, self._written = None, number
+            self._condition.notify_all()
+
+    def look(self) -> None:
+        """See whether the disk has room. For the scribe's own thread: a disk that hangs does not even say that."""
+        try:
+            found = os.statvfs(self._folder)
+        except OSError as error:
+            self._space = Reason("disk_failing", f"The folder {self._folder} cannot be looked at: {error.strerror}.")
+            return
+        if found.f_flag & os.ST_RDONLY:
+            text = f"The disk of {self._folder} is read-only ({os.strerror(errno.EROFS)}): nothing can be kept."
+            self._space = Reason("disk_read_only", text)
+        elif found.f_bavail * found.f_frsize < FULL_BYTES:
+            text = f"The disk of {self._folder} is full: nothing can be kept. Free space."
+            self._space = Reason("disk_full", text)
+        else:
+            self._space = None
+
+    def _run(self, thread: ServiceThread) -> None:
+        seen = -1
+        while not thread.stopping:
+            thread.beat()
+            with self._condition:
+                if self._asked == seen:
+                    self._condition.wait(RETRY_S)
+                seen = self._asked
+            self.look()
+            if self._due:
+                self.write_due()
+        self.write_due()
+
+    def request_stop(self) -> None:
+        """Write what is due once more, and end the thread."""
+        self.thread.request_stop()
+        with self._condition:
+            self._condition.notify_all()
