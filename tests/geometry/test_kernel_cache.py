@@ -1,4 +1,5 @@
-"""Where compiled kernels are kept: private, writable, and another place after every edit of a source."""
+"""Where compiled kernels are kept: private, writable, and another place after every edit of a source. And for which
+processors."""
 
 import os
 import stat
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import coec
-from coec.geometry.compiler import kernel_cache_directory
+from coec.geometry.compiler import kernel_cache_directory, with_wide_registers
 
 
 @pytest.fixture
@@ -85,3 +86,10 @@ def test_the_import_sets_it_unless_the_user_has(tmp_path: Path) -> None:
     assert ours.parent == tmp_path / "cache" / "coec"
     theirs = _numba_cache_directory(cache_home | {"NUMBA_CACHE_DIR": str(tmp_path / "mine")})
     assert theirs == str(tmp_path / "mine")
+
+
+def test_only_processors_that_hold_their_clock_use_registers_of_512_bits() -> None:
+    first, later = "+avx2,+avx512f,-avx512vbmi2", "+avx2,+avx512f,+avx512vbmi2"
+    assert with_wide_registers("+avx2,-avx512f") == "+avx2,-avx512f"
+    assert with_wide_registers(first) == first
+    assert with_wide_registers(later) == f"{later},-prefer-256-bit"

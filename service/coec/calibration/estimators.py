@@ -173,8 +173,10 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     ranked = sorted(((fusion.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
     to_rank = near(config.search, fusion.ranking[-1])
     # The neighbourhood of the start, whatever the charts say of it.
-    begun = [start, *(basin for _, basin in ranked[:POLISHED_BASINS])]
-    ends = [polish_in_turn(fusion.ranking, basin, to_rank, progress) for basin in begun]
+    ends = [polish_in_turn(fusion.ranking, start, to_rank, progress)]
+    for _, basin in ranked[:POLISHED_BASINS]:
+        if sum(not _differ(end.T_camera_lidar, basin) for end in ends) < SETTLED_POSES:
+            ends.append(polish_in_turn(fusion.ranking, basin, to_rank, progress))
     polished = [(fusion.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
 
     def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:

@@ -1,12 +1,14 @@
 """The significance of range edges on edge maps against its plain form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.alignment import EdgeFrames, alignment_of_parts, frame_alignment, significances
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.projection import project
 from oracles import alignment_sums
@@ -59,6 +61,19 @@ def test_every_camera_model_agrees_with_the_plain_form_between_pixels(model: str
     assert at.significance == pytest.approx(strength / np.sqrt(square), abs=1e-4)
     assert at.of_frames.mean() == pytest.approx(at.significance)
     assert at.of_frames[1] == 0.0
+
+
+def test_a_part_is_what_its_points_are_by_themselves() -> None:
+    frames = frames_of(CAMERAS["double_sphere"], (2000, 0, 1, 1501))
+    part = np.random.default_rng(1).integers(0, 4, len(frames.weight)).astype(np.uint8)
+    at = alignment_of_parts(frames, part, 5, POSE)
+    for number in range(5):
+        # Nothing but weight makes a point count.
+        alone = frame_alignment(replace(frames, weight=np.where(part == number, frames.weight, np.float32(0.0))), POSE)
+        assert at.strength[:, number].tolist() == alone.strength.tolist()
+        assert at.square[:, number].tolist() == alone.square.tolist()
+    assert (at.square[:, :4].sum(axis=0) > 50.0).all()
+    assert not at.square[:, 4].any()
 
 
 @pytest.mark.parametrize("model", CAMERAS)

@@ -106,13 +106,10 @@ def build_edges(
         raise CalibrationError("no sweep has a jump in range: there is nothing to lay onto the edges of the images")
     # Motion compensation turns a shift of a tenth of a degree by two degrees at most: no need to.
     xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(found)])
-    lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
     weight = np.concatenate([edges.weight for edges in found])
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
     finest = min(finest, coarsest + 1 - BANDS)
-    # The third column of a rotation is where it takes the third axis.
-    scales = EdgeScales(lit, finest, coarsest, upright=rig.T_camera_lidar_nominal[:2, 2])
-    sharp, whole, *of_bands = _maps(scales, greys, len(pairs))
+    sharp, whole, *of_bands = _maps(rig, finest, coarsest, greys, len(pairs))
     points_m = np.ascontiguousarray(xyz_m.T)
 
     def frames(level: int, maps: NDArray[np.int8], chosen: NDArray[np.int64]) -> EdgeFrames:
@@ -143,12 +140,17 @@ def build_edges(
     )
 
 
-def _maps(scales: EdgeScales, greys: Iterable[NDArray[np.uint8]], frames: int) -> list[NDArray[np.int8]]:
+def _maps(
+    rig: Rig, finest: int, coarsest: int, greys: Iterable[NDArray[np.uint8]], frames: int
+) -> list[NDArray[np.int8]]:
     """The sharpest map, the whole one and the last `BANDS` bands of all images, each (F, h, w).
 
     An image at a time: none is in memory twice, nor longer than its turn where `greys` are decoded as they are asked
-    for.
+    for. What a pyramid is made in, as much as five maps, is gone before the charts are made.
     """
+    lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
+    # The third column of a rotation is where it takes the third axis.
+    scales = EdgeScales(lit, finest, coarsest, upright=rig.T_camera_lidar_nominal[:2, 2])
     stacks: list[NDArray[np.int8]] = []
     for frame, grey in enumerate(greys):
         if grey.shape != scales.shape:

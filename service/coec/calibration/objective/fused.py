@@ -18,7 +18,13 @@ from coec.calibration.objective.mutual_information import Evaluation, MutualInfo
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import in_image
-from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.alignment import (
+    LEAST_SQUARE,
+    EdgeFrames,
+    alignment_of_parts,
+    frame_alignment,
+    significances,
+)
 from coec.geometry.edges.charts import charted_significances
 from coec.geometry.projection import project
 
@@ -89,29 +95,18 @@ class FusedObjective:
         seen = valid & in_image(edges.camera, uv_px)
         frame = np.repeat(np.arange(len(edges.maps)), np.diff(edges.first_point))
         # What lies outside counts with the first sector, should a step bring it into view.
-        sector = np.zeros(len(p_camera), np.int64)
+        sector = np.zeros(len(p_camera), np.uint8)
         sector[seen] = sectors(uv_px[seen])
-        parts = [_chosen(edges, np.flatnonzero(sector == number)) for number in range(COLUMNS * ROWS)]
 
         def at(pose: Matrix4) -> NDArray[np.float64]:
-            of_parts = [frame_alignment(part, pose) for part in parts]
-            square = float(np.sum([part.square for part in of_parts]))
+            of_sectors = alignment_of_parts(edges, sector, COLUMNS * ROWS, pose)
+            square = float(of_sectors.square.sum())
             scale = len(edges.maps) / sqrt(max(square, LEAST_SQUARE)) / self._of_edges.deviation
-            of_edges = [part.strength * scale for part in of_parts]
-            return np.stack([*of_edges, self._depth.evaluate(pose).frame_scores / self._of_depth.deviation], axis=1)
+            of_depth = self._depth.evaluate(pose).frame_scores / self._of_depth.deviation
+            return np.column_stack([of_sectors.strength * scale, of_depth])
 
         sight = SightLines(p_camera[seen], edges.weight[seen].astype(np.float64), frame[seen])
         return Cells(at, CELL_STEP * self._step_rad, sight)
-
-
-def _chosen(edges: EdgeFrames, index: NDArray[np.int64]) -> EdgeFrames:
-    """Some of the range edges (ascending), on the same maps."""
-    return replace(
-        edges,
-        xyz_m=np.ascontiguousarray(edges.xyz_m[:, index]),
-        weight=edges.weight[index],
-        first_point=np.searchsorted(index, edges.first_point),
-    )
 
 
 class Fusion:

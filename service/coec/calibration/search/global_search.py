@@ -17,8 +17,8 @@ from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
+from coec.geometry.cover import moved_by, unit_ball
 from coec.geometry.edges.charts import EdgeCharts, charted_significances, climb, keep_apart
-from coec.geometry.vectors import lengths
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
@@ -112,21 +112,13 @@ class _Cover:
     than the edges of a window."""
 
     def __init__(self, start: Matrix4, reach: SearchBox, count: int) -> None:
-        self._start, self._reach, self._ball = start, reach, _ball(count)
+        self._start, self._reach, self._ball = np.ascontiguousarray(start), reach, unit_ball(count)
 
     def poses(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
         """(n, 4, 4) those with the given numbers."""
-        start, count = self._start, len(self._ball)
-        poses = np.tile(np.eye(4), (len(index), 1, 1))
-        for begin in range(0, len(index), BLOCK):
-            block, made = index[begin : begin + BLOCK], poses[begin : begin + BLOCK]
-            turn = _rotations(self._ball[block] * self._reach.rotation_rad)
-            # Translations in another order, so that they do not go along with the rotations.
-            shift = self._ball[(block * 7919) % count] * self._reach.translation_m
-            # einsum and not @: the last bit of a BLAS product may differ between two processes.
-            made[:, :3, :3] = np.einsum("nij,jk->nik", turn, start[:3, :3])
-            made[:, :3, 3] = np.einsum("nij,j->ni", turn, start[:3, 3]) + shift
-        return poses
+        # Translations in another order, so that they do not go along with the rotations.
+        turn_rad, shift_m = self._ball[index], self._ball[(index * 7919) % len(self._ball)]
+        return moved_by(self._start, turn_rad * self._reach.rotation_rad, shift_m * self._reach.translation_m)
 
 
 def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
@@ -162,30 +154,3 @@ def _climbed(
 def _apart(poses: NDArray[np.float64], z: NDArray[np.float64], count: int, apart_rad: float) -> NDArray[np.int64]:
     """Indices of the best poses, best first, no two closer in rotation than `apart_rad`."""
     return np.asarray(keep_apart(poses, np.argsort(-z, kind="stable"), count, 1.0 + 2.0 * cos(apart_rad)))
-
-
-def _ball(count: int) -> NDArray[np.float64]:
-    """(count, 3) points of the unit ball from the R₃ sequence (Roberts 2018, "The unreasonable effectiveness of
-    quasirandom sequences"), rejected from its cube."""
-    ratio = 1.2207440846057596  # the real root of x⁴ = x + 1
-    steps = (1.0 / ratio) ** np.arange(1, 4)
-    cube = np.outer(np.arange(1, int(count * 6.0 / pi * 1.02) + 100), steps)
-    cube += 0.5
-    np.remainder(cube, 1.0, out=cube)
-    cube *= 2.0
-    cube -= 1.0
-    ball: NDArray[np.float64] = cube[np.einsum("ij,ij->i", cube, cube) <= 1.0][:count]
-    return ball
-
-
-def _rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 3, 3) of rotation vectors (N, 3), radians (Rodrigues, all at once)."""
-    angle = lengths(vectors)
-    axis = vectors / np.maximum(angle, 1e-12)[:, None]
-    cross = np.zeros((len(vectors), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
-    cross -= np.swapaxes(cross, 1, 2)
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    along = axis[:, :, None] * axis[:, None, :]
-    turns: NDArray[np.float64] = cosine * np.eye(3) + sine * cross + (1.0 - cosine) * along
-    return turns

@@ -70,11 +70,31 @@ class Alignment:
         return math.sqrt(max(float(self.square.sum()), LEAST_SQUARE))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PartedAlignment:
+    """As `Alignment`, per frame and part: `strength` (F, P) Σ w·e, `square` (F, P) Σ w²."""
+
+    strength: NDArray[np.float64]
+    square: NDArray[np.float64]
+
+
 def frame_alignment(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> Alignment:
     """The alignment at one pose (4, 4), with e interpolated between pixels: smooth in the pose."""
     pose = np.ascontiguousarray(T_camera_lidar, np.float64)
     sums = _smooth_sums(frames.camera, pose, frames.xyz_m, frames.weight, frames.first_point, frames.maps)
     return Alignment(sums[:, 0], sums[:, 1])
+
+
+def alignment_of_parts(
+    frames: EdgeFrames, part: NDArray[np.uint8], parts: int, T_camera_lidar: NDArray[np.float64]
+) -> PartedAlignment:
+    """The same at one pose (4, 4), of each of so many `parts` of the range edges by itself; `part` (E,) is where each
+    belongs."""
+    pose = np.ascontiguousarray(T_camera_lidar, np.float64)
+    sums = _smooth_sums_of_parts(
+        frames.camera, pose, frames.xyz_m, frames.weight, part, frames.first_point, frames.maps, parts
+    )
+    return PartedAlignment(sums[:, :, 0], sums[:, :, 1])
 
 
 def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -84,7 +104,7 @@ def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.
     )
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def _smooth_sums(
     camera: Camera,
     T: NDArray[np.float64],
@@ -97,24 +117,76 @@ def _smooth_sums(
     sums = np.zeros((frames, 2))
     for f in prange(frames):
         strength, square = 0.0, 0.0
-        u, v = np.empty(BLOCK), np.empty(BLOCK)
+        u, v, place = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.int32)
+        edges = maps[f].ravel()
         for begin in range(first_point[f], first_point[f + 1], BLOCK):
             end = min(begin + BLOCK, first_point[f + 1])
             _pixels(camera, T, xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end], u, v)
+            _split(camera, u[: end - begin], v[: end - begin], place)
             for i in range(end - begin):
-                if not (u[i] >= 0.0 and v[i] >= 0.0 and u[i] < camera.width - 1.0 and v[i] < camera.height - 1.0):
-                    continue
-                column, row = int(u[i]), int(v[i])
-                p, q = maps[f, row, column], maps[f, row, column + 1]
-                r, s = maps[f, row + 1, column], maps[f, row + 1, column + 1]
-                if p != VOID and q != VOID and r != VOID and s != VOID:
-                    a, b = u[i] - column, v[i] - row
-                    e = (1.0 - b) * ((1.0 - a) * p + a * q) + b * ((1.0 - a) * r + a * s)
-                    w = float(weight[begin + i])
-                    strength += w * e
-                    square += w * w
+                if place[i] >= 0:
+                    e, seen = _between(edges, camera.width, place[i], u[i], v[i])
+                    if seen:
+                        w = float(weight[begin + i])
+                        strength += w * e
+                        square += w * w
         sums[f, 0], sums[f, 1] = strength / STRENGTH_STEPS, square
     return sums
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _smooth_sums_of_parts(
+    camera: Camera,
+    T: NDArray[np.float64],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    part: NDArray[np.uint8],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.int8],
+    parts: int,
+) -> NDArray[np.float64]:
+    frames = first_point.shape[0] - 1
+    sums = np.zeros((frames, parts, 2))
+    for f in prange(frames):
+        u, v, place = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.int32)
+        edges, of_frame = maps[f].ravel(), sums[f]
+        for begin in range(first_point[f], first_point[f + 1], BLOCK):
+            end = min(begin + BLOCK, first_point[f + 1])
+            _pixels(camera, T, xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end], u, v)
+            _split(camera, u[: end - begin], v[: end - begin], place)
+            for i in range(end - begin):
+                if place[i] >= 0:
+                    e, seen = _between(edges, camera.width, place[i], u[i], v[i])
+                    if seen:
+                        w, k = float(weight[begin + i]), part[begin + i]
+                        of_frame[k, 0] += w * e
+                        of_frame[k, 1] += w * w
+        of_frame[:, 0] /= STRENGTH_STEPS
+    return sums
+
+
+@njit(cache=True, error_model="numpy")
+def _split(camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64], place: NDArray[np.int32]) -> None:
+    """Pixel coordinates (n,) as the pixel above and to the left (row · width + column) into `place`, -1 where there is
+    none, and what is left of them, in place. Without a branch, as `_pixels`."""
+    right, bottom = camera.width - 1.0, camera.height - 1.0
+    for i in range(u.shape[0]):
+        inside = (u[i] >= 0.0) & (v[i] >= 0.0) & (u[i] < right) & (v[i] < bottom)
+        across, down = (u[i] if inside else 0.0), (v[i] if inside else 0.0)
+        column, row = np.floor(across), np.floor(down)
+        u[i], v[i] = across - column, down - row
+        place[i] = np.int32(row * camera.width + column) if inside else np.int32(-1)
+
+
+@njit(cache=True, inline="always")
+def _between(edges: NDArray[np.int8], width: int, place: np.int32, right: float, down: float) -> tuple[float, bool]:
+    """The strength, in steps, between a pixel of a map (h·w,), its neighbours to the right and below and the one
+    between those, so much aside; and whether all four have one."""
+    here = np.uint64(place)
+    below = here + np.uint64(width)
+    p, q, r, s = edges[here], edges[here + np.uint64(1)], edges[below], edges[below + np.uint64(1)]
+    upper, lower = (1.0 - right) * p + right * q, (1.0 - right) * r + right * s
+    return (1.0 - down) * upper + down * lower, (p != VOID) & (q != VOID) & (r != VOID) & (s != VOID)
 
 
 @njit(cache=True, parallel=True)

@@ -32,6 +32,9 @@ WEIGHT_STEPS = 64
 MAX_CHART_POINTS = 150_000
 """So many points a chart may hold, for that reason."""
 
+CELLS_PER_WORD = 4
+"""Cells are read by words of 32 bits: a processor gathers words, and no bytes, sixteen at a time."""
+
 MAX_FIELD_RAD = math.radians(110.0)
 """Half field of view of a chart at most: beyond no lens sees."""
 
@@ -41,8 +44,8 @@ class EdgeCharts:
     """Range edges and charted edge maps of the frames of a window, at one blur.
 
     Attributes:
-        cells: (1 + F·height·width,) int8, strengths as in `EdgePyramid`; `VOID` where the image shows nothing. Cell 0
-            stands for everything outside of the charts.
+        cells: (1 + F·height·width,) int8, and up to three more that fill the last word; strengths as in `EdgePyramid`,
+            `VOID` where the image shows nothing. Cell 0 stands for everything outside of the charts.
         size: height and width of one frame's chart.
         cells_per_unit: cells per unit of the stereographic plane.
         centre: (2,) float32, column and row of the optical axis.
@@ -125,7 +128,7 @@ def _pixels(camera: Camera, height: int, width: int, unit: float, centre: NDArra
 def _cells(maps: NDArray[np.int8], pixel: NDArray[np.int32]) -> NDArray[np.int8]:
     """The cells of the charts of all maps (F, h·w), from the pixel of each cell of a chart."""
     per_chart = pixel.shape[0]
-    cells = np.full(1 + maps.shape[0] * per_chart, VOID)
+    cells = np.full(-(-(1 + maps.shape[0] * per_chart) // CELLS_PER_WORD) * CELLS_PER_WORD, VOID)
     for f in prange(maps.shape[0]):
         first = 1 + f * per_chart
         for i in range(per_chart):
@@ -177,7 +180,7 @@ def climb(
 
 
 _Arguments = tuple[
-    NDArray[np.int8], int, int, np.float32, NDArray[np.float32], NDArray[np.float32], NDArray[np.int32],
+    NDArray[np.int32], int, int, np.float32, NDArray[np.float32], NDArray[np.float32], NDArray[np.int32],
     NDArray[np.int32],
 ]  # fmt: skip
 
@@ -185,14 +188,14 @@ _Arguments = tuple[
 def _arguments(charts: EdgeCharts) -> _Arguments:
     height, width = charts.size
     return (
-        charts.cells, height, width, np.float32(charts.cells_per_unit), charts.centre, charts.xyz_m, charts.weight,
-        charts.first_cell,
+        charts.cells.view(np.int32), height, width, np.float32(charts.cells_per_unit), charts.centre, charts.xyz_m,
+        charts.weight, charts.first_cell,
     )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
 def _charted_z_at(
-    cells: NDArray[np.int8],
+    words: NDArray[np.int32],
     height: int,
     width: int,
     unit: np.float32,
@@ -224,7 +227,10 @@ def _charted_z_at(
         cell[i] = first_cell[i] + row * stride + column if inside else np.int32(0)
     strength, square = np.int32(0), np.int32(0)
     for i in range(xyz.shape[1]):
-        e = np.int32(cells[cell[i]])
+        # The byte of the word that the cell is, the first one lowest, brought to the top and down again with its sign.
+        place = np.uint32(cell[i])
+        word = words[np.uint64(place >> np.uint32(2))]
+        e = np.int32(word << (np.int32(24) - np.int32((place & np.uint32(3)) << np.uint32(3)))) >> np.int32(24)
         w = weight[i] if e != VOID else np.int32(0)
         strength += w * e
         square += w * w
@@ -234,7 +240,7 @@ def _charted_z_at(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _charted_z(
-    cells: NDArray[np.int8],
+    words: NDArray[np.int32],
     height: int,
     width: int,
     unit: np.float32,
@@ -248,13 +254,13 @@ def _charted_z(
     for k in prange(poses.shape[0]):
         narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
         narrow[:] = poses[k, :3]
-        z[k] = _charted_z_at(cells, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
+        z[k] = _charted_z_at(words, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
     return z
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _climb(
-    cells: NDArray[np.int8],
+    words: NDArray[np.int32],
     height: int,
     width: int,
     unit: np.float32,
@@ -274,28 +280,32 @@ def _climb(
         pose = starts[k].copy()
         narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
         narrow[:] = pose[:3]
-        best = _charted_z_at(cells, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
+        best = _charted_z_at(words, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
         step = steps.copy()
-        halved = 0
-        for _ in range(MAX_SWEEPS):
-            improved = False
-            for axis in range(6):
-                if step[axis] == 0.0:
+        halved, axis, last, way = 0, 0, -1, 0.0
+        # Axes in a row that led nowhere. After all six there is nothing left at this step; after five, the sixth is the
+        # one that was stepped along last, and the way back is known to be worse.
+        idle = 0
+        for _ in range(6 * MAX_SWEEPS):
+            idle += 1
+            for sign in (-1.0, 1.0):
+                if step[axis] == 0.0 or (idle == 6 and axis == last and sign == -way):
                     continue
-                for sign in (-1.0, 1.0):
-                    trial = _moved(pose, axis, sign * step[axis])
-                    if not _within(trial, centre, reach):
-                        continue
-                    narrow[:] = trial[:3]
-                    score = _charted_z_at(cells, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
-                    if score > best:
-                        best, pose, improved = score, trial, True
-                        break
-            if not improved:
+                trial = _moved(pose, axis, sign * step[axis])
+                if not _within(trial, centre, reach):
+                    continue
+                narrow[:] = trial[:3]
+                score = _charted_z_at(words, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
+                if score > best:
+                    best, pose, last, way, idle = score, trial, axis, sign, 0
+                    break
+            axis = (axis + 1) % 6
+            if idle == 6:
                 halved += 1
                 if halved > halvings:
                     break
                 step *= 0.5
+                idle, axis, last = 0, 0, -1
         ends[k] = pose
         scores[k] = best
     return ends, scores

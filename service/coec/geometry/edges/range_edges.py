@@ -20,12 +20,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.compiler import njit
+from coec.geometry.compiler import njit, prange
 from coec.geometry.vectors import lengths
 
 BAND_RAD = math.radians(0.42)
 """Height of a band of elevation where no ring is known: the beam spacing of a 64-beam sensor. Wider bands only cost
 time, narrower ones cut scan lines of a tilted sensor into pieces."""
+
+BANDS = math.ceil(0.5 * math.pi / BAND_RAD)
+"""Of a quarter of a turn, from the horizon up or down."""
 
 SAME_LINE_RAD = math.radians(0.15)
 """Largest difference of elevation between neighbours of a band: below half the spacing of common 64-beam sensors, so
@@ -87,18 +90,49 @@ def range_edges(xyz_m: NDArray[np.float32], ring: NDArray[np.uint16] | None) -> 
     azimuth = np.arctan2(kept_m[:, 1], kept_m[:, 0])
     elevation = np.arcsin(np.clip(kept_m[:, 2] / np.maximum(range_m, MIN_RANGE_M), -1.0, 1.0))
     if ring is None or (len(ring) and ring.min() == ring.max()):  # one number for all beams tells none from another
-        row, same_line = np.floor(elevation / BAND_RAD).astype(np.int64), SAME_LINE_RAD
+        # A point without an elevation lands in the highest band: it is near to none there.
+        band = np.fmin(np.floor(elevation / BAND_RAD), BANDS - 1)
+        row, rows, same_line = (band + BANDS).astype(np.uint16), 2 * BANDS, SAME_LINE_RAD
     else:
-        row, same_line = ring[far].astype(np.int64), math.pi
-    order = np.lexsort((azimuth, row))
+        row, rows, same_line = ring[far], int(ring.max(initial=0)) + 1, math.pi
+    order = _along_the_rows(row, rows, azimuth)
     index, turn_rad, weight = _jumps(row[order], azimuth[order], elevation[order], range_m[order], same_line)
     near = far[order[index]]
     return RangeEdges(near, _about_the_axis(kept_m[order[index]], turn_rad), weight)
 
 
+@njit(cache=True, parallel=True)
+def _along_the_rows(row: NDArray[np.uint16], rows: int, azimuth: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Indices that bring points into order of their row, and within a row of their azimuth; else as they were.
+
+    Counted into their rows first: those of most sweeps are in order then, or begin in the middle of a turn.
+    """
+    first = np.zeros(rows + 1, np.int64)
+    for k in row:
+        first[k + 1] += 1
+    for k in range(rows):
+        first[k + 1] += first[k]
+    order, following = np.empty(row.shape[0], np.int64), first[:-1].copy()
+    for i in range(row.shape[0]):
+        order[following[row[i]]] = i
+        following[row[i]] += 1
+    for k in prange(rows):
+        of_row = order[first[k] : first[k + 1]]
+        count, descents, cut = of_row.shape[0], 0, 0
+        for i in range(1, count):
+            if azimuth[of_row[i]] < azimuth[of_row[i - 1]]:
+                descents, cut = descents + 1, i
+        if descents == 1 and azimuth[of_row[count - 1]] < azimuth[of_row[0]]:
+            turned = of_row.copy()
+            of_row[: count - cut], of_row[count - cut :] = turned[cut:], turned[:cut]
+        elif descents > 0:
+            of_row[:] = of_row[np.argsort(azimuth[of_row], kind="mergesort")]
+    return order
+
+
 @njit(cache=True)
 def _jumps(
-    row: NDArray[np.int64],
+    row: NDArray[np.uint16],
     azimuth: NDArray[np.float32],
     elevation: NDArray[np.float32],
     range_m: NDArray[np.float32],
