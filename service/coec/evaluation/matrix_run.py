@@ -42,7 +42,7 @@ WINDOWS = 2
 PAIR_S = 2.0
 """Between two pairs: at 8 m/s another place each time."""
 START_DEG, START_M = (2.0, 10.0), (0.0, 0.1)
-"""Least and greatest error of a start, in a random direction."""
+"""Least and greatest error of a start, in a random direction; of a translation that is searched."""
 CHECK_PAIRS = MIN_PAIRS
 """Pairs of a check, all of them new: as few as a check takes, so that a short drive has several."""
 MOVES_DEG = (("right", 0.0), ("0.5 deg", 0.5), ("1 deg", 1.0))
@@ -130,6 +130,9 @@ def _solved(
         xi[:3] = radians(float(rng.uniform(*START_DEG))) * random_direction(rng)
         if dof == 6:
             xi[3:] = float(rng.uniform(*START_M)) * random_direction(rng)
+        else:
+            # What is held is as wrong as the budget of σ says that it is: an exact one would flatter the estimate.
+            xi[3:] = rng.normal(0.0, configuration.verdict.held_translation_sigma_m, 3)
         rows.append(_solve(stage, pairs, truth, xi, dof, configuration))
     return tuple(rows)
 
