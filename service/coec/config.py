@@ -218,7 +218,8 @@ class VerdictConfig(Stage):
     min_range_edges: int = Field(
         default=1000,
         ge=1,
-        description="independent range jumps of the window's sweeps; a few hundred fit wrong poses by chance (fused)",
+        description="independent range jumps of the window's sweeps, with 6 dof twice as many; a few hundred fit wrong "
+        "poses by chance (fused)",
     )
     min_edge_contrast: float = Field(
         default=6.0, gt=0, description="edge significance, in standard deviations of that of other poses (fused)"

@@ -8,7 +8,9 @@ from math import degrees
 
 import numpy as np
 
+from coec.calibration.confidence.from_before import summit_from_before
 from coec.calibration.confidence.loosened import LENS_FREE, Loosened, loosen
+from coec.calibration.confidence.modes import Rivals
 from coec.calibration.confidence.told import LENS
 from coec.calibration.confidence.uncertainty import measure_uncertainty
 from coec.calibration.estimators import ESTIMATORS, Found, sight_of
@@ -55,9 +57,8 @@ def calibrate(
     held = tuple(axis for axis in TRANSLATIONS if axis not in every)
     loosened = _loosened(found, sight.window, search.T_camera_lidar, held)
     held_m = config.verdict.held_translation_sigma_m
-    uncertainty = measure_uncertainty(
-        objective, search.T_camera_lidar, every, found.rivals, loosened, sight.window, held_m
-    )
+    rivals = (*found.rivals, *_from_before(found, sight.window, dof))
+    uncertainty = measure_uncertainty(objective, search.T_camera_lidar, every, rivals, loosened, sight.window, held_m)
     blind = unobservable(curvature, uncertainty.sigma, dof, config.verdict)
     if blind:
         search = without(blind, search, objective, window.T_camera_lidar_start, config.search, progress)
@@ -65,7 +66,7 @@ def calibrate(
         told = tuple(axis for axis in every if axis not in blind)
         loosened = _loosened(found, sight.window, search.T_camera_lidar, blind)
         uncertainty = measure_uncertainty(
-            objective, search.T_camera_lidar, told, found.rivals, loosened, sight.window, held_m
+            objective, search.T_camera_lidar, told, rivals, loosened, sight.window, held_m
         )
     pose = search.T_camera_lidar
     # Self-diagnosis, equation (2).
@@ -117,10 +118,16 @@ def calibrate(
 def _loosened(found: Found, window: Window, pose: Matrix4, held: tuple[int, ...]) -> tuple[Loosened, ...]:
     """What setting free what was told comes to, on bands that feel a lens which is off by pixels, and on the sharpest
     edges."""
-    if found.edges is None:
+    return () if found.edges is None else loosen(found.edges.to_the_sharpest, window, pose, held)
+
+
+def _from_before(found: Found, window: Window, dof: int) -> tuple[Rivals, ...]:
+    """With translations searched, the summit next to where the camera was before is a rival of what was found."""
+    if found.edges is None or dof <= TRANSLATIONS.start:
         return ()
-    fine, coarse = found.edges.bands[:2]
-    return loosen((coarse, fine, found.edges.sharp), window, pose, held)
+    pose = found.search.T_camera_lidar
+    summit = summit_from_before(found.edges.to_the_sharpest, window, pose)
+    return () if summit is None else (Rivals(found.objective, pose, (summit,)),)
 
 
 def _told_of_lens(loosened: Sequence[Loosened], window: Window) -> str:
