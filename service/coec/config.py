@@ -227,7 +227,8 @@ class VerdictConfig(Stage):
     min_range_edges: int = Field(
         default=1000,
         ge=1,
-        description="independent range jumps of the window's sweeps; a few hundred fit wrong poses by chance (fused)",
+        description="independent range jumps of the window's sweeps, with 6 dof twice as many; a few hundred fit wrong "
+        "poses by chance (fused)",
     )
     min_edge_contrast: float = Field(
         default=6.0, gt=0, description="edge significance, in standard deviations of that of other poses (fused)"
@@ -243,6 +244,18 @@ class VerdictConfig(Stage):
         gt=0,
         description="what two poses, one after the other, may score more than one, in standard deviations of a frame's "
         "score; above: the camera moved within the window (fused)",
+    )
+    max_intrinsics_certainty: float = Field(
+        default=1.5,
+        gt=0,
+        description="certainty with which another lens may explain the window better, half a standard deviation each; "
+        "above: the intrinsics are off (fused)",
+    )
+    held_translation_sigma_m: float = Field(
+        default=0.01,
+        ge=0,
+        description="how well the camera's centre is known along each axis where it is not searched: standard "
+        "deviation of a mount that was measured with a rule or taken from a drawing, m",
     )
     min_change_deg: float = Field(
         default=0.4, ge=0, description="a smaller turn within a window does not refuse it (fused)"

@@ -183,6 +183,20 @@ def test_a_window_that_cannot_tell_is_no_evidence(before: PairState, code: str) 
     assert (state.health, state.reasons) == (before.health, before.reasons)
 
 
+@pytest.mark.parametrize("code", [None, "runner_up", "edge_contrast", "range_edges", "overlap"])
+def test_a_window_through_another_lens_degrades_the_pair_and_says_so(code: str | None) -> None:
+    """Unless no pose stands out in it: then it says nothing of the lens, either."""
+    others = () if code is None else (Reason(code, "too little"),)
+    verdict = Verdict(Decision.FAILED, (), (Reason("intrinsics_off", "another lens"), *others))
+    state = solved(HEALTHY, replace(estimate(3.0, 300, Decision.FAILED), verdict=verdict))
+    np.testing.assert_array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
+    if code in (None, "runner_up"):
+        assert state.health is HealthState.DEGRADED
+        assert [reason.code for reason in state.reasons] == ["intrinsics_off"]
+    else:
+        assert (state.health, state.reasons) == (HEALTHY.health, HEALTHY.reasons)
+
+
 def moved_within(before_deg: float, after_deg: float, stamp_s: int = 300) -> Estimate:
     """A window that was refused as the camera turned within it; it was solved to the pose before."""
     refused = estimate(before_deg, stamp_s, Decision.FAILED)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.loosened import CLOCKS_FREE, LENS_FREE, Loosened
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.types import MOVED, Decision, Metric, StopReason, Verdict
-from coec.calibration.verdict import change_metric, counted_once, judge, shape_metrics
+from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, Metric, StopReason, Verdict
+from coec.calibration.verdict import change_metric, counted_once, intrinsics_metric, judge, shape_metrics
 from coec.config import VerdictConfig
 from coec.geometry import se3
 
@@ -155,3 +156,25 @@ def test_a_knock_within_the_window_refuses_it_and_says_when() -> None:
 )
 def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
     assert verdict_after(change).decision is Decision.ACCEPTED
+
+
+def loosened(name: str, certainty: float, moved_px: float) -> Loosened:
+    return Loosened(name, certainty, moved_px, np.zeros(12), np.zeros(6))
+
+
+@pytest.mark.parametrize(
+    ("found", "refused"),
+    [
+        (loosened(LENS_FREE, 3.0, 1.0), True),
+        (loosened(LENS_FREE, 3.0, 0.1), False),
+        (loosened(LENS_FREE, 1.0, 1.0), False),
+        (loosened(CLOCKS_FREE, 3.0, 1.0), False),
+    ],
+    ids=["another lens", "one that hardly matters", "one that is not certain", "other clocks"],
+)
+def test_a_window_through_another_lens_is_refused_for_that(found: Loosened, refused: bool) -> None:
+    verdict = verdict_on(of_objective=(*OUTSTANDING, *intrinsics_metric([found], LIMITS)))
+    assert [reason.code for reason in verdict.reasons] == ([INTRINSICS_OFF] if refused else [])
+    assert verdict.tells_another_lens is refused
+    if refused:
+        assert verdict.cannot_tell

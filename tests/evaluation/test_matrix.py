@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from coec.config import CalibrationConfig
-from coec.evaluation import matrix, matrix_drives
+from coec.evaluation import matrix, matrix_drives, matrix_run
 from coec.evaluation.matrix_drives import DRIVES, SEEDS
 from coec.schemas.matrix import MatrixRow, SolvedWindow, Watched
 from coec.schemas.replies import Maybe6
@@ -161,3 +162,17 @@ def test_drives_are_chosen_by_their_name() -> None:
     assert matrix_drives.chosen(None) == DRIVES
     assert matrix_drives.chosen("moon") == ()
     assert CalibrationConfig().search.rotation_deg >= 10.0  # the box holds the farthest start
+
+
+def test_a_start_is_off_by_what_is_searched_and_what_is_held_by_what_the_budget_says() -> None:
+    held = np.array([matrix_run.drawn_start(drive.name, 0, 3, 0.01) for drive in DRIVES])
+    searched = np.array([matrix_run.drawn_start(drive.name, 0, 6, 0.01) for drive in DRIVES])
+    for drawn in (held, searched):
+        turned = np.degrees(np.linalg.norm(drawn[:, :3], axis=1))
+        assert (turned >= 2.0).all()
+        assert (turned <= 10.0).all()
+    np.testing.assert_allclose(held[:, 3:].std(axis=0), 0.01, rtol=0.3)
+    shifted = np.linalg.norm(searched[:, 3:], axis=1)
+    assert shifted.max() <= 0.1
+    assert shifted.mean() > 0.03
+    np.testing.assert_array_equal(held[0], matrix_run.drawn_start(DRIVES[0].name, 0, 3, 0.01))

@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from math import degrees
 
 import numpy as np
 
+from coec.calibration.confidence.from_before import summit_from_before
+from coec.calibration.confidence.loosened import LENS_FREE, Loosened, loosen
+from coec.calibration.confidence.modes import Rivals
+from coec.calibration.confidence.told import LENS
 from coec.calibration.confidence.uncertainty import measure_uncertainty
-from coec.calibration.estimators import ESTIMATORS, sight_of
+from coec.calibration.estimators import ESTIMATORS, Found, sight_of
 from coec.calibration.frames.motion_compensation import compensation
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
 from coec.calibration.search.change_point import ChangePoint, change_point
-from coec.calibration.search.observability import unobservable, without
-from coec.calibration.types import MOVED, Compensation, Estimate, MovedWithin, Optimum, Window
-from coec.calibration.verdict import change_metric, counted_once, judge, shape_metrics
+from coec.calibration.search.observability import TRANSLATIONS, unobservable, without
+from coec.calibration.types import (
+    INTRINSICS_OFF,
+    MOVED,
+    Compensation,
+    Estimate,
+    Matrix4,
+    MovedWithin,
+    Optimum,
+    Window,
+)
+from coec.calibration.verdict import change_metric, counted_once, intrinsics_metric, judge, shape_metrics
 from coec.config import CalibrationConfig, config_hash
 from coec.errors import CalibrationError
 from coec.geometry import se3
@@ -40,13 +54,20 @@ def calibrate(
     found = ESTIMATORS[config.objective.kind](sight, config)
     objective, search, every = found.objective, found.search, tuple(range(dof))
     curvature = measure_curvature(objective, search.T_camera_lidar, dof)
-    uncertainty = measure_uncertainty(objective, search.T_camera_lidar, every, found.rivals, sight.window)
+    held = tuple(axis for axis in TRANSLATIONS if axis not in every)
+    loosened = _loosened(found, sight.window, search.T_camera_lidar, held)
+    held_m = config.verdict.held_translation_sigma_m
+    rivals = (*found.rivals, *_from_before(found, sight.window, dof))
+    uncertainty = measure_uncertainty(objective, search.T_camera_lidar, every, rivals, loosened, sight.window, held_m)
     blind = unobservable(curvature, uncertainty.sigma, dof, config.verdict)
     if blind:
         search = without(blind, search, objective, window.T_camera_lidar_start, config.search, progress)
         curvature = measure_curvature(objective, search.T_camera_lidar, dof, blind)
         told = tuple(axis for axis in every if axis not in blind)
-        uncertainty = measure_uncertainty(objective, search.T_camera_lidar, told, found.rivals, sight.window)
+        loosened = _loosened(found, sight.window, search.T_camera_lidar, blind)
+        uncertainty = measure_uncertainty(
+            objective, search.T_camera_lidar, told, rivals, loosened, sight.window, held_m
+        )
     pose = search.T_camera_lidar
     # Self-diagnosis, equation (2).
     at_optimum = objective.evaluate(pose)
@@ -55,10 +76,11 @@ def calibrate(
     metrics = (
         *counted_once(found.metrics, looks, pairs),
         *shape_metrics(at_optimum, curvature, uncertainty.sigma, config.verdict),
+        *intrinsics_metric(loosened, config.verdict),
         *change_metric(change, config.verdict),
     )
     moved = None if change is None else _moved(change, window)
-    details = {} if moved is None else {MOVED: _told(moved, window)}
+    details = {INTRINSICS_OFF: _told_of_lens(loosened, window), MOVED: "" if moved is None else _told(moved, window)}
     verdict = judge(metrics, search.stop_reason, looks, pairs, details)
     progress.step("diagnosis", 1, 1)
 
@@ -90,6 +112,32 @@ def calibrate(
             config.objective, config.search, config.verdict, str(config.motion_compensation), depth.identity
         ),
         moved=moved if any(reason.code == MOVED for reason in verdict.reasons) else None,
+    )
+
+
+def _loosened(found: Found, window: Window, pose: Matrix4, held: tuple[int, ...]) -> tuple[Loosened, ...]:
+    """What setting free what was told comes to, on bands that feel a lens which is off by pixels, and on the sharpest
+    edges."""
+    return () if found.edges is None else loosen(found.edges.to_the_sharpest, window, pose, held)
+
+
+def _from_before(found: Found, window: Window, dof: int) -> tuple[Rivals, ...]:
+    """With translations searched, the summit next to where the camera was before is a rival of what was found."""
+    if found.edges is None or dof <= TRANSLATIONS.start:
+        return ()
+    pose = found.search.T_camera_lidar
+    summit = summit_from_before(found.edges.to_the_sharpest, window, pose)
+    return () if summit is None else (Rivals(found.objective, pose, (summit,)),)
+
+
+def _told_of_lens(loosened: Sequence[Loosened], window: Window) -> str:
+    lens = [one.deviation[LENS] for one in loosened if one.name == LENS_FREE]
+    if not lens:
+        return ""
+    (right, down, longer), camera = lens[0].tolist(), window.rig.camera
+    return (
+        f", a focal length {100.0 * longer:+.1f} % and a principal point {right * camera.fx:+.1f} px across and "
+        f"{down * camera.fy:+.1f} px down from it"
     )
 
 

@@ -193,7 +193,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     ]
     limits = config.verdict
     metrics = (
-        Metric("range_edges", len(edges.sharp.weight), limits.min_range_edges, at_least=True),
+        Metric("range_edges", len(edges.sharp.weight), least_range_edges(config), at_least=True),
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
         Metric("runner_up", runner_up(contrast, rivals), limits.max_runner_up, at_least=False),
     )
@@ -213,6 +213,13 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
         Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
     )
     return Found(finest, found, metrics, summits, edges)
+
+
+def least_range_edges(config: CalibrationConfig) -> float:
+    """Range jumps that it takes: as many for each degree of freedom. The more poses there are to try, the better one of
+    them fits by chance: the largest of N normal deviates grows as √(2·ln N), a significance as the root of the jumps,
+    and with the translations within 20 cm N is ten thousand times as large as for the rotations within 10° alone."""
+    return config.verdict.min_range_edges * config.search.dof / 3.0
 
 
 def runner_up(contrast: float, rivals: Sequence[float]) -> float:

@@ -297,6 +297,9 @@ whether there is one. Every other reason says that the window cannot tell."""
 MOVED = "moved_within_window"
 """Code of the reason that refuses a window within which the camera moved."""
 
+INTRINSICS_OFF = "intrinsics_off"
+"""Code of the reason that refuses a window whose images another lens has taken than the one of the rig."""
+
 TWO_POSES = ELSEWHERE | {MOVED, "runner_up"}
 """Codes of the reasons that a window has which holds two poses, and tells both well."""
 
@@ -314,6 +317,12 @@ class Verdict:
         """Of a refused window: the camera moved within it, and nothing else is wrong with it."""
         codes = {reason.code for reason in self.reasons}
         return MOVED in codes and codes <= TWO_POSES
+
+    @property
+    def tells_another_lens(self) -> bool:
+        """Of a refused window: a pose stands out in it, and through another lens it would do so more clearly."""
+        codes = {reason.code for reason in self.reasons}
+        return INTRINSICS_OFF in codes and not codes & {"edge_contrast", "range_edges", "overlap"}
 
     @property
     def cannot_tell(self) -> bool:

@@ -9,7 +9,7 @@ a rig is commissioned.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import degrees, isfinite, radians
 from types import MappingProxyType
@@ -17,10 +17,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.loosened import LENS_FREE, Loosened
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.types import MOVED, Decision, Metric, Reason, StopReason, Verdict
+from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
@@ -44,6 +45,7 @@ _MEANING = {
     "sigma_m": "what was seen does not settle a translation, or is too little to tell",
     "overlap": "too few LiDAR points are in view",
     MOVED: "the camera moved while the window was taken",
+    INTRINSICS_OFF: "another lens explains the window better than the intrinsics of the rig",
 }
 
 
@@ -88,6 +90,21 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
         return ()
     gain = change.gain if change.of_camera and degrees(change.turn_rad) >= limits.min_change_deg else 0.0
     return (Metric(MOVED, gain, limits.max_change_gain, at_least=False),)
+
+
+def intrinsics_metric(loosened: Sequence[Loosened], limits: VerdictConfig) -> tuple[Metric, ...]:
+    """How certainly another lens explains the window better than that of the rig; nothing where none was tried. One
+    that moves the edges by less than matters gains nothing."""
+    return tuple(
+        Metric(
+            INTRINSICS_OFF,
+            one.certainty if one.contradicts else 0.0,
+            limits.max_intrinsics_certainty,
+            at_least=False,
+        )
+        for one in loosened
+        if one.name == LENS_FREE
+    )
 
 
 def _newton_step(curvature: Curvature, axes: slice) -> float:

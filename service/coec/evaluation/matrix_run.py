@@ -42,7 +42,7 @@ WINDOWS = 2
 PAIR_S = 2.0
 """Between two pairs: at 8 m/s another place each time."""
 START_DEG, START_M = (2.0, 10.0), (0.0, 0.1)
-"""Least and greatest error of a start, in a random direction."""
+"""Least and greatest error of a start, in a random direction; of a translation that is searched."""
 CHECK_PAIRS = MIN_PAIRS
 """Pairs of a check, all of them new: as few as a check takes, so that a short drive has several."""
 MOVES_DEG = (("right", 0.0), ("0.5 deg", 0.5), ("1 deg", 1.0))
@@ -125,13 +125,19 @@ def _solved(
         if not pairs:
             continue
         truth = stage.drive.truth(pairs[-1].stamp_ns)
-        rng = np.random.default_rng([_number_of(drive.name), place, dof])
-        xi = np.zeros(6)
-        xi[:3] = radians(float(rng.uniform(*START_DEG))) * random_direction(rng)
-        if dof == 6:
-            xi[3:] = float(rng.uniform(*START_M)) * random_direction(rng)
+        xi = drawn_start(drive.name, place, dof, configuration.verdict.held_translation_sigma_m)
         rows.append(_solve(stage, pairs, truth, xi, dof, configuration))
     return tuple(rows)
+
+
+def drawn_start(name: str, place: int, dof: int, held_m: float) -> NDArray[np.float64]:
+    """(6,) ξ of the start of a window, the `place`-th of the drive of this name, from the truth. A translation that is
+    held is as wrong as the budget of σ says that it is, `held_m` along each axis: an exact one would flatter the
+    estimate."""
+    rng = np.random.default_rng([_number_of(name), place, dof])
+    turn = radians(float(rng.uniform(*START_DEG))) * random_direction(rng)
+    shift = float(rng.uniform(*START_M)) * random_direction(rng) if dof == 6 else rng.normal(0.0, held_m, 3)
+    return np.concatenate([turn, shift])
 
 
 def _solve(

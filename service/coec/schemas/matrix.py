@@ -19,7 +19,7 @@ class SolvedWindow(Part):
 
     pairs: Count
     start_deg: float = Field(description="angle from the truth at which the search began")
-    start_m: float = Field(description="and distance; 0 with 3 dof")
+    start_m: float = Field(description="and distance; with 3 dof that of the centre that is held")
     accepted: bool
     hit: bool = Field(description="within the limits of a hit; with 6 dof the translation counts, too")
     rotation_deg: float | None = Field(description="angle of the rotation error; null without an estimate")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.budget import COLUMN_SHARE, EDGE_PX, STAMP_S, TERMS, systematic
+from coec.calibration.confidence.budget import COLUMN_SHARE, EDGE_PX, HELD, STAMP_S, TERMS, systematic
 from coec.calibration.confidence.grain import LENS_PX, Grain, column_rad, grain_of
 from coec.calibration.objective.cells import SightLines
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Window
@@ -22,6 +22,7 @@ GRAIN = Grain(
     column_rad=3e-3,
     velocity_mps=np.tile([0.0, 0.0, 10.0], (FRAMES, 1)),
     turn_radps=np.zeros((FRAMES, 3)),
+    held_m=0.01,
 )
 
 
@@ -38,8 +39,9 @@ def shifts(sight: SightLines, dof: int, grain: Grain = GRAIN) -> dict[str, Array
 
 
 def test_every_term_answers_on_the_axes_that_were_searched_and_on_no_other(rng: np.random.Generator) -> None:
+    assert list(shifts(street(rng), 6)) == list(TERMS)
     found = shifts(street(rng), 3)
-    assert list(found) == list(TERMS)
+    assert list(found) == [*TERMS, *HELD.values()]
     for shift in found.values():
         assert np.isfinite(shift).all()
         np.testing.assert_array_equal(shift[3:], 0.0)
@@ -51,6 +53,18 @@ def test_a_principal_point_aside_is_a_turn_of_the_camera(rng: np.random.Generato
     assert found["lens_across"][1] == pytest.approx(off, rel=0.15)
     assert found["lens_down"][0] == pytest.approx(-off, rel=0.15)
     assert np.abs(found["lens_across"][[0, 2]]).max() < 0.1 * off
+
+
+def test_a_centre_that_is_held_beside_is_a_turn_by_its_angle_at_the_range_of_things(rng: np.random.Generator) -> None:
+    """Everything 4 m ahead: a centimetre to the side is 2.5 mrad, and forward it is none."""
+    sight = street(rng)
+    ahead = replace(sight, p_camera=4.0 * sight.p_camera / sight.p_camera[:, 2:])
+    found = shifts(ahead, 3)
+    assert abs(found["held_across"][1]) == pytest.approx(GRAIN.held_m / 4.0, rel=0.2)
+    assert abs(found["held_down"][0]) == pytest.approx(GRAIN.held_m / 4.0, rel=0.2)
+    assert np.abs(found["held_forward"]).max() < 0.1 * GRAIN.held_m / 4.0
+    only_forward = systematic(ahead, GRAIN, (0, 1, 2, 3, 4), UP_OF_LIDAR)
+    assert [name for name in only_forward if name not in TERMS] == ["held_forward"]
 
 
 def test_a_stamp_that_is_late_is_a_shift_along_the_way(rng: np.random.Generator) -> None:
@@ -84,7 +98,7 @@ def test_what_a_fitted_camera_misses_is_in_the_budget() -> None:
     pair = FramePair(CameraFrame(0, "camera", image), sweep)
     window = Window("w", RIG, RIG.T_camera_lidar_nominal, (pair,))
     missing = replace(window, rig=replace(RIG, camera_residual_px=33.7))
-    good, poor = (grain_of(one, RIG.T_camera_lidar_nominal) for one in (window, missing))
+    good, poor = (grain_of(one, RIG.T_camera_lidar_nominal, 0.01) for one in (window, missing))
     assert good.lens_px == LENS_PX
     assert poor.lens_px == pytest.approx(33.7 / np.sqrt(3.0), rel=1e-3)
     np.testing.assert_array_equal(good.velocity_mps, np.zeros((1, 3)))

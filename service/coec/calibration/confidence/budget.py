@@ -4,6 +4,8 @@ Each term is a displacement of the sight lines by its standard deviation; the po
 that displacement over the points that settled it. What an error does alike to all things in view it does to a rotation
 whole; what it does to near things alone, to a translation. Errors that differ from edge to edge, as the place of an
 edge within a beam or a column does, are in the scatter of the noise and have no line here.
+
+A translation that is held is such an error, too: it was measured once, and not to the last millimetre.
 """
 
 from __future__ import annotations
@@ -83,6 +85,9 @@ TERMS: MappingProxyType[str, Term] = MappingProxyType(
 """By name, in a fixed order. The lens is displaced to the right, down and outwards (its principal point and focal
 length); what is finer than that differs from sector to sector of the image and is in the scatter."""
 
+HELD: MappingProxyType[int, str] = MappingProxyType({3: "held_across", 4: "held_down", 5: "held_forward"})
+"""Further terms, of each translation that was not searched, by its place in ξ."""
+
 
 def systematic(
     sight: SightLines, grain: Grain, moved: tuple[int, ...], axis_of_sweep: NDArray[np.float64]
@@ -107,9 +112,12 @@ def systematic(
         inverse = np.array(inverted(normal))
     except ValueError:
         return {}
+    displacements = {name: term(lines, grain) for name, term in TERMS.items()}
+    for axis, name in HELD.items():
+        if axis not in moved:
+            displacements[name] = grain.held_m * _answer(lines, axis)
     shifts = {}
-    for name, term in TERMS.items():
-        displaced = term(lines, grain)
+    for name, displaced in displacements.items():
         right = np.array([float(np.sum(weighted[:, :, i] * displaced)) for i in each])
         shift = np.zeros(6)
         shift[list(moved)] = np.sum(inverse * right[None], axis=1)

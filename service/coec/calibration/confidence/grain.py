@@ -27,6 +27,7 @@ class Grain:
         lens_px: standard deviation of the camera model, pixels.
         column_rad: the turn between two firings of a beam.
         velocity_mps, turn_radps: (F, 3) of the LiDAR in each pair, camera frame; zero where it is not known.
+        held_m: standard deviation of the camera's centre, along each axis, where it is held.
     """
 
     pixel_rad: float
@@ -34,10 +35,11 @@ class Grain:
     column_rad: float
     velocity_mps: NDArray[np.float64]
     turn_radps: NDArray[np.float64]
+    held_m: float
 
 
-def grain_of(window: Window, T_camera_lidar: Matrix4) -> Grain:
-    """Of a window, its camera at `T_camera_lidar` (4, 4).
+def grain_of(window: Window, T_camera_lidar: Matrix4, held_m: float) -> Grain:
+    """Of a window, its camera at `T_camera_lidar` (4, 4); a centre that is held is known to `held_m`.
 
     Of a fitted camera any miss up to its largest is as likely as another where the edges happen to lie: they gather on
     the horizon and at the rim, and the fit was best for all of the image.
@@ -49,6 +51,7 @@ def grain_of(window: Window, T_camera_lidar: Matrix4) -> Grain:
         column_rad=column_rad(window.pairs[0].lidar),
         velocity_mps=velocity_mps,
         turn_radps=turn_radps,
+        held_m=held_m,
     )
 
 

@@ -52,10 +52,17 @@ class Landscape:
 
         On a hill that is a paraboloid it is half the distance in standard deviations of the optimum.
         """
-        lower = self.centre - cells
-        noise = scatter(lower[None])[0][0]
-        total = fsum(lower.ravel().tolist())
-        return total / sqrt(noise) if noise > 0.0 else float(np.copysign(np.inf, total))
+        return certainty(self.centre - cells)
+
+
+def certainty(gained: NDArray[np.float64]) -> float:
+    """How surely cells (F, B) of what one pose gains over another are a gain in all: in standard deviations of their
+    sum, as frames and sectors scatter. Nothing gained anywhere is no gain."""
+    noise = scatter(gained[None])[0][0]
+    total = fsum(gained.ravel().tolist())
+    if noise > 0.0:
+        return total / sqrt(noise)
+    return float(np.copysign(np.inf, total)) if total != 0.0 else 0.0
 
 
 def scatter(cells: NDArray[np.float64], fitted: int = 0) -> list[list[float]]:

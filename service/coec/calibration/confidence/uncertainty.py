@@ -1,5 +1,5 @@
-"""How far an optimum may be off, all in all: chance, the shape of the hill, other summits, and what all frames
-share."""
+"""How far an optimum may be off, all in all: chance, the shape of the hill, other summits, what all frames share, and
+what the window itself has against what it was told."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from coec.calibration.confidence.budget import systematic
 from coec.calibration.confidence.grain import grain_of
 from coec.calibration.confidence.landscape import Landscape
+from coec.calibration.confidence.loosened import Loosened
 from coec.calibration.confidence.modes import Rivals, with_modes
 from coec.calibration.confidence.noise import measure_noise
 from coec.calibration.confidence.ridges import widened
@@ -18,10 +19,17 @@ from coec.calibration.types import Matrix4, Uncertainty, Window
 
 
 def measure_uncertainty(
-    objective: Divisible, pose: Matrix4, moved: Sequence[int], rivals: Sequence[Rivals], window: Window
+    objective: Divisible,
+    pose: Matrix4,
+    moved: Sequence[int],
+    rivals: Sequence[Rivals],
+    loosened: Sequence[Loosened],
+    window: Window,
+    held_m: float,
 ) -> Uncertainty:
     """Of the optimum at `pose` (4, 4), searched along the axes `moved` of ξ; `rivals` are summits that the search came
-    to as well. Unknown where the objective has no maximum there or the frames are too few."""
+    to as well, `loosened` is what setting free what was told came to, a translation that is held is known to `held_m`.
+    Unknown where the objective has no maximum there or the frames are too few."""
     axes = tuple(moved)
     landscape = Landscape.about(objective.cells(pose), pose, axes)
     noise = measure_noise(landscape)
@@ -33,5 +41,8 @@ def measure_uncertainty(
     whole = np.full((6, 6), np.nan)
     whole[np.ix_(axes, axes)] = covariance
     axis_of_sweep = pose[:3, 2]  # the third axis of the LiDAR
-    shared = systematic(landscape.cells.sight, grain_of(window, pose), axes, axis_of_sweep)
+    shared = systematic(landscape.cells.sight, grain_of(window, pose, held_m), axes, axis_of_sweep)
+    for one in loosened:
+        if one.contradicts:
+            shared[one.name] = np.where(np.isin(np.arange(6), axes), one.shift, 0.0)
     return Uncertainty(whole, shared, noise.looks)

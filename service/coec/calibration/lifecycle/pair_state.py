@@ -27,7 +27,7 @@ from coec.calibration.monitor.change_detector import (
 from coec.calibration.monitor.change_detector import after_observation as check_taken
 from coec.calibration.monitor.sensor_faults import CAUSES, Cause
 from coec.calibration.tracker import Measurement, StepState, Track, absorb, prior_sigma
-from coec.calibration.types import Decision, Estimate, Matrix4, MovedWithin, Reason, Rig
+from coec.calibration.types import INTRINSICS_OFF, Decision, Estimate, Matrix4, MovedWithin, Reason, Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import CoecError
 from coec.geometry import se3
@@ -201,6 +201,8 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
     if estimate.verdict.decision is Decision.FAILED:
         state = replace(state, status=Status.FAILED)
         moved = _well_told_move(estimate)
+        if estimate.verdict.tells_another_lens:
+            return _poor(state, Event.DATA_CAUSE, estimate.data_stamp_ns, CAUSES[INTRINSICS_OFF].as_reason())
         # Along a tunnel two poses fit as well as in front of and behind a knock: without a check that has something
         # against the pairs that is no witness.
         if (moved is None and estimate.verdict.cannot_tell) or (moved is not None and not _objected(state)):

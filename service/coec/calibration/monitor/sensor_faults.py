@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import cell_means
-from coec.calibration.types import FramePair, Reason
+from coec.calibration.types import INTRINSICS_OFF, FramePair, Reason
 from coec.geometry.vectors import lengths
 
 BLOCK_ROWS, BLOCK_COLUMNS = 18, 32
@@ -91,6 +91,7 @@ CAMERA_FROZEN = Cause("camera_frozen", "The camera repeats the same picture whil
 BEAMS_LOST = Cause("lidar_beams_lost", "Some directions of the LiDAR return far fewer points than when commissioned.")
 EGO_MOTION_WRONG = Cause("ego_motion_wrong", "The sweeps fit the images better with another ego-motion.")
 TIME_OFFSET = Cause("time_offset", "The sweeps fit the images better with another time between the sensors.")
+INTRINSICS_WRONG = Cause(INTRINSICS_OFF, "A window fits another lens better than the intrinsics of the rig.")
 DARK = Cause("dark", "It is too dark for the camera.")
 OPEN_FIELD = Cause("open_field", "There is too little structure in reach of the LiDAR.")
 
@@ -106,6 +107,7 @@ CAUSES = {
         OPEN_FIELD,
         EGO_MOTION_WRONG,
         TIME_OFFSET,
+        INTRINSICS_WRONG,
     )
 }
 """By code, those that hide the others first."""

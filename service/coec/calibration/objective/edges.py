@@ -63,6 +63,11 @@ class EdgeWitness:
     charts: tuple[EdgeCharts, EdgeCharts]
     thinned: tuple[EdgeCharts, EdgeCharts]
 
+    @property
+    def to_the_sharpest(self) -> tuple[EdgeFrames, EdgeFrames, EdgeFrames]:
+        """Levels by which a climb from some pixels beside gets to the sharpest edges: two bands, and these."""
+        return self.bands[1], self.bands[0], self.sharp
+
 
 class EdgesAlone:
     """The edge witness as an objective by itself, at one blur."""

@@ -10,7 +10,7 @@ laid at random, z would have mean 0 and standard deviation about 1, however many
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,15 @@ class EdgeFrames:
     weight: NDArray[np.float32]
     first_point: NDArray[np.int64]
     maps: NDArray[np.int8]
+
+    def of_points(self, kept: NDArray[np.int64]) -> EdgeFrames:
+        """Those with the given indices, ascending, on the same maps."""
+        return replace(
+            self,
+            xyz_m=np.ascontiguousarray(self.xyz_m[:, kept]),
+            weight=self.weight[kept],
+            first_point=np.searchsorted(kept, self.first_point).astype(np.int64),
+        )
 
 
 LEAST_SQUARE = 1e-9

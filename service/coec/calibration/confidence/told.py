@@ -1,0 +1,129 @@
+"""What a window is told beside its frames: where the camera is, when its exposures were, through which lens they were
+taken. And where its range edges would lie in the images, were it otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.motion_compensation import sensor_twist
+from coec.calibration.types import Matrix4, Window
+from coec.geometry import se3
+from coec.geometry.cameras import Camera
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
+from coec.geometry.projection import project
+from coec.geometry.thinning import thinned
+
+TURNS, SHIFTS, CLOCKS, LENS = range(3), range(3, 6), range(6, 9), range(9, 12)
+"""Places in a deviation (12,): the perturbation ξ of the pose, rad and m; by how much the camera was exposed later than
+it was told, by how much more at the end of the window than at its beginning, and by how much more in its last row than
+in its first, s; by how much the principal point lies further right and down, in focal lengths, and the share by which
+the focal length is longer."""
+
+SIZE = 12
+
+REACH = np.array([radians(3.0)] * 3 + [0.4] * 3 + [0.08, 0.08, 0.06] + [0.04, 0.04, 0.05])
+"""How far each may be from what was told. Clocks: most of a frame at 10 Hz, and the readout of the slowest rolling
+shutters; a lens: beyond what a focus ring or another unit of the same type does. A mount: as far as the edges of the
+coarsest band lead back."""
+
+STEPS = np.array([1e-3] * 3 + [7e-3] * 3 + [5e-3] * 3 + [2e-3] * 3)
+"""Difference steps: each moves what lies 7 m away by about a pixel or less."""
+
+SLOWEST_MPS = 1.0
+"""Below that an offset of a clock of a tenth of a second moves nothing by more than 10 cm, and all is alike."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """The range edges of a window on the image edges of one level, as it was told, and what it takes to see them
+    otherwise.
+
+    Attributes:
+        frames: as told.
+        pose: (4, 4) from which deviations are counted.
+        passing: (3, E) how fast what stands still passes the LiDAR, m/s, LiDAR frame.
+        share: (3, E) of each clock's error at each range edge, 0 without ego-motion.
+    """
+
+    frames: EdgeFrames
+    pose: Matrix4
+    passing: NDArray[np.float32]
+    share: NDArray[np.float32]
+
+    def otherwise(self, deviation: NDArray[np.float64]) -> tuple[EdgeFrames, Matrix4]:
+        """The edges and the pose (4, 4) at a deviation (12,)."""
+        frames, later_s = self.frames, deviation[CLOCKS].astype(np.float32)
+        if later_s.any():
+            late = later_s[0] * self.share[0] + later_s[1] * self.share[1] + later_s[2] * self.share[2]
+            frames = replace(frames, xyz_m=frames.xyz_m + self.passing * late)
+        if deviation[LENS].any():
+            frames = replace(frames, camera=_through(frames.camera, deviation[LENS]))
+        return frames, se3.perturb(self.pose, deviation[: SHIFTS.stop])
+
+    def significance(self, deviation: NDArray[np.float64]) -> float:
+        """Of the alignment at a deviation (12,)."""
+        return frame_alignment(*self.otherwise(deviation)).significance
+
+    def pixels(self, deviation: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(E, 2) where the range edges lie at a deviation (12,), and (E,) whether they do."""
+        frames, T = self.otherwise(deviation)
+        p_camera = np.einsum("ij,jn->ni", T[:3, :3], frames.xyz_m.astype(np.float64)) + T[:3, 3]
+        return project(frames.camera, p_camera)
+
+    def moved(
+        self, deviation: NDArray[np.float64], places: tuple[int, ...]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(E, 2, n) how far each of n places of a deviation moves the range edges about one (12,), pixels per unit; and
+        (E,) which of them."""
+        uv_px, seen = self.pixels(deviation)
+        height, width = self.frames.maps.shape[1:]
+        seen = seen & (uv_px >= 0.0).all(axis=1) & (uv_px <= [width - 1.0, height - 1.0]).all(axis=1)
+        columns = np.empty((len(uv_px), 2, len(places)))
+        for column, place in enumerate(places):
+            step = np.zeros(SIZE)
+            step[place] = STEPS[place]
+            (ahead, seen_ahead), (behind, seen_behind) = self.pixels(deviation + step), self.pixels(deviation - step)
+            columns[:, :, column] = (ahead - behind) / (2.0 * STEPS[place])
+            seen = seen & seen_ahead & seen_behind
+        return columns, seen
+
+
+def told(frames: EdgeFrames, window: Window, pose: Matrix4, at_most: int) -> Told:
+    """About `at_most` range edges of a window, which is at `pose` (4, 4)."""
+    chosen = thinned(len(frames.weight), at_most)
+    frames = frames.of_points(chosen)
+    counts, pairs = np.diff(frames.first_point), window.pairs
+    frame = np.repeat(np.arange(len(pairs)), counts)
+    velocity, turn, moves = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3)), np.zeros(len(pairs))
+    for index, pair in enumerate(pairs):
+        if pair.motion is not None:
+            turn[index], velocity[index] = sensor_twist(pair.motion, window.rig.T_lidar_ego)
+            moves[index] = 1.0
+    xyz_m = frames.xyz_m.T.astype(np.float64)
+    passing = -(velocity[frame] + np.cross(turn[frame], xyz_m))
+    begin_ns, end_ns = pairs[0].stamp_ns, pairs[-1].stamp_ns
+    elapsed = np.array([(pair.stamp_ns - begin_ns) / max(end_ns - begin_ns, 1) - 0.5 for pair in pairs])
+    as_told = Told(frames, pose, passing.T.astype(np.float32), np.zeros((3, len(frame)), np.float32))
+    uv_px, _ = as_told.pixels(np.zeros(SIZE))
+    row = np.clip(uv_px[:, 1] / frames.camera.height - 0.5, -0.5, 0.5)
+    share = moves[frame] * np.stack([np.ones(len(frame)), elapsed[frame], row])
+    return replace(as_told, share=share.astype(np.float32))
+
+
+def moves(window: Window) -> bool:
+    """Whether the vehicle moves enough for a clock to show."""
+    return any(pair.motion is not None and pair.motion.speed_mps >= SLOWEST_MPS for pair in window.pairs)
+
+
+def _through(camera: Camera, lens: NDArray[np.float64]) -> Camera:
+    right, down, longer = lens.tolist()
+    return camera._replace(
+        cx=camera.cx + right * camera.fx,
+        cy=camera.cy + down * camera.fy,
+        fx=camera.fx * (1.0 + longer),
+        fy=camera.fy * (1.0 + longer),
+    )

@@ -1,0 +1,108 @@
+"""Climbs of the alignment of range edges over a pose and over what the window was told.
+
+What is set free moves along with the pose that answers it: a principal point further right is a camera turned to the
+left, on most of the image, and what is left after the turn is what the window can tell of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import fsum, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.confidence.told import REACH, SHIFTS, SIZE, Told
+from coec.calibration.search.bounded import Box, maximum_in
+from coec.geometry.edges.alignment import LEAST_SQUARE
+from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, SHARP_SIGMA_PX
+from coec.geometry.linear import inverted
+
+LEADING, SETTLING = 0.1, 0.03
+"""Shares of its first step within which a climb ends, on a level that leads to the next and on the sharpest. An offset
+of the clocks and a shift along the way differ by little: its hill is a ridge."""
+
+MAX_EVALUATIONS = 200
+"""Bound on one climb; it takes 20 to 80."""
+
+SHARP_STEP_PX = 2.0 * SHARP_SIGMA_PX
+"""First step on the sharpest edges: their hill is as wide."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ways:
+    """The directions of a climb, n of them.
+
+    Attributes:
+        directions: (12, n) of a deviation: what moves by itself, and what is set free with its answer.
+        steps: (n,) along each of them that move the edges by one pixel of the sharpest map.
+        free: places of what is set free.
+        residual: (f, f) mean products of what the f free ones move the edges by beside their answers, px².
+    """
+
+    directions: NDArray[np.float64]
+    steps: NDArray[np.float64]
+    free: tuple[int, ...]
+    residual: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, sharp: Told, at: NDArray[np.float64], base: tuple[int, ...], free: tuple[int, ...]) -> Ways:
+        """About a deviation (12,): `base` moves already, `free` is set free.
+
+        Raises:
+            ValueError: the edges in view do not determine what moves already.
+        """
+        places, count = (*base, *free), len(base)
+        columns, seen = sharp.moved(at, places)
+        weight = np.where(seen, sharp.frames.weight, 0.0)[:, None]
+        whole = max(float(weight.sum()), LEAST_SQUARE)
+        n = range(len(places))
+        weighted = columns * weight[:, :, None]
+        # Sums without a BLAS product: to the bit the same in every process.
+        normal = [[float(np.sum(weighted[:, :, i] * columns[:, :, j])) / whole for j in n] for i in n]
+        own = [row[:count] for row in normal[:count]]
+        directions = np.zeros((SIZE, len(places)))
+        directions[places, n] = 1.0
+        inverse = inverted(own)
+        answers = [[fsum(a * normal[k][j] for k, a in enumerate(row)) for row in inverse] for j in n[count:]]
+        for column, answer in enumerate(answers, start=count):
+            directions[list(base), column] = np.negative(answer)
+        residual = [
+            [normal[i][j] - fsum(a * normal[i][k] for k, a in enumerate(answers[j - count])) for j in n[count:]]
+            for i in n[count:]
+        ]
+        squares = [normal[i][i] for i in range(count)] + [residual[k][k] for k in range(len(free))]
+        return cls(directions, np.array([1.0 / sqrt(max(s, LEAST_SQUARE)) for s in squares]), free, np.array(residual))
+
+    def moved_px(self, deviation: NDArray[np.float64]) -> float:
+        """What the free ones of a deviation (12,) move the edges by, beside their answers."""
+        values = deviation[list(self.free)].tolist()
+        rows = self.residual.tolist()
+        square = fsum(a * b * rows[i][j] for i, a in enumerate(values) for j, b in enumerate(values))
+        return sqrt(max(square, 0.0))
+
+
+def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The deviation (12,) of the most significant alignment next to `start` (12,) on the last level, to which the ones
+    before it lead."""
+    sharpest = levels[-1].frames.camera.width
+    reach = REACH[:, None] / np.maximum(np.abs(ways.directions), 1e-9)
+    widest = 0.5 * reach.min(axis=0)
+    at = start
+    for level in levels:
+        last = level is levels[-1]
+        blur_px = SHARP_STEP_PX if last else BLUR_SIGMA_PX * sharpest / level.frames.camera.width
+        step = np.minimum(blur_px * ways.steps, widest)
+        begin = at
+
+        def score(along: NDArray[np.float64], level: Told = level, begin: NDArray[np.float64] = begin) -> float:
+            deviation = begin + np.sum(ways.directions * along, axis=1)
+            # Half a deviation at the end of its reach: what the window does not tell stays as it was told.
+            unlike = deviation[SHIFTS.stop :] / REACH[SHIFTS.stop :]
+            return level.significance(deviation) - 0.5 * float(np.sum(unlike * unlike))
+
+        box = Box(-2.0 * widest, 2.0 * widest, step, (SETTLING if last else LEADING) * step)
+        found, _ = maximum_in(box, score, np.zeros(len(step)), MAX_EVALUATIONS)
+        at = begin + np.sum(ways.directions * found, axis=1)
+    return at

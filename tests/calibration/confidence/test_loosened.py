@@ -1,0 +1,116 @@
+"""What a window was told is believed until the window contradicts it; then it says what, and by how much."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LENS_FREE, Loosened, loosen
+from coec.calibration.confidence.told import CLOCKS, LENS, SHIFTS
+from coec.config import VerdictConfig
+from coec.geometry import se3
+from corners import ABOUT_NOTHING, CAMERA, FRAMES, levels, motions, pixels, things, window
+
+
+def by_name(found: tuple[Loosened, ...]) -> dict[str, Loosened]:
+    return {one.name: one for one in found}
+
+
+@pytest.mark.parametrize("held", [(), (3, 4, 5)])
+def test_what_is_right_is_not_contradicted(held: tuple[int, ...], rng: np.random.Generator) -> None:
+    """The pose itself may be off by a little: that is no fault of what was told."""
+    points, beside = things(rng), se3.perturbation(np.array([1e-3, -1e-3, 1e-3, 0.0, 0.0, 0.0]))
+    found = loosen(levels(pixels(points), points), window(motions()), beside, held)
+    assert [one.name for one in found] == [*([HELD_FREE] if held else []), CLOCKS_FREE, LENS_FREE]
+    for one in found:
+        assert not one.contradicts
+
+
+@pytest.mark.fault("intrinsics that are off by 2 % or by four pixels", "the window says so, and by how much")
+@pytest.mark.parametrize(
+    "deviation", [(0.0, 0.0, 0.02), (4 / 240, -3 / 240, 0.0)], ids=["focal length", "principal point"]
+)
+def test_another_lens_is_seen_and_told(
+    deviation: tuple[float, float, float],
+    rng: np.random.Generator,
+    record_property: Callable[[str, object], None],
+) -> None:
+    """The pose is the one that makes up for it best as far as a turn can."""
+    points = things(rng)
+    right, down, longer = deviation
+    lens = CAMERA._replace(
+        fx=CAMERA.fx * (1.0 + longer),
+        fy=CAMERA.fy * (1.0 + longer),
+        cx=CAMERA.cx + right * CAMERA.fx,
+        cy=CAMERA.cy + down * CAMERA.fy,
+    )
+    turned = se3.perturbation(np.array([-deviation[1], deviation[0], 0.0, 0.0, 0.0, 0.0]))
+    seen = pixels(points, lens)
+    found = by_name(loosen(levels(seen, points), window(motions()), turned, ()))
+    assert found[LENS_FREE].contradicts
+    record_property(
+        "figure", f"certainty {found[LENS_FREE].certainty:.1f}, limit {VerdictConfig().max_intrinsics_certainty}"
+    )
+    assert found[LENS_FREE].certainty > VerdictConfig().max_intrinsics_certainty
+    np.testing.assert_allclose(found[LENS_FREE].deviation[LENS], deviation, atol=0.004)
+    assert not found[CLOCKS_FREE].contradicts
+    turn = np.linalg.norm(found[LENS_FREE].shift[:3])
+    assert turn == pytest.approx(np.hypot(*deviation[:2]), abs=0.008)
+
+
+@pytest.mark.fault(
+    "clocks that are late, drift, or a shutter that rolls, by 30 to 60 ms", "the window says so, and by how much"
+)
+@pytest.mark.parametrize("expected_s", [(0.03, 0.0, 0.0), (0.0, 0.06, 0.0), (0.0, 0.0, 0.04)])
+def test_clocks_that_are_off_are_seen_and_told(
+    expected_s: tuple[float, float, float], rng: np.random.Generator
+) -> None:
+    """The camera is late, later and later, or takes its rows one after the other."""
+    points, driven = things(rng), motions()
+    passed = []
+    for frame, (at, motion) in enumerate(zip(points, driven, strict=True)):
+        elapsed, row = frame / (FRAMES - 1) - 0.5, pixels([at])[0][:, 1] / CAMERA.height - 0.5
+        late_s = expected_s[0] + expected_s[1] * elapsed + expected_s[2] * row
+        speed = np.array(motion.linear_mps) + np.cross(motion.angular_radps, at)
+        passed.append(at - speed * late_s[:, None])
+    found = by_name(loosen(levels(pixels(passed), points), window(driven), ABOUT_NOTHING, ()))
+    assert found[CLOCKS_FREE].contradicts
+    np.testing.assert_allclose(found[CLOCKS_FREE].deviation[CLOCKS], expected_s, atol=0.006)
+    assert not found[LENS_FREE].contradicts
+
+
+@pytest.mark.fault(
+    "a camera whose centre is 6 cm from where it is held", "the window says so, and what it turns the camera by"
+)
+def test_a_centre_that_was_held_elsewhere_is_seen_and_its_turn_told(rng: np.random.Generator) -> None:
+    points, truth = things(rng), np.array([0.0, 0.0, 0.0, 0.05, -0.03, 0.0])
+    near = [at[at[:, 2] < 8.0] for at in points]
+    seen = pixels([at + truth[3:] for at in near])
+    found = by_name(loosen(levels(seen, near), window(motions()), ABOUT_NOTHING, (3, 4, 5)))
+    assert found[HELD_FREE].contradicts
+    np.testing.assert_allclose(found[HELD_FREE].deviation[list(SHIFTS)], truth[3:], atol=0.01)
+    assert not by_name(loosen(levels(seen, near), window(motions()), se3.perturbation(truth), (3, 4, 5)))[
+        HELD_FREE
+    ].contradicts
+
+
+def test_a_standing_vehicle_tells_nothing_of_its_clocks(rng: np.random.Generator) -> None:
+    points = things(rng)
+    found = loosen(levels(pixels(points), points), window(motions(speed=0.0)), ABOUT_NOTHING, ())
+    assert [one.name for one in found] == [LENS_FREE]
+
+
+def test_where_nothing_is_in_view_nothing_is_asked(rng: np.random.Generator) -> None:
+    behind = [-at for at in things(rng)]
+    assert loosen(levels(pixels(things(rng)), behind), window(motions()), ABOUT_NOTHING, ()) == ()
+
+
+def test_the_same_window_gives_the_same_bits(rng: np.random.Generator) -> None:
+    points = things(rng)
+    edges, of = levels(pixels(points, CAMERA._replace(cx=242.0)), points), window(motions())
+    one, other = (loosen(edges, of, ABOUT_NOTHING, ()) for _ in range(2))
+    for a, b in zip(one, other, strict=True):
+        assert (a.certainty, a.moved_px) == (b.certainty, b.moved_px)
+        np.testing.assert_array_equal(a.deviation, b.deviation)
