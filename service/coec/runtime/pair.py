@@ -50,7 +50,7 @@ class Pair:
             rig, baseline.calibration, pair.window.min_pairs, {"vehicle": config.vehicle, "pair": pair.name}
         )
         self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost)
-        chooser = Chooser(pair, config.limits, rig, store.served, questions, self.recorder, losses)
+        chooser = Chooser(pair, config.limits, rig, store.served, questions, self.recorder, losses, store.kept)
         self.stream = Stream(pair, config, chooser, lambda: self.recorder.has_room, losses)
         self.answers = PairAnswers(
             pair, config, rig, store, folder, self.recorder, self.stream, losses, outside, lambda: self.commands.counts
