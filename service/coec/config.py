@@ -236,7 +236,7 @@ class VerdictConfig(Stage):
         "score; above: the camera moved within the window (fused)",
     )
     min_change_deg: float = Field(
-        default=0.4, ge=0, description="a smaller turn within a window does not refuse it (fused)"
+        default=0.25, ge=0, description="a smaller turn within a window does not refuse it (fused)"
     )
 
 
