@@ -19,7 +19,9 @@ from coec.calibration.frames.window import SliceEnded
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.types import (
+    MOVED,
     CameraFrame,
+    Decision,
     EgoMotion,
     EncodedImage,
     Estimate,
@@ -27,8 +29,10 @@ from coec.calibration.types import (
     ImageFormat,
     LidarFrame,
     Matrix4,
+    MovedWithin,
     Reason,
     Uncertainty,
+    Verdict,
 )
 from coec.config import AuthorityConfig, CalibrationConfig, Config, LimitsConfig
 from coec.geometry import se3
@@ -202,6 +206,8 @@ class InstantRecorder:
         self.waiting = 0
         self.recorded = 0
         self.loses = False
+        self.sees_knocks = False
+        self.stamps: dict[str, list[int]] = {}
         self.latest: Path | None = None
         self._folder = folder
         self._on_recorded = on_recorded
@@ -222,6 +228,12 @@ class InstantRecorder:
         stamps, self._stamps = self._stamps, []
         if not ended.complete:
             return
+        if ended.kept is not None:
+            kept = [stamp for stamp in self.stamps[ended.kept.window_id] if stamp >= ended.kept.since_ns]
+            assert len(kept) == ended.kept.pairs
+            stamps = kept + stamps
+        assert len(stamps) == ended.pairs
+        self.stamps[ended.window_id] = stamps
         if self.loses:
             self._on_lost(ended.window_id)
             return
@@ -239,6 +251,9 @@ class InstantRecorder:
             correction=se3.difference(pose, NOMINAL),
             uncertainty=Uncertainty.independent(np.array([5e-4] * 3 + [np.nan] * 3)),
         )
+        late = [stamp for stamp in stamps if stamp >= STEP_S * S]
+        if self.sees_knocks and 0 < len(late) < len(stamps):
+            self.worker.estimates[ended.window_id] = knocked(self.worker.estimates[ended.window_id], stamps, late)
         self._on_recorded(ended.window_id, self.latest, True)
 
 
@@ -248,6 +263,13 @@ class InstantScribe(Scribe):
     def write(self, *books: Book) -> None:
         super().write(*books)
         self.write_due()
+
+
+def knocked(of: Estimate, stamps: list[int], late: list[int]) -> Estimate:
+    """The estimate of a window that was refused as it holds the step."""
+    last_before = stamps[stamps.index(late[0]) - 1]
+    verdict = Verdict(Decision.FAILED, (), (Reason(MOVED, "the camera moved"),))
+    return replace(of, verdict=verdict, moved=MovedWithin(last_before, late[0], len(late), BEFORE, AFTER))
 
 
 class Bench:

@@ -258,7 +258,7 @@ class VerdictConfig(Stage):
         "deviation of a mount that was measured with a rule or taken from a drawing, m",
     )
     min_change_deg: float = Field(
-        default=0.4, ge=0, description="a smaller turn within a window does not refuse it (fused)"
+        default=0.25, ge=0, description="a smaller turn within a window does not refuse it (fused)"
     )
 
 

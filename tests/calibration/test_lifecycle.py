@@ -201,7 +201,7 @@ def moved_within(before_deg: float, after_deg: float, stamp_s: int = 300) -> Est
     """A window that was refused as the camera turned within it; it was solved to the pose before."""
     refused = estimate(before_deg, stamp_s, Decision.FAILED)
     moved = MovedWithin(
-        (stamp_s - 20) * S, (stamp_s - 18) * S, pose_of(estimate(before_deg)), pose_of(estimate(after_deg))
+        (stamp_s - 20) * S, (stamp_s - 18) * S, 7, pose_of(estimate(before_deg)), pose_of(estimate(after_deg))
     )
     return replace(refused, verdict=Verdict(Decision.FAILED, (), (KNOCK,)), moved=moved)
 

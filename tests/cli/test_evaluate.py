@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from math import radians
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from coec.calibration.types import LidarFrame
 from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, Options, configuration_of
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
-from coec.evaluation import experiments
+from coec.evaluation import experiments, steps
 from coec.evaluation.starts import perturbations
 from coec.geometry import se3
 from coec.schemas.evaluation import ClosureReport, ComparisonReport, EvaluationReport
@@ -243,6 +244,14 @@ def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.Monk
     assert detection == {key: diagnosed[key] for key in ("splits", "pairs", "moves")}
     assert [row["name"] for row in detection["moves"]][:4] == ["right", "0.5 deg", "1 deg", "3 deg"]
     assert all(row["checks"] == 2 for row in detection["moves"])
+
+
+def test_knocks_are_laid_into_the_recording(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(experiments, "KNOCKS", (steps.Knock("none", 0.0), steps.Knock("3 deg", radians(3.0))))
+    outcome = coec("evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--steps", "2")
+    assert outcome.status == 0
+    assert "accepted and wrong" in " ".join(outcome.out.split())
+    assert any("3 deg" in line and " 2 " in line for line in outcome.out.splitlines()), "two windows"
 
 
 def test_a_recording_too_short_for_detection_is_refused_before_the_work(coec: Coec) -> None:

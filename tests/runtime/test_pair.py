@@ -116,6 +116,69 @@ def test_a_restart_in_the_middle_changes_no_decision(bench: Bench, tmp_path: Pat
     assert broken.store.history.damage is None
 
 
+def seeing(folder: Path) -> Bench:
+    bench = Bench(folder)
+    bench.recorder.sees_knocks = True
+    return bench
+
+
+def with_knock(bench: Bench) -> tuple[list[int], list[int]]:
+    """Stamps of the window that holds the step, and of the one after it, in seconds since the step."""
+    told = list(bench.recorder.stamps.values())
+    place = next(i for i, stamps in enumerate(told) if stamps[0] < STEP_S * S <= stamps[-1])
+    before, after = ([round(stamp / S) - STEP_S for stamp in stamps] for stamps in told[place : place + 2])
+    return before, after
+
+
+def test_the_pairs_after_a_knock_are_in_the_next_window_which_comes_the_sooner(tmp_path: Path) -> None:
+    bench = seeing(tmp_path / "state")
+    bench.drive(BEGIN_S, STEP_S + 30)
+    knocked, following = with_knock(bench)
+    after = [stamp for stamp in knocked if stamp >= 0]
+    assert after
+    assert following[: len(after)] == after
+    assert len(following) == bench.config.pairs[0].window.pairs
+    np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
+    assert bench.health == "healthy"
+
+
+@pytest.mark.fault("killed between a knock and the end of the next window", "no pair after the knock is lost")
+@pytest.mark.parametrize("after_s", [16, 18, 20])
+def test_a_restart_loses_no_pair_after_a_knock(tmp_path: Path, after_s: int) -> None:
+    whole, broken = seeing(tmp_path / "whole"), seeing(tmp_path / "broken")
+    whole.drive(STEP_S - 60, STEP_S + 30)
+    knocked, _ = with_knock(whole)
+    restart_s = STEP_S + after_s
+    broken.drive(STEP_S - 60, restart_s)
+    stamps = broken.recorder.stamps
+    broken.store.save()
+    broken.restart()
+    broken.recorder.sees_knocks, broken.recorder.stamps = True, stamps
+    broken.drive(restart_s, STEP_S + 40)
+    of_broken, following = with_knock(broken)
+    assert of_broken == knocked
+    after = [stamp for stamp in knocked if stamp >= 0]
+    assert following[: len(after)] == after
+    np.testing.assert_allclose(broken.pose, AFTER, atol=1e-9)
+
+
+def test_what_is_kept_after_a_knock_does_not_hang_on_when_the_worker_answers(tmp_path: Path) -> None:
+    quick, slow = seeing(tmp_path / "quick"), Bench(tmp_path / "slow", worker=SlowWorker)
+    slow.recorder.sees_knocks = True
+    assert isinstance(slow.worker, SlowWorker)
+    end_s = STEP_S + 30
+    for one in (quick, slow):
+        one.drive(STEP_S - 60, end_s)
+    for _ in range(1000):
+        if not slow.pair.stream.report.held:
+            break
+        slow.worker.work(share=0.5)
+        slow.settle()
+    slow.drive(end_s, end_s)
+    assert with_knock(slow) == with_knock(quick)
+    assert slow.recorder.stamps == quick.recorder.stamps
+
+
 def test_with_never_the_candidate_waits_until_a_person_applies_it(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "state", apply="never")
     bench.drive(BEGIN_S, END_S)

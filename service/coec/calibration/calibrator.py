@@ -143,7 +143,7 @@ def _told_of_lens(loosened: Sequence[Loosened], window: Window) -> str:
 
 def _moved(change: ChangePoint, window: Window) -> MovedWithin:
     before, after = (window.pairs[index].stamp_ns for index in (change.first_late - 1, change.first_late))
-    return MovedWithin(before, after, change.T_before, change.T_after)
+    return MovedWithin(before, after, len(window.pairs) - change.first_late, change.T_before, change.T_after)
 
 
 def _told(moved: MovedWithin, window: Window) -> str:

@@ -393,11 +393,13 @@ class MovedWithin:
 
     Attributes:
         last_before_ns, first_after_ns: stamps of the pairs between which it moved.
+        pairs_after: how many pairs there are after it.
         T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after; turned about the camera's centre.
     """
 
     last_before_ns: int
     first_after_ns: int
+    pairs_after: int
     T_before: Matrix4
     T_after: Matrix4
 

@@ -196,6 +196,15 @@ def _evaluate(
             min=0,
         ),
     ] = 0,
+    steps: Annotated[
+        int,
+        typer.Option(
+            help="Also lay knocks of several sizes into the recording, N of each at drawn times: is it refused, is the "
+            "time told?",
+            metavar="N",
+            min=0,
+        ),
+    ] = 0,
     output: Annotated[
         Path | None, typer.Option(help="Write plots, overlays, starts.csv and report.json.", metavar="DIR")
     ] = None,
@@ -223,6 +232,7 @@ def _evaluate(
         halves=halves,
         nees=nees,
         detection=detection,
+        steps=steps,
         output=output,
         as_json=as_json,
     )
@@ -230,10 +240,11 @@ def _evaluate(
         if relative is not None:
             raise UsageError("--relative tells the pose between two sources: it needs --closure A B")
         raise typer.Exit(command.run(options))
-    if objective == command.ALL or against_frames or against_slice or halves or nees or detection or camera_model:
+    others = (against_frames, against_slice, halves, nees, detection, steps, camera_model)
+    if objective == command.ALL or any(others):
         raise UsageError(
             "--closure is an experiment of its own: leave out --objective all, --against-frames, --against-slice, "
-            "--halves, --nees, --detection and --camera-model"
+            "--halves, --nees, --detection, --steps and --camera-model"
         )
     raise typer.Exit(closure_command.run(closure_command.Options(*closure, options, relative)))
 

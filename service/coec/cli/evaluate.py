@@ -35,10 +35,11 @@ from coec.reports.evaluation_documents import (
     normalised_of,
     slice_point_of,
     spread_of,
+    steps_of,
     verdicts_of,
 )
 from coec.schemas.base import to_json
-from coec.schemas.evaluation import ComparisonReport, DetectionReport, EvaluationReport
+from coec.schemas.evaluation import ComparisonReport, DetectionReport, EvaluationReport, StepRow
 from coec.schemas.replies import Vector6
 from coec.sources import open_source, windows
 from coec.sources.recording import KnowsTruth
@@ -62,7 +63,7 @@ METHODS = ("fused", "mi", "intensity")
 @dataclass(frozen=True, slots=True)
 class Options:
     """The arguments of the command; None = not given. `halves` and `detection` are numbers of splits, `nees` is one of
-    windows and of splits; 0 = none."""
+    windows and of splits, `steps` one of knocks of each kind; 0 = none."""
 
     source: str
     rotation_deg: float
@@ -79,6 +80,7 @@ class Options:
     halves: int = 0
     nees: int = 0
     detection: int = 0
+    steps: int = 0
     output: Path | None = None
     as_json: bool = False
 
@@ -105,6 +107,7 @@ class _Experiments:
     halves: Halves | None
     normalised: dict[str, NormalisedErrors]
     detection: DetectionReport | None
+    steps: tuple[StepRow, ...]
 
 
 def run(options: Options) -> int:
@@ -276,7 +279,8 @@ def _experiments(options: Options, subject: _Subject, bench: Bench, stages: Stag
     if options.detection:
         tried = experiments.detected(bench, options.detection, experiments.CHECKS, stages)
         detection = detection_of(tried, options.detection, len(bench.window.pairs))
-    return _Experiments(from_reference, outcomes, frames, slices, halves, normalised, detection)
+    knocked = experiments.knocked(bench, options.steps, stages) if options.steps else []
+    return _Experiments(from_reference, outcomes, frames, slices, halves, normalised, detection, steps_of(knocked))
 
 
 def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
@@ -332,6 +336,7 @@ def _report(
         slices=tuple(slice_point_of(point) for point in done.slices),
         halves=None if done.halves is None else halves_of(done.halves),
         detection=done.detection,
+        steps=done.steps,
         normalised=tuple(normalised_of(against, found) for against, found in done.normalised.items()),
         depth_identity=solved.depth_identity,
         config_hash=solved.config_hash,

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import radians
+from math import radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.learning import is_flagged, learn_accuracy, learn_limits
+from coec.calibration.commissioning.quantiles import normal_quantile
 from coec.calibration.monitor.check import Check, CheckInput, check_at
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS
 from coec.calibration.types import Matrix4
@@ -46,14 +47,20 @@ SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
 
+CONFIDENCE = 0.95
+"""Of the interval of a share."""
+
+
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """Checks after one kind of move: how many, and the share that each classifier flagged. Of the right pose these are
-    the false alarms."""
+    """Checks after one kind of move: how many, the share that each classifier flagged, and the interval of the first at
+    `CONFIDENCE`, as if every check were of pairs of its own. Of the right pose these are the false alarms."""
 
     name: str
     checks: int
     flagged: float
+    flagged_low: float
+    flagged_high: float
     flagged_by_paper: float
 
 
@@ -125,10 +132,26 @@ def table(tried: Sequence[Tried]) -> tuple[Detection, ...]:
     for name, _, _ in MOVES:
         of = [one for one in tried if one.name == name]
         if of:
-            flagged = sum(one.flagged for one in of) / len(of)
+            flagged = sum(one.flagged for one in of)
             by_paper = sum(one.flagged_by_paper for one in of) / len(of)
-            rows.append(Detection(name, len(of), flagged, by_paper))
+            rows.append(Detection(name, len(of), flagged / len(of), *interval(flagged, len(of)), by_paper))
     return tuple(rows)
+
+
+def interval(hits: int, of: int) -> tuple[float, float]:
+    """Between which shares the true one lies, at `CONFIDENCE`, where `hits` of `of` draws were seen (Wilson 1927): it
+    holds for none and for all of them, too.
+
+    Raises:
+        ValueError: no draw was seen.
+    """
+    if of < 1:
+        raise ValueError("no draw was seen")
+    z = normal_quantile(0.5 + 0.5 * CONFIDENCE)
+    share, shrink = hits / of, 1.0 + z * z / of
+    middle = (share + 0.5 * z * z / of) / shrink
+    half = z / shrink * sqrt(share * (1.0 - share) / of + 0.25 * z * z / of**2)
+    return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 def _move(rng: np.random.Generator, turn_rad: float, shift_m: float, axes: Sequence[int]) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ from coec.errors import CalibrationError, DecodeError, SourceError
 from coec.evaluation import split_halves, starts, statistics
 from coec.evaluation.detection import Tried, try_detection
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint, Trial
+from coec.evaluation.steps import KNOCKS, TriedKnock, try_knocks
 
 SUBSETS = 20
 """Solves for every number of frames and every length of a slice, each with a start of its own."""
@@ -261,6 +262,16 @@ def detected(bench: Bench, splits: int, checks: int, stages: Stages) -> list[Tri
     decode(1, "")
     return try_detection(
         evidence, bench.reference, bench.configuration, splits, checks, lambda done, _: heard(done, "")
+    )
+
+
+def knocked(bench: Bench, trials: int, stages: Stages) -> list[TriedKnock]:
+    """What is said of the recording with knocks laid into it, `trials` times each kind."""
+    total = 1 + trials * sum(knock.moves for knock in KNOCKS)
+    heard = stages.begin("steps", total)
+    window = replace(bench.window, T_camera_lidar_start=bench.reference)
+    return try_knocks(
+        window, bench.depth, bench.images, bench.configuration, trials, KNOCKS, lambda done: heard(done, "")
     )
 
 

@@ -11,11 +11,12 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.evaluation import statistics
+from coec.evaluation import statistics, steps
 from coec.evaluation.closure import Closure
 from coec.evaluation.detection import Tried, table
 from coec.evaluation.normalised_errors import BIN_EDGES, CONFIDENCES, NormalisedErrors
 from coec.evaluation.split_halves import Halves
+from coec.evaluation.steps import TriedKnock
 from coec.schemas import evaluation as wire
 from coec.schemas.replies import Maybe6
 
@@ -83,6 +84,11 @@ def detection_of(tried: Sequence[Tried], splits: int, pairs: int) -> wire.Detect
     """The checks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
     moves = tuple(wire.DetectionRow(**asdict(row)) for row in table(tried))
     return wire.DetectionReport(splits=splits, pairs=pairs, moves=moves)
+
+
+def steps_of(tried: Sequence[TriedKnock]) -> tuple[wire.StepRow, ...]:
+    """The windows of `try_knocks`, counted by knock."""
+    return tuple(wire.StepRow(**asdict(row)) for row in steps.table(tried))
 
 
 def normalised_of(against: str, found: NormalisedErrors) -> wire.NormalisedErrorsReport:

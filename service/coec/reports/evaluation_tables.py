@@ -25,6 +25,7 @@ from coec.schemas.evaluation import (
     NormalisedErrorsReport,
     SlicePoint,
     Spread,
+    StepRow,
 )
 
 CSV_FIGURES = (
@@ -84,7 +85,8 @@ def show_comparison(report: ComparisonReport) -> None:
     for name, reason in report.not_evaluated.items():
         console.show(f"{name} was not evaluated: {reason}", "yellow")
     for name, method in report.methods.items():
-        if method.frames or method.slices or method.halves or method.normalised or method.detection:
+        experiments = (method.frames, method.slices, method.halves, method.normalised, method.detection, method.steps)
+        if any(experiments):
             console.show(name, "bold")
             _show_experiments(method)
     console.show(_seconds(report.elapsed_s))
@@ -186,6 +188,8 @@ def _show_experiments(report: EvaluationReport) -> None:
         _show_normalised(of_claims)
     if report.detection is not None:
         show_detection(report.detection)
+    if report.steps:
+        _show_steps(report.steps)
 
 
 def show_closure(report: ClosureReport) -> None:
@@ -241,9 +245,11 @@ def _show_normalised(found: NormalisedErrorsReport) -> None:
 
 def show_detection(detection: DetectionReport) -> None:
     """Checks of moved extrinsics: how many of them each classifier flags."""
-    table = console.table("extrinsic", "checks", "flagged", "by equation (2)", right=(1, 2, 3))
+    table = console.table("extrinsic", "checks", "flagged", "95 %", "by equation (2)", right=(1, 2, 3, 4))
     for row in detection.moves:
-        table.add_row(row.name, str(row.checks), f"{100 * row.flagged:.1f} %", f"{100 * row.flagged_by_paper:.1f} %")
+        between = f"{100 * row.flagged_low:.1f} to {100 * row.flagged_high:.1f} %"
+        by_paper = f"{100 * row.flagged_by_paper:.1f} %"
+        table.add_row(row.name, str(row.checks), f"{100 * row.flagged:.1f} %", between, by_paper)
     console.out.print(table)
     console.show(
         f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other; "
@@ -255,6 +261,16 @@ def show_detection(detection: DetectionReport) -> None:
             "equation (2) is shown for comparison and decides nothing: it flags "
             f"{100 * right.flagged_by_paper:.1f} % of right extrinsics"
         )
+
+
+def _show_steps(steps: Sequence[StepRow]) -> None:
+    columns = ("mount moves by", "windows", "refused for it", "accepted", "accepted and wrong", "time known to 2 s")
+    table = console.table(*columns, right=range(1, 6))
+    for row in steps:
+        shares = (row.moved, row.accepted, row.wrong, row.time_known)
+        told = ("-" if share is None else f"{100 * share:.0f} %" for share in shares)
+        table.add_row(row.name, str(row.windows), *told)
+    console.out.print(table)
 
 
 def _show_halves(halves: HalvesReport, dof: int) -> None:

@@ -51,7 +51,7 @@ class Pair:
         self._rig, self._vehicle = rig, config.vehicle
         plan = self._plan(pair, baseline.calibration)
         self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost)
-        chooser = Chooser(pair, config.limits, rig, store.served, questions, self.recorder, losses)
+        chooser = Chooser(pair, config.limits, rig, store.served, questions, self.recorder, losses, store.kept)
         self.stream = Stream(pair, config, chooser, lambda: self.recorder.has_room, losses)
         self.answers = PairAnswers(
             pair, config, rig, store, folder, self.recorder, self.stream, losses, outside, lambda: self.commands.counts

@@ -80,6 +80,10 @@ class DetectionRow(Part):
     name: str = Field(description="`right`, or how far the extrinsic was moved")
     checks: Count
     flagged: float = Field(ge=0, le=1, description="by the distance of the local optimum")
+    flagged_low: float = Field(
+        ge=0, le=1, description="of its 95 % interval (Wilson), as if no two checks shared a pair"
+    )
+    flagged_high: float = Field(ge=0, le=1, description="likewise")
     flagged_by_paper: float = Field(
         ge=0, le=1, description="by equation (2) with learned limits; for comparison, it decides nothing"
     )
@@ -91,6 +95,21 @@ class DetectionReport(Part):
     splits: Count
     pairs: Count = Field(description="camera-LiDAR pairs that were split in two")
     moves: tuple[DetectionRow, ...]
+
+
+class StepRow(Part):
+    """Windows within which the mount was moved, and what became of them."""
+
+    name: str = Field(description="of the knock; `none` of no move")
+    windows: Count
+    accepted: float = Field(ge=0, le=1, description="share that was accepted")
+    wrong: float = Field(
+        ge=0, le=1, description="share that was accepted more than 0.3 deg and 4 σ from where the mount is at the end"
+    )
+    moved: float = Field(ge=0, le=1, description="share that was refused as the camera moved within it")
+    time_known: float | None = Field(
+        description="share whose time is told to 2 s; a step lies anywhere between two frames; null where it has none"
+    )
 
 
 class NormalisedErrorsReport(Part):
@@ -216,6 +235,7 @@ class EvaluationReport(Message):
     detection: DetectionReport | None = Field(
         default=None, description="how well a wrong extrinsic is seen; null if not asked for"
     )
+    steps: tuple[StepRow, ...] = Field(default=(), description="windows with a knock in them; empty if not asked for")
     normalised: tuple[NormalisedErrorsReport, ...] = Field(
         default=(), description="errors over what is claimed for them; empty if not asked for"
     )

@@ -103,6 +103,7 @@ class MovedWithin(Part):
 
     last_before_ns: int = Field(description="stamp of the last pair before it moved, ns")
     first_after_ns: int = Field(description="stamp of the first pair after it, ns")
+    pairs_after: Count = Field(description="pairs after it; they are kept for the next window")
     before: Transform = Field(description="camera_from_lidar that fits the pairs before it; turned, not shifted")
     after: Transform = Field(description="likewise after it")
 

@@ -82,7 +82,7 @@ def estimate(seed: int = 0, **changes: Any) -> Estimate:
 
 def test_a_move_within_the_window_travels_with_the_result() -> None:
     rng = np.random.default_rng(3)
-    moved = MovedWithin(11, 12, perturbation(rng.normal(size=6)), perturbation(rng.normal(size=6)))
+    moved = MovedWithin(11, 12, 5, perturbation(rng.normal(size=6)), perturbation(rng.normal(size=6)))
     sent = estimate(moved=moved)
     read = from_json(CalibrationResult, to_json(result_of(sent, RIG, "truck-7")))
     assert same(estimate_of(read).moved, moved)

@@ -30,6 +30,7 @@ from coec.adapters.mcap.windows import (
     RecordedWindow,
     WindowWriter,
     is_window,
+    pairs_since,
     read_result,
     read_window,
     salvage,
@@ -204,6 +205,54 @@ def test_a_sweep_without_optional_columns_comes_back_without_them(tmp_path: Path
     bare = replace(pair, lidar=LidarFrame(pair.lidar.stamp_ns, "lidar", pair.lidar.xyz_m))
     a_window(tmp_path / "w.mcap", [bare])
     assert_same_pair(read_window(tmp_path / "w.mcap")[0].pairs[0], bare)
+
+
+def kept_window(path: Path, from_pair: int, points: int = 300) -> WindowWriter:
+    """Pairs 2 and 3, and behind them those of an earlier window from a pair on."""
+    earlier = a_window(path.with_name("front-0.mcap"), [a_pair(i, points=points) for i in range(2)])
+    rig = a_rig()
+    writer = WindowWriter(path, rig, rig.T_camera_lidar_nominal, path.stem, CONFIGURATION, {"vehicle": "car"})
+    for index in (2, 3):
+        writer.add(a_pair(index, points=points))
+    since_ns = a_pair(from_pair).stamp_ns
+    writer.note_kept(earlier.window_id, since_ns)
+    for pair in pairs_since(earlier.path, since_ns):
+        writer.add(pair)
+    return writer
+
+
+def notes(path: Path) -> dict[str, str]:
+    with path.open("rb") as stream:
+        (note,) = (record.metadata for record in make_reader(stream).iter_metadata() if record.name == "coec_kept")
+    return note
+
+
+@pytest.mark.parametrize(("from_pair", "pairs"), [(0, [0, 1, 2, 3]), (1, [1, 2, 3])])
+def test_pairs_of_another_window_are_read_in_the_order_of_time_and_the_file_says_whose_they_are(
+    tmp_path: Path, from_pair: int, pairs: list[int]
+) -> None:
+    path = tmp_path / "front-2.mcap"
+    kept_window(path, from_pair).finish()
+    window, _ = read_window(path)
+    for got, index in zip(window.pairs, pairs, strict=True):
+        assert_same_pair(got, a_pair(index))
+    assert window.stamp_ns == a_pair(3).stamp_ns
+    write_result(path, a_result("front-2"))
+    assert notes(path) == {"from_window": "front-0", "since_ns": str(a_pair(from_pair).stamp_ns)}
+    assert len(read_window(path)[0].pairs) == len(pairs)
+
+
+def test_a_salvaged_window_says_which_pairs_are_of_another(tmp_path: Path) -> None:
+    path = tmp_path / "front-2.mcap"
+    part = path.with_name(path.name + PART_SUFFIX)
+    writer = kept_window(path, 0, points=5_000)  # a chunk is closed with every pair
+    killed_here = part.read_bytes()
+    writer.abandon()
+    part.write_bytes(killed_here)
+    recorded = salvage(part, lambda: None)
+    assert recorded is not None
+    assert recorded.pairs == 3  # the chunk of the last one was open
+    assert notes(path)["from_window"] == "front-0"
 
 
 def test_senders_sequence_numbers_are_not_kept(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from math import radians
 from types import SimpleNamespace
 from typing import cast
 
@@ -16,15 +17,16 @@ from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.commissioning import learning, verdict_limits
 from coec.calibration.commissioning.baseline import PRIOR_SPREAD_POSE, Baseline, learned_hash
 from coec.calibration.commissioning.learning import commission, learn_accuracy
+from coec.calibration.commissioning.quantiles import distance2_quantile
 from coec.calibration.commissioning.verdict_limits import learned
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import CheckInput, gather
-from coec.calibration.monitor.check_verdict import observe
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, observe
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Decision, Estimate, Metric, Rig, Verdict, Window
 from coec.config import CalibrationConfig, LimitsConfig, SearchConfig
 from coec.errors import CalibrationError
-from coec.evaluation.detection import MIN_RECORDED, table, try_detection
+from coec.evaluation.detection import MIN_RECORDED, interval, table, try_detection
 from coec.geometry import se3
 from estimates import estimate
 
@@ -147,6 +149,15 @@ def test_detection_learns_on_some_pairs_and_tries_others(
     assert all(row.checks == 3 for row in rows.values())
 
 
+@pytest.mark.parametrize(
+    ("hits", "of", "low", "high"),
+    # Wilson 1927, by hand: all or none of n leave n / (n + z²) and z² / (n + z²).
+    [(0, 100, 0.0, 0.03699), (100, 100, 0.96301, 1.0), (50, 100, 0.40383, 0.59617), (1, 2, 0.09453, 0.90547)],
+)
+def test_a_share_has_an_interval(hits: int, of: int, low: float, high: float) -> None:
+    assert interval(hits, of) == pytest.approx((low, high), abs=1e-4)
+
+
 def test_detection_refuses_checks_that_the_monitor_would_not_take(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
@@ -154,6 +165,41 @@ def test_detection_refuses_checks_that_the_monitor_would_not_take(
     evidence = gather(sight_of(few, stereo, images, CONFIG, Silence()))
     with pytest.raises(CalibrationError, match=f"needs {MIN_RECORDED} pairs, there are {MIN_RECORDED - 1}"):
         try_detection(evidence, few.T_camera_lidar_start, CONFIG, 1, 3, lambda *_: None)
+
+
+def limits_of(says: NDArray[np.float64], rig: Rig, monkeypatch: pytest.MonkeyPatch) -> tuple[float, float]:
+    """The limits that are learned where a check at a pose says the mean of what its pairs say (n, 6)."""
+
+    def check_of(evidence: _Scripted, pose: NDArray[np.float64], *_: object) -> SimpleNamespace:
+        offset = evidence.says.mean(axis=0) - se3.difference(pose, np.eye(4))
+        return SimpleNamespace(
+            pairs=len(evidence.pairs), offset_rotation=np.where(np.arange(6) < 3, offset, 0.0), offset_pose=offset,
+            edges_at_best=20.0, edges_kept=0.99, agreement_rad=0.0, overlap=1.0, mi=1.0, f1=1.0, f2=1.0,
+        )  # fmt: skip
+
+    monkeypatch.setattr(learning, "check_at", check_of)
+    monkeypatch.setattr(learning, "CHECKS", 12)
+    evidence = cast(CheckInput, _Scripted(says, rig))
+    limits = learning.learn_limits(
+        evidence, np.eye(4), CONFIG, learn_accuracy(evidence, np.eye(4), CONFIG), FALSE_ALARM_RATE
+    )
+    return limits.max_distance2_rotation, limits.max_farthest2_pose
+
+
+def test_limits_are_those_of_blocks_of_time_that_were_left_out(
+    sharp_street: Window, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Blocks that lie apart by more than pairs vary within them tell that other streets will lie apart, too."""
+    rng = np.random.default_rng(5)
+    noise = rng.normal(size=(48, 6)) * np.array([radians(0.1)] * 3 + [0.02] * 3)
+    apart = np.repeat(rng.normal(size=(4, 6)), 12, axis=0) * np.array([radians(0.5)] * 3 + [0.1] * 3)
+    same = limits_of(noise, sharp_street.rig, monkeypatch)
+    other = limits_of(noise + apart, sharp_street.rig, monkeypatch)
+    mixed = limits_of(noise + apart[rng.permutation(48)], sharp_street.rig, monkeypatch)
+    known_by = learning.PRIOR_BLOCKS + learning.BLOCKS - 1
+    least = distance2_quantile(1.0 - FALSE_ALARM_RATE / 2.0, 3, known_by)
+    assert same[0] >= least
+    assert other[0] > 1.5 * mixed[0] or other[1] > 1.5 * mixed[1]
 
 
 def with_metrics(contrast: float, runner_up: float, sigma_deg: float) -> Estimate:

@@ -38,7 +38,7 @@ class Drive:
             for event in self.cutter.offer(pair, self.street.T_camera_lidar_start):
                 if isinstance(event, PairSelected):
                     self.selected.append(second)
-                else:
+                elif isinstance(event, SliceEnded):
                     ends.append((second, event))
                     self.urgency.ended(event, self.cutter, self.rate_hz)
         return ends

@@ -17,7 +17,7 @@ import pytest
 
 from coec.adapters.mcap.windows import WindowWriter, read_window
 from coec.adapters.system.logs import LossCounter
-from coec.calibration.frames.window import SliceEnded
+from coec.calibration.frames.window import KeptPairs, SliceEnded
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, StateConfig
 from coec.errors import RecordingError
@@ -111,6 +111,32 @@ def test_too_few_pairs_leave_no_file(bench: Bench) -> None:
     assert bench.files() == ["front-50.mcap"]
     assert bench.losses.snapshot() == {("window", "too_few_pairs"): 1}
     assert bench.lost == ["front-10"]
+
+
+def test_a_window_takes_what_an_earlier_one_keeps_for_it_from_the_disk(bench: Bench) -> None:
+    kept = KeptPairs("front-10", 20, 30, 2)
+    with bench.running():
+        bench.window("front-10", [10, 20, 30])
+        bench.recorder.add("front-50", pair(50), NOMINAL)
+        bench.recorder.end(SliceEnded("front-50", 3, True, kept))
+        names = [bench.recorded.get(timeout=DEADLINE_S)[0] for _ in range(2)]
+        assert names == ["front-10", "front-50"]
+    window, _ = read_window(bench.store.path("front-50"))
+    assert [p.stamp_ns for p in window.pairs] == [20, 30, 50]
+    assert bench.losses.snapshot() == {}
+
+
+@pytest.mark.fault("a window whose last pairs the next one is to hold is gone", "the loss is counted, the next is kept")
+def test_kept_pairs_that_are_gone_are_counted_and_cost_no_window(bench: Bench) -> None:
+    with bench.running():
+        for name, stamps in (("front-50", [50, 60]), ("front-70", [70])):
+            for stamp_ns in stamps:
+                bench.recorder.add(name, pair(stamp_ns), NOMINAL)
+            bench.recorder.end(SliceEnded(name, len(stamps) + 3, True, KeptPairs("front-10", 20, 30, 3)))
+        assert bench.recorded.get(timeout=DEADLINE_S)[0] == "front-50"
+    assert bench.files() == ["front-50.mcap"]
+    assert bench.lost == ["front-70"], "without them it is none"
+    assert bench.losses.snapshot() == {("window", "kept_pairs_lost"): 6, ("window", "too_few_pairs"): 1}
 
 
 def test_a_stop_finishes_the_open_window(bench: Bench) -> None:

@@ -96,6 +96,7 @@ def _moved_of(moved: MovedWithin) -> replies.MovedWithin:
     return replies.MovedWithin(
         last_before_ns=moved.last_before_ns,
         first_after_ns=moved.first_after_ns,
+        pairs_after=moved.pairs_after,
         before=transform_of(moved.T_before),
         after=transform_of(moved.T_after),
     )
@@ -143,7 +144,13 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
 
 
 def _moved_within(moved: replies.MovedWithin) -> MovedWithin:
-    return MovedWithin(moved.last_before_ns, moved.first_after_ns, matrix_of(moved.before), matrix_of(moved.after))
+    return MovedWithin(
+        moved.last_before_ns,
+        moved.first_after_ns,
+        moved.pairs_after,
+        matrix_of(moved.before),
+        matrix_of(moved.after),
+    )
 
 
 def metric_of(metric: Metric) -> replies.MetricReply:

@@ -5,6 +5,9 @@ that whatever is cut off behind them can be salvaged. Then pair by pair the swee
 and image, each dated by its sensor and with the index of its pair as sequence number; the image comes last and
 completes the pair. `write_result` adds `/diagnostics`, the result as a JSON channel and as attachment `result.json`.
 
+A window may hold pairs of an earlier one that were kept for it. They come last, though they were taken first; the
+metadata `coec_kept` name the window that they are from. A reader sorts pairs by their stamps.
+
 The sender's own sequence numbers are not kept: the pairs of a window were chosen, so gaps between them mean nothing.
 Chunks are not compressed: images are encoded already, clouds shrink by an eighth, lz4 costs a fifth of the throughput.
 Equal pairs give equal bytes: nothing in the file tells when or where it was written.
@@ -234,6 +237,18 @@ class WindowWriter:
         self._file.metadata(_METADATA, {"window_id": window_id, **metadata})
         self._file.sync()
 
+    def note_kept(self, from_window_id: str, since_ns: int) -> None:
+        """The pairs that are added from now on are those of another window from a stamp on.
+
+        Raises:
+            RecordingError: it could not be written; the `.part` file has been removed.
+        """
+        self.note_of_kept({"from_window": from_window_id, "since_ns": str(since_ns)})
+
+    def note_of_kept(self, values: Mapping[str, str]) -> None:
+        """The same, in the words that were found in another file."""
+        self._file.metadata(_KEPT, values)
+
     def add(self, pair: FramePair) -> None:
         """Appends a pair.
 
@@ -338,12 +353,29 @@ def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
     for record in _records(path, max_unpacked_bytes=size * MAX_UNPACKED + CHUNK_BYTES):
         content.take(record)
     rig, T_camera_lidar_start, window_id = content.head(path)
-    pairs = tuple(content.pair(path, index) for index in sorted(content.parts))
+    written = [content.pair(path, index) for index in sorted(content.parts)]
+    pairs = tuple(sorted(written, key=lambda pair: pair.stamp_ns))
     if not pairs:
         raise WindowError(f"{path} holds no camera-LiDAR pair")
     # The service began it at the extrinsic in use.
     window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD)
     return window, content.parsed_configuration(path)
+
+
+def pairs_since(path: Path, since_ns: int) -> Iterator[FramePair]:
+    """The pairs of a window from a stamp on, in the order in which they are in its file, one at a time in memory.
+
+    Raises:
+        WindowError: unreadable, cut off or damaged.
+    """
+    content = _Content()
+    for record in _records(path, max_unpacked_bytes=_size(path) * MAX_UNPACKED + CHUNK_BYTES):
+        index = content.take(record)
+        if index is None:
+            continue
+        pair = content.pair(path, index)
+        if pair.stamp_ns >= since_ns:
+            yield pair
 
 
 def read_result(path: Path) -> CalibrationResult | None:
@@ -386,6 +418,7 @@ class _Content:
 
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
+    kept: dict[str, str] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     parts: dict[int, _Parts] = field(default_factory=dict)
@@ -401,6 +434,8 @@ class _Content:
                 self.attachments[record.name] = record.data
             case Metadata() if record.name == _METADATA:
                 self.metadata = record.values
+            case Metadata() if record.name == _KEPT:
+                self.kept = record.values
             case Message():
                 return self._take_message(record)
         return None
@@ -483,6 +518,8 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> Rec
     if writer.pairs == 0:
         writer.abandon()
         return None
+    if content.kept:
+        writer.note_of_kept(content.kept)
     return writer.finish()
 
 
@@ -563,6 +600,7 @@ def _size(path: Path) -> int:
 
 _JSON = "application/json"
 _METADATA = "coec"
+_KEPT = "coec_kept"
 _FRAME_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE, cdr.POINT_CLOUD, cdr.ODOMETRY)
 
 _OK, _WARN = 0, 1

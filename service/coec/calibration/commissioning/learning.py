@@ -2,14 +2,16 @@
 
 Nothing is set by hand: the same windows are checked where they are right and after they were moved by known amounts,
 and each limit is put where it flags no more right checks of other pairs than the stated rate (a spread that few pairs
-tell is itself uncertain, so the limit is that of a prediction), and as many of the moved ones as that leaves. Moves are
-seeded: the same windows give the same baseline.
+tell is itself uncertain, so the limit is that of a prediction), and as many of the moved ones as that leaves. What the
+rig does where it is right is tried on blocks of time that were left out when its bias was learned: a limit of frames
+that were learned from would be that of a rig at places it has been to. Moves are seeded: the same windows give the same
+baseline.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import radians, sqrt
 
 import numpy as np
@@ -26,7 +28,7 @@ from coec.calibration.commissioning.baseline import (
     pixel_floor,
 )
 from coec.calibration.commissioning.equation_2 import PaperLimits, beyond
-from coec.calibration.commissioning.quantiles import distance2_quantile, normal_quantile
+from coec.calibration.commissioning.quantiles import chi2_quantile, distance2_quantile, normal_quantile
 from coec.calibration.commissioning.verdict_limits import verdict_limits
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import POSE_DOF, ROTATION_DOF, Check, CheckInput, check_at, gather
@@ -59,6 +61,10 @@ CHECK_PAIRS = 6
 
 CHECKS, FAR_CHECKS = 12, 5
 """Checks at the right pose and after every move, and far off."""
+
+FOLDS = 4
+"""Blocks of time, each checked where the others put the rig: of the 25 to 48 pairs of one or two windows each is as
+long as a check, and the others are three quarters of what is known."""
 
 SMALL_RAD, SMALL_M = radians(0.5), 0.10
 """The smallest moves that have to be seen."""
@@ -134,7 +140,7 @@ def commission(
     rotation, pose = _accuracies(evidence, right, config, heard)
     _check(rotation)
     checks = _Checks(evidence, right, config, rotation.expected, heard)
-    clean = checks.moved(0.0, 0.0, "right", CHECKS)
+    clean = checks.left_out(rotation, pose, "right", CHECKS)
     moved = {name: checks.moved(turn_rad, shift_m, name, CHECKS) for name, turn_rad, shift_m in MOVES}
     far = checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS)
     known_by = _known_by(len(evidence.pairs))
@@ -182,7 +188,7 @@ def learn_limits(
     checks = _Checks(evidence, right, config, rotation.expected, Silence())
     moved = {name: checks.moved(turn_rad, shift_m, name, CHECKS) for name, turn_rad, shift_m in MOVES[::3]}
     return _monitor_limits(
-        checks.moved(0.0, 0.0, "right", CHECKS),
+        checks.left_out(rotation, pose, "right", CHECKS),
         moved,
         checks.moved(FAR_RAD, 0.0, "far", FAR_CHECKS),
         rotation,
@@ -276,6 +282,16 @@ def _check(rotation: Accuracy) -> None:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _LeftOut:
+    """A check at the right pose, and how it lies about where pairs of other times put the rig: squared distance over
+    rotations, and the farthest axis of the pose, as in `Accuracy`."""
+
+    seen: Check
+    distance2_rotation: float
+    farthest2_pose: float
+
+
 class _Checks:
     """Checks at seeded subsets of the pairs, near the right pose moved by a known amount in seeded directions."""
 
@@ -309,9 +325,40 @@ class _Checks:
             self._heard.step(name, number, count)
         return seen
 
+    def left_out(self, rotation: Accuracy, pose: Accuracy, name: str, count: int) -> list[_LeftOut]:
+        """`count` checks at the right pose, in every block of time as many, against the bias that the other blocks
+        tell. Of too few pairs for that, they are checks of pairs that the bias was learned from, too."""
+        pairs = len(self._evidence.pairs)
+        blocks = [block.tolist() for block in np.array_split(np.arange(pairs), FOLDS)]
+        if min(len(block) for block in blocks) < MIN_PAIRS:
+            return [self._against(seen, rotation, pose) for seen in self.moved(0.0, 0.0, name, count)]
+        rng = np.random.default_rng([SEED, pairs])
+        found: list[_LeftOut] = []
+        for fold, block in enumerate(blocks):
+            rest = [index for other in blocks if other is not block for index in other]
+            told = check_at(self._evidence.of(rest), self._right, self._config)
+            of_rotation = replace(rotation, bias=told.offset_rotation + 0.0 * rotation.bias)
+            of_pose = replace(pose, bias=told.offset_pose)
+            size = min(CHECK_PAIRS, len(block))
+            while len(found) * FOLDS < count * (fold + 1):
+                first = int(rng.integers(0, len(block) - size + 1))
+                part = self._evidence.of(block[first : first + size])
+                seen = check_at(part, self._right, self._config, of_rotation.expected)
+                found.append(self._against(seen, of_rotation, of_pose))
+                self._heard.step(name, len(found), count)
+        return found
+
+    @staticmethod
+    def _against(seen: Check, rotation: Accuracy, pose: Accuracy) -> _LeftOut:
+        return _LeftOut(
+            seen,
+            rotation.distance2(seen.offset_rotation, seen.pairs),
+            pose.farthest2(seen.offset_pose, seen.pairs),
+        )
+
 
 def _monitor_limits(
-    clean: Sequence[Check],
+    left_out: Sequence[_LeftOut],
     moved: dict[str, list[Check]],
     far: Sequence[Check],
     rotation: Accuracy,
@@ -319,6 +366,13 @@ def _monitor_limits(
     rate: float,
     known_by: int,
 ) -> MonitorLimits:
+    clean = [one.seen for one in left_out]
+    right_rotation = distance2_quantile(1.0 - rate / 2.0, ROTATION_DOF, known_by) * _times(
+        [one.distance2_rotation for one in left_out], chi2_quantile(0.5, ROTATION_DOF)
+    )
+    right_pose = distance2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1, known_by) * _times(
+        [one.farthest2_pose for one in left_out], chi2_quantile(0.5 ** (1.0 / POSE_DOF), 1)
+    )
     turned = [rotation.distance2(seen.offset_rotation, seen.pairs) for seen in moved["0.5 deg"]]
     shifted = [pose.farthest2(seen.offset_pose, seen.pairs) for seen in moved["10 cm"]]
     edges = float(np.min([edges_per_pair(seen) for seen in clean]))
@@ -327,8 +381,8 @@ def _monitor_limits(
     of_paper = PaperLimits.learned(clean, rate)
     agreement = beyond([seen.agreement_rad for seen in clean], normal_quantile(1.0 - rate / 3.0))
     return MonitorLimits(
-        max_distance2_rotation=_between(distance2_quantile(1.0 - rate / 2.0, ROTATION_DOF, known_by), min(turned)),
-        max_farthest2_pose=_between(distance2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1, known_by), min(shifted)),
+        max_distance2_rotation=_between(right_rotation, min(turned)),
+        max_farthest2_pose=_between(right_pose, min(shifted)),
         min_edges_per_pair=min(sqrt(edges * max(lost, LAYOUT_SHARE * edges)), POOREST_SHARE * edges),
         min_edges_kept=min(1.0 - LOSS_ALLOWED * (1.0 - kept), MOST_KEPT),
         max_agreement_rad=max(agreement, AGREEMENT_RAD),
@@ -337,6 +391,12 @@ def _monitor_limits(
         max_f1=of_paper.max_f1,
         min_f2=of_paper.min_f2,
     )
+
+
+def _times(distances2: Sequence[float], median: float) -> float:
+    """By how much the squared distances of checks that were left out exceed what the spread of the rig leads to expect,
+    whose `median` is known; no less than 1. A median: one check that ended in another basin is none of the spread."""
+    return max(1.0, float(np.median(distances2)) / median)
 
 
 def _between(right: float, wrong: float) -> float:

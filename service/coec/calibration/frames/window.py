@@ -2,6 +2,9 @@
 
 The slice is divided into as many bins as pairs are wanted; the first good pair of a bin is taken, and the rest of the
 bin is not even decoded. Bins and slices are cut by sensor time, so a replay at any rate chooses the same pairs.
+
+Pairs of an earlier window that was refused because the camera moved within it are as good as any if they were taken
+after that: they are kept, and count for the next window.
 """
 
 from __future__ import annotations
@@ -39,12 +42,41 @@ class PairSelected:
 
 
 @dataclass(frozen=True, slots=True)
+class KeptPairs:
+    """Pairs of a recorded window that the next one is to hold, too.
+
+    Attributes:
+        window_id: of the window that holds them.
+        since_ns: stamp of the first of them; all later ones of that window belong to them.
+        last_ns: stamp of the last.
+        pairs: how many they are.
+    """
+
+    window_id: str
+    since_ns: int
+    last_ns: int
+    pairs: int
+
+
+@dataclass(frozen=True, slots=True)
 class SliceEnded:
-    """The end of a slice that had at least one pair; `complete` when there are enough of them for a window."""
+    """The end of a slice of which at least one pair was chosen. `pairs` counts those that were `kept` for it, and it is
+    `complete` when there are enough of them for a window."""
 
     window_id: str
     pairs: int
     complete: bool
+    kept: KeptPairs | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class KeptForgotten:
+    """The kept pairs are of another time than the slice that begins: they will be in no other window."""
+
+    kept: KeptPairs
+
+
+Event = PairSelected | SliceEnded | KeptForgotten
 
 
 @dataclass(slots=True)
@@ -72,6 +104,7 @@ class WindowCutter:
         self._next_config = config
         self._hurried_ns: int | None = None
         self._open: _Slice | None = None
+        self._kept: KeptPairs | None = None
         self.rejections: Counter[str] = Counter()
         self.last_quality: ImageQuality | None = None
 
@@ -86,8 +119,8 @@ class WindowCutter:
 
     @property
     def selected(self) -> int:
-        """Pairs chosen so far in the open slice."""
-        return len(self._open.filled) if self._open else 0
+        """Pairs that the open slice has so far: those chosen, and those kept for it."""
+        return len(self._open.filled) + self._kept_pairs if self._open else 0
 
     @property
     def slice_end_ns(self) -> int | None:
@@ -99,10 +132,12 @@ class WindowCutter:
         """Stamp of the pair that opened the slice; None when none is open."""
         return self._open.start_ns if self._open else None
 
-    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[PairSelected | SliceEnded]:
-        """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, by which it must be in view."""
-        events: list[PairSelected | SliceEnded] = [*self._end_before(pair.stamp_ns)]
+    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[Event]:
+        """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, by which it must be in view. With kept
+        pairs a slice ends as soon as it is as large as any."""
+        events: list[Event] = [*self._end_before(pair.stamp_ns)]
         if self._open is None:
+            events += self._forget_before(pair.stamp_ns)
             window_id = f"{self._rig.pair}-{pair.stamp_ns}"
             self._config = self._next_config
             length_ns = self._hurried_ns or round(self._config.slice_s * NS_PER_S)
@@ -110,7 +145,14 @@ class WindowCutter:
             self._hurried_ns = None
         if self._select(self._open, pair, T_camera_lidar):
             events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
+            if self._kept is not None and self.selected >= self._config.pairs:
+                events += self.finish()
         return events
+
+    def keep(self, kept: KeptPairs) -> None:
+        """The window that is open, or else the next one, is to hold these pairs, too. Earlier ones that wait for the
+        same are a part of them, or of another time."""
+        self._kept = kept
 
     def advance(self, stamp_ns: int) -> list[SliceEnded]:
         """Sensor time has passed `stamp_ns` though no pair came."""
@@ -121,11 +163,28 @@ class WindowCutter:
         self._hurried_ns = round(slice_s * NS_PER_S)
 
     def finish(self) -> list[SliceEnded]:
-        """Ends the open slice here and now."""
-        ended, self._open = self._open, None
+        """Ends the open slice here and now. One that is no window leaves what was kept to the next one."""
+        ended, pairs, kept = self._open, self.selected, self._kept
+        self._open = None
         if ended is None or not ended.filled:
             return []
-        return [SliceEnded(ended.window_id, len(ended.filled), len(ended.filled) >= self._config.min_pairs)]
+        complete = pairs >= self._config.min_pairs
+        if complete:
+            self._kept = None
+        return [SliceEnded(ended.window_id, pairs, complete, kept if complete else None)]
+
+    @property
+    def _kept_pairs(self) -> int:
+        return self._kept.pairs if self._kept is not None else 0
+
+    def _forget_before(self, start_ns: int) -> list[KeptForgotten]:
+        """What is kept is of the time before a slice that begins, by a slice at most: what is older, or younger since
+        sensor time stepped back, is not of one window with it."""
+        kept = self._kept
+        if kept is None or 0 <= start_ns - kept.last_ns <= round(self._config.slice_s * NS_PER_S):
+            return []
+        self._kept = None
+        return [KeptForgotten(kept)]
 
     def _end_before(self, stamp_ns: int) -> list[SliceEnded]:
         """Ends the open slice if the stamp lies outside it; sensor time that stepped back is outside, too."""

@@ -13,6 +13,7 @@ from math import degrees, fsum, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.frames.window import KeptPairs
 from coec.calibration.lifecycle import policy
 from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
 from coec.calibration.monitor.change_detector import (
@@ -251,6 +252,14 @@ def window_wanted_since(state: PairState) -> int | None:
     moved = None if state.latest is None else _well_told_move(state.latest)
     suspected = state.health in (HealthState.SUSPECT, HealthState.MISCALIBRATED)
     return moved.first_after_ns if moved is not None and suspected else None
+
+
+def kept_for_next(estimate: Estimate) -> KeptPairs | None:
+    """The pairs of a window after the camera moved within it: they are as good as those of the next one."""
+    moved = estimate.moved
+    if moved is None:
+        return None
+    return KeptPairs(estimate.window_id, moved.first_after_ns, estimate.data_stamp_ns, moved.pairs_after)
 
 
 def after_failure(state: PairState, reason: Reason) -> PairState:

@@ -21,6 +21,7 @@ from coec.adapters.system.logs import LossCounter
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Drift
+from coec.calibration.frames.window import KeptPairs
 from coec.calibration.lifecycle import HealthState, PairState, Rules
 from coec.calibration.types import Decision, Reason
 from coec.config import CalibrationConfig, PairConfig
@@ -62,6 +63,9 @@ class StreamSide(Protocol):
 
     def alarm(self, since_ns: int) -> None:
         """A window is wanted soon, of pairs since this sensor time."""
+
+    def keep(self, kept: KeptPairs) -> None:
+        """Pairs of a window belong to the next one."""
 
     def calm(self) -> None:
         """There is no suspicion any more."""
@@ -350,11 +354,13 @@ class Decider:
             completed=False,
         )
         self._add_window_after(result.window_id)
-        return self._step(
+        effect = self._step(
             lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules),
             result.data_stamp_ns,
             completed=told,
         )
+        kept = lifecycle.kept_for_next(estimate)
+        return effect if kept is None or effect is None else partial(self._keep_and_go_on, kept, effect)
 
     def _take_failure(self, reason: Reason, live: bool) -> Effect | None:
         if reason.code == STOPPING.code:
@@ -408,6 +414,10 @@ class Decider:
         self._pictures.draw(waiting, window_id, "after")
 
     # --- on the stream's thread -------------------------------------------------------------------------------------
+
+    def _keep_and_go_on(self, kept: KeptPairs, effect: Effect) -> None:
+        self._stream.keep(kept)
+        effect()
 
     def _go_on_with(self, taken: Taken, by_check: bool) -> None:
         """What a step changes for the pairs to come: the extrinsic at which they are looked at, and how soon a window

@@ -19,7 +19,17 @@ import numpy as np
 from coec.adapters.files.conversions import transform_of
 from coec.adapters.files.scribe import Scribe
 from coec.adapters.system.logs import LossCounter
-from coec.calibration.lifecycle import HealthState, PairState, Provenance, aged, initial_state, overdue, restored
+from coec.calibration.frames.window import KeptPairs
+from coec.calibration.lifecycle import (
+    HealthState,
+    PairState,
+    Provenance,
+    aged,
+    initial_state,
+    kept_for_next,
+    overdue,
+    restored,
+)
 from coec.calibration.types import Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
@@ -130,6 +140,16 @@ class PairStore:
     def served(self) -> Served:
         """What is served now."""
         return Served(self._epoch, self._state.T_camera_lidar)
+
+    @property
+    def kept(self) -> KeptPairs | None:
+        """Pairs of the latest window that belong to the next one: the camera moved before they were taken, and no
+        window has been recorded since."""
+        latest = self._state.latest
+        recorded = self._folder.windows(self._rig.pair)
+        if latest is None or not recorded or recorded[-1].stem != latest.window_id:
+            return None
+        return kept_for_next(latest)
 
     @property
     def since_ns(self) -> int:

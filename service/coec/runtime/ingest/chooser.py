@@ -16,7 +16,7 @@ from coec.adapters.frames.msgpack_frames import encode_camera
 from coec.adapters.images.codec import Inspector
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.sampling import CheckSampler
-from coec.calibration.frames.window import PairSelected, SliceEnded, WindowCutter
+from coec.calibration.frames.window import KeptPairs, PairSelected, SliceEnded, WindowCutter
 from coec.calibration.monitor.urgency import Urgency
 from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
 from coec.config import LimitsConfig, PairConfig, WindowConfig
@@ -107,14 +107,18 @@ class Chooser:
         asks: Asks,
         recorder: Writes,
         losses: LossCounter,
+        kept: KeptPairs | None = None,
     ) -> None:
-        """`served` is the extrinsic at which pairs are looked at until another is adopted."""
+        """`served` is the extrinsic at which pairs are looked at until another is adopted; `kept` are pairs of an
+        earlier run that belong to the first window."""
         self._asks = asks
         self._recorder = recorder
         self._losses = losses
         self._served = served
         self._infers = pair.calibration.depth.model != STEREO
         self._cutter = WindowCutter(pair.window, rig, Inspector(limits))
+        if kept is not None:
+            self._cutter.keep(kept)
         self._sampler = CheckSampler(pair.monitor)
         self._urgency = Urgency(pair.monitor)
         self._pace = SensorClock()
@@ -171,9 +175,12 @@ class Chooser:
             if isinstance(event, PairSelected):
                 self._frozen = False
                 self._select(event, T_camera_lidar)
-            else:
+            elif isinstance(event, SliceEnded):
                 self._end(event, pair.stamp_ns)
                 self._urgency.ended(event, self._cutter, self._pace.rate_hz)
+            else:
+                told = f"pairs of {event.kept.window_id} since {event.kept.since_ns} ns are in no other window"
+                self._losses.add("window", "kept_pairs_forgotten", event.kept.pairs, detail=told)
         self._frozen |= self._cutter.rejections["frozen"] > frozen_before
         check = self._sampler.offer(pair)
         if check is not None:
@@ -209,6 +216,10 @@ class Chooser:
     def alarm(self, since_ns: int) -> None:
         """A window is wanted soon, of pairs since this sensor time."""
         self._urgency.alarm(since_ns)
+
+    def keep(self, kept: KeptPairs) -> None:
+        """The camera moved within a window; its pairs after that belong to the next one."""
+        self._cutter.keep(kept)
 
     def calm(self) -> None:
         """There is no suspicion any more."""

@@ -10,6 +10,7 @@ from typing import TypeVar
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration.frames.pairing import Pairer
+from coec.calibration.frames.window import KeptPairs
 from coec.calibration.types import FramePair
 from coec.config import Config, PairConfig
 from coec.runtime.handover import Handover
@@ -104,6 +105,10 @@ class Stream:
     def alarm(self, since_ns: int) -> None:
         """See `Chooser`; on this thread."""
         self._chooser.alarm(since_ns)
+
+    def keep(self, kept: KeptPairs) -> None:
+        """See `Chooser`; on this thread."""
+        self._chooser.keep(kept)
 
     def calm(self) -> None:
         """See `Chooser`; on this thread."""

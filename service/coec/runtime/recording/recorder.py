@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coec.adapters.files import durable
-from coec.adapters.mcap.windows import RecordedWindow, WindowWriter, read_result, salvage
+from coec.adapters.mcap.windows import RecordedWindow, WindowWriter, pairs_since, read_result, salvage
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.system.threads import ServiceThread
-from coec.calibration.frames.window import SliceEnded
+from coec.calibration.frames.window import KeptPairs, SliceEnded
 from coec.calibration.types import FramePair, Matrix4, Reason, Rig
 from coec.config import CalibrationConfig
-from coec.errors import CoecError, RecordingError
+from coec.errors import CoecError, RecordingError, WindowError
 from coec.runtime.recording.digests import DigestReader
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.timings import QUICK_S, Histogram
@@ -183,14 +183,14 @@ class Recorder:
                 self._write(item)
                 self.writing_took.add(time.monotonic() - begun_s)
             elif isinstance(item, SliceEnded):
-                self._end(item.window_id)
+                self._end(item.window_id, item.kept)
             elif thread.stopping:
                 break
             else:
                 unread = self._read()
         self._digests.close()
         if self._open is not None:
-            self._end(self._open.window_id)
+            self._end(self._open.window_id, None)
 
     def _read(self) -> bool:
         """Go on with windows of which nothing is known, and see by that what others have done in the folder; False when
@@ -265,16 +265,18 @@ class Recorder:
         )
         return _Open(item.window_id, writer, self._plan.min_pairs)
 
-    def _end(self, window_id: str) -> None:
+    def _end(self, window_id: str, kept: KeptPairs | None) -> None:
         if self._open is None or self._open.window_id != window_id:
             self._on_lost(window_id)
             return
         opened = self._open
-        if opened.pairs < opened.min_pairs:
-            self._close_stray()
-            self._on_lost(window_id)
-            return
         try:
+            if kept is not None:
+                self._add_kept(kept, opened)
+            if opened.pairs < opened.min_pairs:
+                self._close_stray()
+                self._on_lost(window_id)
+                return
             recorded = opened.writer.finish()
         except (RecordingError, OSError) as error:
             self._lose(window_id, error)
@@ -282,6 +284,19 @@ class Recorder:
             return
         self._open = None
         self._finished(recorded)
+
+    def _add_kept(self, kept: KeptPairs, into: _Open) -> None:
+        """Copy the pairs that another window keeps for this one. They are on the disk, so that to keep them costs no
+        memory, and what is cut short by a restart is still there."""
+        before = into.pairs
+        try:
+            into.writer.note_kept(kept.window_id, kept.since_ns)
+            for pair in pairs_since(self._store.path(kept.window_id), kept.since_ns):
+                self.thread.beat()
+                into.writer.add(pair)
+                into.pairs += 1
+        except WindowError as error:
+            self._losses.add("window", "kept_pairs_lost", kept.pairs - (into.pairs - before), detail=str(error))
 
     def _finished(self, recorded: RecordedWindow) -> None:
         self.recorded += 1

@@ -1,0 +1,205 @@
+"""What a calibration says of windows within which the mount moved: knocks of known size at known times, laid into a
+recording whose pose is known.
+
+To move the late sweeps by S⁻¹ is to move the mount by S: exact, but for the few centimetres by which a turn about the
+camera moves the LiDAR. Sweeps are motion-compensated first, with the mount as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.calibrator import calibrate
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.search.mount_prior import MOUNT_RAD
+from coec.calibration.types import MOVED, Decision, Estimate, FramePair, Matrix4, Window
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+from coec.geometry.vectors import random_direction
+
+WRONG_RAD, WRONG_SIGMAS = radians(0.3), 4.0
+"""An accepted window is wrong where it ends farther than both from where the mount is at its end."""
+
+KNOWN_TO_S = 2.0
+"""The time of a step is known where it is told to this, s."""
+
+NS_PER_S = 1_000_000_000
+
+SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Knock:
+    """A movement of the mount within a window: a turn about a drawn axis (rad) and a shift in a drawn direction (m),
+    at once between two pairs, or evenly from the first pair to the last."""
+
+    name: str
+    turn_rad: float
+    shift_m: float = 0.0
+    creeps: bool = False
+
+    @property
+    def moves(self) -> bool:
+        """Whether the mount moves at all."""
+        return self.turn_rad > 0.0 or self.shift_m > 0.0
+
+
+KNOCKS = (
+    Knock("none", 0.0),
+    Knock("0.3 deg", radians(0.3)),
+    Knock("0.5 deg", radians(0.5)),
+    Knock("1 deg", radians(1.0)),
+    Knock("2 deg", radians(2.0)),
+    Knock("3 deg", radians(3.0)),
+    Knock("6 deg", radians(6.0)),
+    Knock("5 cm", 0.0, 0.05),
+    Knock("10 cm", 0.0, 0.10),
+    Knock("1 deg, slowly", radians(1.0), creeps=True),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class TriedKnock:
+    """What was said of one window.
+
+    Attributes:
+        name: of the knock.
+        accepted: whether the window was.
+        wrong: whether it was accepted elsewhere than where the mount is at its end.
+        moved: whether it was refused because the camera moved within it.
+        off_s: how far the told time is from that of the knock, s; None where no time was told, or there was no step.
+        late: share of the pairs after the knock.
+    """
+
+    name: str
+    accepted: bool
+    wrong: bool
+    moved: bool
+    off_s: float | None
+    late: float
+
+
+@dataclass(frozen=True, slots=True)
+class KnockRow:
+    """The windows with one knock: shares of them, and of those with a step the share whose time is known."""
+
+    name: str
+    windows: int
+    accepted: float
+    wrong: float
+    moved: float
+    time_known: float | None
+
+
+def try_knocks(
+    window: Window,
+    depth: DepthModel,
+    images: ImageReader,
+    config: CalibrationConfig,
+    trials: int,
+    knocks: Sequence[Knock],
+    heard: Callable[[int], None],
+) -> list[TriedKnock]:
+    """Solves `window`, which starts where the mount is, `trials` times with every knock (seeded), and once without one;
+    `heard(done)` counts them.
+
+    Raises:
+        CalibrationError: fewer than two pairs, or there is no estimate even without a knock.
+    """
+    if len(window.pairs) < 2:
+        raise CalibrationError(f"a knock lies between two pairs of a window, there are {len(window.pairs)}")
+    still = replace(window, pairs=_compensated(window, config), start_known_to_rad=MOUNT_RAD)
+    config = config.model_copy(update={"motion_compensation": False})
+    tried: list[TriedKnock] = []
+    for number, knock in enumerate(knocks):
+        # Without a knock every trial is the same.
+        for trial in range(trials if knock.moves else 1):
+            rng = np.random.default_rng([SEED, number, trial])
+            tried.append(_try(knock, still, depth, images, config, rng))
+            heard(len(tried))
+    return tried
+
+
+def table(tried: Sequence[TriedKnock]) -> tuple[KnockRow, ...]:
+    """The shares by knock, in the order of their first trials."""
+    rows = []
+    for name in dict.fromkeys(one.name for one in tried):
+        of = [one for one in tried if one.name == name]
+        known = [one.off_s is not None and one.off_s <= KNOWN_TO_S for one in of]
+        has_time = not any(knock.name == name and (knock.creeps or not knock.moves) for knock in KNOCKS)
+        rows.append(
+            KnockRow(
+                name,
+                len(of),
+                sum(one.accepted for one in of) / len(of),
+                sum(one.wrong for one in of) / len(of),
+                sum(one.moved for one in of) / len(of),
+                sum(known) / len(of) if has_time else None,
+            )
+        )
+    return tuple(rows)
+
+
+def _try(
+    knock: Knock,
+    still: Window,
+    depth: DepthModel,
+    images: ImageReader,
+    config: CalibrationConfig,
+    rng: np.random.Generator,
+) -> TriedKnock:
+    count, start = len(still.pairs), still.T_camera_lidar_start
+    first_late = int(rng.integers(1, count))
+    xi = np.concatenate([knock.turn_rad * random_direction(rng), knock.shift_m * random_direction(rng)])
+    at_ns = int(rng.integers(still.pairs[first_late - 1].stamp_ns, still.pairs[first_late].stamp_ns))
+    shares = np.arange(count) / (count - 1) if knock.creeps else np.arange(count) >= first_late
+    pairs = tuple(_moved(pair, start, xi * share) for pair, share in zip(still.pairs, shares, strict=True))
+    try:
+        estimate = calibrate(replace(still, pairs=pairs), depth, images, config, Silence())
+    except CalibrationError:
+        return TriedKnock(knock.name, accepted=False, wrong=False, moved=False, off_s=None, late=1 - first_late / count)
+    accepted = estimate.verdict.decision is Decision.ACCEPTED
+    off_s = None
+    if estimate.moved is not None and knock.moves and not knock.creeps:
+        told_ns = (estimate.moved.last_before_ns + estimate.moved.first_after_ns) // 2
+        off_s = abs(told_ns - at_ns) / NS_PER_S
+    return TriedKnock(
+        knock.name,
+        accepted,
+        accepted and _is_wrong(estimate, se3.perturb(start, xi)),
+        any(reason.code == MOVED for reason in estimate.verdict.reasons),
+        off_s,
+        1 - first_late / count,
+    )
+
+
+def _compensated(window: Window, config: CalibrationConfig) -> tuple[FramePair, ...]:
+    """The pairs with their sweeps as they were at the exposures."""
+
+    def of(pair: FramePair) -> FramePair:
+        xyz_m = compensate(pair, window.rig, enabled=config.motion_compensation)
+        return replace(pair, lidar=replace(pair.lidar, xyz_m=xyz_m))
+
+    return tuple(of(pair) for pair in window.pairs)
+
+
+def _moved(pair: FramePair, T_camera_lidar: Matrix4, xi: NDArray[np.float64]) -> FramePair:
+    """The pair as if the mount were moved by ξ (6,) from `T_camera_lidar` (4, 4)."""
+    carried = (se3.inverse(se3.perturb(T_camera_lidar, xi)) @ T_camera_lidar).astype(np.float32)
+    xyz_m = pair.lidar.xyz_m @ carried[:3, :3].T + carried[:3, 3]
+    return replace(pair, lidar=replace(pair.lidar, xyz_m=np.ascontiguousarray(xyz_m)))
+
+
+def _is_wrong(estimate: Estimate, truth: Matrix4) -> bool:
+    """By the angle, which every window is to tell."""
+    error = se3.difference(estimate.optimum.T_camera_lidar, truth)
+    sigma_rad = float(np.max(estimate.sigma[:3]))
+    return bool(np.linalg.norm(error[:3]) > max(WRONG_RAD, WRONG_SIGMAS * sigma_rad))
