@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -12,6 +14,19 @@ from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
 
 TLS = "transport/link/tls"
+
+MAX_FILE_BYTES = 2**20
+"""Of a file of Zenoh's, as of ours: access control of a hundred subjects has a tenth of it."""
+
+MAX_DEPTH = 64
+"""Of lists and objects in one another. Zenoh's own configuration is 8 deep; its reader goes down a level of the stack
+for each, and takes the process with it when there is no more (seen between 20,000 and 100,000)."""
+
+_TOKENS = re.compile(
+    r"""//[^\n\r\u2028\u2029]*|/\*.*?\*/|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|(?P<opens>[\[{])|(?P<closes>[\]}])""",
+    re.DOTALL,
+)
+"""Of JSON5: what may hold brackets that mean nothing, and those that do."""
 
 
 def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
@@ -32,7 +47,7 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
         "scouting/gossip/enabled": False,
     }
     try:
-        settings = zenoh.Config.from_file(config.file) if config.file else zenoh.Config()
+        settings = zenoh.Config.from_json5(_text(config.file)) if config.file else zenoh.Config()
         unsaid = zenoh.Config()
         for key, value in silent.items():
             # A peer listens on every interface by default, at any port.
@@ -53,6 +68,24 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
             "`zenoh.insecure: true`, and health will say so"
         )
     return settings
+
+
+def _text(path: Path) -> str:
+    """A file that Zenoh may be given.
+
+    Raises:
+        OSError, ValueError: it is none that can be read, or larger or deeper than anything that a person writes.
+    """
+    with path.open("rb") as stream:
+        data = stream.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise ValueError(f"it has more than {MAX_FILE_BYTES} bytes")
+    text, depth = data.decode("utf-8"), 0
+    for token in _TOKENS.finditer(text):
+        depth += 1 if token["opens"] else -1 if token["closes"] else 0
+        if depth > MAX_DEPTH:
+            raise ValueError(f"it is nested deeper than {MAX_DEPTH}")
+    return text
 
 
 def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
