@@ -1,6 +1,9 @@
-"""Hypothesis strategies that prefer the places where formulas break: zero, the axis, right angles, half turns."""
+"""Hypothesis strategies that prefer the places where formulas break (zero, the axis, right angles, half turns), and
+where readers do (the ends of types, and one type where another is expected)."""
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
@@ -52,4 +55,27 @@ def twists() -> st.SearchStrategy[NDArray[np.float64]]:
         rotation_vectors(),
         directions(),
         st.sampled_from((0.0, 1e-9, 0.5)) | st.floats(0.0, 100.0),
+    )
+
+
+def scalars() -> st.SearchStrategy[Any]:
+    """What a document may hold at its ends, in every encoding."""
+    texts = st.sampled_from(("", "\0", "/", "..", "1e999", "front", "accepted"))
+    return st.one_of(
+        st.none(),
+        st.booleans(),
+        st.sampled_from((0, -1, 2**31, 2**53, 2**63 - 1, -(2**63))),
+        st.sampled_from((0.0, -0.0, 1e308, 5e-324, 0.5)) | st.floats(allow_nan=False, allow_infinity=False),
+        texts | st.text(st.characters(codec="utf-8"), max_size=8),
+    )
+
+
+def documents(names: Sequence[str]) -> st.SearchStrategy[Any]:
+    """Maps and lists in one another that every encoding can write, with these names for most of their fields."""
+    fields = st.sampled_from(tuple(names)) | st.text(st.characters(codec="utf-8"), max_size=4)
+    rows = st.just([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    return st.recursive(
+        scalars() | rows,
+        lambda inner: st.lists(inner, max_size=6) | st.dictionaries(fields, inner, max_size=6),
+        max_leaves=20,
     )

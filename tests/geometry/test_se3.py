@@ -132,6 +132,7 @@ def _with(row: int, column: int, value: float) -> Array:
         (_with(3, 0, 1e-3), False),
         (_with(3, 3, 2.0), False),
         (_with(1, 3, math.nan), False),
+        (_with(1, 1, 1e200), False),
         (_reflected(), False),
         (np.eye(3), False),
     ],
@@ -149,5 +150,6 @@ def test_wrong_shapes_are_refused() -> None:
         se3.rotation_exp(np.zeros(6))
     with pytest.raises(ValueError, match=r"\(3, 3\)"):
         se3.rotation_log(np.eye(4))
-    with pytest.raises(ValueError, match="not zero"):
-        se3.rotation_from_quaternion_xyzw(np.zeros(4))
+    for length in (0.0, 1e200, math.nan):
+        with pytest.raises(ValueError, match="not zero"):
+            se3.rotation_from_quaternion_xyzw(np.full(4, length))

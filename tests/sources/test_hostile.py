@@ -3,10 +3,8 @@ with little memory."""
 
 from __future__ import annotations
 
-import io
 import struct
 import tracemalloc
-import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from cloud_files import npy, npz, pcd, with_header
 from coec.config import MAX_YAML_BYTES, load_config, load_yaml
 from coec.errors import CoecError, ConfigError, SourceError
 from coec.sources import open_source, reading
@@ -26,31 +25,6 @@ from coec.sources.pcd import MAX_TABLE_BYTES, MAX_UNPACKED_BYTES, PcdError, pars
 DEEP = 100_000
 DIGITS = "9" * 5000
 MB = 2**20
-
-
-def npy(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
-
-
-def with_header(header: str, body: bytes = b"") -> bytes:
-    text = header.encode().ljust(117) + b"\n"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + body
-
-
-def npz(**members: bytes) -> bytes:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in members.items():
-            archive.writestr(f"{name}.npy", data)
-    return stream.getvalue()
-
-
-def pcd(fields: str, sizes: str, types: str, points: int, encoding: str, body: bytes = b"", counts: str = "") -> bytes:
-    lines = ["VERSION 0.7", f"FIELDS {fields}", f"SIZE {sizes}", f"TYPE {types}", f"COUNT {counts}" if counts else "#"]
-    lines += [f"WIDTH {points}", "HEIGHT 1", f"POINTS {points}", f"DATA {encoding}", ""]
-    return "\n".join(lines).encode() + body
 
 
 XYZ = ("x y z", "4 4 4", "F F F")
@@ -100,6 +74,9 @@ def test_doubles_that_no_float_holds_go_with_their_point(tmp_path: Path) -> None
     path = tmp_path / "cloud.npy"
     path.write_bytes(npy(np.array([[1e300, 0, 0, 1], [1, 2, 3, 4]])))
     assert load_cloud(0, "lidar", path).xyz_m.tolist() == [[1, 2, 3]]
+    path = tmp_path / "cloud.npz"
+    path.write_bytes(npz(xyz=npy(np.ones((2, 3)) * [[1], [2]]), time_offset_s=npy(np.array([0.25, -1e300]))))
+    assert load_cloud(0, "lidar", path).xyz_m.tolist() == [[1, 1, 1]]
     path = tmp_path / "cloud.pcd"
     path.write_bytes(pcd(*XYZ, 2, "ascii", b"1e300 0 0\n1 2 3\n"))
     assert load_cloud(0, "lidar", path).xyz_m.tolist() == [[1, 2, 3]]

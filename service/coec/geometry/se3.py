@@ -102,9 +102,11 @@ def quaternion_xyzw_from_rotation(rotation: Array) -> Array:
 
 
 def rotation_from_quaternion_xyzw(quaternion_xyzw: Array) -> Array:
-    """Rotation matrix (3, 3) of a quaternion [x y z w] of any length. Raises ValueError if it is zero or not finite."""
+    """Rotation matrix (3, 3) of a quaternion [x y z w] of any length. Raises ValueError if it is zero or not finite, or
+    if its square is."""
     q = _vector("quaternion_xyzw", quaternion_xyzw, 4)
-    norm = float(np.linalg.norm(q))
+    with np.errstate(over="ignore"):
+        norm = float(np.linalg.norm(q))
     if not (norm > 0.0 and math.isfinite(norm)):
         raise ValueError(f"quaternion_xyzw must be finite and not zero, got {q.tolist()}")
     x, y, z, w = q / norm
@@ -185,5 +187,7 @@ def is_rigid(transform: Array, tolerance: float = 1e-6) -> bool:
     if t.shape != (4, 4) or not np.isfinite(t).all() or not np.array_equal(t[3], [0.0, 0.0, 0.0, 1.0]):
         return False
     rotation = t[:3, :3]
+    if np.abs(rotation).max() > 1.0 + tolerance:  # no rotation, and its square may be more than a double holds
+        return False
     orthonormal = bool(np.abs(rotation.T @ rotation - np.eye(3)).max() <= tolerance)
     return orthonormal and float(np.linalg.det(rotation)) > 0.0

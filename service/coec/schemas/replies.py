@@ -26,6 +26,7 @@ Provenance = Literal["nominal", "commissioned", "estimated", "restored"]
 Status = Literal["not_accepted", "accepted", "failed"]
 AxisStatus = Literal["not_solved", "not_observable", "not_accepted", "accepted", "failed"]
 Decision = Literal["accepted", "failed"]
+StopReason = Literal["tolerance_reached", "optimum_at_bound", "evaluations_exhausted"]
 HealthState = Literal["unknown", "healthy", "suspect", "miscalibrated", "degraded", "stale"]
 
 ROS_LEVELS: dict[HealthState, Literal[0, 1, 2, 3]] = {
@@ -149,7 +150,7 @@ class CalibrationResult(Message):
     overlap: float | None = Field(description="share of the guarded points that lie in view, 0 to 1")
     points_in_view: Count = Field(description="over all pairs")
     evaluations: Count = Field(description="of the objective")
-    stop_reason: str
+    stop_reason: StopReason
     first_derivative: Maybe6 = Field(description="f': d(objective) per rad or m; null where not searched")
     second_derivative: Maybe6 = Field(description="f'': -d²(objective) per rad² or m²; null where not searched")
     compensation: Counts = Field(description="pairs by outcome of motion compensation")

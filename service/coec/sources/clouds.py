@@ -42,7 +42,7 @@ def _frame(stamp_ns: int, frame_id: str, path: Path, columns: Columns) -> LidarF
     xyz_m = np.ascontiguousarray(columns["xyz"], dtype=np.float32)
     keep = np.isfinite(xyz_m).all(axis=1)
     if "time_offset_s" in columns:
-        keep &= np.isfinite(columns["time_offset_s"].astype(np.float64))
+        keep &= np.isfinite(columns["time_offset_s"].astype(np.float32))
     if not keep.any():
         raise SourceError(f"{path} holds no finite point ({len(xyz_m)} rows)")
     intensity, ring, time_offset_s = (

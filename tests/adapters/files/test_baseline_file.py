@@ -81,3 +81,11 @@ def test_a_matrix_that_is_not_rigid_is_refused() -> None:
     document["T_camera_lidar"][0][0] = 3.0
     with pytest.raises(StateError, match="not a rigid transform"):
         baseline_from_json(document)
+
+
+@pytest.mark.parametrize(("part", "short"), [("gradient", [[1.0], []]), ("bands", [1.0]), ("sectors", [])])
+def test_a_scene_of_other_parts_than_the_monitor_looks_at_is_refused(part: str, short: object) -> None:
+    document = baseline_to_json(a_baseline())
+    document["scene"][part] = short
+    with pytest.raises(StateError, match=part):
+        baseline_from_json(document)

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -23,10 +23,12 @@ from coec.calibration.types import (
     Uncertainty,
     Verdict,
 )
+from coec.errors import DecodeError
 from coec.geometry.cameras import build
 from coec.geometry.se3 import perturbation
 from coec.schemas.base import from_json, from_msgpack, to_json, to_msgpack
 from coec.schemas.replies import CalibrationResult
+from coec.schemas.replies import StopReason as TheirReason
 
 NAN = math.nan
 RIG = Rig(
@@ -162,3 +164,11 @@ def test_a_transform_has_one_matrix_in_three_forms() -> None:
     assert transform.translation_m == (0.1, 0.2, 0.3)
     assert transform.quaternion_xyzw == pytest.approx((0.5, -0.5, 0.5, 0.5))
     assert matrix_of(transform).tobytes() == T.tobytes()
+
+
+def test_the_wire_knows_every_end_of_a_search_and_no_other() -> None:
+    """What a forged window or history says beyond them is not its form, and no fault of whoever reads it."""
+    assert set(get_args(TheirReason)) == {reason.value for reason in StopReason}
+    forged = json.loads(to_json(result_of(estimate(), RIG, "test"))) | {"stop_reason": "toleqance_reached"}
+    with pytest.raises(DecodeError, match="stop_reason"):
+        from_json(CalibrationResult, json.dumps(forged).encode())

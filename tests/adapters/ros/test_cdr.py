@@ -12,100 +12,16 @@ from hypothesis import strategies as st
 from mcap_ros2.decoder import DecoderFactory
 
 from coec.adapters.frames.incoming import Refusal
-from coec.adapters.images.codec import encode_depth_png, encode_jpeg, probe
+from coec.adapters.images.codec import encode_depth_png, probe
 from coec.adapters.ros import cdr
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, build
+from ros_messages import JPEG, NSEC, SEC, STAMP, cloud, compressed, image, odometry, packed, twist
 
 LIMITS = LimitsConfig()
-SEC, NSEC = 1_700_000_000, 123_456_789
-STAMP = SEC * 10**9 + NSEC
-JPEG = encode_jpeg(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8))
 NAN = math.nan
-
-CODES = {"i1": 1, "u1": 2, "<i2": 3, "<u2": 4, "<i4": 5, "<u4": 6, "<f4": 7, "<f8": 8}
-
-
-class Packer:
-    """CDR, little-endian, packed by hand: alignment counts from behind the 4 bytes of encapsulation."""
-
-    def __init__(self) -> None:
-        self.body = bytearray()
-
-    def put(self, form: str, *values: float) -> "Packer":
-        for value in values:
-            self.body += bytes(-len(self.body) % struct.calcsize("<" + form))
-            self.body += struct.pack("<" + form, value)
-        return self
-
-    def text(self, text: str) -> "Packer":
-        self.put("I", len(text.encode()) + 1)
-        self.body += text.encode() + b"\0"
-        return self
-
-    def octets(self, data: bytes, claimed: int | None = None) -> "Packer":
-        self.put("I", len(data) if claimed is None else claimed)
-        self.body += data
-        return self
-
-    def header(self, frame_id: str, sec: int = SEC, nsec: int = NSEC) -> "Packer":
-        return self.put("i", sec).put("I", nsec).text(frame_id)
-
-    def done(self) -> bytes:
-        return b"\x00\x01\x00\x00" + bytes(self.body)
-
-
-def compressed(data: bytes = JPEG, form: str = "jpeg", **header: Any) -> bytes:
-    return Packer().header(**({"frame_id": "camera"} | header)).text(form).octets(data).done()
-
-
-def image(encoding: str, width: int, height: int, step: int, data: bytes) -> bytes:
-    packer = Packer().header("camera").put("I", height, width).text(encoding)
-    return packer.put("B", 0).put("I", step).octets(data).done()
-
-
-def cloud(
-    fields: list[tuple[str, int, int]],
-    data: bytes,
-    width: int,
-    point_step: int,
-    *,
-    height: int = 1,
-    row_step: int | None = None,
-    big: bool = False,
-    claimed: int | None = None,
-    claimed_fields: int | None = None,
-) -> bytes:
-    packer = Packer().header("lidar").put("I", height, width)
-    packer.put("I", len(fields) if claimed_fields is None else claimed_fields)
-    for name, offset, datatype in fields:
-        packer.text(name).put("I", offset).put("B", datatype).put("I", 1)
-    packer.put("?", big).put("I", point_step, width * point_step if row_step is None else row_step)
-    return packer.octets(data, claimed).put("?", False).done()
-
-
-def packed(columns: list[tuple[str, str, list[float]]], **options: Any) -> bytes:
-    """A cloud of one row, without padding, its columns in the order given."""
-    fields, formats, offset = [], [], 0
-    for name, form, _ in columns:
-        fields.append((name, offset, CODES[form]))
-        formats.append((name, form))
-        offset += np.dtype(form).itemsize
-    rows = np.zeros(len(columns[0][2]), formats)
-    for name, _, values in columns:
-        rows[name] = values
-    return cloud(fields, rows.tobytes(), len(rows), offset, **options)
-
-
-def twist(linear: tuple[float, ...] = (1.5, 0.0, -0.25), angular: tuple[float, ...] = (0.0, 0.5, 0.125)) -> bytes:
-    return Packer().header("base_link").put("d", *linear, *angular).done()
-
-
-def odometry(child: str = "base_link") -> bytes:
-    packer = Packer().header("odom").text(child).put("d", *range(7), *[0.0] * 36)
-    return packer.put("d", 1.5, 0.0, -0.25, 0.0, 0.5, 0.125, *[0.0] * 36).done()
 
 
 XYZ: list[tuple[str, str, list[float]]] = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]

@@ -106,3 +106,28 @@ def test_what_is_wrong_in_a_file_is_told_without_what_stands_there(tmp_path: Pat
         settings_of(of_file(tmp_path, text), LIMITS)
     assert SECRET not in str(refused.value)
     assert "zenoh.json5 is no configuration of Zenoh" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, "{mode: [" + "[[//]\r" * 100_000, "{a: '" + "[" * 2**20, "\x00", '{a: "[\\', "// [" * 9, ""]
+)
+def test_a_file_that_is_no_configuration_ends_in_an_error_and_not_the_process(tmp_path: Path, text: str) -> None:
+    with pytest.raises(ConfigError, match=r"zenoh\.json5"):
+        settings_of(of_file(tmp_path, text), LIMITS)
+
+
+def test_brackets_that_mean_nothing_do_not_count(tmp_path: Path) -> None:
+    many = "[{" * 100
+    text = f'{{ // {many}\n/* {many} */ mode: "peer", metadata: {{ a: "{many}", b: \'{many}\' }} }}'
+    assert unguarded(settings_of(of_file(tmp_path, text), LIMITS)) == ()
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", None, ""], ids=["no text", "absent", "a folder"])
+def test_a_file_that_is_not_text_or_not_there_is_refused(tmp_path: Path, content: bytes | str | None) -> None:
+    path = tmp_path / "zenoh.json5"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        path.mkdir()
+    with pytest.raises(ConfigError, match=r"zenoh\.json5"):
+        settings_of(ZenohConfig(file=path), LIMITS)

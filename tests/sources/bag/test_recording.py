@@ -186,6 +186,15 @@ def test_frames_that_no_transform_connects(tmp_path: Path) -> None:
         open_source(str(path))
 
 
+@pytest.mark.parametrize("x_m", [np.nan, np.inf, -1e308])
+def test_a_transform_to_nowhere_is_refused(tmp_path: Path, x_m: float) -> None:
+    broken = a_joint("base", "lidar", T_BASE_LIDAR)
+    broken.transform.translation = ros.geometry_msgs__msg__Vector3(x_m, 0.0, 0.0)
+    path = Bag(a_drive(tree=[broken, *TREE[1:]])).write(tmp_path / "bag.mcap")
+    with pytest.raises(SourceError, match="a transform on /tf_static is not one"):
+        open_source(str(path))
+
+
 def test_the_camera_info_of_the_cameras_frame_is_taken(tmp_path: Path) -> None:
     other = ("/rear/camera_info", an_info("equidistant", [0.1] * 4, frame_id="rear"))
     path = Bag([other, *a_drive()]).write(tmp_path / "bag.mcap")

@@ -10,21 +10,27 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from coec.adapters.files import durable
 from coec.adapters.files.rig import matrix_rows, rigid_matrix
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.commissioning.baseline import Accuracy, Baseline, MonitorLimits
-from coec.calibration.monitor.sensor_faults import SceneBaseline
+from coec.calibration.monitor.sensor_faults import BANDS, BLOCK_COLUMNS, BLOCK_ROWS, SECTORS, SceneBaseline
 from coec.config import Matrix4x4, describe
 from coec.errors import ConfigError, StateError
 
 Maybe6 = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
+
+
+def _length(count: int) -> FieldInfo:
+    field: FieldInfo = Field(min_length=count, max_length=count)
+    return field
 
 
 BASELINES = "rig.json"
@@ -58,11 +64,11 @@ class LimitsDocument(_Document):
 
 
 class SceneDocument(_Document):
-    """`SceneBaseline`."""
+    """`SceneBaseline`, of just as many parts as the monitor looks at."""
 
-    gradient: tuple[tuple[float, ...], ...]
-    bands: tuple[float, ...]
-    sectors: tuple[float, ...]
+    gradient: Annotated[tuple[Annotated[tuple[float, ...], _length(BLOCK_COLUMNS)], ...], _length(BLOCK_ROWS)]
+    bands: Annotated[tuple[float, ...], _length(BANDS)]
+    sectors: Annotated[tuple[float, ...], _length(SECTORS)]
     range_edges: float
 
 

@@ -29,6 +29,9 @@ _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _HEADER = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
 """`std_msgs/Header.stamp` (sec, nanosec), with which every type above begins, by the byte order of the message."""
 
+MAX_JOINT_M = 1e9
+"""Of a static transform, per axis, metres: frames of maps may lie at the centre of the earth, 6.4e6 m away."""
+
 
 @dataclass(frozen=True, slots=True, order=True)
 class Place:
@@ -123,6 +126,8 @@ class Index:
         rotation, translation = joint.transform.rotation, joint.transform.translation
         quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
         offset_m = np.array([translation.x, translation.y, translation.z])
+        if not (np.abs(offset_m) <= MAX_JOINT_M).all():
+            raise SourceError(f"{self.path}: a transform on {topic} is not one: no finite place, or far away")
         try:
             T_parent_child = transform_from(rotation_from_quaternion_xyzw(quaternion), offset_m)
         except ValueError as error:

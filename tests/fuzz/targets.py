@@ -1,0 +1,670 @@
+"""What is fuzzed: every reader of bytes that somebody else may have written, as the service and the commands use it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import socket
+import struct
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import msgpack
+import numpy as np
+import zenoh
+from mcap.opcode import Opcode
+
+from baselines import a_baseline
+from cloud_files import npy, npz, pcd
+from coec.adapters.depth.model_cards import CARDS, read_card
+from coec.adapters.files.baseline_file import baseline_to_json, load_baseline
+from coec.adapters.files.conversions import estimate_of, result_of
+from coec.adapters.files.rig import rig_of, rig_to_json
+from coec.adapters.frames.msgpack_frames import decode_camera, decode_ego, decode_lidar
+from coec.adapters.images.codec import Inspector, decode_depth, encode_depth_png, encode_png
+from coec.adapters.mcap.windows import PART_SUFFIX, is_window, read_result, read_window, salvage
+from coec.adapters.ros import cdr
+from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.settings import mode_of, settings_of
+from coec.calibration.lifecycle import Rules, after_estimate, initial_state, restored
+from coec.calibration.types import CameraFrame, LidarFrame
+from coec.config import (
+    CalibrationConfig,
+    LimitsConfig,
+    MonitorConfig,
+    PolicyConfig,
+    StateConfig,
+    TrackerConfig,
+    ZenohConfig,
+    load_config,
+)
+from coec.errors import SourceError, UsageError
+from coec.geometry.cameras import build
+from coec.runtime.api import payloads
+from coec.runtime.api.extrinsic import extrinsic_of
+from coec.runtime.decisions.pair_store import PairStore
+from coec.runtime.decisions.state_store import Clocks, StateStore
+from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.worker.answers import MalformedAnswerError, number_of, pack_answer, read_answer
+from coec.runtime.worker.jobs import Drawn, Kind, Solved
+from coec.runtime.worker.link import Link, NoMessageError
+from coec.schemas import keys
+from coec.schemas.base import to_json
+from coec.schemas.replies import CalibrationResult
+from coec.sources import open_source
+from coec.sources.clouds import load_cloud
+from coec.sources.kitti_files import read_numbers, read_stamps
+from coec.sources.recording import Recording
+from estimates import RIG, estimate
+from fuzz.formats import (
+    attachment,
+    behind,
+    book,
+    canonical,
+    chained,
+    checksummed,
+    chunk,
+    in_archive,
+    in_json,
+    in_lines,
+    in_msgpack,
+    in_records,
+    in_yaml,
+    mcap_file,
+    packed_records,
+    with_checksum,
+)
+from fuzz.loop import Target
+from ros_messages import JPEG, Packer, cloud, compressed, image, odometry, packed, twist
+
+LOG = logging.getLogger(__name__)
+LIMITS = LimitsConfig()
+INSPECTOR = Inspector(LIMITS)
+VEHICLE = "vehicle"
+GREY = encode_png(np.zeros((8, 8), np.uint8))
+DEPTH = encode_depth_png(np.arange(1, 193, dtype=np.uint16).reshape(12, 16))
+
+
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+def _inspected(frame: object) -> None:
+    """A frame that was taken is looked at by the thread that took it."""
+    if isinstance(frame, CameraFrame):
+        INSPECTOR.inspect(frame)
+        if frame.depth is not None:
+            decode_depth(frame.depth, LIMITS)
+    if isinstance(frame, LidarFrame):
+        assert len(frame.xyz_m)
+        assert np.isfinite(frame.xyz_m).all()
+        assert frame.time_offset_s is None or np.isfinite(frame.time_offset_s).all()
+
+
+def _camera_seeds() -> list[bytes]:
+    head = {"stamp_ns": 12, "frame_id": "camera", "sequence": 3, "schema_version": 1}
+    raw = {"format": "mono8", "data": bytes(range(12)), "width": 4, "height": 3}
+    images = ({"format": "jpeg", "data": JPEG}, {"format": "png", "data": GREY, "width": 8, "height": 8}, raw)
+    messages: list[dict[str, Any]] = [{**head, "image": image} for image in images]
+    messages.append({**messages[0], "depth": {"format": "png", "data": DEPTH}})
+    return [msgpack.packb(message) for message in messages]
+
+
+def _lidar_seeds() -> list[bytes]:
+    points = struct.pack("<6f", 1, 2, 3, -4, 5, 0.5)
+    columns = {
+        "intensity": struct.pack("<2f", 9, 8),
+        "ring": struct.pack("<2H", 63, 65535),
+        "time_offset_s": struct.pack("<2f", -0.05, 0.05),
+    }
+    head = {"stamp_ns": 5, "frame_id": "lidar", "points": points}
+    return [msgpack.packb(head), msgpack.packb({**head, **columns, "sequence": 2**63 - 1})]
+
+
+def _ego_seeds() -> list[bytes]:
+    motion = {"stamp_ns": 12, "frame_id": "base", "linear_mps": [1.5, 0.0, 0.0], "angular_radps": [0.0, 0.0, 0.1]}
+    return [msgpack.packb(motion)]
+
+
+MESSAGES: Final = (cdr.COMPRESSED_IMAGE, cdr.IMAGE, cdr.POINT_CLOUD, cdr.ODOMETRY, cdr.TWIST, "other/msg/Type")
+
+
+def _cdr(data: bytes, folder: Path) -> None:
+    """The first byte chooses the type of the message."""
+    del folder
+    _inspected(cdr.decode(MESSAGES[data[0] % len(MESSAGES) if data else 0], data[1:], LIMITS))
+
+
+XYZ: list[tuple[str, str, list[float]]] = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
+
+
+def _cdr_seeds() -> list[bytes]:
+    doubles: list[tuple[str, str, list[float]]] = [(name, "<f8", values) for name, _, values in XYZ]
+    messages = [
+        (0, compressed()),
+        (0, compressed(GREY, "png")),
+        (1, image("rgb8", 2, 2, 8, bytes(16))),
+        (1, image("mono8", 4, 3, 4, bytes(12))),
+        (2, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 9])])),
+        (2, packed([*doubles, ("ring", "<u2", [1, 2]), ("timestamp", "<f8", [1.7e9, 1.7e9])])),
+        (2, cloud([("x", 0, 7), ("y", 4, 7), ("z", 8, 7)], bytes(96), 2, 16, height=2, row_step=48)),
+        (3, odometry()),
+        (4, twist()),
+    ]
+    return [bytes([kind]) + message for kind, message in messages]
+
+
+# --- recordings -------------------------------------------------------------------------------------------------------
+
+
+def _cloud_file(data: bytes, folder: Path, suffix: str) -> None:
+    path = folder / f"cloud.{suffix}"
+    path.write_bytes(data)
+    _inspected(load_cloud(0, "lidar", path))
+
+
+POINTS = struct.pack("<12f", *range(12))
+
+
+def _pcd_seeds() -> list[bytes]:
+    xyz = ("x y z", "4 4 4", "F F F")
+    more = ("x y z intensity ring t", "4 4 4 4 2 4", "F F F F U U")
+    rows = b"".join(struct.pack("<4fHI", i, i, i, i, i, i) for i in range(3))
+    columns = struct.pack("<6f", 1, 2, 3, 4, 5, 6)
+    return [
+        pcd(*xyz, 4, "ascii", b"1 2 3\n" * 4),
+        pcd(*xyz, 4, "binary", POINTS, counts="1 1 1"),
+        pcd(*xyz, 2, "binary_compressed", struct.pack("<II", 25, 24) + bytes([23]) + columns),
+        pcd(*xyz, 20, "binary_compressed", struct.pack("<II", 5, 240) + bytes([0, 0, 0xE0, 230, 0])),
+        pcd(*more, 3, "binary", rows),
+        pcd("_ x y z time", "1 8 8 8 4", "U F F F F", 1, "ascii", b"1 1 1 2 3 0.5\n", counts="2 1 1 1 1"),
+    ]
+
+
+def _npy_seeds() -> list[bytes]:
+    arrays = (
+        np.ones((4, 3)),
+        np.ones((4, 4), np.float32),
+        np.asfortranarray(np.ones((2, 3), ">f8")),
+        np.ones((3, 4), "f2"),
+    )
+    return [npy(array) for array in arrays]
+
+
+def _npz_seeds() -> list[bytes]:
+    columns = {
+        "intensity": npy(np.arange(4)),
+        "ring": npy(np.arange(4, dtype=np.uint16)),
+        "time_offset_s": npy(np.zeros(4)),
+    }
+    return [npz(xyz=npy(np.ones((4, 3)))), npz(xyz=npy(np.ones((4, 3), np.float32)), **columns)]
+
+
+def _manifest(data: bytes, folder: Path) -> None:
+    if not (folder / "a.png").exists():
+        (folder / "a.png").write_bytes(GREY)
+        (folder / "a.ppm").write_bytes(b"P6 8 8 255\n" + bytes(192))
+        (folder / "a.bin").write_bytes(POINTS[:16])
+        (folder / "depth.png").write_bytes(DEPTH)
+        (folder / "depth.npy").write_bytes(npy(np.ones((4, 3), np.float32)))
+    path = folder / "dataset.yaml"
+    path.write_bytes(data)
+    _played(open_source(str(path)))
+
+
+def _played(recording: Recording) -> None:
+    for message in recording.messages():
+        _inspected(message)
+
+
+CAMERA = "{model: pinhole, width: 8, height: 8, fx: 4, fy: 4, cx: 3.5, cy: 3.5}"
+FISHEYE = (
+    "{model: kannala_brandt, width: 8, height: 8, fx: 4, fy: 4, cx: 3.5, cy: 3.5, k1: -0.1, k2: 0.1, k3: 0.1, k4: 0}"
+)
+IDENTITY = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+
+
+def _manifest_seeds() -> list[bytes]:
+    twist = "twist: {linear_mps: [1, 0, 0], angular_radps: [0, 0, 0.1]}"
+    texts = [
+        f"pair: front\ncamera: {CAMERA}\nT_camera_lidar: {IDENTITY}\n"
+        f"frames: [{{image: a.png, cloud: a.bin, stamp_ns: 1, {twist}}}]\n",
+        f"pair: front\nmask: a.png\ncamera: {FISHEYE}\nT_camera_lidar: {IDENTITY}\nframes:\n"
+        "  - {image: a.ppm, cloud: a.bin, stamp_ns: 1, depth: depth.npy}\n"
+        "  - {image: a.png, cloud: a.bin, stamp_ns: 100000000, cloud_stamp_ns: 90000000, depth: depth.png}\n",
+    ]
+    return [text.encode() for text in texts]
+
+
+def _kitti(data: bytes, folder: Path) -> None:
+    path = folder / "kitti.txt"
+    path.write_bytes(data)
+    for read in (read_numbers, read_stamps):
+        with suppress(SourceError):
+            read(path)
+
+
+def _bag(data: bytes, folder: Path) -> None:
+    path = folder / "bag.mcap"
+    path.write_bytes(data)
+    recording = open_source(str(path))
+    assert np.isfinite(recording.rig.T_camera_lidar_nominal).all()
+    _played(recording)
+
+
+def _camera_info() -> bytes:
+    packer = Packer().header("camera").put("I", 48, 64).text("plumb_bob").put("I", 5).put("d", *[0.1] * 5)
+    packer.put("d", 50, 0, 31.5, 0, 50, 23.5, 0, 0, 1, *np.eye(3).ravel(), *[0.0] * 12)
+    return packer.put("I", 0, 0, 0, 0, 0, 0).put("?", False).done()
+
+
+def _tf() -> bytes:
+    packer = Packer().put("I", 2)
+    for parent, child in (("base", "camera"), ("base", "lidar")):
+        packer.header(parent).text(child).put("d", 0.1, 0.2, 0.3, 0, 0, 0, 1)
+    return packer.done()
+
+
+SWEEP = packed([*XYZ, ("time", "<f4", [0, 0.01])])
+
+
+def _recorded(topics: Sequence[tuple[str, str, bytes]], sequence: int = 0) -> list[tuple[int, bytes]]:
+    """Schema, channel and message for each."""
+
+    def text(*texts: str) -> bytes:
+        return b"".join(struct.pack("<I", len(text)) + text.encode() for text in texts)
+
+    records: list[tuple[int, bytes]] = []
+    for number, (topic, kind, data) in enumerate(topics, start=1):
+        records += [
+            (Opcode.SCHEMA, struct.pack("<H", number) + text(kind, "ros2msg", "")),
+            (Opcode.CHANNEL, struct.pack("<HH", number, number) + text(topic, "cdr") + bytes(4)),
+            (Opcode.MESSAGE, struct.pack("<HIQQ", number, sequence, 1, 1) + data),
+        ]
+    return records
+
+
+def _bag_seeds() -> list[bytes]:
+    topics = [
+        ("/image", cdr.COMPRESSED_IMAGE, compressed()),
+        ("/points", cdr.POINT_CLOUD, SWEEP),
+        ("/odom", cdr.ODOMETRY, odometry()),
+        ("/info", cdr.CAMERA_INFO, _camera_info()),
+        ("/tf_static", cdr.TF, _tf()),
+    ]
+    header = (Opcode.HEADER, struct.pack("<I", 5) + b"ros2\0" + bytes(4))
+    records = _recorded(topics)
+    twisted = _recorded([topics[0], topics[1], ("/twist", cdr.TWIST, twist()), *topics[3:]])
+    return [mcap_file([header, *records]), mcap_file([(Opcode.CHUNK, chunk(packed_records(twisted)))])]
+
+
+def _window(data: bytes, folder: Path) -> None:
+    """Read as the worker reads it; and salvaged, as it is found after a power cut."""
+    path, part = folder / "front-1.mcap", folder / f"front-2.mcap{PART_SUFFIX}"
+    path.write_bytes(data)
+    part.write_bytes(data)
+    (folder / "front-2.mcap").unlink(missing_ok=True)
+    salvaged = salvage(part, lambda: None)
+    if salvaged is not None:
+        read_window(salvaged.path)
+    result = read_result(path)
+    if result is not None:
+        estimate_of(result)
+    is_window(path)
+    window, _ = read_window(path)
+    assert np.isfinite(window.T_camera_lidar_start).all()
+    for pair in window.pairs:
+        _inspected(pair.camera)
+        _inspected(pair.lidar)
+
+
+def _window_seeds() -> list[bytes]:
+    camera = build("pinhole", width=64, height=48, fx=30.0, fy=30.0, cx=31.5, cy=23.5)
+    rig = replace(RIG, camera=camera)
+    start = rig.T_camera_lidar_nominal.tolist()
+    head = {"window_id": "front-1", "T_camera_lidar_start": start, "rig": rig_to_json(rig)}
+    metadata = struct.pack("<I", 4) + b"coec" + struct.pack("<I", 0)
+    result = to_json(result_of(estimate(1), RIG, VEHICLE))
+    mask = encode_png(np.full((48, 64), 255, np.uint8))
+    topics = [
+        ("/coec/front/lidar/points", cdr.POINT_CLOUD, SWEEP),
+        ("/coec/front/odometry", cdr.ODOMETRY, odometry()),
+        ("/coec/front/camera/depth/compressed", cdr.COMPRESSED_IMAGE, compressed(DEPTH, cdr.DEPTH_FORMAT)),
+        ("/coec/front/camera/image/compressed", cdr.COMPRESSED_IMAGE, compressed()),
+    ]
+    attachments = [("rig.json", canonical(head)), ("configuration.json", to_json(CalibrationConfig()))]
+    first = [(int(Opcode.ATTACHMENT), attachment(name, data)) for name, data in attachments]
+    more = [
+        (int(Opcode.ATTACHMENT), attachment(name, data)) for name, data in (("mask.png", mask), ("result.json", result))
+    ]
+    whole = [*first, *more, (int(Opcode.METADATA), metadata), *_recorded(topics)]
+    chunked = [*first, (int(Opcode.CHUNK), chunk(packed_records(_recorded(topics, 7))))]
+    return [mcap_file(whole), mcap_file(chunked)]
+
+
+# --- requests ---------------------------------------------------------------------------------------------------------
+
+KEYS = keys.Keys("coec", VEHICLE)
+SELECTORS: Final = (
+    keys.parse_selector,
+    keys.parse_command_selector,
+    keys.parse_history_selector,
+    keys.parse_range_selector,
+    keys.parse_overlay_selector,
+    keys.parse_evidence_selector,
+)
+
+
+def _selector(data: bytes, folder: Path) -> None:
+    """A key, `?`, and parameters that are given to every resource's own reader."""
+    del folder
+    key, _, parameters = data.decode("utf-8", errors="replace").partition("?")
+    refused: list[UsageError] = []
+    for parse in (KEYS.parse, KEYS.parse_claim):
+        try:
+            parse(key)
+        except UsageError as error:
+            refused.append(error)
+    for read in SELECTORS:
+        try:
+            read(parameters)
+        except UsageError as error:
+            refused.append(error)
+    assert all(len(str(error)) < 1000 for error in refused)
+
+
+def _selector_seeds() -> list[bytes]:
+    texts = [
+        f"{KEYS.history('front')}?since=1;until=2;limit=3;format=json",
+        f"{KEYS.window('front', 'front-1')}?offset=0;length=5",
+        f"{KEYS.command('front', 'hold')}?timeout_ms=100;_time=1",
+        f"{KEYS.overlay('front')}?at=nominal;window=front-1",
+        f"{KEYS.evidence_of('front', 'front-1')}?overlay=before;format=msgpack",
+        f"{KEYS.root}/alive/serving/0a1b/1700000000000000000",
+        KEYS.status,
+    ]
+    return [text.encode() for text in texts]
+
+
+def _command(data: bytes, folder: Path) -> None:
+    """The first byte chooses the command, the second says how much of the rest is the sender's attachment."""
+    del folder
+    name = (*payloads.NAMES, "other")[data[0] % (len(payloads.NAMES) + 1) if data else 0]
+    cut = 2 + data[1] if len(data) > 1 else 2
+    sender = payloads.sender_of(data[2:cut])
+    assert sender.isascii()
+    assert sender.isprintable()
+    assert len(sender) <= payloads.MAX_SENDER
+    for told in payloads.parse(name, data[cut:]).values():
+        to_json_of(told)
+
+
+def to_json_of(value: object) -> bytes:
+    """What a command was told goes into the log and the history."""
+    return json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
+
+
+def _command_seeds() -> list[bytes]:
+    sender = b"\x05alice"
+    return [
+        bytes([5]) + sender + msgpack.packb({"release": True}),
+        bytes([2]) + sender + msgpack.packb({"to": "0123456789abcdef"}),
+        bytes([2]) + sender + b'{"to": "front-1"}',
+        bytes([0, 0]),
+    ]
+
+
+# --- what lies on the disk --------------------------------------------------------------------------------------------
+
+RULES = Rules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())
+
+
+def _state(data: bytes, folder: Path) -> None:
+    """A start of the service on it: what is remembered is served, and put on the disk again."""
+    shutil.rmtree(folder / "state", ignore_errors=True)
+    (folder / "state").mkdir()
+    (folder / "state" / "state.json").write_bytes(data)
+    _started(folder / "state")
+
+
+def _started(folder: Path) -> None:
+    config = StateConfig(directory=folder)
+    store = PairStore(
+        RIG,
+        VEHICLE,
+        config,
+        StateStore(folder, VEHICLE),
+        WindowStore(folder / "windows", config),
+        LossCounter(LOG, "front"),
+    )
+    state = store.state
+    accepted = None if state.accepted is None else result_of(state.accepted, RIG, VEHICLE)
+    to_json(extrinsic_of(VEHICLE, RIG, state, accepted, 0.0, "0"))
+    for kept in store.history.entries():
+        to_json(kept.chained)
+    for check in store.checks():
+        to_json(check)
+    for result in store.history.results():
+        to_json(result_of(estimate_of(result), RIG, VEHICLE))
+    store.save()
+
+
+def _state_seeds() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        state = initial_state(RIG)
+        for window in (1, 2):
+            state = after_estimate(state, estimate(window), 0, RULES)
+        StateStore(folder, VEHICLE).remember(RIG, restored(state), Clocks(77, 88, 99), {"results": f"3 {'a' * 64}"})
+        return [(folder / "state.json").read_bytes(), with_checksum(b'{"pairs":{}}')]
+
+
+BOOKS: Final = (
+    "history-front.jsonl",
+    "states-front.jsonl",
+    "commands-front.jsonl",
+    "checks-front.jsonl",
+    "windows.jsonl",
+)
+
+
+def _books(data: bytes, folder: Path) -> None:
+    """The first byte chooses which of the files of lines it is."""
+    shutil.rmtree(folder / "state", ignore_errors=True)
+    (folder / "state").mkdir()
+    (folder / "state" / BOOKS[data[0] % len(BOOKS) if data else 0]).write_bytes(data[1:])
+    _started(folder / "state")
+
+
+def _books_seeds() -> list[bytes]:
+    result = json.loads(to_json(result_of(estimate(1), RIG, VEHICLE)))
+    entry = {
+        "sequence": 0,
+        "previous_sha256": "",
+        "kind": "estimate",
+        "code": "accepted",
+        "text": "A window",
+        "wall_ns": 1,
+        "stamp_ns": 1,
+        "window_id": "front-1",
+    }
+    served = {**entry, "sequence": 1, "kind": "extrinsic", "camera_from_lidar": result["camera_from_lidar"]}
+    version = {"size_bytes": 1, "modified_ns": 1, "sha256": "0" * 64, "pairs": 3, "decision": "accepted"}
+    return [
+        b"\x00" + book([(entry, result), (served, None)]),
+        b"\x01" + book([({**entry, "kind": "state", "code": "healthy"}, None)]),
+        b"\x02" + book([({**entry, "kind": "command", "code": "hold"}, None)]),
+        b"\x04" + canonical({"window_id": "front-1", "order": 1, "version": version}) + b"\n",
+    ]
+
+
+def _baseline(data: bytes, folder: Path) -> None:
+    path = folder / "rig.json"
+    path.write_bytes(data)
+    load_baseline(path, "front")
+
+
+def _baseline_seeds() -> list[bytes]:
+    return [with_checksum(canonical({"pairs": {"front": baseline_to_json(a_baseline())}}))]
+
+
+# --- configuration ----------------------------------------------------------------------------------------------------
+
+
+def _configuration(data: bytes, folder: Path) -> None:
+    """As `coec check-config` and the service look at it."""
+    if not (folder / "mask.png").exists():
+        (folder / "mask.png").write_bytes(GREY)
+        (folder / "zenoh.json5").write_bytes(b'{mode: "peer"}')
+    path = folder / "coec.yaml"
+    path.write_bytes(data)
+    config = load_config(path)
+    for pair in config.pairs:
+        rig_of(pair)
+    settings_of(config.zenoh, config.limits)
+
+
+def _configuration_seeds() -> list[bytes]:
+    pair = (
+        f"{{name: front, camera: {{key: sensors/camera, intrinsics: {CAMERA}, mask: mask.png}}, "
+        f"lidar: {{key: sensors/lidar, sweep: {{period_s: 0.1, sign: -1}}}}, ego: {{key: sensors/ego}}, "
+        f"T_camera_lidar: {IDENTITY}}}"
+    )
+    return [
+        f"pairs: [{pair}]\n".encode(),
+        f"vehicle: car\nzenoh: {{file: zenoh.json5, connect: [tcp/127.0.0.1:7447]}}\npairs:\n  - {pair}\n".encode(),
+        f"zenoh: {{embedded_router: true, listen: ['tls/[::1]:7447#enable_mtls=true']}}\npairs: [{pair}]\n".encode(),
+        f"state: {{directory: s, history: 5}}\nlimits: {{max_points: 2048}}\npairs: [{pair}]".encode(),
+    ]
+
+
+def _zenoh(data: bytes, folder: Path) -> None:
+    path = folder / "zenoh.json5"
+    path.write_bytes(data)
+    settings: zenoh.Config = settings_of(ZenohConfig(file=path), LIMITS)
+    assert mode_of(settings) in ("router", "peer", "client")
+
+
+def _zenoh_seeds() -> list[bytes]:
+    texts = [
+        '{mode: "peer"}',
+        '{mode: "router", listen: {endpoints: ["tcp/127.0.0.1:7447"]}} // a router',
+        '{mode: "client", connect: {endpoints: {client: ["tls/[::1]:7447#a=b"]}}, scouting: {delay: 3}}',
+        '{"listen": {"endpoints": ["tcp/127.0.0.1:7447"], "exit_on_failure": true}, "id": "ab", "namespace": "a/b"}',
+        '{listen: {endpoints: {peer: ["tls/0.0.0.0:7447"]}}, transport: {link: {tls: {enable_mtls: true, '
+        'root_ca_certificate: "/ca.pem"}}}, access_control: {enabled: true, default_permission: "deny", rules: []}}',
+        '{"mode": "peer", "transport": {"unicast": {"max_sessions": 64}, "shared_memory": {"enabled": false}}}',
+    ]
+    return [text.encode() for text in texts]
+
+
+def _model_card(data: bytes, folder: Path) -> None:
+    path = folder / "network.yaml"
+    path.write_bytes(data)
+    card = read_card(path)
+    for height, width in ((376, 1408), (1400, 1400), (1, 16384)):
+        assert min(card.input.size.size_for(height, width)) >= 1
+
+
+def _model_card_seeds() -> list[bytes]:
+    cards = [path.read_bytes() for path in sorted(CARDS.glob("*.yaml"))]
+    return [*cards, b"card: midas_small\n"]
+
+
+# --- the worker -------------------------------------------------------------------------------------------------------
+
+KINDS: Final = (*Kind, None)
+
+
+def _worker(data: bytes, folder: Path) -> None:
+    """An answer over the wire: the first byte chooses the question, and at how many bytes the message is parted."""
+    del folder
+    kind, parts = KINDS[data[0] % len(KINDS) if data else 0], 1 + (data[0] >> 4 if data else 0)
+    ours, theirs = socket.socketpair()
+    link = Link(ours.detach())
+    try:
+        with theirs:
+            body = data[1 : 2**14]  # nobody reads while it is sent: it has to fit into the socket
+            size = max(1, len(body) // parts)
+            theirs.settimeout(1)
+            for part in (*(body[at : at + size] for at in range(0, len(body), size)), b""):
+                theirs.sendall(struct.pack("!i", len(part)) + part)
+        message = link.receive(2**20)
+        number_of(message)
+        read_answer(message, kind)
+    finally:
+        link.close()
+
+
+def _worker_seeds() -> list[bytes]:
+    result: CalibrationResult = result_of(estimate(1), RIG, VEHICLE)
+    answers = [(0, pack_answer(3, Solved(result, None))), (2, pack_answer(4, Drawn(b"jpeg")))]
+    refused: dict[str, Any] = {"id": 5, "refused": {"code": "bad_window", "text": "damaged"}}
+    pose = msgpack.ExtType(1, msgpack.packb([[4, 4], np.eye(4).tobytes()]))
+    learned = {"id": 1, "result": {"pose": pose, "baseline_hash": "a", "windows": 2, "pairs": 40}}
+    observation = {
+        "textured": 4, "stamp_ns": 7, "pair_stamps_ns": [5, 7],
+        "flagged": True, "weak": False, "flagged_by_paper": None,
+        "metrics": [{"name": "mi", "value": 0.3, "limit": 1.0, "at_least": True}],
+        "causes": [{"code": "dark", "text": "It is dark."}], "distance2": 0.1, "drift": None, "dirty": [3],
+        **{name: msgpack.ExtType(1, msgpack.packb([[6], bytes(48)])) for name in
+           ("offset", "sigma", "noise", "place", "first_derivative", "second_derivative")},
+    }  # fmt: skip
+    checked = {"id": 2, "result": {"observation": observation, "baseline_not_used": None}}
+    messages = [*answers, (0, refused), (3, learned), (1, checked), (4, {"id": 1, "result": None})]
+    return [bytes([kind]) + msgpack.packb(message) for kind, message in messages]
+
+
+# --- all --------------------------------------------------------------------------------------------------------------
+
+YAML_WORDS = (
+    b"!!python/object:os.system ",
+    b"&a [*a]",
+    b"*a",
+    b"<<: ",
+    b"? ",
+    b"- ",
+    b"!!timestamp ",
+    b".inf",
+    b"0x",
+    b"\t",
+)
+JSON_WORDS = (b'"', b"null", b"NaN", b"{}", b"[]", b"\\ud800")
+
+TARGETS: Final = {
+    target.name: target
+    for target in (
+        Target("camera", lambda data, _: _inspected(decode_camera(data, LIMITS)), _camera_seeds, (in_msgpack,)),
+        Target("lidar", lambda data, _: _inspected(decode_lidar(data, LIMITS)), _lidar_seeds, (in_msgpack,)),
+        Target("ego", lambda data, _: _inspected(decode_ego(data, LIMITS)), _ego_seeds, (in_msgpack,)),
+        Target("cdr", _cdr, _cdr_seeds),
+        Target(
+            "pcd", lambda data, folder: _cloud_file(data, folder, "pcd"), _pcd_seeds, words=(b"FIELDS", b"_", b"ring")
+        ),
+        Target(
+            "npy", lambda data, folder: _cloud_file(data, folder, "npy"), _npy_seeds, words=(b"'<f8'", b"True", b"(")
+        ),
+        Target("npz", lambda data, folder: _cloud_file(data, folder, "npz"), _npz_seeds, (in_archive,)),
+        Target("manifest", _manifest, _manifest_seeds, (in_yaml,), (*YAML_WORDS, b"depth", b"double_sphere", b"mei")),
+        Target("kitti", _kitti, lambda: [b"R: 1 0 0\nT: 1 2 3\n", b"2013-05-28 08:46:02.904483072\n"]),
+        Target("bag", _bag, _bag_seeds, (in_records,), (b"lz4", b"zstd", b"equidistant")),
+        Target("window", _window, _window_seeds, (in_records,), (b"lz4", b"zstd")),
+        Target("selector", _selector, _selector_seeds, words=(b";", b"=", b"/", b"@v1", b"*", b"?", b"_")),
+        Target("command", _command, _command_seeds, (behind(7, in_msgpack), behind(7, in_json)), JSON_WORDS),
+        Target("state", _state, _state_seeds, (checksummed, checksummed, in_json), JSON_WORDS),
+        Target(
+            "books", _books, _books_seeds, (behind(1, chained), behind(1, chained), behind(1, in_lines)), JSON_WORDS
+        ),
+        Target("baseline", _baseline, _baseline_seeds, (checksummed,), JSON_WORDS),
+        Target("configuration", _configuration, _configuration_seeds, (in_yaml,), YAML_WORDS),
+        Target("zenoh", _zenoh, _zenoh_seeds, (in_json,), (b"endpoints", b"peer:", b"//", b"/*", *JSON_WORDS)),
+        Target("model_card", _model_card, _model_card_seeds, (in_yaml,), YAML_WORDS),
+        Target(
+            "worker", _worker, _worker_seeds, (behind(1, in_msgpack),), refusals=(MalformedAnswerError, NoMessageError)
+        ),
+    )
+}

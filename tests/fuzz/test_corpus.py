@@ -1,0 +1,166 @@
+"""Every known input, and some mutations of each kind, keep the promise: a value or an error of ours, soon, in little
+memory. `tests/fuzz/run` looks for more of them, and so does the long form here."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fuzz.corpus import MAX_KEPT_BYTES, inputs_of
+from fuzz.loop import MAX_BYTES, MAX_CPU_S, Fuzzer, Report, tried
+from fuzz.targets import TARGETS
+
+MUTATIONS = 12
+"""Of a target, beside what is known: the same in every run."""
+
+LONG_S = float(os.environ.get("COEC_FUZZ_SECONDS", "10"))
+"""Of the long form, for each target."""
+
+Replay = Callable[[str], None]
+
+
+@pytest.fixture(autouse=True)
+def _silent() -> Iterator[None]:
+    """What the readers log of every input is read by nobody, and takes as long as reading."""
+    logging.disable()
+    yield
+    logging.disable(logging.NOTSET)
+
+
+@pytest.fixture
+def held(tmp_path: Path, record_property: Callable[[str, object], None]) -> Replay:
+    """Holds a target to the promise with what is known, and some mutations of it."""
+
+    def replay(name: str) -> None:
+        target = TARGETS[name]
+        known = inputs_of(target)
+        fuzzer = Fuzzer(target, tmp_path, seed=0)
+        fuzzer.report.corpus = known
+        inputs = [*known, *(fuzzer.next() for _ in range(MUTATIONS))]
+        slowest_s, most_bytes = 0.0, 0
+        for data in inputs:
+            trial = tried(target, data, tmp_path)
+            assert trial.problem is None, f"{data[:200]!r}: {trial.problem}"
+            slowest_s, most_bytes = max(slowest_s, trial.cpu_s), max(most_bytes, trial.grown_bytes)
+        record_property("figure", f"{len(inputs)} inputs, {slowest_s * 1e3:.0f} ms and {most_bytes >> 20} MB at most")
+        assert slowest_s < MAX_CPU_S
+        assert most_bytes < MAX_BYTES
+
+    return replay
+
+
+def test_camera(held: Replay) -> None:
+    held("camera")
+
+
+def test_lidar(held: Replay) -> None:
+    held("lidar")
+
+
+def test_ego(held: Replay) -> None:
+    held("ego")
+
+
+def test_cdr(held: Replay) -> None:
+    held("cdr")
+
+
+def test_pcd(held: Replay) -> None:
+    held("pcd")
+
+
+def test_npy(held: Replay) -> None:
+    held("npy")
+
+
+def test_npz(held: Replay) -> None:
+    held("npz")
+
+
+def test_manifest(held: Replay) -> None:
+    held("manifest")
+
+
+def test_kitti(held: Replay) -> None:
+    held("kitti")
+
+
+def test_bag(held: Replay) -> None:
+    held("bag")
+
+
+def test_window(held: Replay) -> None:
+    held("window")
+
+
+def test_selector(held: Replay) -> None:
+    held("selector")
+
+
+def test_command(held: Replay) -> None:
+    held("command")
+
+
+def test_state(held: Replay) -> None:
+    held("state")
+
+
+def test_books(held: Replay) -> None:
+    held("books")
+
+
+def test_baseline(held: Replay) -> None:
+    held("baseline")
+
+
+def test_configuration(held: Replay) -> None:
+    held("configuration")
+
+
+def test_zenoh(held: Replay) -> None:
+    held("zenoh")
+
+
+def test_model_card(held: Replay) -> None:
+    held("model_card")
+
+
+def test_worker(held: Replay) -> None:
+    held("worker")
+
+
+def test_no_target_is_left_out() -> None:
+    assert {f"test_{name}" for name in TARGETS} <= globals().keys()
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_a_target_begins_with_is_taken(tmp_path: Path, name: str) -> None:
+    refused = [data for data in TARGETS[name].seeds() if not tried(TARGETS[name], data, tmp_path).accepted]
+    assert not refused
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_is_kept_is_small(name: str) -> None:
+    made_by_hand = len(TARGETS[name].seeds())
+    assert all(len(data) <= MAX_KEPT_BYTES for data in inputs_of(TARGETS[name])[made_by_hand:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TARGETS)
+def test_fuzzed_for_longer(tmp_path: Path, name: str) -> None:
+    """In this process: what ends it, ends the run. `tests/fuzz/run` gives every target one of its own."""
+    fuzzer = Fuzzer(TARGETS[name], tmp_path, seed=time.time_ns())
+    fuzzer.replay(inputs_of(TARGETS[name]))
+    end_s = time.monotonic() + LONG_S
+
+    def enough(report: Report) -> bool:
+        return bool(report.findings) or time.monotonic() > end_s
+
+    report = fuzzer.mutate(enough)
+    print(f"\n{name}: {report.figure}")
+    assert not report.findings, [(one.text, one.data) for one in report.findings.values()]
