@@ -55,6 +55,7 @@ from coec.runtime.worker.jobs import Drawn, Kind, Solved
 from coec.runtime.worker.link import Link, NoMessageError
 from coec.schemas import keys
 from coec.schemas.base import to_json
+from coec.schemas.commands import NAMES
 from coec.schemas.replies import CalibrationResult
 from coec.sources import open_source
 from coec.sources.clouds import load_cloud
@@ -80,6 +81,7 @@ from fuzz.formats import (
     with_checksum,
 )
 from fuzz.loop import Target
+from pair_bench import InstantScribe
 from ros_messages import JPEG, Packer, cloud, compressed, image, odometry, packed, twist
 
 LOG = logging.getLogger(__name__)
@@ -393,7 +395,7 @@ def _selector_seeds() -> list[bytes]:
 def _command(data: bytes, folder: Path) -> None:
     """The first byte chooses the command, the second says how much of the rest is the sender's attachment."""
     del folder
-    name = (*payloads.NAMES, "other")[data[0] % (len(payloads.NAMES) + 1) if data else 0]
+    name = (*NAMES, "other")[data[0] % (len(NAMES) + 1) if data else 0]
     cut = 2 + data[1] if len(data) > 1 else 2
     sender = payloads.sender_of(data[2:cut])
     assert sender.isascii()
@@ -438,17 +440,18 @@ def _started(folder: Path) -> None:
         VEHICLE,
         config,
         StateStore(folder, VEHICLE),
+        InstantScribe(folder),
         WindowStore(folder / "windows", config),
         LossCounter(LOG, "front"),
     )
     state = store.state
     accepted = None if state.accepted is None else result_of(state.accepted, RIG, VEHICLE)
     to_json(extrinsic_of(VEHICLE, RIG, state, accepted, 0.0, "0"))
-    for kept in store.history.entries():
+    for kept in store.told().entries:
         to_json(kept.chained)
-    for check in store.checks():
+    for check in store.told().checks:
         to_json(check)
-    for result in store.history.results():
+    for result in store.told().results:
         to_json(result_of(estimate_of(result), RIG, VEHICLE))
     store.save()
 
@@ -459,7 +462,9 @@ def _state_seeds() -> list[bytes]:
         state = initial_state(RIG)
         for window in (1, 2):
             state = after_estimate(state, estimate(window), 0, RULES)
-        StateStore(folder, VEHICLE).remember(RIG, restored(state), Clocks(77, 88, 99), {"results": f"3 {'a' * 64}"})
+        StateStore(folder, VEHICLE).remember(
+            RIG, restored(state), Clocks(77, 88, 99), lambda: {"results": f"3 {'a' * 64}"}
+        )
         return [(folder / "state.json").read_bytes(), with_checksum(b'{"pairs":{}}')]
 
 

@@ -55,24 +55,6 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
     return settings
 
 
-def _text(path: Path) -> str:
-    """A file that Zenoh may be given.
-
-    Raises:
-        OSError, ValueError: it is none that can be read, or larger or deeper than anything that a person writes.
-    """
-    with path.open("rb") as stream:
-        data = stream.read(MAX_FILE_BYTES + 1)
-    if len(data) > MAX_FILE_BYTES:
-        raise ValueError(f"it has more than {MAX_FILE_BYTES} bytes")
-    text, depth = data.decode("utf-8"), 0
-    for token in _TOKENS.finditer(text):
-        depth += 1 if token["opens"] else -1 if token["closes"] else 0
-        if depth > MAX_DEPTH:
-            raise ValueError(f"it is nested deeper than {MAX_DEPTH}")
-    return text
-
-
 def unguarded(settings: zenoh.Config) -> tuple[str, ...]:
     """Endpoints that are listened on, as they may be shown, where a program on another computer gets in without a
     certificate.
