@@ -11,7 +11,7 @@ import pytest
 
 from cli.conftest import Coec
 from coec.adapters.files.conversions import result_of
-from coec.calibration.lifecycle import Rules, after_estimate, initial_state
+from coec.calibration.lifecycle import PairState, Rules, after_estimate, initial_state
 from coec.calibration.types import Decision, Reason, Verdict
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.geometry import se3
@@ -25,6 +25,12 @@ CLOCKS = Clocks(None, None, None)
 SERVED = after_estimate(initial_state(RIG), estimate(1), 0, RULES)
 
 
+def kept(folder: Path, state: PairState) -> None:
+    store = StateStore(folder, "v7")
+    store.remember(RIG, state, CLOCKS, dict)
+    store.flush()
+
+
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
     path = tmp_path / "result.json"
@@ -36,7 +42,7 @@ def result(tmp_path: Path) -> Path:
 def state(tmp_path: Path) -> Path:
     folder = tmp_path / "state"
     folder.mkdir()
-    StateStore(folder, "v7").remember(RIG, SERVED, CLOCKS, dict)
+    kept(folder, SERVED)
     return folder
 
 
@@ -93,7 +99,7 @@ def test_what_is_not_accepted_is_refused_and_forced(coec: Coec, tmp_path: Path) 
 
 
 def test_a_nominal_state_is_refused(coec: Coec, tmp_path: Path) -> None:
-    StateStore(tmp_path, "v7").remember(RIG, initial_state(RIG), CLOCKS, dict)
+    kept(tmp_path, initial_state(RIG))
     outcome = coec("export", tmp_path, "--format", "tf")
     assert outcome.status == 2
     assert "nothing was accepted yet" in outcome.err
