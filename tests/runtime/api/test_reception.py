@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -187,3 +189,32 @@ def test_what_comes_through_a_door_for_everybody_is_denied(tmp_path: Path, door:
         wait_until(lambda: bool(list(client.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
         code, why = refusal(lambda: plainly(client))
         assert (code, "it listens at" in why) == ("not_allowed", True)
+
+
+@pytest.mark.fault("a window that is read without an end in sight", "`hold` is acknowledged all the same, in 100 ms")
+def test_a_command_does_not_wait_for_a_window_that_is_read(
+    router: zenoh.Session,
+    vehicle: Served,
+    monkeypatch: pytest.MonkeyPatch,
+    record_property: Callable[[str, object], None],
+) -> None:
+    there = vehicle(AuthorityConfig())
+    entered, read = threading.Event(), threading.Event()
+
+    def reading(*_: object) -> bytes:
+        entered.set()
+        assert read.wait(PATIENCE_S)
+        return b"a piece"
+
+    monkeypatch.setattr(there.bench.answers, "read_window", reading)
+    waiting = router.get(KEYS.window(PAIR, "front-1"), timeout=PATIENCE_S)
+    assert entered.wait(PATIENCE_S)
+    times_s = []
+    for payload in (None, RELEASE) * 5:
+        began_s = time.monotonic()
+        assert plainly(router, payload)["accepted"]
+        times_s.append(time.monotonic() - began_s)
+    record_property("figure", f"median {sorted(times_s)[5] * 1e3:.0f} ms, longest {max(times_s) * 1e3:.0f} ms")
+    read.set()
+    (reply,) = waiting
+    assert reply.ok is not None
