@@ -23,6 +23,7 @@ default_ca = here
 [here]
 database = {database}
 new_certs_dir = {folder}
+rand_serial = yes
 default_md = sha256
 policy = any
 x509_extensions = uses
@@ -73,7 +74,7 @@ class TestAuthority:
         end = (datetime.now(UTC) + timedelta(seconds=seconds)).strftime("%y%m%d%H%M%SZ")
         ours = ("-cert", self.root, "-keyfile", self.folder / "ca-key.pem", "-config", settings)
         files = ("-in", self.folder / f"{file}.csr", "-out", self.folder / f"{file}.pem")
-        _openssl("ca", "-batch", "-notext", "-rand_serial", *ours, *files, "-enddate", end)
+        _openssl("ca", "-batch", "-notext", *ours, *files, "-enddate", end)
         return file
 
     def of_service(self, *senders: SenderConfig, anonymous: str = "never") -> AuthorityConfig:
