@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from coec.adapters.tls.conversation import Credentials
@@ -14,6 +15,24 @@ from conftest import REPOSITORY
 MAKE = REPOSITORY / "deploy" / "make-test-ca"
 NAMES = ("router", "vehicle", "sensors", "operator", "viewer")
 USES = "basicConstraints=critical,CA:FALSE\nextendedKeyUsage=clientAuth\nsubjectAltName=DNS:{name}\n"
+
+
+BRIEF = """
+[ca]
+default_ca = here
+[here]
+database = {database}
+new_certs_dir = {folder}
+rand_serial = yes
+default_md = sha256
+policy = any
+x509_extensions = uses
+[any]
+commonName = supplied
+[uses]
+extendedKeyUsage = clientAuth
+"""
+"""Of `openssl ca`, the only one that is told a second (openssl 3.0)."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +63,18 @@ class TestAuthority:
         )
         ours = ("-CA", self.root, "-CAkey", self.folder / "ca-key.pem", "-extfile", extensions)
         _openssl("x509", "-req", "-in", request, *ours, "-days", days, "-out", self.folder / f"{file}.pem")
+        return file
+
+    def sign_for(self, common_name: str, file: str, seconds: float) -> str:
+        """A certificate of a client that expires so many seconds from now."""
+        self.sign(common_name, file)
+        database, settings = self.folder / f"{file}.index", self.folder / f"{file}.cnf"
+        database.touch()
+        settings.write_text(BRIEF.format(database=database, folder=self.folder))
+        end = (datetime.now(UTC) + timedelta(seconds=seconds)).strftime("%y%m%d%H%M%SZ")
+        ours = ("-cert", self.root, "-keyfile", self.folder / "ca-key.pem", "-config", settings)
+        files = ("-in", self.folder / f"{file}.csr", "-out", self.folder / f"{file}.pem")
+        _openssl("ca", "-batch", "-notext", *ours, *files, "-enddate", end)
         return file
 
     def of_service(self, *senders: SenderConfig, anonymous: str = "never") -> AuthorityConfig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import stat
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from certificates import MAKE, NAMES, TestAuthority
-from coec.adapters.tls.conversation import Listener, credentials_of
+from coec.adapters.tls.conversation import Listener, Speaker, credentials_of
 from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.config import AuthorityConfig, load_yaml
 from conftest import REPOSITORY
@@ -19,10 +20,9 @@ from conftest import REPOSITORY
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
 
 
-def make(*arguments: object, path: str | None = None) -> subprocess.CompletedProcess[str]:
+def make(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [str(MAKE), *(str(argument) for argument in arguments)]
-    environment = None if path is None else {"PATH": path}
-    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | environment)
 
 
 def test_its_certificates_pass_the_strictest_look(authority: TestAuthority) -> None:
@@ -40,14 +40,17 @@ def test_keys_are_their_owners_alone(authority: TestAuthority) -> None:
 
 def test_what_it_says_is_a_configuration_that_can_be_used(tmp_path: Path) -> None:
     folder = tmp_path / "a folder"
-    told = make(folder, "vehicle-7.example", "10.0.0.7", "fd00::7")
+    told = make(folder, "vehicle-7.example", "10.0.0.7", "fd00::7", VEHICLE="truck-7")
     assert told.returncode == 0, told.stderr
     (section,) = re.findall(r"^ +authority:\n(?: {17}.*\n)+", told.stdout, re.MULTILINE)
     file = tmp_path / "said.yaml"
     file.write_text("\n".join(line[15:] for line in section.splitlines()))
     credentials = credentials_of(AuthorityConfig.model_validate(load_yaml(file)["authority"]))
     assert credentials is not None
-    Listener(credentials)
+    speaker = Speaker(TestAuthority(folder).credentials("operator"), "truck-7")
+    flight = Listener(credentials).hear("1", speaker.hello())
+    assert isinstance(flight, bytes)
+    speaker.say(flight, b"hold")
     for name in ("vehicle", "sensors", "operator", "viewer"):
         settings = read_settings(folder / f"{name}.json5")
         assert settings.get_json("connect/endpoints") == '["tls/vehicle-7.example:7448"]'
@@ -87,5 +90,5 @@ def test_without_openssl_it_says_what_to_install(tmp_path: Path) -> None:
         found = shutil.which(name)
         assert found is not None
         (tools / name).symlink_to(found)
-    refused = make(tmp_path / "x", path=str(tools))
+    refused = make(tmp_path / "x", PATH=str(tools))
     assert (refused.returncode, "apt-get install openssl" in refused.stderr) == (1, True)

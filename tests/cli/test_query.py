@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import getpass
 import hashlib
 import json
 import re
+import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -31,6 +33,7 @@ from ports import free_port
 DEADLINE_S = 20.0
 KEYS = Keys("coec", "vehicle")
 WINDOW = bytes(range(256))
+CLAIMS: list[bytes | None] = []
 
 
 @pytest.fixture
@@ -93,9 +96,10 @@ def window_routes(key: str) -> Sequence[Route]:
 
 
 def acknowledging(key: str) -> Sequence[Route]:
-    """With the parameters that came."""
+    """With the parameters that came; what its sender says of himself is noted."""
 
     def answer(request: Request) -> Answer:
+        CLAIMS.append(request.attachment)
         done = Acknowledgement(
             vehicle="vehicle", pair="front", command="hold", accepted=True, code="held", text=request.parameters
         )
@@ -225,6 +229,14 @@ def test_a_command_says_how_long_its_sender_waits(coec: Coec, vehicle: str, key:
     assert parse_command_selector(outcome.document["text"]).timeout_ms == 3600, "less than the four seconds"
     given = coec("query", key, "--param", "timeout_ms=7", "--connect", vehicle, "--json")
     assert parse_command_selector(given.document["text"]).timeout_ms == 7
+
+
+def test_a_command_tells_who_says_that_he_gives_it(coec: Coec, vehicle: str) -> None:
+    CLAIMS.clear()
+    assert coec("query", "command/hold", "--connect", vehicle).status == 0
+    assert coec("query", "health", "--connect", vehicle).status == 1
+    (claim,) = CLAIMS
+    assert claim == f"{getpass.getuser()}@{socket.gethostname()}".encode()
 
 
 def test_of_several_pairs_one_has_to_be_named(coec: Coec, endpoint: str, tmp_path: Path) -> None:

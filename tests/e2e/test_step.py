@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from certificates import TestAuthority
-from coec.adapters.zenoh.client import Reply, ask_one
+from coec.adapters.tls.conversation import Credentials, Speaker
+from coec.adapters.zenoh.client import JSON, RemoteError, Reply, ask_one
+from coec.adapters.zenoh.proven import give
 from coec.config import DepthConfig
 from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
 from e2e.planted import plant, said, written
@@ -34,6 +36,13 @@ def drive() -> Drive:
 
 def asked(running: Service, selector: str) -> Reply:
     return ask_one(running.session, selector, PATIENCE_S)
+
+
+def commanded(running: Service, name: str, credentials: Credentials) -> str:
+    """What a proven command comes to."""
+    speaker, selector = Speaker(credentials, running.config.vehicle), running.keys.command(running.pair, name)
+    told = give(running.session, f"{selector}?format=json", None, PATIENCE_S, speaker, JSON)
+    return str(json.loads(told.payload)["code"])
 
 
 @pytest.mark.fault(
@@ -91,6 +100,10 @@ def test_a_step_is_noticed_corrected_and_remembered(
         assert len(replies) > 30
         programs = (running.process.pid, running.worker()["pid"])
         lines = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in programs]
+        assert commanded(running, "hold", authority.credentials("operator")) == "held"
+        with pytest.raises(RemoteError, match="'viewer' may give no commands"):
+            commanded(running, "hold", authority.credentials("viewer"))
+        running.until(running.counters, lambda pair: pair["commands"].get("hold_not_allowed") == 1, "it is counted")
         entries = running.history()["entries"]
         assert running.terminate() == 0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import create_autospec
@@ -145,7 +146,11 @@ def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, m
     assert bench.do("commission") == "commissioning"
 
 
-def test_commands_that_come_too_fast_are_answered_and_do_nothing(tmp_path: Path) -> None:
+def test_commands_that_come_too_fast_are_answered_and_do_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # However long they take here, they come at once.
+    monkeypatch.setattr(commands, "RateLimit", partial(rate_limit.RateLimit, clock=lambda: 0.0))
     bench = Bench(tmp_path / "state")
     codes = [bench.do("hold") for _ in range(rate_limit.BURST)]
     assert set(codes) == {"held"}

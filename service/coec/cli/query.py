@@ -71,7 +71,11 @@ class Asked:
 
 
 def asked_of(
-    config: Path | None, vehicle: str | None, prefix: str | None, connect: str | None, zenoh_file: Path | None
+    config: Path | None,
+    vehicle: str | None,
+    prefix: str | None,
+    connect: str | None,
+    zenoh_file: Path | None = None,
 ) -> Asked:
     """The service of a configuration, or one with the default names; what else is given comes first.
 

@@ -46,6 +46,17 @@ def test_a_connection_is_nobody_who_waits(tmp_path: Path) -> None:
     assert addresses_of_port("tcp", 7447, tmp_path) == {ipaddress.ip_address("127.0.0.1")}
 
 
+def test_an_address_of_ipv4_on_a_socket_of_ipv6_is_one_of_ipv4() -> None:
+    with socket.socket(socket.AF_INET6, socket.SOCK_STREAM) as one:
+        try:
+            one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+            one.bind(("::ffff:127.0.0.1", 0))
+        except OSError:
+            pytest.skip("this computer has no IPv6")
+        one.listen()
+        assert addresses_of_port("tcp", one.getsockname()[1]) == {ipaddress.ip_address("127.0.0.1")}
+
+
 def test_a_system_without_tables_says_so(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="tcp"):
         addresses_of_port("tcp", 7447, tmp_path)

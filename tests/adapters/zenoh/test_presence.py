@@ -178,9 +178,7 @@ def hiding(*messages: str) -> dict[str, object]:
     }
 
 
-@pytest.mark.fault(
-    "a router whose rules hide liveliness tokens", "status and health say `tokens_hidden` until it is over"
-)
+@pytest.mark.fault("a router whose rules hide liveliness tokens", "the daemon sees it, and when it is over")
 @pytest.mark.parametrize("messages", [("liveliness_token",), ("liveliness_query",)])
 def test_tokens_that_a_router_hides_are_told_of(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, messages: tuple[str, ...]

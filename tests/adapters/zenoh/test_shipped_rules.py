@@ -34,6 +34,9 @@ PATIENCE_S = 20.0
 REFUSED_S = 0.5
 """A session that is let in is open in some 20 ms."""
 
+BRIEF_S = 6
+"""Of a certificate; openssl counts whole seconds."""
+
 FRAMES = "sensors/front/camera"
 READABLE = {
     "extrinsic": KEYS.extrinsic(PAIR),
@@ -240,6 +243,23 @@ def test_who_shows_no_good_certificate_gets_no_session(door: Door, tmp_path: Pat
         endpoint = f"tcp/127.0.0.1:{endpoint.rpartition(':')[2]}"
     with pytest.raises(ConnectionFailedError), connected_by(Way((endpoint,), file), REFUSED_S):
         pass
+
+
+@pytest.mark.slow
+@pytest.mark.fault("a certificate that expires while its session is open", "the session is closed")
+def test_a_session_ends_with_its_certificate(
+    authority: TestAuthority, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    with ExitStack() as stack:
+        door = stack.enter_context(opened(authority, tmp_path))
+        brief = authority.sign_for("operator", "brief", seconds=BRIEF_S)
+        began_s = time.monotonic()
+        session = stack.enter_context(connected_by(door.way(brief), PATIENCE_S))
+        assert list(session.info.routers_zid())
+        wait_until(lambda: not list(session.info.routers_zid()), "the end of the session")
+        closed_s = time.monotonic() - began_s
+        assert closed_s > BRIEF_S - 2
+        record_property("figure", f"certificate of {BRIEF_S} s, closed after {closed_s:.1f} s")
 
 
 def test_a_second_daemon_on_another_computer_sees_the_first(authority: TestAuthority, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coec.errors import UsageError
-from coec.runtime.api.payloads import MAX_SENDER, parse, sender_of
+from coec.runtime.api.payloads import MAX_SENDER, parse, proven_sender, sender_of
 from coec.schemas.commands import NAMES
 
 
@@ -91,3 +91,17 @@ def test_long_and_binary_senders_are_bounded() -> None:
 def test_any_bytes_are_a_command_or_an_error_of_ours(name: str, payload: bytes) -> None:
     with suppress(UsageError):
         parse(name, payload)
+
+
+@given(st.binary(max_size=200) | st.text(alphabet="operator (certificate)", max_size=40).map(str.encode))
+def test_no_attachment_comes_to_a_name_that_is_proven(attachment: bytes) -> None:
+    assert not sender_of(attachment).endswith(" (certificate)")
+
+
+@given(st.text(max_size=64))
+def test_a_proven_name_is_one_short_harmless_line(name: str) -> None:
+    line = proven_sender(name)
+    assert line.endswith(" (certificate)")
+    assert line.isascii()
+    assert line.isprintable()
+    assert len(line) <= MAX_SENDER + len(" (certificate)")

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import threading
+import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,7 +19,8 @@ from coec.adapters.zenoh.bus import JSON, open_session
 from coec.adapters.zenoh.client import RemoteError, ask_one
 from coec.adapters.zenoh.proven import give
 from coec.config import AuthorityConfig, SenderConfig, ZenohConfig
-from coec.runtime.api.rate_limit import BURST
+from coec.runtime.api import commands
+from coec.runtime.api.rate_limit import BURST, RateLimit
 from coec.schemas.base import to_json
 from coec.schemas.commands import ProvenCommand
 from fakes import wait_until
@@ -128,11 +132,12 @@ def test_a_name_that_is_claimed_is_not_proven(authority: TestAuthority, router: 
 
 
 def test_a_proven_sender_is_not_held_up_by_those_who_are_not(
-    authority: TestAuthority, router: zenoh.Session, vehicle: Served
+    authority: TestAuthority, router: zenoh.Session, vehicle: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(commands, "RateLimit", partial(RateLimit, clock=lambda: 0.0))
     there = vehicle(authority.of_service(OPERATOR, anonymous="always"))
     told = [plainly(router)["code"] for _ in range(BURST + 2)]
-    assert "too_many" in told
+    assert told == ["held"] * BURST + ["too_many"] * 2
     assert proven(router, authority, "operator", payload=RELEASE)["code"] == "released"
     assert not there.is_held
 
@@ -187,3 +192,32 @@ def test_what_comes_through_a_door_for_everybody_is_denied(tmp_path: Path, door:
         wait_until(lambda: bool(list(client.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
         code, why = refusal(lambda: plainly(client))
         assert (code, "it listens at" in why) == ("not_allowed", True)
+
+
+@pytest.mark.fault("a window that is read without an end in sight", "`hold` is acknowledged all the same, in 100 ms")
+def test_a_command_does_not_wait_for_a_window_that_is_read(
+    router: zenoh.Session,
+    vehicle: Served,
+    monkeypatch: pytest.MonkeyPatch,
+    record_property: Callable[[str, object], None],
+) -> None:
+    there = vehicle(AuthorityConfig())
+    entered, read = threading.Event(), threading.Event()
+
+    def reading(*_: object) -> bytes:
+        entered.set()
+        assert read.wait(PATIENCE_S)
+        return b"a piece"
+
+    monkeypatch.setattr(there.bench.answers, "read_window", reading)
+    waiting = router.get(KEYS.window(PAIR, "front-1"), timeout=PATIENCE_S)
+    assert entered.wait(PATIENCE_S)
+    times_s = []
+    for payload in (None, RELEASE) * 5:
+        began_s = time.monotonic()
+        assert plainly(router, payload)["accepted"]
+        times_s.append(time.monotonic() - began_s)
+    record_property("figure", f"median {sorted(times_s)[5] * 1e3:.0f} ms, longest {max(times_s) * 1e3:.0f} ms")
+    read.set()
+    (reply,) = waiting
+    assert reply.ok is not None

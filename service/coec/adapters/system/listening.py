@@ -33,8 +33,10 @@ def _waiting(table: str, state: str) -> Iterator[tuple[Address, int]]:
     for line in table.splitlines()[1:]:
         columns = line.split()
         if columns[3] == state:
-            address, _, port = columns[1].partition(":")
-            yield ipaddress.ip_address(_in_network_order(address)), int(port, 16)
+            digits, _, port = columns[1].partition(":")
+            address = ipaddress.ip_address(_in_network_order(digits))
+            # A socket of IPv6 may be bound to an address of IPv4.
+            yield getattr(address, "ipv4_mapped", None) or address, int(port, 16)
 
 
 def _in_network_order(digits: str) -> bytes:
