@@ -8,6 +8,7 @@ any beginning may have been written.
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from collections.abc import Callable, Container, Iterator
@@ -232,3 +233,75 @@ def _states(
             found = {path: getattr(files[file], version) for path, file in names.files.items()}
             inside = {path: data for path, data in found.items() if str(Path(path).parent) in (".", *folders)}
             yield Cut(tuple(sorted(inside.items())), folders, acknowledged)
+
+
+class FullDisk:
+    """The disk below `root`, also for files that are written through streams, while `monkeypatch` lasts: each write,
+    fsync, name and the like is counted, and refused where it is told to. It models no power cut.
+
+    Attributes:
+        operations: how many there were.
+        refuses: numbers of those that it refuses.
+    """
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch, error: int = errno.ENOSPC) -> None:
+        self.operations = 0
+        self.refuses: Container[int] = ()
+        self._root = root
+        self._error = error
+        self._opened: set[int] = set()
+        disk = self
+
+        class File(io.FileIO):
+            def __init__(self, path: Any, mode: str = "r") -> None:
+                self._below = disk._is_below(path)
+                if self._below and mode != "rb":
+                    disk._count()
+                super().__init__(path, mode)
+                if self._below:
+                    disk._opened.add(self.fileno())
+
+            def write(self, data: Any) -> int:
+                if self._below:
+                    disk._count()
+                return super().write(data)
+
+            def close(self) -> None:
+                if not self.closed:
+                    disk._opened.discard(self.fileno())
+                super().close()
+
+        monkeypatch.setattr(io, "FileIO", File)
+        for name in ("fsync", "fdatasync", "pwrite"):
+            monkeypatch.setattr(os, name, self._of_file(getattr(os, name)))
+        for name in ("unlink", "mkdir", "replace", "link", "open"):
+            monkeypatch.setattr(os, name, self._of_name(getattr(os, name)))
+
+    def _count(self) -> None:
+        self.operations += 1
+        if self.operations - 1 in self.refuses:
+            raise OSError(self._error, os.strerror(self._error))
+
+    def _is_below(self, path: Any) -> bool:
+        return Path(os.fspath(path)).is_relative_to(self._root)
+
+    def _of_file(self, real: Callable[..., Any]) -> Callable[..., Any]:
+        def changed(descriptor: int, *rest: Any) -> Any:
+            if descriptor in self._opened:
+                self._count()
+            return real(descriptor, *rest)
+
+        return changed
+
+    def _of_name(self, real: Callable[..., Any]) -> Callable[..., Any]:
+        def changed(path: Any, *rest: Any, **options: Any) -> Any:
+            below = options.get("dir_fd") is None and self._is_below(path)
+            reads = real.__name__ == "open" and not rest[0] & (os.O_WRONLY | os.O_RDWR)
+            if below and not reads:
+                self._count()
+            found = real(path, *rest, **options)
+            if below and real.__name__ == "open":
+                self._opened.add(found)
+            return found
+
+        return changed

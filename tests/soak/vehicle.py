@@ -66,7 +66,8 @@ class Vehicle:
         sent: frames of each stream, numbered and not.
     """
 
-    def __init__(self, session: zenoh.Session, seed: int) -> None:
+    def __init__(self, session: zenoh.Session, seed: int, points: int = POINTS) -> None:
+        """`points` of a sweep."""
         self.sent: Counter[str] = Counter()
         self._numbers: Counter[str] = Counter()
         self._shift_ns = 0
@@ -76,7 +77,7 @@ class Vehicle:
             for stream in (CAMERA, LIDAR, EGO)
         }
         rng = np.random.default_rng(seed)
-        self._scenes = [_scene(rng) for _ in range(SCENES)]
+        self._scenes = [_scene(rng, points) for _ in range(SCENES)]
         self._ticks = 0
         self._thread = threading.Thread(target=self._run, name="vehicle")
 
@@ -123,7 +124,7 @@ class Vehicle:
         self.sent[stream] += 1
 
 
-def _scene(rng: np.random.Generator) -> tuple[EncodedImage, EncodedImage, NDArray[np.float32]]:
+def _scene(rng: np.random.Generator, points: int) -> tuple[EncodedImage, EncodedImage, NDArray[np.float32]]:
     """Boxes at different ranges, as picture, depth and points."""
     range_m = np.full((HEIGHT, WIDTH), 40.0)
     grey = rng.integers(90, 110, (HEIGHT, WIDTH)).astype(np.uint8)
@@ -131,7 +132,7 @@ def _scene(rng: np.random.Generator) -> tuple[EncodedImage, EncodedImage, NDArra
         u, v, half = int(rng.integers(0, WIDTH)), int(rng.integers(0, HEIGHT)), int(rng.integers(4, 10))
         box = (slice(max(v - half, 0), v + half), slice(max(u - half, 0), u + half))
         range_m[box], grey[box] = rng.uniform(5.0, 30.0), rng.integers(0, 255)
-    rows, columns = rng.integers(0, HEIGHT, POINTS), rng.integers(0, WIDTH, POINTS)
+    rows, columns = rng.integers(0, HEIGHT, points), rng.integers(0, WIDTH, points)
     z = range_m[rows, columns]
     camera = np.stack([(columns - LENS["cx"]) / LENS["fx"] * z, (rows - LENS["cy"]) / LENS["fy"] * z, z], axis=1)
     lidar = camera[:, [2, 0, 1]] * np.array([1.0, -1.0, -1.0])

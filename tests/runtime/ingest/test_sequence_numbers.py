@@ -47,3 +47,20 @@ def test_what_is_sent_is_received_or_lost_in_whatever_order_it_comes(seed: int) 
     order = sent[np.argsort(sent + rng.uniform(0, LATE_FRAMES, len(sent)))]
     end = int(sent.max())
     assert lost(0, *map(int, order), *range(end + 1, end + 2 * LATE_FRAMES)) == end - len(sent)
+
+
+def test_a_frame_that_was_lost_here_is_no_gap_as_well() -> None:
+    told = SequenceNumbers()
+    losses = [told.lost_by(number) for number in (0, 1)]
+    told.counted()  # number 2
+    losses += [told.lost_by(number) for number in (3, 4, *range(6, 60))]
+    assert sum(losses) == 1, "number 5 only"
+
+
+def test_a_gap_of_much_later_is_not_taken_for_what_somebody_else_sent() -> None:
+    told = SequenceNumbers()
+    told.lost_by(0)
+    told.counted()  # it had no number
+    losses = [told.lost_by(number) for number in range(1, 100)]
+    losses += [told.lost_by(number) for number in range(101, 200)]
+    assert sum(losses) == 1

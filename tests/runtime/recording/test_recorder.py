@@ -302,6 +302,6 @@ def test_a_thread_that_the_disk_does_not_let_go_is_told(tmp_path: Path) -> None:
     assert recorder.trouble is None
     recorder.thread._beat_s -= STUCK_S + 1.0  # since the last sign of life
     assert recorder.trouble is not None
-    assert (recorder.trouble.code, "4 s" in recorder.trouble.text) == ("recording_stuck", True)
+    assert (recorder.trouble.code, "3 s" in recorder.trouble.text) == ("recording_stuck", True)
     recorder.thread.beat()
     assert recorder.trouble is None

@@ -13,6 +13,10 @@ from coec.adapters.zenoh.settings_file import TLS, read_settings
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
 
+DEAF_US = 500_000
+"""Who has not taken 64 kB for so long, microseconds, is cut off when something is to be sent to him that may not be
+dropped: meanwhile a router forwards nothing of that sender to anybody. By default it would be 5 s for each."""
+
 
 def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
     """What `config.file` says stands; what it does not say opens no door: nobody listens, and nobody is looked for, who
@@ -30,6 +34,7 @@ def settings_of(config: ZenohConfig, limits: LimitsConfig) -> zenoh.Config:
         "listen/endpoints": listen,
         "connect/endpoints": connect,
         "scouting/gossip/enabled": False,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": DEAF_US,
     }
     try:
         settings = read_settings(config.file) if config.file else zenoh.Config()

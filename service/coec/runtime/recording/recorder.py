@@ -34,7 +34,7 @@ UNSOLVED_RESUMED = 4
 POLL_S = 0.2
 """Between two looks at the folder: so late is what the list says of files that others put there."""
 
-STUCK_S = 3.0
+STUCK_S = 2.0
 """Without a sign of life of the thread: it gives one several times a second, and between two writes."""
 
 DIGEST_BYTES = 4 * 2**20

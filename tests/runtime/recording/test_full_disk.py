@@ -1,0 +1,104 @@
+"""A disk that refuses at every point of a window's life: it costs that window, and is told; the next one is whole."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coec.adapters.mcap.windows import read_window
+from coec.adapters.system.logs import LossCounter
+from coec.calibration.frames.window import SliceEnded
+from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
+from coec.config import CalibrationConfig, StateConfig
+from coec.geometry.cameras import build
+from coec.runtime.recording.recorder import Recorder, RecordingPlan
+from coec.runtime.recording.window_store import WindowStore
+from disks import FullDisk
+from fakes import wait_until
+
+NOMINAL = np.eye(4)
+RIG = Rig(
+    "front",
+    build("pinhole", width=4, height=3, fx=2.0, fy=2.0, cx=1.5, cy=1.0),
+    "camera",
+    "lidar",
+    NOMINAL,
+    NOMINAL,
+)
+PLAN = RecordingPlan(RIG, CalibrationConfig(), 2, {"vehicle": "test"})
+
+
+def pair(stamp_ns: int) -> FramePair:
+    image = EncodedImage(ImageFormat.MONO8, 4, 3, bytes(range(12)))
+    cloud = np.arange(30, dtype=np.float32).reshape(10, 3)
+    return FramePair(CameraFrame(stamp_ns, "camera", image), LidarFrame(stamp_ns, "lidar", cloud))
+
+
+class Life:
+    """A recorder, and what it says of the windows that it is given."""
+
+    def __init__(self, folder: Path) -> None:
+        self.store = WindowStore(folder / "windows", StateConfig(min_free_bytes=0))
+        self.losses = LossCounter(logging.getLogger("test"), "front")
+        self.recorded: list[str] = []
+        self.lost: list[str] = []
+        self.recorder = Recorder(
+            PLAN, self.store, self.losses, lambda window_id, *_: self.recorded.append(window_id), self.lost.append
+        )
+        self.recorder.thread.start()
+
+    def window(self, start_ns: int) -> bool:
+        """Whether a window of three pairs came to the disk; every window comes to one end."""
+        name, before = f"front-{start_ns}", len(self.recorded) + len(self.lost)
+        for stamp_ns in range(start_ns, start_ns + 3):
+            self.recorder.add(name, pair(stamp_ns), NOMINAL)
+        self.recorder.end(SliceEnded(name, 3, True))
+        wait_until(lambda: len(self.recorded) + len(self.lost) > before, "the end of the window")
+        return name in self.recorded
+
+    def stop(self) -> None:
+        self.recorder.request_stop()
+        assert self.recorder.thread.join(20.0)
+        assert self.recorder.thread.failure is None
+
+
+@pytest.mark.fault(
+    "a disk that is full or read-only at any write, fsync or rename of a window's life",
+    "that window is lost and told, or whole; the next one is whole, and no half file is left",
+)
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EROFS])
+@pytest.mark.parametrize("length", [1, 1000])
+def test_a_disk_that_refuses_at_any_point_costs_that_window_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: Any, error: int, length: int
+) -> None:
+    first, points, refused = 0, 0, True
+    while refused:
+        folder = tmp_path / str(first)
+        with monkeypatch.context() as patch:
+            life = Life(folder)
+            disk = FullDisk(folder, patch, error)
+            disk.refuses = range(first, first + length)
+            whole = life.window(10)
+            refused = disk.operations > first
+            trouble = life.recorder.trouble
+            disk.refuses = ()
+            assert life.window(50), f"the next window, after operation {first}"
+            assert life.recorder.trouble is None
+            life.stop()
+        assert whole or (trouble is not None and os.strerror(error) in trouble.text)
+        assert whole or not refused or life.losses.snapshot()["window", "recording_failed"] == 1
+        assert life.lost == ([] if whole else ["front-10"])
+        again = WindowStore(folder / "windows", StateConfig(min_free_bytes=0))
+        for path in again.windows("front"):
+            assert len(read_window(path)[0].pairs) == 3
+        assert {path.stem for path in again.windows("front")} >= set(life.recorded)
+        points += 1
+        first += 1
+    assert points > 15
+    record_property("figure", f"{points} points")
