@@ -46,7 +46,7 @@ time.sleep(30)
 
 COMMANDS = (
     ("models",),
-    ("sim", "view", "/tmp/view.jpg", "--camera", "fisheye160"),
+    ("sim", "view", "--output", "/tmp/view.jpg", "--camera", "fisheye160"),
     ("calibrate", "sim:seed=1&seconds=12&camera=pinhole240x120&lidar=16&camera_hz=0.5&lidar_hz=0.5&depth=yes"),
 )
 """What uses the optional extra, too."""
@@ -206,8 +206,9 @@ def networks() -> list[str]:
 def test_what_the_dockerfile_builds_speaks_to_nobody_either(built: Mapping[str, Any], record_property: Record) -> None:
     record_property("figure", silent(built))
     assert set(built["answers"].values()) == {"answered"}, built["answers"]
-    assert len(built["commands"]) == len(COMMANDS)
-    assert set(built["commands"]) <= {0, 1}, "1 is a refused result"
+    models, view, calibrate = built["commands"]
+    assert (models, view) == (0, 0)
+    assert calibrate in (0, 1), "1: the verdict refuses a drive this small"
     assert set(built["solved"]) == set(networks())
     assert built["installed"] == ["coec.cdx.json", "licences.md"]
     assert [built[f"{name}: health"] for name in compose()] == [0, 0, 0]

@@ -172,10 +172,9 @@ def stand_in() -> None:
     """/opt/coec, as far as commands are concerned: this checkout's, with its interpreter and its packages."""
     folder = Path("/opt/coec/bin")
     folder.mkdir(parents=True)
-    path = os.pathsep.join([str(REPOSITORY / "service")])
     for name, words in (("coec", "-m coec"), ("python", "")):
         script = folder / name
-        script.write_text(f'#!/bin/sh\nPYTHONPATH={path} exec {sys.executable} {words} "$@"\n')
+        script.write_text(f'#!/bin/sh\nPYTHONPATH={REPOSITORY / "service"} exec {sys.executable} {words} "$@"\n')
         script.chmod(0o755)
 
 
@@ -383,9 +382,9 @@ def heard(log: Path) -> dict[str, list[str]]:
 
 def ended(command: Sequence[str]) -> int:
     """Exit status of a command of this checkout, with its optional extras."""
-    path = os.pathsep.join(str(REPOSITORY / folder) for folder in ("service",))
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "service")}
     whole = [sys.executable, "-m", *command]
-    return subprocess.run(whole, env={**os.environ, "PYTHONPATH": path}, stdout=sys.stderr, cwd="/tmp").returncode
+    return subprocess.run(whole, env=environment, stdout=sys.stderr, cwd="/tmp").returncode
 
 
 def told_all() -> None:

@@ -27,12 +27,15 @@ def run(lock: Path | None, output: Path | None, *, as_json: bool) -> int:
         UsageError: the lock file cannot be read.
         OutputError: a file cannot be written.
     """
-    inventory = inventory_here()
     hashes = {} if lock is None else pinned_hashes(lock)
+    inventory = inventory_here()
     document = bill_of_materials.cyclonedx(inventory, hashes, datetime.now(UTC))
     if output is not None:
         text = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
-        written = [write(output / DOCUMENT, text.encode()), write(output / TABLE, table_of(inventory).encode())]
+        written = [
+            write(output / DOCUMENT, text.encode()),
+            write(output / TABLE, bill_of_materials.licence_table(inventory).encode()),
+        ]
         console.say(f"coec: wrote {', '.join(str(path) for path in written)}")
     if as_json:
         console.print_json(document)
@@ -54,11 +57,6 @@ def inventory_here() -> Inventory:
     packages = installed(APPLICATION)
     application = packages.pop(APPLICATION)
     return Inventory(application, packages, platform.python_version(), _networks())
-
-
-def table_of(inventory: Inventory) -> str:
-    """The licence table, as docs/licences.md."""
-    return bill_of_materials.licence_table(inventory)
 
 
 def _networks() -> Sequence[Network]:
