@@ -35,7 +35,7 @@ from pair_bench import configuration, pair_at
 from ports import free_port
 
 RATE_HZ = 10.0
-SECONDS = 2.5
+SECONDS = 1.5
 HOUR_S = 3600.0
 ADVISED = ("warn", "fail")
 
@@ -161,6 +161,7 @@ def test_what_is_in_order_is_ok(vehicle: Sequence[Finding]) -> None:
     assert any(one.check == "service" and "no service" in one.text for one in vehicle)
 
 
+@pytest.mark.fault("a sensor that sends nothing", "the doctor names its key, and where to look")
 def test_a_stream_that_is_silent_fails(vehicle: Sequence[Finding]) -> None:
     for stream in ("camera", "lidar", "ego"):
         level, text = of(vehicle, "stream", key("silent", stream))
@@ -183,12 +184,14 @@ def test_a_clock_an_hour_off_is_told(vehicle: Sequence[Finding]) -> None:
     assert [one.level for one in in_step] == ["ok", "ok"], "both are off by the same, and pairs are formed"
 
 
+@pytest.mark.fault("clocks of camera and LiDAR an hour apart", "the doctor says so, and that no pair comes of it")
 def test_two_clocks_an_hour_apart_make_no_pairs(vehicle: Sequence[Finding]) -> None:
     (apart,) = [one for one in vehicle if one.where == "apart" and one.text.startswith("camera and LiDAR")]
     assert apart.level == "fail"
     assert "0 % of the frames have a sweep" in apart.text
 
 
+@pytest.mark.fault("frames that cannot be decoded", "the doctor says of which stream, and why")
 def test_what_cannot_be_decoded_fails_and_says_why(vehicle: Sequence[Finding]) -> None:
     level, text = of(vehicle, "decoding", key("damaged", "camera"))
     assert level == "fail"
@@ -207,6 +210,20 @@ def test_whatever_is_not_in_order_has_an_advice(vehicle: Sequence[Finding]) -> N
     assert [one for one in vehicle if one.level in ADVISED and not one.advice] == []
 
 
+@pytest.mark.parametrize(("level", "status"), [("ok", 0), ("warn", 0), ("fail", 1)])
+def test_only_what_failed_makes_it_fail(coec: Coec, monkeypatch: pytest.MonkeyPatch, level: str, status: int) -> None:
+    found = Finding.model_validate(
+        {"check": "disk", "level": level, "where": "/var", "text": "what it is like", "advice": "what to do"}
+    )
+    monkeypatch.setattr("coec.cli.doctor.examine", lambda *_: iter([found]))
+    told = coec("doctor")
+    assert told.status == status
+    assert f"{level:<5}disk          /var: what it is like\n     → what to do\n" in told.out
+    report = coec("doctor", "--json").document
+    assert report["healthy"] is (status == 0)
+    assert report["findings"] == [json.loads(found.model_dump_json())]
+
+
 # --- the way to the router --------------------------------------------------------------------------------------------
 
 
@@ -223,6 +240,7 @@ def test_no_router_is_told_and_fails(coec: Coec, tmp_path: Path) -> None:
     assert "session" not in [one["check"] for one in report["findings"]], "there is nobody to talk to"
 
 
+@pytest.mark.fault("another program at the port of the router", "the doctor tells it from no router")
 def test_a_port_at_which_something_else_answers_is_told_from_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -377,6 +395,7 @@ def levels(config: Config) -> dict[str, str]:
     return {one.check: one.level for one in machine.state_findings(config.state)}
 
 
+@pytest.mark.fault("a full disk before the start", "the doctor says so, and leaves nothing behind on it")
 def test_a_full_disk_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = configuration(tmp_path)
     assert levels(config) == {"state": "ok", "lock": "ok", "disk": "ok", "writing": "ok"}
