@@ -25,6 +25,8 @@ from cli.conftest import Coec
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.adapters.system import clock
 from coec.adapters.zenoh.bus import MSGPACK, open_session
+from coec.adapters.zenoh.endpoints import Endpoint
+from coec.adapters.zenoh.tls import CertificateError, Material, host_and_port, material_of, read_certificate
 from coec.calibration.types import LidarFrame
 from coec.cli.doctor import examine, machine, router
 from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, ZenohConfig
@@ -386,6 +388,35 @@ def test_rules_that_refuse_are_told_from_no_router(authority: Path, guarded: int
     found = found_with(authority, guarded, "vehicle", tmp_path, vehicle="other")
     assert [found[check].level for check in ("router", "tls", "session", "rules")] == ["ok", "ok", "ok", "fail"]
     assert "its access control refuses" in found["rules"].text
+
+
+def material(folder: Path, certificate: str, key: str, root: str = "ca") -> Material:
+    return Material(
+        folder / f"{root}.pem", folder / f"{certificate}.pem", folder / f"{key}-key.pem", names_checked=True
+    )
+
+
+def test_files_that_do_not_belong_together_are_told(authority: Path) -> None:
+    assert read_certificate(material(authority, "router", "router"), "listen").names == ("localhost", "127.0.0.1")
+    assert read_certificate(material(authority, "expired", "expired"), "connect").not_after_s < time.time()
+    for wrong, why in (
+        (material(authority, "vehicle", "router"), "key values mismatch"),
+        (material(authority, "vehicle", "vehicle", "foreign-ca"), "unable to get local issuer certificate"),
+        (material(authority, "absent", "vehicle"), "cannot be read: No such file"),
+        (material(authority, "router", "router", "vehicle-key"), "cannot be used"),
+    ):
+        with pytest.raises(CertificateError, match=why):
+            read_certificate(wrong, "connect")
+
+
+@pytest.mark.usefixtures("guarded")
+def test_an_endpoint_has_files_of_its_own(authority: Path) -> None:
+    settings = zenoh.Config.from_file(authority / "router.json5")
+    plain, own = Endpoint.parse("tls/[::1]:7448"), Endpoint.parse("tls/[::1]:7448#listen_certificate_file=/own.pem")
+    assert material_of(settings, plain, "listen").certificate == authority / "router.pem"
+    assert material_of(settings, own, "listen").certificate == Path("/own.pem")
+    assert material_of(settings, own, "connect").certificate is None
+    assert host_and_port(own) == ("::1", 7448)
 
 
 # --- this computer ----------------------------------------------------------------------------------------------------
