@@ -51,6 +51,10 @@ def test_the_unit_gives_up_on_a_bad_configuration_and_on_nothing_else() -> None:
     assert re.search(r"^StartLimitIntervalSec=0$", UNIT, re.MULTILINE), "the fifth quick failure would be the last"
 
 
+def test_a_reload_of_the_unit_is_the_signal_that_the_service_heeds() -> None:
+    assert re.search(r"^ExecReload=/bin/kill -HUP \$MAINPID$", UNIT, re.MULTILINE)
+
+
 def test_a_port_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

@@ -23,8 +23,8 @@ from coec.schemas.commands import NAMES, CommandName
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 """A name that becomes one chunk of a Zenoh key and part of a file name."""
 
-KeyExpression = Annotated[str, Field(pattern=r"^[^\s/*$?#][^\s*$?#]*$", max_length=256)]
-"""A Zenoh key without wildcards."""
+KeyExpression = Annotated[str, Field(pattern=r"^[^\s/*$?#]+(/[^\s/*$?#]+)*$", max_length=256)]
+"""A Zenoh key without wildcards, and without empty chunks."""
 
 Matrix4x4 = tuple[
     tuple[float, float, float, float],

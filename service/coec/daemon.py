@@ -306,10 +306,10 @@ class Daemon:
     def _take(self, config: Config) -> None:
         """Go on with another configuration, in which only what can be taken differs."""
         before, self._config = self._config, config
+        self._door.use(config.metrics)  # also where nothing differs: its port may be free by now
         if config == before:
             return
         logs.configure(config.log.level, config.log.format)
-        self._door.use(config.metrics)
         self._folder.use(config.state)
         self._shown = self._shown_now()
         for old, new in zip(before.pairs, config.pairs, strict=True):
@@ -329,7 +329,7 @@ class Daemon:
         worker = self._worker.status()
         failing = worker.failure if worker.state is WorkerState.STARTING else None
         hidden = TOKENS_HIDDEN if self._presence.hidden else None
-        own = (self._scribe.trouble, self._insecure, hidden, self._router.trouble, self._door.trouble)
+        own = (self._scribe.trouble, self._insecure, hidden, self._router.trouble, self._door.insecure)
         return tuple(reason for reason in (self._fault, failing, *own) if reason is not None)
 
     # --- status -----------------------------------------------------------------------------------------------------
@@ -353,11 +353,12 @@ class Daemon:
 
     def _status_now(self) -> replies.StatusReply:
         usage = self._folder.usage()
+        own = () if self._door.trouble is None else (self._door.trouble,)
         return replies.StatusReply(
             version=__version__,
             vehicle=self._config.vehicle,
             state=self._state,
-            reasons=reasons_of(self._troubles()),
+            reasons=reasons_of((*self._troubles(), *own)),
             started_ns=self._started_ns,
             uptime_s=time.monotonic() - self._started_s,
             config_hash=config_hash(self._config),

@@ -11,6 +11,7 @@ from cli.conftest import SMALL, Coec
 from coec.cli.check_config import example, template
 from coec.cli.convert import configuration_for
 from coec.config import Config, config_hash, load_config
+from coec.errors import ConfigError
 from coec.reports.commented_yaml import commented_yaml
 from coec.simulation.source import open_sim
 from conftest import REPOSITORY
@@ -47,6 +48,14 @@ def test_template_names_every_key() -> None:
 
     visit(document)
     assert missing == []
+
+
+@pytest.mark.parametrize("key", ["a//b", "a/", "/a", "a/*", "a b", ""])
+def test_what_zenoh_takes_for_no_key_is_refused(tmp_path: Path, key: str) -> None:
+    text = template().replace("key: sensors/front/lidar", f'key: "{key}"')
+    assert text != template()
+    with pytest.raises(ConfigError, match=r"lidar\.key"):
+        _read(text, tmp_path)
 
 
 def test_defaults_prints_the_template(coec: Coec) -> None:

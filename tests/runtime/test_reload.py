@@ -108,7 +108,11 @@ def test_pairs_that_come_and_go_wait(tmp_path: Path) -> None:
 @pytest.mark.fault("SIGHUP with a configuration that could not be started with", "refused as a whole, nothing changes")
 def test_what_could_not_be_started_with_is_refused_as_a_whole(tmp_path: Path) -> None:
     config = configuration(tmp_path)
-    for places in ({"zenoh__connect": ["tcp/nowhere"]}, {"pairs__0__camera__mask": str(tmp_path / "none.png")}):
+    for places in (
+        {"zenoh__connect": ["tcp/nowhere"]},
+        {"pairs__0__camera__mask": str(tmp_path / "none.png")},
+        {"pairs__0__calibration__depth__model": str(tmp_path / "none.onnx")},
+    ):
         with pytest.raises(ConfigError):
             reload_of(config, changed(config, log__level="debug", **places))
 

@@ -152,6 +152,10 @@ def status(payload: bytes) -> None:
     )
     for reason in reply.reasons:
         console.show(f"  {reason.code}: {reason.text}", "yellow")
+    if reply.configuration is not None and reply.configuration.refused is not None:
+        console.show(f"  the configuration on the disk was refused: {reply.configuration.refused}", "yellow")
+    elif reply.configuration is not None and reply.configuration.waiting:
+        console.show(f"  waits for a restart: {', '.join(reply.configuration.waiting)}", "yellow")
     console.show(
         f"worker {worker.state}, process {worker.pid or '-'}, {worker.restarts} restarts, {worker.queued} waiting; "
         f"windows {storage.bytes_used / 1e6:.0f} MB, free {storage.bytes_free / 1e9:.1f} GB"

@@ -9,11 +9,13 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from coec.adapters.files.rig import rig_of
 from coec.adapters.zenoh.settings import settings_of
 from coec.config import Config, PairConfig, config_hash
+from coec.errors import ConfigError
 
 RELOADED: Mapping[str, str] = {
     "log.*": "at once in the service; its worker logs as it was started until the next start",
@@ -59,6 +61,7 @@ def reload_of(running: Config, read: Config) -> Reload:
     settings_of(read.zenoh, read.limits)
     for pair in read.pairs:
         rig_of(pair)
+        _network_of(pair)
     old, new = _by_name(running.model_dump()), _by_name(read.model_dump())
     taken: list[str] = []
     waiting: list[str] = []
@@ -70,6 +73,13 @@ def reload_of(running: Config, read: Config) -> Reload:
             waiting.append(".".join(names))
     pairs = list(old["pairs"].values())
     return Reload(Config.model_validate({**old, "pairs": pairs}), tuple(taken), tuple(waiting))
+
+
+def _network_of(pair: PairConfig) -> None:
+    """A file is at least there; what it holds is for the worker to open, which this process does without."""
+    model = pair.calibration.depth.model
+    if model.endswith(".onnx") and not Path(model).is_file():
+        raise ConfigError(f"pair {pair.name}, calibration.depth.model: there is no file {model}")
 
 
 def settings_hash(pair: PairConfig) -> str:

@@ -109,6 +109,7 @@ def test_slow_clients_keep_nobody_waiting(
     assert server._connections == []
 
 
+@pytest.mark.fault("a client of the HTTP page that reads nothing", "it is dropped, and nothing is kept for it")
 def test_who_reads_nothing_is_dropped(server: HttpServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(served, "DEADLINE_S", 0.3)
     with opened(server, b"GET /endless HTTP/1.1\r\n\r\n") as client:

@@ -85,9 +85,16 @@ def test_the_door_follows_the_configuration(door: HttpDoor) -> None:
     assert (answers(first), answers(second)) == (False, True)
     door.use(MetricsConfig())
     assert not answers(second)
-    assert door.trouble is None
+    assert (door.trouble, door.insecure) == (None, None)
+    door.use(MetricsConfig(http=f"0.0.0.0:{first}", insecure=True))
+    assert door.insecure is not None
+    assert door.insecure.code == "http_insecure"
 
 
+@pytest.mark.fault(
+    "the port of the metrics is taken",
+    "status says so; the calibration goes on, and the port is tried again with the next reload",
+)
 def test_a_taken_port_is_a_trouble_and_no_end(door: HttpDoor) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]

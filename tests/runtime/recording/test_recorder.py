@@ -9,11 +9,13 @@ import os
 import queue
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from coec.adapters.mcap.windows import WindowWriter, read_window
 from coec.adapters.system.logs import LossCounter
@@ -101,6 +103,31 @@ def test_a_window_is_written_and_reported(bench: Bench) -> None:
         assert info.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert bench.files() == ["front-10.mcap"]
     assert bench.recorder.latest == path
+
+
+def metadata_of(path: Path) -> dict[str, str]:
+    """What a window says of where it comes from."""
+    found: dict[str, str] = {}
+    with path.open("rb") as stream:
+        for record in make_reader(stream).iter_metadata():
+            found |= record.metadata
+    return found
+
+
+def test_a_window_says_by_which_settings_it_was_taken(bench: Bench) -> None:
+    """Those of its first pair, also where others came while it was open: it still takes as many as they asked for."""
+    first, then = (replace(PLAN, metadata={"settings_hash": name}) for name in ("first", "then"))
+    bench.recorder.follow(first)
+    with bench.running():
+        bench.recorder.add("front-10", pair(10), NOMINAL)
+        wait_until(lambda: bench.recorder.waiting == 0 and bench.files() != [], "the first pair")
+        bench.recorder.follow(replace(then, min_pairs=3))
+        bench.window("front-10", [20])
+        _, path, _ = bench.recorded.get(timeout=DEADLINE_S)
+        assert metadata_of(path)["settings_hash"] == "first"
+        bench.window("front-50", [50, 60, 70])
+        _, path, _ = bench.recorded.get(timeout=DEADLINE_S)
+        assert metadata_of(path)["settings_hash"] == "then"
 
 
 def test_too_few_pairs_leave_no_file(bench: Bench) -> None:

@@ -93,7 +93,7 @@ def read_certificate(material: Material, role: Literal["connect", "listen"]) -> 
         if material.authority is not None:
             checks.load_verify_locations(material.authority)
     except ssl.SSLError as error:
-        raise CertificateError(f"certificate and key cannot be used: {error.reason or error}") from error
+        raise CertificateError(f"certificate and key cannot be used: {_words(error)}") from error
     except OSError as error:
         files = ", ".join(str(path) for path in (material.certificate, material.key, material.authority) if path)
         raise CertificateError(f"one of {files} cannot be read: {error.strerror}") from error
@@ -102,7 +102,7 @@ def read_certificate(material: Material, role: Literal["connect", "listen"]) -> 
     except ssl.SSLCertVerificationError as error:
         raise CertificateError(error.verify_message) from error
     except ssl.SSLError as error:
-        raise CertificateError(str(error.reason or error)) from error
+        raise CertificateError(_words(error)) from error
     return _certificate(seen)
 
 
@@ -141,10 +141,15 @@ def host_and_port(endpoint: Endpoint) -> tuple[str, int]:
 
 
 def _alert(error: ssl.SSLError) -> str:
-    reason = (error.reason or str(error)).lower().replace("_", " ")
+    reason = _words(error)
     if "alert" in reason:
         return f"the other end refuses: {reason.rpartition('alert ')[2]}"
     return f"no TLS comes about: {reason}"
+
+
+def _words(error: ssl.SSLError) -> str:
+    """OpenSSL's reason, as people write."""
+    return (error.reason or str(error)).lower().replace("_", " ")
 
 
 def _shake_hands(server: ssl.SSLContext, client: ssl.SSLContext, *, of_client: bool) -> Mapping[str, Any]:

@@ -15,7 +15,8 @@ from rich.text import Text
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files.rig import rig_of
 from coec.adapters.zenoh.bus import closed
-from coec.adapters.zenoh.settings import settings_of
+from coec.adapters.zenoh.endpoints import Endpoint
+from coec.adapters.zenoh.settings import connected_of, listened_of, settings_of
 from coec.cli.doctor import machine, router, service, streams
 from coec.cli.doctor.found import fail, ok
 from coec.cli.doctor.listening import listen
@@ -96,7 +97,9 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
         config = load_config(path.resolve())  # as a service has it, whose paths are complete
         for pair in config.pairs:
             rig_of(pair)
-        settings_of(config.zenoh, config.limits)
+        settings = settings_of(config.zenoh, config.limits)
+        for endpoint in (*connected_of(settings), *listened_of(settings)):
+            Endpoint.parse(endpoint)
     except ConfigError as error:
         return None, fail("configuration", str(path), str(error), advice)
     names = ", ".join(pair.name for pair in config.pairs)

@@ -31,8 +31,14 @@ CLOCK_LIMIT_S = 1.0
 def state_findings(state: StateConfig) -> Iterator[Finding]:
     """Whether the state directory is there, ours, free, large and fast enough."""
     folder, where = state.directory, str(state.directory)
-    if not folder.exists():
+    try:
+        there = folder.exists()
         above = next(parent for parent in folder.resolve().parents if parent.exists())
+    except OSError as error:
+        advice = "give the user of the service the way there, or name another in state.directory"
+        yield fail("state", where, f"cannot be looked at: {error.strerror}", advice)
+        return
+    if not there:
         if os.access(above, os.W_OK | os.X_OK):
             yield ok("state", where, "is not there yet; the service makes it")
         else:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import zenoh
 
 from coec import __version__
-from coec.adapters.zenoh.client import Reply, ask, ask_one
+from coec.adapters.zenoh.client import ask, ask_one
 from coec.cli.doctor.found import fail, ok, warn
 from coec.config import Config
 from coec.errors import CoecError, NotFoundError
@@ -44,15 +44,14 @@ def service_findings(session: zenoh.Session, config: Config) -> Iterator[Finding
         return
     yield from _status(status, keys)
     yield _compared(session, config, keys)
-    for reply in _healths(session, keys):
-        yield from _health(from_json(HealthReply, reply.payload), keys)
-
-
-def _healths(session: zenoh.Session, keys: Keys) -> list[Reply]:
     try:
-        return ask(session, f"{keys.health('*')}?format=json", TIMEOUT_S)
-    except CoecError:
-        return []
+        replies = ask(session, f"{keys.health('*')}?format=json", TIMEOUT_S)
+        healths = [from_json(HealthReply, reply.payload) for reply in replies]
+    except CoecError as error:
+        yield fail("health", keys.health("*"), f"answers wrongly: {error}", "see to its log")
+        return
+    for health in healths:
+        yield from _health(health, keys)
 
 
 def _compared(session: zenoh.Session, config: Config, keys: Keys) -> Finding:

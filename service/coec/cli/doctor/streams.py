@@ -77,9 +77,11 @@ def _stream(pair: PairConfig, name: str, heard: Heard, config: Config, seconds: 
 
 
 def _rate(pair: PairConfig, name: str, heard: Heard, seconds: float) -> Finding:
-    rate_hz = heard.rate_hz or len(heard.arrivals_s) / seconds
-    rate = sum(heard.sizes) / seconds / 1e6
-    text = f"{name}: {rate_hz:.1f} Hz, {median(heard.sizes) / 1e3:.1f} kB each, {rate:.1f} MB/s"
+    # Of one sample alone only this much is known: the next one did not come while it was listened.
+    rate_hz = heard.rate_hz or 2.0 / seconds
+    told = f"{rate_hz:.1f} Hz" if heard.rate_hz else f"one sample in {seconds:g} s"
+    load = sum(heard.sizes) / seconds / 1e6
+    text = f"{name}: {told}, {median(heard.sizes) / 1e3:.1f} kB each, {load:.1f} MB/s"
     monitor = pair.monitor
     if name == EGO:
         wanted_hz = least_hz = 0.5 / pair.pairing.motion_tolerance_s
@@ -90,6 +92,8 @@ def _rate(pair: PairConfig, name: str, heard: Heard, seconds: float) -> Finding:
     advice = "a faster stream, or a longer monitor.period_s"
     if rate_hz < least_hz:
         return fail("stream", heard.key, f"{text}: {why}", advice)
+    if heard.rate_hz is None:
+        return warn("stream", heard.key, f"{text}: {why}", "listen for longer (--seconds)")
     if rate_hz < wanted_hz:
         return warn("stream", heard.key, f"{text}: {why}", advice)
     return ok("stream", heard.key, text)

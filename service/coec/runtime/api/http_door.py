@@ -22,7 +22,8 @@ class HttpDoor:
 
     Attributes:
         server: who answers now; None while nobody does.
-        trouble: why nobody does though somebody should, or that everybody is let in; None otherwise.
+        trouble: why nobody does though somebody should; None otherwise. It ails no calibration.
+        insecure: that other computers get in; None otherwise.
     """
 
     def __init__(self, find: Callable[[str], Page | None]) -> None:
@@ -31,13 +32,14 @@ class HttpDoor:
         self._config = MetricsConfig()
         self.server: HttpServer | None = None
         self.trouble: Reason | None = None
+        self.insecure: Reason | None = None
 
     def use(self, config: MetricsConfig) -> None:
         """Answer where this says, and nowhere else."""
         if config == self._config and self.trouble is None:
             return
         self.close(STOP_S)
-        self._config, self.trouble = config, None
+        self._config, self.trouble, self.insecure = config, None, None
         if config.address is None:
             return
         try:
@@ -50,7 +52,7 @@ class HttpDoor:
         _log.info(f"metrics and health at http://{config.http}/metrics and /health")
         if config.is_open:
             text = f"Whoever reaches {config.http} can read the metrics: `metrics.insecure` is set. Listen on loopback."
-            self.trouble = Reason("http_insecure", text)
+            self.insecure = Reason("http_insecure", text)
 
     def close(self, deadline_s: float) -> bool:
         """Answer nobody any more; False when that took longer than the deadline."""

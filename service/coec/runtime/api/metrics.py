@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import accumulate
 from typing import Literal
 
@@ -46,7 +46,7 @@ class View:
     health: Mapping[str, HealthReply]
     memory_bytes: int = 0
     worker_memory_bytes: int = 0
-    took: Mapping[str, Sequence[Took]] | None = None
+    took: Mapping[str, Sequence[Took]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class Family:
             yield f"{self.name}{suffix}{_braces(self.labels, values)} {_number(value)}"
 
     def _buckets(self, view: View) -> Iterable[str]:
-        for took in (view.took or {}).get(self.name, ()):
+        for took in view.took.get(self.name, ()):
             bounds = (*took.histogram.bounds_s, math.inf)
             for values, counted in sorted(took.histogram.counted().items()):
                 own = (*took.label, *values)

@@ -254,16 +254,17 @@ class Recorder:
             self._lose(item.window_id, error)
 
     def _start(self, item: _Add) -> _Open:
+        plan = self._plan  # another may come meanwhile
         self._store.make_room(self.thread.beat)
         writer = WindowWriter(
             self._store.path(item.window_id),
-            self._plan.rig,
+            plan.rig,
             item.T_camera_lidar,
             item.window_id,
             self._configuration,
-            self._plan.metadata,
+            plan.metadata,
         )
-        return _Open(item.window_id, writer, self._plan.min_pairs)
+        return _Open(item.window_id, writer, plan.min_pairs)
 
     def _end(self, window_id: str, kept: KeptPairs | None) -> None:
         if self._open is None or self._open.window_id != window_id:
