@@ -246,7 +246,7 @@ class VerdictConfig(Stage):
         "score; above: the camera moved within the window (fused)",
     )
     max_intrinsics_certainty: float = Field(
-        default=1.5,
+        default=1.75,
         gt=0,
         description="certainty with which another lens may explain the window better, half a standard deviation each; "
         "above: the intrinsics are off (fused)",

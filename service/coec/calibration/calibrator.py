@@ -9,7 +9,7 @@ from math import degrees
 import numpy as np
 
 from coec.calibration.confidence.from_before import summit_from_before
-from coec.calibration.confidence.loosened import LENS_FREE, Loosened, loosen
+from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LENS_FREE, Loosened, loosen
 from coec.calibration.confidence.modes import Rivals
 from coec.calibration.confidence.told import LENS
 from coec.calibration.confidence.uncertainty import measure_uncertainty
@@ -33,6 +33,9 @@ from coec.calibration.verdict import change_metric, counted_once, intrinsics_met
 from coec.config import CalibrationConfig, config_hash
 from coec.errors import CalibrationError
 from coec.geometry import se3
+
+CONTRADICTED = {HELD_FREE: "with the held centre", CLOCKS_FREE: "with the clocks"}
+"""What was set free, in words."""
 
 
 def calibrate(
@@ -80,7 +83,11 @@ def calibrate(
         *change_metric(change, config.verdict),
     )
     moved = None if change is None else _moved(change, window)
-    details = {INTRINSICS_OFF: _told_of_lens(loosened, window), MOVED: "" if moved is None else _told(moved, window)}
+    details = {
+        "sigma_deg": _told_of_words(loosened),
+        INTRINSICS_OFF: _told_of_lens(loosened, window),
+        MOVED: "" if moved is None else _told(moved, window),
+    }
     verdict = judge(metrics, search.stop_reason, looks, pairs, details)
     progress.step("diagnosis", 1, 1)
 
@@ -128,6 +135,16 @@ def _from_before(found: Found, window: Window, dof: int) -> tuple[Rivals, ...]:
     pose = found.search.T_camera_lidar
     summit = summit_from_before(found.edges.to_the_sharpest, window, pose)
     return () if summit is None else (Rivals(found.objective, pose, (summit,)),)
+
+
+def _told_of_words(loosened: Sequence[Loosened]) -> str:
+    """What the window contradicts of what it was told, and by how much that turns the camera."""
+    turns = [
+        f"{CONTRADICTED[one.name]} set free, it turns by {degrees(float(np.linalg.norm(one.shift[:3]))):.1f}°"
+        for one in loosened
+        if one.contradicts and one.name in CONTRADICTED
+    ]
+    return f" ({'; '.join(turns)})" if turns else ""
 
 
 def _told_of_lens(loosened: Sequence[Loosened], window: Window) -> str:

@@ -98,7 +98,7 @@ def intrinsics_metric(loosened: Sequence[Loosened], limits: VerdictConfig) -> tu
     return tuple(
         Metric(
             INTRINSICS_OFF,
-            one.certainty if one.contradicts else 0.0,
+            one.certainty if one.matters else 0.0,
             limits.max_intrinsics_certainty,
             at_least=False,
         )

@@ -11,15 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coec.calibration.confidence.told import SHIFTS, SIZE, TURNS, told
+from coec.calibration.confidence.told import SHIFTS, SIZE, TURNS, levels_told
 from coec.calibration.confidence.ways import Ways, climbed
 from coec.calibration.search.observability import CentreKept
 from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
 from coec.geometry.edges.alignment import EdgeFrames
-
-POINTS = 12_000
-"""Range edges that are asked, at most: as many as settle the summit to a fraction of its width."""
 
 
 def summit_from_before(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> Matrix4 | None:
@@ -29,7 +26,7 @@ def summit_from_before(edges: Sequence[EdgeFrames], window: Window, pose: Matrix
     `edges` are those of the window, from a level that leads there to the sharpest one.
     """
     kept = CentreKept(tuple(SHIFTS), window.T_camera_lidar_start)(pose)
-    levels = [told(level, window, kept, POINTS) for level in edges]
+    levels = levels_told(edges, window, kept)
     nothing, turns, every = np.zeros(SIZE), tuple(TURNS), (*TURNS, *SHIFTS)
     try:
         turned = climbed(levels, Ways.of(levels[-1], nothing, turns, ()), nothing)
