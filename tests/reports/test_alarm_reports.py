@@ -7,7 +7,7 @@ from math import inf
 import pytest
 
 from coec.config import MonitorConfig
-from coec.evaluation.alarms import Alarms, Creep, Delay, FalseAlarms
+from coec.evaluation.alarms import Alarms, Creep, Delay, FalseAlarms, FromStart
 from coec.reports import alarm_reports
 
 ALARMS = Alarms(
@@ -15,6 +15,7 @@ ALARMS = Alarms(
     (FalseAlarms(10.0, 5.0, 1),),
     (Delay(0.1, (inf, 5.0), (inf, inf)), Delay(1.0, (5.0, 10.0, 10.0), (10.0, 15.0, 20.0))),
     Creep(0.1, (2.0, 3.0, 4.0), (3.0, 4.0, inf)),
+    (FromStart(0.5, (10.0, 10.0, 15.0, inf)),),
 )
 
 
@@ -33,4 +34,5 @@ def test_the_tables_say_what_is_stated_and_what_was(capsys: pytest.CaptureFixtur
     alarm_reports.show(alarm_reports.document_of(ALARMS))
     told = capsys.readouterr().out
     assert "10 h" in told
+    assert "75 %" in told
     assert "0.1°/h is suspected after 3.0 h and confirmed after 4.0 h" in " ".join(told.split())

@@ -1,5 +1,5 @@
 """What the change detector does with streams of checks whose truth is known: how often it accuses a right mount, how
-soon it notices a step of any size, and a creep.
+soon it notices a step of any size, a creep, and a mount that was wrong before the first check.
 
 The streams are drawn, not rendered: 100 hours of driving are 72 000 checks. They are worse than what the detector
 assumes: bad checks come in bursts.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from math import radians
+from math import inf, radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from coec.calibration.commissioning.baseline import PRIOR_SPREAD_POSE as SPREAD_
 from coec.calibration.commissioning.baseline import PRIOR_SPREAD_ROTATION as SPREAD_ROTATION
 from coec.calibration.commissioning.baseline import STREET, UNCOMMISSIONED_BIAS, Accuracy
 from coec.calibration.monitor.change_detector import (
+    ACCUSING,
     S_PER_H,
     AlarmLevels,
     MonitorState,
@@ -26,6 +27,7 @@ from coec.calibration.monitor.change_detector import (
     alarm_level,
     alarm_levels,
 )
+from coec.calibration.monitor.check_verdict import UNCOMMISSIONED
 from coec.calibration.monitor.likelihood import FREEDOM
 from coec.config import MonitorConfig
 from coec.geometry.vectors import random_direction
@@ -54,8 +56,9 @@ STEPS_DEG = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 2.0, 3.0, 4.5, 7.0)
 CREEP_DEG_PER_H, CREEP_H, CREEPS = 0.1, 12.0, 3
 """How fast a mount creeps, for how long at most, and how many of them."""
 
-FLAGGED_AT = 4.0
-"""Standard deviations on any axis at which a check of a stream is flagged by itself."""
+WRONG_DEG, WRONG_CHECKS = (0.0, 0.3, 0.5, 0.7, 1.0, 2.0, 3.0), 12
+"""How far from what is served a mount is from the first check on, and the checks in which that has to be noticed: a
+minute at one every five seconds."""
 
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
@@ -92,18 +95,29 @@ class Creep:
 
 
 @dataclass(frozen=True, slots=True)
+class FromStart:
+    """From the first check of a mount that is wrong by so much from then on to the check that wants a window soon, per
+    drawn rig, s; infinite where none of `WRONG_CHECKS` did. Nothing was learned of the rig: that it may be right, and
+    the estimator off by as much, is weighed by what estimators are off on other rigs."""
+
+    off_deg: float
+    wanted_s: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Alarms:
-    """All three experiments at one configuration."""
+    """All experiments at one configuration."""
 
     config: MonitorConfig
     false: tuple[FalseAlarms, ...]
     delays: tuple[Delay, ...]
     creep: Creep
+    from_start: tuple[FromStart, ...]
 
 
 def measured(config: MonitorConfig, hours: float, steps: int, heard: Heard) -> Alarms:
     """The experiments: so many hours of a right mount, so many steps of every size (seeded)."""
-    total = 2 + len(STEPS_DEG)
+    total = 2 + len(STEPS_DEG) + len(WRONG_DEG)
     false = false_alarms(config, hours)
     heard(1, total)
     delays = []
@@ -111,8 +125,11 @@ def measured(config: MonitorConfig, hours: float, steps: int, heard: Heard) -> A
         delays.append(delay(config, step_deg, steps))
         heard(2 + place, total)
     crept = creep(config)
-    heard(total, total)
-    return Alarms(config, false, tuple(delays), crept)
+    started = []
+    for place, off_deg in enumerate(WRONG_DEG):
+        started.append(from_start(config, off_deg, steps))
+        heard(3 + len(STEPS_DEG) + place, total)
+    return Alarms(config, false, tuple(delays), crept, tuple(started))
 
 
 def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarms, ...]:
@@ -159,6 +176,18 @@ def creep(config: MonitorConfig) -> Creep:
     return Creep(CREEP_DEG_PER_H, tuple(suspect), tuple(confirmed))
 
 
+def from_start(config: MonitorConfig, off_deg: float, rigs: int) -> FromStart:
+    """Rigs that are wrong about drawn axes from the first check on."""
+    wanted, levels = [], alarm_levels(config)
+    for number in range(rigs):
+        rng = np.random.default_rng([SEED, round(off_deg * 1000), number, WRONG_CHECKS])
+        truth = np.zeros((WRONG_CHECKS, 6))
+        truth[:, :3] = radians(off_deg) * random_direction(rng)
+        states = enumerate(_states(_stream(rng, truth, config), levels), start=1)
+        wanted.append(next((check * config.period_s for check, state in states if state.outcome in ACCUSING), inf))
+    return FromStart(off_deg, tuple(wanted))
+
+
 def _first(config: MonitorConfig, stream: Iterator[Observation], after: int) -> tuple[float, float]:
     """Checks after so many until the evidence came to both levels."""
     levels = alarm_levels(config)
@@ -197,6 +226,11 @@ def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: Monito
     street = np.cumsum(rng.random(checks) < 1.0 / STREET_CHECKS)
     offset = truth + rig + streets[street] + rng.standard_t(FREEDOM, (checks, 6)) * noise
     offset = np.where(np.array(_bad(rng, checks))[:, None], rng.standard_t(FREEDOM, (checks, 6)) * BAD, offset)
+    squares = (offset / sigma) ** 2
+    distance2 = np.maximum(
+        squares[:, :3].sum(axis=1) / UNCOMMISSIONED.max_distance2_rotation,
+        squares.max(axis=1) / UNCOMMISSIONED.max_farthest2_pose,
+    )
     period_ns = round(config.period_s * 1e9)
     for number in range(checks):
         begin_ns = number * period_ns
@@ -208,8 +242,8 @@ def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: Monito
             sigma=sigma,
             noise=noise,
             place=STREET,
-            distance2=float(np.max((offset[number] / sigma / FLAGGED_AT) ** 2)),
-            flagged=bool(np.any(np.abs(offset[number]) > FLAGGED_AT * sigma)),
+            distance2=float(distance2[number]),
+            flagged=bool(distance2[number] > 1.0),
             weak=False,
             flagged_by_paper=None,
             causes=(),

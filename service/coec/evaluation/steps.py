@@ -7,6 +7,7 @@ camera moves the LiDAR. Sweeps are motion-compensated first, with the mount as i
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import radians
@@ -118,11 +119,13 @@ def try_knocks(
         raise CalibrationError(f"a knock lies between two pairs of a window, there are {len(window.pairs)}")
     still = replace(window, pairs=_compensated(window, config), start_known_to_rad=MOUNT_RAD)
     config = config.model_copy(update={"motion_compensation": False})
+    # Other recordings, other knocks: what many of them tell is of many.
+    drawn_for = zlib.crc32(window.pairs[0].camera.image.data)
     tried: list[TriedKnock] = []
     for number, knock in enumerate(knocks):
         # Without a knock every trial is the same.
         for trial in range(trials if knock.moves else 1):
-            rng = np.random.default_rng([SEED, number, trial])
+            rng = np.random.default_rng([SEED, number, trial, drawn_for])
             tried.append(_try(knock, still, depth, images, config, rng))
             heard(len(tried))
     return tried

@@ -34,6 +34,15 @@ def document_of(alarms: Alarms) -> wire.AlarmsReport:
         creep_deg_per_h=alarms.creep.deg_per_h,
         creep_suspect_h=_spread(alarms.creep.suspect_h),
         creep_confirmed_h=_spread(alarms.creep.confirmed_h),
+        from_start=tuple(
+            wire.FromStartRow(
+                off_deg=row.off_deg,
+                rigs=len(row.wanted_s),
+                wanted=float(np.mean(np.isfinite(row.wanted_s))),
+                wanted_s=_spread(row.wanted_s),
+            )
+            for row in alarms.from_start
+        ),
     )
 
 
@@ -49,6 +58,11 @@ def show(report: wire.AlarmsReport) -> None:
         figures = (step.suspect_s.median, step.suspect_s.p95, step.confirmed_s.median, step.confirmed_s.p95)
         delays.add_row(f"{step.step_deg:g}°", str(step.steps), *(console.figure(value, 0) for value in figures), "s")
     console.out.print(delays)
+    started = console.table("wrong from the first check", "rigs", "window wanted", "median", "unit", right=range(4))
+    for rigs in report.from_start:
+        median = console.figure(rigs.wanted_s.median, 0)
+        started.add_row(f"{rigs.off_deg:g}°", str(rigs.rigs), f"{100 * rigs.wanted:.0f} %", median, "s")
+    console.out.print(started)
     suspect, confirmed = report.creep_suspect_h, report.creep_confirmed_h
     console.show(
         f"a creep of {report.creep_deg_per_h:g}°/h is suspected after {console.figure(suspect.median, 1)} h and "

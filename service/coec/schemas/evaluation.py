@@ -182,6 +182,16 @@ class DelayRow(Part):
     confirmed_s: Spread
 
 
+class FromStartRow(Part):
+    """From the first check of an uncommissioned mount that is wrong from then on to the check that wants a window soon,
+    s."""
+
+    off_deg: float
+    rigs: Count
+    wanted: float = Field(ge=0, le=1, description="share of the rigs of which a window was wanted within a minute")
+    wanted_s: Spread = Field(description="null where not in time")
+
+
 class AlarmsReport(Message):
     """What `coec alarms --json` prints: the change detector on drawn streams of checks."""
 
@@ -193,6 +203,7 @@ class AlarmsReport(Message):
     creep_deg_per_h: float = Field(description="of a mount that turns steadily")
     creep_suspect_h: Spread = Field(description="until it is suspected, h; null where not in time")
     creep_confirmed_h: Spread = Field(description="until it is confirmed, h")
+    from_start: tuple[FromStartRow, ...]
 
 
 class EvaluationReport(Message):
