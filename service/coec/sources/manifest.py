@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.images.codec import encode_depth_png, probe, raw_image
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, Rig
-from coec.config import CameraIntrinsics, LimitsConfig, Matrix4x4, Name, describe, load_yaml
+from coec.config import CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Name, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.sources.clouds import load_cloud
 from coec.sources.kitti_files import load_image
@@ -51,11 +51,11 @@ class TwistDocument(_Strict):
 class FrameDocument(_Strict):
     """One image and its cloud; paths are relative to the manifest."""
 
-    image: Path
-    cloud: Path
+    image: FilePath
+    cloud: FilePath
     stamp_ns: int = Field(ge=0, lt=_MAX_STAMP_NS)
     cloud_stamp_ns: int | None = Field(default=None, ge=0, lt=_MAX_STAMP_NS)
-    depth: Path | None = None
+    depth: FilePath | None = None
     twist: TwistDocument | None = None
 
 
@@ -64,7 +64,7 @@ class ManifestDocument(_Strict):
 
     pair: Name
     camera: CameraIntrinsics
-    mask: Path | None = None
+    mask: FilePath | None = None
     T_camera_lidar: Matrix4x4
     frames: tuple[FrameDocument, ...] = Field(min_length=1)
 

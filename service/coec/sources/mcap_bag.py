@@ -24,7 +24,7 @@ from coec.adapters.mcap.files import Message as McapMessage
 from coec.adapters.mcap.windows import is_window, read_window
 from coec.adapters.ros import cdr
 from coec.calibration.types import CameraFrame, FramePair, Matrix4, Rig
-from coec.config import CalibrationConfig, CameraIntrinsics, LimitsConfig, Matrix4x4, describe, load_yaml
+from coec.config import CalibrationConfig, CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.geometry import cameras
 from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
@@ -61,7 +61,7 @@ class RigFile(BaseModel):
 
     camera: CameraIntrinsics
     T_camera_lidar: Matrix4x4 | None = None
-    mask: Path | None = None
+    mask: FilePath | None = None
 
 
 def open_mcap(spec: SourceSpec) -> Recording:
