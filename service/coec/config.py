@@ -9,11 +9,12 @@ from __future__ import annotations
 import hashlib
 import ipaddress
 import json
+import os
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -25,6 +26,24 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 KeyExpression = Annotated[str, Field(pattern=r"^[^\s/*$?#]+(/[^\s/*$?#]+)*$", max_length=256)]
 """A Zenoh key without wildcards, and without empty chunks."""
+
+MAX_NAME_BYTES = 255
+"""Of one name in a path: what Linux's file systems take (limits.h, NAME_MAX)."""
+
+MAX_PATH_BYTES = 2048
+"""Of a path: half of what Linux takes (limits.h, PATH_MAX); the folder that it is relative to may have the rest."""
+
+
+def _path(path: Path) -> Path:
+    if "\0" in str(path) or any(len(os.fsencode(name)) > MAX_NAME_BYTES for name in path.parts):
+        raise ValueError(f"a name in a path has no zero byte, and at most {MAX_NAME_BYTES} bytes")
+    if len(os.fsencode(path)) > MAX_PATH_BYTES:
+        raise ValueError(f"a path has at most {MAX_PATH_BYTES} bytes")
+    return path
+
+
+FilePath = Annotated[Path, AfterValidator(_path)]
+"""A path that can be asked for. What a text file says may be none, and Python raises whatever it likes about it."""
 
 Matrix4x4 = tuple[
     tuple[float, float, float, float],
@@ -90,7 +109,7 @@ class CameraConfig(Stage):
     encoding: Encoding = Field(default="msgpack", description="assumed when a sample names no encoding")
     type: Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"] = "sensor_msgs/msg/CompressedImage"
     intrinsics: CameraIntrinsics
-    mask: Path | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
+    mask: FilePath | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
 
 
 class LidarConfig(Stage):
@@ -388,7 +407,7 @@ class LimitsConfig(Stage):
 class StateConfig(Stage):
     """The state directory; deleting it returns the vehicle to nominal."""
 
-    directory: Path = Path("coec-state")
+    directory: FilePath = Path("coec-state")
     max_bytes: int = Field(default=4 * 2**30, ge=2**20, description="windows kept, bytes; the oldest go first")
     max_age_days: float = Field(default=90.0, gt=0)
     min_free_bytes: int = Field(
@@ -420,7 +439,7 @@ class ZenohConfig(Stage):
     insecure: bool = Field(
         default=False, description="listen even where whoever comes is let in without a certificate; health says so"
     )
-    file: Path | None = None
+    file: FilePath | None = None
 
     @property
     def router(self) -> tuple[str, ...]:

@@ -194,6 +194,17 @@ def test_yaml_is_refused_by_an_error_of_ours(tmp_path: Path, text: str) -> None:
             read(path)
 
 
+@pytest.mark.parametrize("name", ["a\\0b", "x" * 300, "é" * 200, "../" * 2000])
+@pytest.mark.parametrize("key", ["mask: %s", "frames: [{image: %s, cloud: a.bin, stamp_ns: 1}]"])
+def test_a_path_that_no_file_can_have_is_refused_by_place(tmp_path: Path, key: str, name: str) -> None:
+    (tmp_path / "dataset.yaml").write_text("pair: front\n" + key % f'"{name}"' + "\n")
+    with pytest.raises(SourceError, match=r"dataset\.yaml.*(mask|frames\.0\.image): Value error, a (name in a )?path"):
+        open_source(str(tmp_path))
+    (tmp_path / "coec.yaml").write_text(f'state: {{directory: "{name}"}}\nzenoh: {{file: "{name}"}}\n')
+    with pytest.raises(ConfigError, match=r"zenoh\.file: Value error.*state\.directory: Value error"):
+        load_config(tmp_path / "coec.yaml")
+
+
 def test_a_binary_file_is_no_yaml(tmp_path: Path) -> None:
     path = tmp_path / "dataset.yaml"
     path.write_bytes(b"\xff\xfe\x00")

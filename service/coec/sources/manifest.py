@@ -19,7 +19,7 @@ from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.images.codec import encode_depth_png, probe, raw_image
 from coec.calibration.frames.origin import apparent_origin, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
-from coec.config import IDENTITY, CameraIntrinsics, LimitsConfig, Matrix4x4, Name, describe, load_yaml
+from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Name, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.sources.clouds import load_cloud
 from coec.sources.kitti_files import load_image
@@ -52,11 +52,11 @@ class TwistDocument(_Strict):
 class FrameDocument(_Strict):
     """One image and its cloud; paths are relative to the manifest."""
 
-    image: Path
-    cloud: Path
+    image: FilePath
+    cloud: FilePath
     stamp_ns: int = Field(ge=0, lt=_MAX_STAMP_NS)
     cloud_stamp_ns: int | None = Field(default=None, ge=0, lt=_MAX_STAMP_NS)
-    depth: Path | None = None
+    depth: FilePath | None = None
     twist: TwistDocument | None = None
 
 
@@ -65,7 +65,7 @@ class ManifestDocument(_Strict):
 
     pair: Name
     camera: CameraIntrinsics
-    mask: Path | None = None
+    mask: FilePath | None = None
     T_camera_lidar: Matrix4x4
     T_cloud_lidar: Matrix4x4 = Field(
         default=IDENTITY, description="pose of the LiDAR in the frame in which the points are given"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -147,6 +148,18 @@ def test_foreign_files_are_damage_not_exceptions(tmp_path: Path, text: bytes) ->
     loaded = StateFile(path).load()
     assert loaded.body is None
     assert loaded.damage
+
+
+def test_lists_of_any_depth_are_a_state_or_damage(tmp_path: Path) -> None:
+    """Between what Python reads and what it writes lie some depths, wherever its stack has just been."""
+    path = tmp_path / "state.json"
+    damaged = 0
+    for depth in range(100, 1000):
+        body = f'{{"pairs":{"[" * depth + "]" * depth}}}'.encode()
+        checksum = hashlib.sha256(body).hexdigest()
+        path.write_bytes(b'{"body":%b,"checksum":"%b","schema_version":1}' % (body, checksum.encode()))
+        damaged += bool(StateFile(path).load().damage)
+    assert 0 < damaged < 900
 
 
 def test_a_failed_write_is_an_error_and_keeps_the_old_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

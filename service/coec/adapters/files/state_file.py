@@ -119,7 +119,7 @@ def _decode(data: bytes) -> dict[str, Any]:
         raise StateError(f"is not of schema version {SCHEMA_VERSION}")
     try:
         expected = _encode(body)
-    except (ValueError, UnicodeEncodeError) as error:
+    except (ValueError, RecursionError) as error:  # lists that can be read may be too deep to be written
         raise StateError("holds values that were never written") from error
     if expected != data:
         raise StateError("does not match its checksum")

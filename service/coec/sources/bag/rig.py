@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.ros import cdr
 from coec.calibration.types import CameraFrame, EgoMotion, Rig
-from coec.config import CameraIntrinsics, Matrix4x4, describe, load_yaml
+from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, SourceError
 from coec.geometry import cameras
 from coec.sources.bag.index import Index
@@ -25,7 +25,7 @@ class RigFile(BaseModel):
 
     camera: CameraIntrinsics
     T_camera_lidar: Matrix4x4 | None = None
-    mask: Path | None = None
+    mask: FilePath | None = None
 
 
 def rig_of_bag(
