@@ -468,9 +468,9 @@ class AuthorityConfig(Stage):
 
     anonymous: Literal["never", "loopback", "always"] = "loopback"
     senders: tuple[SenderConfig, ...] = Field(default=(), max_length=64, description="by `name`, and their `commands`")
-    certificate: Path | None = Field(default=None, description="of the service; its common name is the vehicle's name")
-    private_key: Path | None = Field(default=None, description="of the certificate")
-    root_ca: Path | None = Field(default=None, description="the authority that signed the senders' certificates")
+    certificate: FilePath | None = Field(default=None, description="of the service; its common name is the vehicle's name")
+    private_key: FilePath | None = Field(default=None, description="of the certificate")
+    root_ca: FilePath | None = Field(default=None, description="the authority that signed the senders' certificates")
 
     @model_validator(mode="after")
     def _provable(self) -> AuthorityConfig:
