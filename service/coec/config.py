@@ -468,7 +468,9 @@ class AuthorityConfig(Stage):
 
     anonymous: Literal["never", "loopback", "always"] = "loopback"
     senders: tuple[SenderConfig, ...] = Field(default=(), max_length=64, description="by `name`, and their `commands`")
-    certificate: FilePath | None = Field(default=None, description="of the service; its common name is the vehicle's name")
+    certificate: FilePath | None = Field(
+        default=None, description="of the service; its common name is the vehicle's name"
+    )
     private_key: FilePath | None = Field(default=None, description="of the certificate")
     root_ca: FilePath | None = Field(default=None, description="the authority that signed the senders' certificates")
 
