@@ -109,5 +109,5 @@ def test_without_a_router_it_says_so(coec: Coec, tmp_path: Path) -> None:
     file.write_text(json.dumps({"connect": {"endpoints": [endpoint]}}))
     outcome = coec("watch", "--zenoh", file, "--timeout", "0.2")
     assert outcome.status == ConnectionFailedError.exit_code
-    assert str(file) in outcome.err
+    assert endpoint in outcome.err
     assert coec("watch", "--zenoh", tmp_path / "absent.json5").status == ConfigError.exit_code
