@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ import zenoh
 from certificates import TestAuthority
 from coec.adapters.tls.conversation import NotProvenError, Speaker
 from coec.adapters.zenoh.bus import JSON, open_session
-from coec.adapters.zenoh.client import RemoteError, ask_one
+from coec.adapters.zenoh.client import RemoteError, ask_one, connected
 from coec.adapters.zenoh.proven import give
 from coec.config import AuthorityConfig, SenderConfig, ZenohConfig
 from coec.runtime.api import commands
@@ -194,7 +195,7 @@ def test_what_comes_through_a_door_for_everybody_is_denied(tmp_path: Path, door:
         assert (code, "it listens at" in why) == ("not_allowed", True)
 
 
-@pytest.mark.fault("a window that is read without an end in sight", "`hold` is acknowledged all the same, in 100 ms")
+@pytest.mark.fault("a window that is read without an end in sight", "`hold` is acknowledged all the same")
 def test_a_command_does_not_wait_for_a_window_that_is_read(
     router: zenoh.Session,
     vehicle: Served,
@@ -221,3 +222,36 @@ def test_a_command_does_not_wait_for_a_window_that_is_read(
     read.set()
     (reply,) = waiting
     assert reply.ok is not None
+
+
+@pytest.mark.fault("conversations begun without end, 64 at a time, by who proves nothing", "a proven command is done")
+def test_beginnings_without_end_hold_up_no_proven_command(
+    authority: TestAuthority,
+    router: zenoh.Session,
+    endpoint: str,
+    vehicle: Served,
+    record_property: Callable[[str, object], None],
+) -> None:
+    there = vehicle(authority.of_service(OPERATOR))
+    hello = Speaker(authority.credentials("viewer"), "vehicle").hello()
+    stop, ended, begun = threading.Event(), threading.Event(), [0]
+
+    def flood() -> None:
+        with connected([endpoint], PATIENCE_S) as session:
+            while not stop.is_set():
+                conversations = (f"{HOLD}?tls={secrets.token_hex(16)}" for _ in range(64))
+                asked = [session.get(one, payload=hello, timeout=PATIENCE_S) for one in conversations]
+                begun[0] += sum(len(list(replies)) for replies in asked)
+        ended.set()
+
+    threading.Thread(target=flood).start()
+    wait_until(lambda: begun[0] > 200, "the flood")
+    times_s = []
+    for payload in (None, RELEASE, None):
+        began_s = time.monotonic()
+        assert proven(router, authority, "operator", payload=payload)["accepted"]
+        times_s.append(time.monotonic() - began_s)
+    stop.set()
+    assert ended.wait(PATIENCE_S)
+    assert there.is_held
+    record_property("figure", f"longest {max(times_s):.2f} s, beside {begun[0]} beginnings")

@@ -28,8 +28,8 @@ from coec.errors import CoecError, ConfigError
 WAITED_S = 5.0
 """For the second question: what comes later is not heard. A carrier that keeps it back gains no more than this."""
 
-CONVERSATIONS = 64
-"""Begun and not ended, some 50 kB each. The oldest makes room: whoever begins many without end can cut a conversation
+CONVERSATIONS = 256
+"""Begun and not ended, some 36 kB each. The oldest makes room: whoever begins many without end can cut a conversation
 short that is longer under way than theirs, and no more."""
 
 MAX_SAID = 16_384

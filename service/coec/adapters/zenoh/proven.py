@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import secrets
+import time
 
 import zenoh
 
 from coec.adapters.tls.conversation import NotProvenError, Speaker
-from coec.adapters.zenoh.client import Reply, ask_one
+from coec.adapters.zenoh.client import RemoteError, Reply, ask_one
 from coec.schemas.base import to_json
 from coec.schemas.commands import ProvenCommand
+
+BUSY = "busy"
+"""Code of an error reply: too many queries wait."""
+
+PAUSE_S = 0.05
+"""Before a busy service is asked again; it is through with a full queue of beginnings in about that time."""
 
 
 def give(
@@ -28,10 +35,23 @@ def give(
     """
     key = selector.partition("?")[0]
     conversation = f"{key}?tls={secrets.token_hex(16)};format=json"
-    flight = ask_one(session, conversation, timeout_s, speaker.hello()).payload
+    flight = _told(session, conversation, timeout_s, speaker.hello())
     said = ProvenCommand(selector=selector, payload=(payload or b"").decode())
-    sealed = ask_one(session, conversation, timeout_s, speaker.say(flight, to_json(said))).payload
+    sealed = _told(session, conversation, timeout_s, speaker.say(flight, to_json(said)))
     answer = speaker.answer(sealed)
     if not answer:
         raise NotProvenError("the service broke the conversation off")
     return Reply(key, answer, encoding)
+
+
+def _told(session: zenoh.Session, conversation: str, timeout_s: float, goes: bytes) -> bytes:
+    """The answer to the next bytes. A service that is busy is told them again: a conversation is heard to its end once,
+    so that nothing is done twice, whoever said that it is busy."""
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            return ask_one(session, conversation, timeout_s, goes).payload
+        except RemoteError as error:
+            if error.reply_code != BUSY or time.monotonic() + PAUSE_S > deadline_s:
+                raise
+        time.sleep(PAUSE_S)
