@@ -30,6 +30,10 @@ What is promised are 100 ms, and 2 s; the figure tells."""
 MANY_POINTS = 80_000
 """A megabyte: ten seconds of a disk that gives 100 kB/s."""
 
+WINDOWS, WINDOW_BYTES = 5000, 600_000
+LISTED_S = 10.0
+"""For as long as is looked at the beat while windows are read."""
+
 DAMAGE = {"state_damaged", "history_damaged"}
 
 
@@ -154,3 +158,40 @@ def test_a_broken_disk_is_named_keeps_nobody_waiting_and_loses_nothing(
         assert after["entries"][: len(before["entries"])] == before["entries"]
         assert not DAMAGE & codes(running)
         assert running.extrinsic()["held"] is True
+
+
+@pytest.mark.slow
+@pytest.mark.fault(
+    "5,000 windows of which nothing is known, 3 GB, on a disk that gives 50 MB/s",
+    "the first list is there within 1 s, and the beat never later than 2 s",
+)
+def test_thousands_of_windows_are_listed_at_once(
+    tmp_path: Path, router: Router, monkeypatch: pytest.MonkeyPatch, record_property: Any
+) -> None:
+    path = configured(tmp_path, router.endpoint)
+    windows = tmp_path / "state" / "windows"
+    windows.mkdir(parents=True)
+    for number in range(WINDOWS):
+        with (windows / f"front-{number + 1}.mcap").open("wb") as stream:
+            stream.truncate(WINDOW_BYTES)
+    text = path.read_text().replace("max_bytes: 33554432", f"max_bytes: {2 * WINDOWS * WINDOW_BYTES}")
+    path.write_text(text)
+    disk = BrokenDisk(tmp_path / "state", tmp_path / "disk")
+    beats = Beats(tmp_path / "notify")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    disk.becomes("slow 50000000")
+    try:
+        with disk.on_path(), service(path, router) as running:
+            begin_s = time.monotonic()
+            listed = running.windows()
+            first_s = time.monotonic() - begin_s
+            time.sleep(LISTED_S)
+            longest_s = beats.longest_s(begin_s)
+            assert len(listed) == WINDOWS
+            assert running.windows() != listed, "they are being read meanwhile"
+            assert running.terminate() == 0
+    finally:
+        beats.close()
+    record_property("figure", f"first list {first_s:.2f} s, beats {longest_s:.1f} s apart")
+    assert first_s < UNHURRIED_S
+    assert longest_s < UNHURRIED_S

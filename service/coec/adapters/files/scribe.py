@@ -21,7 +21,7 @@ from coec.errors import StateError
 
 _log = logging.getLogger(__name__)
 
-PATIENCE_S = 0.05
+PATIENCE_S = 0.03
 """A disk that is well takes the lines and the state of a command, five fsyncs, within 20 ms; commands are answered
 within 100 ms whatever the disk does."""
 

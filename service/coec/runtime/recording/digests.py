@@ -52,7 +52,7 @@ class DigestReader:
         self._store = store
         self._pair = pair
         self._reading: _Reading | None = None
-        self._unreadable: set[Path] = set()
+        self._unreadable: set[str] = set()
 
     def read(self, max_bytes: int) -> bool:
         """Go on by at most so many bytes, fewer when the disk is slow; the latest window comes first. False when there
@@ -60,9 +60,10 @@ class DigestReader:
         if self._reading is None:
             unread = self._store.unread(self._pair)
             self._unreadable.intersection_update(unread)
-            path = next((path for path in unread if path not in self._unreadable), None)
-            if path is None:
+            window_id = next((one for one in unread if one not in self._unreadable), None)
+            if window_id is None:
                 return False
+            path = self._store.path(window_id)
             self._guarded(path, lambda: self._begin(path))
         reading = self._reading
         if reading is not None:
@@ -83,7 +84,7 @@ class DigestReader:
             self.close()
         except OSError as error:
             self.close()
-            self._unreadable.add(path)
+            self._unreadable.add(path.stem)
             _log.warning(f"a window cannot be read: {error.strerror}", extra={"fields": {"window": path.stem}})
 
     def _begin(self, path: Path) -> None:

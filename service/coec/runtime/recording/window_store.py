@@ -65,11 +65,17 @@ class _Found:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """The windows of one pair, as long as nothing changes: in order, and the files that were not read yet, the latest
-    first."""
+    """The windows of one pair, as long as none comes or goes: in order, and the ids of those that were not read yet,
+    the latest first."""
 
     infos: tuple[WindowInfo, ...]
-    unread: tuple[Path, ...]
+    unread: tuple[str, ...]
+
+    def renewed(self, info: WindowInfo) -> _View:
+        """More is known of one of them. A view of thousands is not made anew for each."""
+        infos = tuple(info if one.window_id == info.window_id else one for one in self.infos)
+        known = info.sha256 is not None
+        return _View(infos, tuple(one for one in self.unread if one != info.window_id) if known else self.unread)
 
 
 class WindowStore:
@@ -187,7 +193,8 @@ class WindowStore:
             found = self._found.get(recorded.window_id)
             if found is not None:
                 found = self._found[recorded.window_id] = replace(found, order=self._index.next_order())
-                self._put(recorded.window_id, found.order, version)
+                self._index.put(IndexedWindow(window_id=recorded.window_id, order=found.order, version=version))
+                self._views.clear()
         self.flush()
 
     def note(self, window_id: str, version: WindowVersion) -> None:
@@ -198,8 +205,11 @@ class WindowStore:
             if found is not None:
                 if version.modified_ns > found.modified_ns:  # written since the folder was looked at
                     size_bytes, modified_ns = version.size_bytes, version.modified_ns
-                    self._found[window_id] = replace(found, size_bytes=size_bytes, modified_ns=modified_ns)
-                self._put(window_id, found.order, version)
+                    found = self._found[window_id] = replace(found, size_bytes=size_bytes, modified_ns=modified_ns)
+                self._index.put(IndexedWindow(window_id=window_id, order=found.order, version=version))
+                view = self._views.get(found.pair)
+                if view is not None:
+                    self._views[found.pair] = view.renewed(self._info(window_id, found))
 
     def flush(self) -> None:
         """Put on the disk what was noted."""
@@ -211,8 +221,8 @@ class WindowStore:
             found = self._found.get(window_id)
             return None if found is None else self._version(window_id, found)
 
-    def unread(self, pair: str) -> tuple[Path, ...]:
-        """The pair's windows of which not everything is known, the latest first."""
+    def unread(self, pair: str) -> tuple[str, ...]:
+        """Ids of the pair's windows of which not everything is known, the latest first."""
         self.look()
         with self._lock:
             return self._view(pair).unread
@@ -365,10 +375,6 @@ class WindowStore:
             return found.order
         return self._index.next_order() if indexed is None else indexed.order
 
-    def _put(self, window_id: str, order: int, version: WindowVersion) -> None:
-        self._index.put(IndexedWindow(window_id=window_id, order=order, version=version))
-        self._views.clear()
-
     def _version(self, window_id: str, found: _Found) -> WindowVersion | None:
         indexed = self._index.get(window_id)
         if indexed is None:
@@ -381,7 +387,7 @@ class WindowStore:
         if view is None:
             ours = [(window_id, found) for window_id, found in self._in_order() if found.pair == pair]
             infos = tuple(self._info(window_id, found) for window_id, found in ours)
-            unread = tuple(self.path(info.window_id) for info in reversed(infos) if info.sha256 is None)
+            unread = tuple(info.window_id for info in reversed(infos) if info.sha256 is None)
             view = self._views[pair] = _View(infos, unread)
         return view
 
