@@ -279,25 +279,25 @@ class Daemon:
             _log.warning("no configuration file to read again")
             return
         self._notifier.reloading()
-        told = replies.ConfigurationStatus(read_ns=time.time_ns(), reloads=self._configuration.reloads)
+        told = self._configuration
         try:
             fresh = reload_of(self._config, reread())
-        except CoecError as error:
-            self._configuration = self._configuration.model_copy(
-                update={"read_ns": told.read_ns, "refused": str(error)}
-            )
-            _log.error(f"the configuration on the disk is refused, the old one stays: {error}")
+        except Exception as error:  # whatever is wrong with a file, what runs goes on
+            self._configuration = told.model_copy(update={"read_ns": time.time_ns(), "refused": str(error)})
+            expected = isinstance(error, CoecError)
+            _log.error(f"the configuration on the disk is refused, the old one stays: {error}", exc_info=not expected)
         else:
-            update = {"taken": fresh.taken, "waiting": fresh.waiting, "reloads": told.reloads + bool(fresh.taken)}
-            self._configuration = told.model_copy(update=update)
+            self._configuration = replies.ConfigurationStatus(
+                read_ns=time.time_ns(),
+                reloads=told.reloads + bool(fresh.taken),
+                taken=fresh.taken,
+                waiting=fresh.waiting,
+            )
             self._take(fresh.config)
-            fields = {
-                "taken": list(fresh.taken),
-                "waiting": list(fresh.waiting),
-                "config_hash": config_hash(self._config),
-            }
             changed = "it is taken" if fresh.taken else "it changes nothing that runs"
             waits = "; what differs besides waits for a restart" if fresh.waiting else ""
+            places = {"taken": list(fresh.taken), "waiting": list(fresh.waiting)}
+            fields = {**places, "config_hash": config_hash(self._config)}
             _log.info(f"the configuration on the disk is valid; {changed}{waits}", extra={"fields": fields})
         self._renew()
         if self._state == "running":
