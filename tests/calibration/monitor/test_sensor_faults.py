@@ -217,4 +217,4 @@ class TestFacts:
 
     def test_every_cause_is_listed_under_its_code(self) -> None:
         assert all(code == cause.code == cause.as_reason().code for code, cause in CAUSES.items())
-        assert len(CAUSES) == 9
+        assert len(CAUSES) == 10
