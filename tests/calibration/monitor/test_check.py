@@ -11,7 +11,7 @@ from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
-from coec.calibration.monitor.check_verdict import over_limits
+from coec.calibration.monitor.check_verdict import MIN_CONTRAST, judge_check, over_limits
 from coec.calibration.objective.curvature import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.ports import DepthModel, Silence
@@ -101,3 +101,17 @@ class TestOverLimits:
     def test_lost_edges_alone_flag_nothing(self) -> None:
         of_rotation, _ = over_limits(replace(A_CHECK, edges_kept=0.1), self.ACCURACY, self.ACCURACY, self.LIMITS)
         assert of_rotation == 0.0
+
+
+@pytest.mark.parametrize(
+    ("contrast", "edges", "weak"),
+    [(MIN_CONTRAST + 0.5, 10.0, False), (MIN_CONTRAST - 0.5, 10.0, True), (9.0, 1.0, True)],
+)
+def test_an_optimum_that_stands_out_by_chance_only_is_weak(
+    evidence: CheckInput, sharp_street: Window, contrast: float, edges: float, weak: bool
+) -> None:
+    pairs = len(evidence.pairs)
+    seen = replace(A_CHECK, pairs=pairs, contrast=contrast, edges_at_best=edges * float(np.sqrt(pairs)))
+    told = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)
+    assert told.weak is weak
+    assert not told.flagged
