@@ -35,8 +35,8 @@ class Row:
 
 
 OFF_DEG = 0.2
-"""The time of a solve counts where it ends at the truth: within three of the standard deviations that the fused one
-tells of its end, 0.06°, rounded up."""
+"""The time of a solve counts where it ends at the truth: within two of the standard deviations that the fused one tells
+of its end, 0.06 to 0.11°, rounded."""
 
 ROWS: tuple[Row, ...] = (
     Row("mi_25_frames_ms", "one MI, 25 frames of 114,000 points", "ms", 2, 2.5),
