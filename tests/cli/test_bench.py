@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.progress import Progress
 
 from cli.conftest import SMALL, Coec
 from coec.calibration.objective.mutual_information import SearchBox
@@ -58,6 +59,15 @@ def test_the_document_holds_what_is_promised(coec: Coec, no_processes: dict[str,
     assert set(document["required"]) < set(document)
 
 
+@pytest.mark.slow
+def test_the_fused_solve_that_is_timed_ends_at_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A time says nothing of a solve that came to another end than asked."""
+    monkeypatch.setattr(bench, "FEW_REPEATS", 0)
+    with Progress() as bars:
+        figures = bench.measure_fused(bars)
+    assert figures["solve_25deg_6dof_error_deg"] < rows.OFF_DEG
+
+
 def test_a_worker_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene, "POINTS", 30_000)
     monkeypatch.setattr(worker, "SOLVES", {"mi": worker.SOLVES["mi"]})
@@ -82,12 +92,15 @@ def test_a_daemon_is_measured_under_load(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_the_table_says_what_is_not_as_required(capsys: pytest.CaptureFixture[str]) -> None:
     figures = {"io_cpu_percent": 30.0, "ratio_to_numpy": 50.0, "mi_ms_by_frames": {"5": 0.4}, "query_idle_p99_ms": None}
+    figures |= {"solve_10deg_3dof_error_deg": 0.01, "solve_25deg_6dof_error_deg": 0.53}
     Console(width=140).print(rows.table(figures))
     lines = {line.split("  ")[0].strip(): line for line in capsys.readouterr().out.splitlines()}
     assert "✗" in lines["I/O process under load, of one core"]
     assert "≤ 25 %" in lines["I/O process under load, of one core"]
     assert "✓" in lines["times as fast as NumPy"]
     assert "≥ 40 ×" in lines["times as fast as NumPy"]
+    assert "✓" in lines["MI solve: its end beside the truth"]
+    assert "✗" in lines["fused solve: its end beside the truth"]
     assert any("frames 5" in line and "0.40 ms" in line for line in lines.values())
 
 

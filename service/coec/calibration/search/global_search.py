@@ -129,7 +129,11 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     blocks = np.array_split(np.arange(count), -(-count // BLOCK))
     z = np.concatenate([charted_significances(charts, cover.poses(block)) for block in blocks])
     best = np.argsort(-z, kind="stable")[:CANDIDATES]
-    poses = np.concatenate([start[None], cover.poses(best)])
+    # In place: twice all of them is the most that a solve holds.
+    poses = np.empty((1 + len(best), 4, 4))
+    poses[0] = start
+    for begin in range(0, len(best), BLOCK):
+        poses[1 + begin : 1 + begin + BLOCK] = cover.poses(best[begin : begin + BLOCK])
     z = np.concatenate([charted_significances(charts, start[None]), z[best]])
     return poses[_apart(poses, z, ROUNDS[0].poses, ROUNDS[0].apart_rad)]
 

@@ -116,7 +116,25 @@ def measure(bars: Progress) -> dict[str, Any]:
     document["solve_10deg_3dof_s"] = min(times)
     document["solve_10deg_3dof_evaluations"] = found.evaluations
     document["solve_10deg_3dof_error_deg"] = windows.rotation_error_deg(found.T_camera_lidar, pose)
-    return document | _fused(bars)
+    return document | measure_fused(bars)
+
+
+def measure_fused(bars: Progress) -> dict[str, Any]:
+    """The figures of the fused objective, six degrees of freedom, without depth inference: how long, and how far from
+    the truth it ends. The first run may compile."""
+    loaded = windows.load(STREET, None, WindowConfig().pairs, lambda *_: None)
+    xi = np.array([*np.radians(FAR_START_DEG), 0.0, 0.0, 0.0])
+    window = windows.started_at(loaded.window, xi)
+    configuration = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=30.0))
+    depth = open_depth(configuration.depth, LimitsConfig())
+    seconds = []
+    for _ in range(1 + FEW_REPEATS):
+        times = StageTimes(bars)
+        estimate = calibrate(window, depth, GreyImages(LimitsConfig()), configuration, times)
+        elapsed = times.elapsed_s()
+        seconds.append(elapsed["total"] - sum(elapsed.get(stage, 0.0) for stage in APART))
+    error_deg = windows.rotation_error_deg(estimate.optimum.T_camera_lidar, window.rig.T_camera_lidar_nominal)
+    return {"solve_25deg_6dof_s": min(seconds), "solve_25deg_6dof_error_deg": error_deg}
 
 
 def measure_processes(bars: Progress) -> dict[str, Any]:
@@ -157,23 +175,6 @@ def _spread_percent(ms_by_frames: Mapping[str, float]) -> float:
     """How far the time of one frame is from the mean of its times over all numbers of frames, at most, %."""
     per_frame = np.array([ms / int(count) for count, ms in ms_by_frames.items()])
     return float(100.0 * np.abs(per_frame / per_frame.mean() - 1.0).max())
-
-
-def _fused(bars: Progress) -> dict[str, Any]:
-    """The fused objective, six degrees of freedom, without depth inference. The first run may compile."""
-    loaded = windows.load(STREET, None, WindowConfig().pairs, lambda *_: None)
-    xi = np.array([*np.radians(FAR_START_DEG), 0.0, 0.0, 0.0])
-    window = windows.started_at(loaded.window, xi)
-    configuration = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6, reach_deg=30.0))
-    depth = open_depth(configuration.depth, LimitsConfig())
-    seconds = []
-    for _ in range(1 + FEW_REPEATS):
-        times = StageTimes(bars)
-        estimate = calibrate(window, depth, GreyImages(LimitsConfig()), configuration, times)
-        elapsed = times.elapsed_s()
-        seconds.append(elapsed["total"] - sum(elapsed.get(stage, 0.0) for stage in APART))
-    error_deg = windows.rotation_error_deg(estimate.optimum.T_camera_lidar, window.rig.T_camera_lidar_nominal)
-    return {"solve_25deg_6dof_s": min(seconds), "solve_25deg_6dof_error_deg": error_deg}
 
 
 def _nothing_left_out(model: str) -> MutualInformation:
