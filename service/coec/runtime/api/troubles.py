@@ -46,6 +46,22 @@ TROUBLES: Mapping[str, Trouble] = {
         "The disk does not answer: no window can be written.",
         "See to the disk of `state.directory`; `coec doctor` measures it.",
     ),
+    "disk_slow": Trouble(
+        "The disk takes longer than a command may wait: what is acknowledged says that it is not durable yet.",
+        "See to what else writes to the disk of `state.directory`; `coec doctor` measures it.",
+    ),
+    "disk_failing": Trouble(
+        "The disk refuses what is to be remembered; it is kept in memory and tried again.",
+        "See to the disk of `state.directory`: errors, owner, mount.",
+    ),
+    "disk_read_only": Trouble(
+        "The state directory is mounted read-only: nothing is remembered over a restart.",
+        "Mount it for writing; nothing has to be restarted.",
+    ),
+    "disk_full": Trouble(
+        "The disk of the state directory is full: what is to be remembered waits in memory.",
+        "Make room; nothing has to be restarted.",
+    ),
     "state_damaged": Trouble(
         "What was remembered cannot be used and is kept beside; nominal is served.",
         "Calibrate, or restore the file from a backup; look into the disk.",
@@ -93,6 +109,10 @@ TROUBLES: Mapping[str, Trouble] = {
     "thread_died": Trouble(
         "A thread of the service has died; the service ends with exit code 70.",
         "The service manager starts it again; report the traceback in the log.",
+    ),
+    "tokens_hidden": Trouble(
+        "The router hides the liveliness tokens of this vehicle: a second daemon could serve it unseen.",
+        "Let its rules allow the service `liveliness_token` and `liveliness_query`, as `deploy/router.json5` does.",
     ),
     "two_daemons": Trouble(
         "Another daemon serves the vehicle; this one ends with exit code 75.",
