@@ -13,7 +13,7 @@ from coec.adapters.zenoh.settings_file import TLS, read_settings
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import ConfigError
 
-DEAF_US = 500_000
+DEAF_US = 2_000_000
 """Who has not taken 64 kB for so long, microseconds, is cut off when something is to be sent to him that may not be
 dropped: meanwhile a router forwards nothing of that sender to anybody. By default it would be 5 s for each."""
 
