@@ -34,7 +34,7 @@ coarsest band lead back."""
 STEPS = np.array([1e-3] * 3 + [7e-3] * 3 + [5e-3] * 3 + [2e-3] * 3)
 """Difference steps: each moves what lies 7 m away by about a pixel or less."""
 
-LEADING_POINTS, SETTLING_POINTS = 8_000, 20_000
+LEADING_POINTS, SETTLING_POINTS = 4_000, 20_000
 """Range edges that are asked, at most, on a level that leads to the next and on the sharpest: some four hundred
 evaluations of them cost as much as ten of the search's. With half as many, what the sharpest can tell of a principal
 point four pixels beside through a fisheye is a third less certain."""
