@@ -47,7 +47,7 @@ def held(tmp_path: Path, record_property: Callable[[str, object], None]) -> Repl
             trial = tried(target, data, tmp_path)
             assert trial.problem is None, f"{data[:200]!r}: {trial.problem}"
             slowest_s, most_bytes = max(slowest_s, trial.cpu_s), max(most_bytes, trial.grown_bytes)
-        record_property("figure", f"{len(inputs)} inputs, {slowest_s * 1e3:.0f} ms and {most_bytes >> 20} MB at most")
+        record_property("figure", f"{len(inputs)} inputs, {slowest_s * 1e3:.1f} ms and {most_bytes >> 20} MB at most")
         assert slowest_s < MAX_CPU_S
         assert most_bytes < MAX_BYTES
 

@@ -7,6 +7,8 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from coec.adapters.zenoh.bus import JSON, MSGPACK, WAITING, Answer, Bus, Lane, R
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError, UnavailableError
 from fakes import wait_until
-from ports import free_port
+from ports import Relay, free_port
 
 DEADLINE_S = 20.0
 
@@ -134,6 +136,54 @@ def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: B
     release.set()
     for _ in range(WAITING[Lane.FILES] + 1):
         assert replies.get(timeout=DEADLINE_S).ok is not None
+
+
+READERS = 3
+PUBLISHED = 100
+LARGE = bytes(2**18)
+"""Of which 25 MB are published: more than the sockets of three readers hold."""
+
+SOON_S = 5.0
+"""7.7 s were seen where the sender waited for the readers."""
+
+
+def _note(heard: queue.SimpleQueue[int], number: int, _: zenoh.Sample) -> None:
+    heard.put(number)
+
+
+def test_subscribers_that_stopped_reading_hold_nobody_up(
+    bus: Bus, client: zenoh.Session, endpoint: str, record_property: Callable[[str, object], None]
+) -> None:
+    serve_value(bus, "test/quick", b"q")
+    ask_ok(client, "test/quick")
+    heard: queue.SimpleQueue[int] = queue.SimpleQueue()
+    with ExitStack() as opened:
+        relays = [opened.enter_context(Relay(int(endpoint.rpartition(":")[2]))) for _ in range(READERS)]
+        for number, relay in enumerate(relays):
+            config = ZenohConfig(connect=(f"tcp/127.0.0.1:{relay.port}",))
+            session = opened.enter_context(open_session(config, LimitsConfig()))
+            session.declare_subscriber("test/out", partial(_note, heard, number))
+        reached: set[int] = set()
+
+        def all_hear() -> bool:
+            bus.publish("test/out", Answer(b"", MSGPACK))
+            with suppress(queue.Empty):
+                reached.add(heard.get(timeout=0.05))
+            return len(reached) == READERS
+
+        wait_until(all_hear, "all subscriptions are known")
+        for relay in relays:
+            relay.stop_reading()
+        answered_s = published_s = 0.0
+        for _ in range(PUBLISHED):
+            began_s = time.monotonic()
+            bus.publish("test/out", Answer(LARGE, MSGPACK))
+            published_s = max(published_s, time.monotonic() - began_s)
+            began_s = time.monotonic()
+            assert ask_ok(client, "test/quick").payload.to_bytes() == b"q"
+            answered_s = max(answered_s, time.monotonic() - began_s)
+    record_property("figure", f"put {published_s * 1e3:.0f} ms, answer {answered_s * 1e3:.0f} ms at most")
+    assert max(answered_s, published_s) < SOON_S
 
 
 def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Session) -> None:
