@@ -20,6 +20,10 @@ _log = logging.getLogger(__name__)
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 
+NUMBERED, ENDS_BYTES = b"\xa8sequence", 512
+"""How a native frame that has a number is told from what is no frame without decoding it: the name of the field stands
+before those with the data, or behind them. One that is not recognised is counted as lost on its way, too."""
+
 Frame = CameraFrame | LidarFrame | EgoMotion
 
 
@@ -47,10 +51,11 @@ class Decoder:
         """Counters of a stream since the start."""
         return StreamCounts(self._received[stream], self._accepted[stream])
 
-    def overrun(self, stream: str) -> None:
+    def overrun(self, parcel: Parcel) -> None:
         """A sample went before it was decoded. Any thread."""
-        self._losses.add(stream, "overrun")
-        self._overruns.append(stream)
+        self._losses.add(parcel.stream, "overrun")
+        if NUMBERED in parcel.payload[:ENDS_BYTES] or NUMBERED in parcel.payload[-ENDS_BYTES:]:
+            self._overruns.append(parcel.stream)
 
     def frame(self, parcel: Parcel) -> Frame | None:
         """The frame in a sample, or None when it was refused (and counted). Never raises for what a sender sent."""
