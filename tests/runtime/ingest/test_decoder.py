@@ -171,7 +171,7 @@ def test_losses_are_logged_first_and_then_ever_more_rarely(caplog: pytest.LogCap
 
 def test_samples_are_taken_in_the_order_of_arrival_and_the_oldest_go_first() -> None:
     overruns: list[str] = []
-    inbox = Inbox({CAMERA: 2, EGO: 8}, 100, overruns.append)
+    inbox = Inbox({CAMERA: 2, EGO: 8}, 100, lambda parcel: overruns.append(parcel.stream))
     for number, stream in enumerate([CAMERA, EGO, CAMERA, EGO, CAMERA]):
         inbox.put(stream, bytes([number]), "")
     taken = [inbox.take(0.0) for _ in range(5)]
@@ -182,7 +182,7 @@ def test_samples_are_taken_in_the_order_of_arrival_and_the_oldest_go_first() -> 
 
 def test_too_many_bytes_take_from_the_stream_that_holds_most() -> None:
     overruns: list[str] = []
-    inbox = Inbox({CAMERA: 16, LIDAR: 16, EGO: 16}, 100, overruns.append)
+    inbox = Inbox({CAMERA: 16, LIDAR: 16, EGO: 16}, 100, lambda parcel: overruns.append(parcel.stream))
     for number in range(3):
         inbox.put(LIDAR, bytes([number]) * 20, "")
     inbox.put(EGO, b"e", "")
@@ -197,7 +197,7 @@ def test_too_many_bytes_take_from_the_stream_that_holds_most() -> None:
 
 def test_a_sample_larger_than_all_that_may_wait_is_taken_alone() -> None:
     overruns: list[str] = []
-    inbox = Inbox({CAMERA: 16, LIDAR: 16}, 100, overruns.append)
+    inbox = Inbox({CAMERA: 16, LIDAR: 16}, 100, lambda parcel: overruns.append(parcel.stream))
     inbox.put(LIDAR, b"sweep", "")
     inbox.put(CAMERA, bytes(200), "")
     assert overruns == [LIDAR]

@@ -60,12 +60,12 @@ class Inbox:
     stream that holds most, so that large messages on one stream push nothing out of another.
     """
 
-    def __init__(self, depths: dict[str, int], max_bytes: int, on_overrun: Callable[[str], None]) -> None:
+    def __init__(self, depths: dict[str, int], max_bytes: int, on_overrun: Callable[[Parcel], None]) -> None:
         """
         Args:
             depths: by stream, how many samples may wait.
             max_bytes: of all samples that wait. The latest sample of all is taken whatever its size.
-            on_overrun: called with the stream for each sample that had to go.
+            on_overrun: called with each sample that had to go.
         """
         self._waiting = {stream: _Waiting(depth) for stream, depth in depths.items()}
         self._max_bytes = max_bytes
@@ -114,13 +114,12 @@ class Inbox:
                 taken = self._pop()
             return taken
 
-    def _make_room(self, stream: str, size: int) -> list[str]:
-        """Take out what has to go for a sample of `size` bytes; the streams whose it was."""
+    def _make_room(self, stream: str, size: int) -> list[Parcel]:
+        """Take out what has to go for a sample of `size` bytes."""
         gone = []
         own = self._waiting[stream]
         if len(own.parcels) == own.depth:
-            own.take()
-            gone.append(stream)
+            gone.append(own.take())
         while sum(waiting.bytes for waiting in self._waiting.values()) + size > self._max_bytes:
             # The new sample counts as its stream's: who sends the large ones makes room for them.
             held = {name: waiting.bytes + size * (name == stream) for name, waiting in self._waiting.items()}
@@ -128,8 +127,7 @@ class Inbox:
             if not full:
                 break
             fullest = max(full, key=lambda name: held[name])
-            self._waiting[fullest].take()
-            gone.append(fullest)
+            gone.append(self._waiting[fullest].take())
         return gone
 
     def _pop(self) -> Parcel | Call | None:
