@@ -4,6 +4,7 @@ told, and left to people. Sensor time is compressed."""
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -33,7 +34,12 @@ def asked(running: Service, selector: str) -> Reply:
     return ask_one(running.session, selector, PATIENCE_S)
 
 
-def test_a_step_is_noticed_corrected_and_remembered(tmp_path: Path, drive: Drive, router: Router) -> None:
+@pytest.mark.fault(
+    "the mount moves by a degree while the service runs", "it is noticed, corrected and remembered over a restart"
+)
+def test_a_step_is_noticed_corrected_and_remembered(
+    tmp_path: Path, drive: Drive, router: Router, record_property: Callable[[str, object], None]
+) -> None:
     config = stepped_configuration(tmp_path, router, MAPS)
     with service(config, router) as running:
         keys, pair = running.keys, running.pair
@@ -49,6 +55,8 @@ def test_a_step_is_noticed_corrected_and_remembered(tmp_path: Path, drive: Drive
         told = [entry for entry in running.entries("state") if entry["stamp_ns"] is not None]
         assert told[0]["code"] == "healthy", "no false alarm"
         states = {entry["code"]: (entry["stamp_ns"] - step_ns) / NS_PER_S for entry in told}
+        figures = [f"{state} after {at_s:.0f} s" for state, at_s in states.items() if at_s > 0]
+        record_property("figure", ", ".join(figures))
         assert 0 < states["suspect"] <= states["miscalibrated"] < NOTICED_S
         # The window that repairs it may end with the check that was certain.
         assert states["miscalibrated"] <= states["healthy"]

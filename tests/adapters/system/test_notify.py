@@ -8,6 +8,8 @@ import logging
 import socket
 from pathlib import Path
 
+import pytest
+
 from coec.adapters.system.logs import JsonFormatter
 from coec.adapters.system.notify import Notifier
 from coec.runtime.api import metrics
@@ -37,6 +39,7 @@ def test_the_manager_is_told_by_datagrams(tmp_path: Path) -> None:
         assert [manager.recv(100) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1", b"STOPPING=1"]
 
 
+@pytest.mark.fault("the service manager's socket vanishes", "no harm is done")
 def test_no_manager_and_a_vanished_one_do_no_harm(tmp_path: Path) -> None:
     Notifier.from_environment({}).ready()
     Notifier(str(tmp_path / "gone")).ready()

@@ -72,6 +72,9 @@ def service(certificates: Path) -> Iterator[ZenohConfig]:
         yield ZenohConfig(file=file)
 
 
+@pytest.mark.fault(
+    "a second daemon on another computer, through the shipped router with certificates", "it sees the first"
+)
 def test_a_second_daemon_on_another_computer_sees_the_first(service: ZenohConfig) -> None:
     with open_session(service, LIMITS) as here, open_session(service, LIMITS) as there:
         first, second = (Presence(session, service, LIMITS, KEYS, 1) for session in (here, there))
