@@ -80,10 +80,12 @@ def table_of(rows: Sequence[Row], figures: Mapping[Row, str]) -> str:
 
 
 class FaultTable:
-    """The pytest plugin: gathers what marked tests measured, and writes the table at the end of the run."""
+    """The pytest plugin: gathers what marked tests measured, and writes the table after each of them: what was measured
+    before a run is ended stays."""
 
     def __init__(self, table: Path) -> None:
         self._table = table
+        self._rows = marked_rows()
         self._figures: dict[Row, list[str]] = {}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -94,13 +96,19 @@ class FaultTable:
         figures = [str(value) for name, value in report.user_properties if name == "figure"]
         for row in (Row(*json.loads(text)) for text in told):
             self._figures.setdefault(row, []).extend(["FAILED"] if report.failed else figures)
+        if told:
+            self._write()
 
     def pytest_sessionfinish(self) -> None:
-        """Write the table: rows of this run with their figures, all others with the last that is told."""
+        """Write the table, also where no marked test was run: rows whose tests are gone go with them."""
+        self._write()
+
+    def _write(self) -> None:
+        """Rows of this run with their figures, all others with the last that is told."""
         figures = figures_told(self._table)
         for row, measured in self._figures.items():
             figures[row] = "; ".join(dict.fromkeys(measured)) or HELD
-        self._table.write_text(table_of(marked_rows(), figures), encoding="utf-8")
+        self._table.write_text(table_of(self._rows, figures), encoding="utf-8")
 
 
 def rows_of_item(item: pytest.Item) -> list[Row]:

@@ -183,6 +183,7 @@ def test_a_drive_an_end_and_a_restart(tmp_path: Path, drive: Drive, router: Rout
         assert running.terminate() == 0
 
 
+@pytest.mark.fault("the service is killed", "its worker goes with it, and its window is salvaged")
 def test_a_killed_service_takes_its_worker_along_and_its_window_is_salvaged(
     tmp_path: Path, drive: Drive, router: Router
 ) -> None:
@@ -207,6 +208,7 @@ def has_ended(pid: int) -> bool:
         return True
 
 
+@pytest.mark.fault("a thread of the service dies", "the process ends with a code of its own after health has said why")
 def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     tmp_path: Path, drive: Drive, router: Router
 ) -> None:
@@ -229,6 +231,7 @@ def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     assert "broken" in why.text
 
 
+@pytest.mark.fault("steps of the end raise", "the others are done all the same")
 def test_the_end_goes_on_after_steps_that_raise(tmp_path: Path, drive: Drive, router: Router) -> None:
     config = configured(tmp_path, drive, router)
     with service(config, router, warm=False, program=STUBBORN) as running:
@@ -242,6 +245,7 @@ def test_the_end_goes_on_after_steps_that_raise(tmp_path: Path, drive: Drive, ro
     assert list((tmp_path / "state" / "windows").glob("*.mcap")), "the recorder was ended all the same"
 
 
+@pytest.mark.fault("wrong keys, parameters and payloads", "each gets an answer with a code")
 def test_every_wrong_question_gets_an_answer(idle: Service) -> None:
     keys = idle.keys
     root = keys.root
@@ -282,6 +286,9 @@ def test_questions_about_the_whole_vehicle(idle: Service) -> None:
     assert text.endswith("# EOF\n")
 
 
+@pytest.mark.fault(
+    "the state directory is in use by another daemon", "exit code 75, which a service manager tries again"
+)
 def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None:
     command = [*COMMAND, "run", "--config", str(idle.log.with_name("coec.yaml"))]
     second = subprocess.run(command, env=environment(), capture_output=True, timeout=PATIENCE_S, check=False)
@@ -289,6 +296,7 @@ def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None
     assert b"in use by another daemon" in second.stdout
 
 
+@pytest.mark.fault("`insecure: true`", "health and status say so, and no key is shown")
 def test_a_door_for_everybody_is_said_and_keys_are_hidden(tmp_path: Path, drive: Drive, router: Router) -> None:
     path = configured(tmp_path, drive, router)
     config = load_config(path)
@@ -323,6 +331,7 @@ def test_a_second_daemon_of_the_vehicle_leaves_and_says_who_is_there(idle: Servi
     assert idle.status()["pairs"], "the first goes on"
 
 
+@pytest.mark.fault("a damaged state at the start", "health says so, and nominal is served")
 def test_a_damaged_state_is_said_and_nominal_is_served(tmp_path: Path, drive: Drive, router: Router) -> None:
     (tmp_path / "state").mkdir()
     (tmp_path / "state" / "state.json").write_text('{"body":{}}')
@@ -333,6 +342,7 @@ def test_a_damaged_state_is_said_and_nominal_is_served(tmp_path: Path, drive: Dr
         assert running.terminate() == 0
 
 
+@pytest.mark.fault("the depth network is not there", "a clear error")
 def test_a_missing_network_ends_the_service_with_a_clear_error(tmp_path: Path, drive: Drive, router: Router) -> None:
     with service(configured(tmp_path, drive, router, depth="absent.onnx"), router, warm=False) as running:
         assert running.process.wait(PATIENCE_S) == 1

@@ -44,6 +44,7 @@ def never_again() -> set[int]:
     return {int(code) for code in line.split()}
 
 
+@pytest.mark.fault("a bad configuration", "exit code 78: the unit gives up on it, and on nothing else")
 def test_the_unit_gives_up_on_a_bad_configuration_and_on_nothing_else() -> None:
     ends = {CoecError.exit_code, UnavailableError.exit_code, daemon.EXIT_THREAD_DIED, ConfigError.exit_code}
     assert ends & never_again() == {ConfigError.exit_code}
@@ -55,6 +56,7 @@ def test_a_reload_of_the_unit_is_the_signal_that_the_service_heeds() -> None:
     assert re.search(r"^ExecReload=/bin/kill -HUP \$MAINPID$", UNIT, re.MULTILINE)
 
 
+@pytest.mark.fault("the port is taken", "exit code 75: the unit tries again")
 def test_a_port_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
@@ -62,6 +64,7 @@ def test_a_port_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
         assert daemon.run(configured(tmp_path / "state", other.getsockname()[1])) == TEMPFAIL
 
 
+@pytest.mark.fault("a state directory that is read-only or full at the start", "exit code 75: the unit tries again")
 def test_a_disk_that_takes_no_file_may_take_one_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")

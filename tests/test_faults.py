@@ -10,12 +10,21 @@ import pytest
 
 from faults import HELD, NOT_RUN, TABLE, FaultTable, Row, figures_told, marked_rows, table_of
 
+MIN_ROWS = 60
+"""Faults and attacks that were seen, or are to be expected, on a vehicle."""
+
 
 def test_the_table_has_every_marked_row_and_no_other() -> None:
     rows = marked_rows()
     assert TABLE.read_text(encoding="utf-8") == table_of(rows, figures_told()), (
         "run the marked tests: pytest -m '' --faults docs/faults.md"
     )
+
+
+def test_there_are_enough_of_them_and_none_twice() -> None:
+    rows = marked_rows()
+    assert len(rows) >= MIN_ROWS
+    assert len({(row.fault, row.promise) for row in rows}) == len(rows)
 
 
 def test_every_promise_was_tried_and_held() -> None:
@@ -51,6 +60,7 @@ def test_a_run_writes_what_its_tests_measured_and_what_failed(
     marks = [("fault", json.dumps(row)), *(("figure", figure) for figure in figures)]
     report = pytest.TestReport(row.test, ("", 0, ""), {}, outcome, None, "call", user_properties=marks)
     writer.pytest_runtest_logreport(report)
+    assert figures_told(tmp_path / "faults.md")[row] == told, "also where the run is ended now"
     writer.pytest_sessionfinish()
     assert figures_told(tmp_path / "faults.md")[row] == told
 

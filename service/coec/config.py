@@ -265,10 +265,10 @@ class VerdictConfig(Stage):
         "score; above: the camera moved within the window (fused)",
     )
     max_intrinsics_certainty: float = Field(
-        default=1.75,
+        default=2.0,
         gt=0,
         description="certainty with which another lens may explain the window better, half a standard deviation each; "
-        "above: the intrinsics are off (fused)",
+        "from 1 on σ grows by what that lens moves, above this the intrinsics are off (fused)",
     )
     held_translation_sigma_m: float = Field(
         default=0.01,

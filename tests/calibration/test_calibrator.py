@@ -123,6 +123,7 @@ class Shuffled:
         return self._maps.infer(self._other[frame.stamp_ns])
 
 
+@pytest.mark.fault("depth maps of other frames", "the result is not believed")
 def test_depth_of_other_frames_is_not_believed(street: Window, stereo: DepthModel) -> None:
     verdict = solve(street, Shuffled(stereo, street)).verdict
     assert verdict.decision is Decision.FAILED
@@ -212,6 +213,7 @@ def knocked(window: Window, first_late: int, turn_deg: float) -> Window:
     return replace(window, pairs=(*window.pairs[:first_late], *late))
 
 
+@pytest.mark.fault("a knock in the middle of a window", "the window is refused, and says when it was")
 def test_a_window_that_holds_a_knock_is_refused_and_says_when_it_was(sharp_street: Window, stereo: DepthModel) -> None:
     estimate = solve(knocked(sharp_street, 7, 2.0), stereo, CalibrationConfig())
     assert estimate.verdict.decision is Decision.FAILED

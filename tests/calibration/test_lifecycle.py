@@ -164,6 +164,7 @@ def test_the_first_accepted_estimate_is_served_to_the_last_bit() -> None:
     assert HEALTHY.reasons == ()
 
 
+@pytest.mark.fault("an estimate that failed", "it is never served")
 @pytest.mark.parametrize("before", [initial_state(RIG), HEALTHY])
 def test_a_failed_estimate_is_never_served(before: PairState) -> None:
     state = solved(before, estimate(3.0, 300, Decision.FAILED))
@@ -304,6 +305,7 @@ def test_a_single_window_that_differs_moves_nothing_and_a_second_one_decides() -
 # --- the monitor ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.fault("a single bad check", "it decides nothing")
 def test_one_bad_check_decides_nothing() -> None:
     state = watched(HEALTHY, *clear_from(110, 3), check(125, flagged=True), *clear_from(130, 2))
     assert state.health is HealthState.HEALTHY
@@ -390,6 +392,7 @@ def test_a_cause_in_the_data_degrades_with_its_own_reason_and_passes(code: str) 
     assert watched(state, *clear_from(300, 6)).health is HealthState.HEALTHY
 
 
+@pytest.mark.fault("bad data while the mount is known to be wrong", "it stays red")
 def test_bad_data_do_not_hide_a_red_state() -> None:
     red = watched(HEALTHY, *flagged_from(200, 3))
     dirty = watched(red, *[check(300 + 5 * i, cause="lens_dirty") for i in range(4)])
@@ -407,6 +410,7 @@ def test_a_monitor_that_sees_nothing_wrong_makes_no_unproven_extrinsic_healthy()
 # --- policy -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.fault("an estimate that steps beyond what the policy allows", "it waits for a person")
 def test_a_step_beyond_the_limits_waits_for_a_person() -> None:
     state = solved(initial_state(RIG), estimate(11.0))
     assert state.health is HealthState.MISCALIBRATED
@@ -479,6 +483,7 @@ def test_commissioning_confirms_what_is_served_and_nothing_else() -> None:
 # --- time -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.fault("silence", "nothing stays healthy that was not looked at")
 def test_what_was_not_looked_at_for_long_is_stale_not_healthy() -> None:
     assert aged(HEALTHY, DAY_S, DAY_S) is HEALTHY
     state = aged(HEALTHY, DAY_S + 1.0, DAY_S)

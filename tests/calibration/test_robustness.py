@@ -85,6 +85,11 @@ def confidence(estimate: Estimate | None) -> float:
 
 
 # ------------------------------------------------------------------------------------------------------- short form
+
+
+@pytest.mark.fault(
+    "windows with fog, blur, wrong stamps, torn clouds, foreign pictures", "never a wrong pose that is accepted"
+)
 @pytest.mark.parametrize("scenario", SHORT)
 def test_on_the_simulated_street(sharp_street: Window, stereo: DepthModel, scenario: str) -> None:
     check(solve(mutated(sharp_street, scenario), stereo, GREY, STARTS_DEG[1]))

@@ -210,6 +210,7 @@ def test_a_step_is_noticed_by_the_first_window_and_taken_at_the_second(rng: np.r
     assert absorb(track, second, STILL).step is StepState.NONE
 
 
+@pytest.mark.fault("a single wrong window", "what is served does not move")
 def test_one_outlier_does_not_move_the_track(rng: np.random.Generator) -> None:
     windows = drawn(rng, 12)
     outlier = about(TRUTH, np.array([0.3, -0.2, 0.1, 0.4, 0.0, 0.0]), SIGMA, 5 * PERIOD_NS)

@@ -85,6 +85,7 @@ def test_a_saddle_is_not_a_maximum() -> None:
     ]
 
 
+@pytest.mark.fault("a figure that is no number", "it passes no limit")
 @pytest.mark.parametrize("at_least", [True, False])
 def test_what_is_not_a_number_never_passes(at_least: bool) -> None:
     assert not Metric("any", float("nan"), 0.0, at_least).passed

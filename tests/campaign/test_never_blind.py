@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -127,7 +127,7 @@ def run(watch: Watch, truth: Truth, flag: Path, course: Course) -> None:
     course.state = watch.ask(watch.keys.status)["state"]
 
 
-def test_never_healthy_for_long_while_wrong(tmp_path: Path) -> None:
+def test_never_healthy_for_long_while_wrong(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     recording = DRIVE.recorded(tmp_path)
     truth = Truth(recording)
     flag = tmp_path / "rubbish"
@@ -159,4 +159,5 @@ def test_never_healthy_for_long_while_wrong(tmp_path: Path) -> None:
         "changes": {name: len(transitions(samples, truth.second)) for name, samples in course.phases.items()},
         "samples": {name: as_rows(samples) for name, samples in course.phases.items()},
     }
+    record_property("figure", f"for {max(blind.values()):.3g} s at most; recovers {recovery}")
     publish("never_blind", tmp_path, figures, details)

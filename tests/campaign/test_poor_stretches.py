@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ def drives() -> list[Drive]:
     return chosen
 
 
-def test_a_right_mount_is_not_accused(tmp_path: Path) -> None:
+def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     found: dict[str, list[Transition]] = {}
     entries: dict[str, Any] = {}
     most_per_minute, worst_deg = 0, 0.0
@@ -76,6 +77,7 @@ def test_a_right_mount_is_not_accused(tmp_path: Path) -> None:
         "transitions": {name: [_row(one) for one in told] for name, told in found.items()},
         "history": entries,
     }
+    record_property("figure", f"accused {len(accused)} times in {len(found)} drives, {worst_deg:.2f} deg off at most")
     publish("poor_stretches", tmp_path, figures, details)
 
 

@@ -63,6 +63,7 @@ def test_deliberate_error_with_json(coec: Coec) -> None:
     assert "does not exist" in outcome.document["error"]["message"]
 
 
+@pytest.mark.fault("a fault of our own in a command", "exit code 70 with a traceback")
 def test_fault_of_our_own_is_70_with_traceback(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> int:
         raise ZeroDivisionError

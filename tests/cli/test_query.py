@@ -149,6 +149,7 @@ def test_what_is_no_question_is_a_usage_error_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.fault("the health check of the container image", "its command works as it is written")
 def test_the_health_check_of_the_image_asks_the_service_of_its_configuration(
     coec: Coec, vehicle: str, endpoint: str, tmp_path: Path
 ) -> None:

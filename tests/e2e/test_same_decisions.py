@@ -54,6 +54,7 @@ def told_of(running: Service, *kinds: str) -> dict[str, Any]:
     }
 
 
+@pytest.mark.fault("killed in the middle of a solve", "the decisions are those of an undisturbed replay")
 def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(
     tmp_path: Path, drive: Drive, router: Router
 ) -> None:

@@ -49,6 +49,9 @@ def commanded(running: Service, name: str, credentials: Credentials) -> str:
     "secrets in endpoints, in the Zenoh file and in private keys, over a whole life with a moved mount and a restart",
     "none is in any reply, log, command line, window, evidence or state",
 )
+@pytest.mark.fault(
+    "the mount moves by a degree while the service runs", "it is noticed, corrected and remembered over a restart"
+)
 def test_a_step_is_noticed_corrected_and_remembered(
     tmp_path: Path,
     drive: Drive,
@@ -72,6 +75,8 @@ def test_a_step_is_noticed_corrected_and_remembered(
         told = [entry for entry in running.entries("state") if entry["stamp_ns"] is not None]
         assert told[0]["code"] == "healthy", "no false alarm"
         states = {entry["code"]: (entry["stamp_ns"] - step_ns) / NS_PER_S for entry in told}
+        figures = [f"{state} after {at_s:.0f} s" for state, at_s in states.items() if at_s > 0]
+        record_property("figure", ", ".join(figures))
         assert 0 < states["suspect"] <= states["miscalibrated"] < NOTICED_S
         # The window that repairs it may end with the check that was certain.
         assert states["miscalibrated"] <= states["healthy"]

@@ -54,82 +54,108 @@ def held(tmp_path: Path, record_property: Callable[[str, object], None]) -> Repl
     return replay
 
 
+@pytest.mark.fault("a camera frame in msgpack, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_camera(held: Replay) -> None:
     held("camera")
 
 
+@pytest.mark.fault("a LiDAR frame in msgpack, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_lidar(held: Replay) -> None:
     held("lidar")
 
 
+@pytest.mark.fault("ego-motion in msgpack, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_ego(held: Replay) -> None:
     held("ego")
 
 
+@pytest.mark.fault("a ROS message of any type, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_cdr(held: Replay) -> None:
     held("cdr")
 
 
+@pytest.mark.fault("a PCD file, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_pcd(held: Replay) -> None:
     held("pcd")
 
 
+@pytest.mark.fault("a `.npy` file, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_npy(held: Replay) -> None:
     held("npy")
 
 
+@pytest.mark.fault("an `.npz` file, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_npz(held: Replay) -> None:
     held("npz")
 
 
+@pytest.mark.fault("a `dataset.yaml`, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_manifest(held: Replay) -> None:
     held("manifest")
 
 
+@pytest.mark.fault(
+    "a calibration or time stamps of KITTI, of any bytes", "a value or an error of ours, within 5 s and 500 MB"
+)
 def test_kitti(held: Replay) -> None:
     held("kitti")
 
 
+@pytest.mark.fault("a ROS 2 bag in MCAP, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_bag(held: Replay) -> None:
     held("bag")
 
 
+@pytest.mark.fault("a recorded window, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_window(held: Replay) -> None:
     held("window")
 
 
+@pytest.mark.fault("a key and its parameters, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_selector(held: Replay) -> None:
     held("selector")
 
 
+@pytest.mark.fault("a command and its sender, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_command(held: Replay) -> None:
     held("command")
 
 
+@pytest.mark.fault("a state file, checksums right, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_state(held: Replay) -> None:
     held("state")
 
 
+@pytest.mark.fault(
+    "the books of the history, hashes right, of any bytes", "a value or an error of ours, within 5 s and 500 MB"
+)
 def test_books(held: Replay) -> None:
     held("books")
 
 
+@pytest.mark.fault(
+    "a commissioned baseline, checksum right, of any bytes", "a value or an error of ours, within 5 s and 500 MB"
+)
 def test_baseline(held: Replay) -> None:
     held("baseline")
 
 
+@pytest.mark.fault("a configuration in YAML, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_configuration(held: Replay) -> None:
     held("configuration")
 
 
+@pytest.mark.fault("a Zenoh file in JSON5, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_zenoh(held: Replay) -> None:
     held("zenoh")
 
 
+@pytest.mark.fault("the card of a depth network, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_model_card(held: Replay) -> None:
     held("model_card")
 
 
+@pytest.mark.fault("an answer of the worker, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_worker(held: Replay) -> None:
     held("worker")
 

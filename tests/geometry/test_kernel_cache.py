@@ -53,6 +53,7 @@ def test_without_a_usable_cache_it_lies_in_the_temporary_folder(
     assert kernel_cache_directory(package) == directory
 
 
+@pytest.mark.fault("a cache of compiled kernels that others may write to", "it is not used")
 def test_a_directory_that_others_may_write_to_is_not_used(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

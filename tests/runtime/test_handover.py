@@ -45,6 +45,7 @@ def test_what_the_work_raises_is_raised_where_it_was_asked_for() -> None:
         handed.result(1.0)
 
 
+@pytest.mark.fault("a flood of `calibrate`", "it is refused, and pairing is not held up")
 def test_a_flood_of_commands_is_refused_and_answers_are_not_held_up() -> None:
     mailbox = Mailbox()
     asking = [threading.Thread(target=_asked, args=(mailbox,)) for _ in range(COMMANDS_WAITING)]

@@ -3,6 +3,7 @@ on restarts, and people have the last word."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,10 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path / "state")
 
 
-def test_a_step_is_noticed_within_a_minute_and_corrected_by_the_next_window(bench: Bench) -> None:
+@pytest.mark.fault("the mount is knocked", "it is noticed within a minute, and corrected by the next window")
+def test_a_step_is_noticed_within_a_minute_and_corrected_by_the_next_window(
+    bench: Bench, record_property: Callable[[str, object], None]
+) -> None:
     bench.drive(BEGIN_S, END_S)
     states = {entry.code: (entry.stamp_ns or 0) / S - STEP_S for entry in bench.entries("state")}
     assert bench.decisions() == [
@@ -38,6 +42,7 @@ def test_a_step_is_noticed_within_a_minute_and_corrected_by_the_next_window(benc
         ("extrinsic", "estimated"),
         ("state", "healthy"),
     ]
+    record_property("figure", ", ".join(f"{state} after {at_s:.0f} s" for state, at_s in states.items() if at_s > 0))
     assert 0 < states["suspect"] < states["miscalibrated"] < 30
     assert states["healthy"] < 60
     np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
@@ -55,6 +60,7 @@ def test_the_same_drive_gives_the_same_decisions(bench: Bench, tmp_path: Path) -
     assert timeless[0] == timeless[1]
 
 
+@pytest.mark.fault("a worker that is slow", "it changes no decision")
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_worker_that_takes_its_time_changes_no_decision(bench: Bench, tmp_path: Path, seed: int) -> None:
     slow = Bench(tmp_path / "slow", worker=SlowWorker)
@@ -96,6 +102,7 @@ def test_a_stream_that_has_waited_for_too_long_goes_on_and_says_so(tmp_path: Pat
     assert bench.losses["monitor", "not_awaited"] == waiting
 
 
+@pytest.mark.fault("a restart in the middle of a drive", "it changes no decision")
 @pytest.mark.parametrize("restart_s", [3, 57, 100, 104, 109, 112, 116, 125, 160])
 def test_a_restart_in_the_middle_changes_no_decision(bench: Bench, tmp_path: Path, restart_s: int) -> None:
     bench.drive(BEGIN_S, END_S)
@@ -272,6 +279,7 @@ def test_every_check_can_be_read_afterwards(bench: Bench) -> None:
     assert bench.answers.history(0, 2**63 - 1, 1000).checks == history.checks
 
 
+@pytest.mark.fault("a monitor that cannot look", "it is told, and nothing stays green")
 def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: Bench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
     assert bench.answers.health_reply.state == "healthy"
@@ -323,6 +331,7 @@ def test_a_baseline_of_another_network_is_refused_at_the_first_check(bench: Benc
     assert bench.answers.health_reply.drift is None
 
 
+@pytest.mark.fault("bad pictures: dark, blurred, covered", "degraded with the reason; the extrinsic does not move")
 @pytest.mark.parametrize("cause", ["lens_dirty", "camera_frozen", "lidar_beams_lost", "dark"])
 def test_bad_data_are_degraded_with_their_reason_and_move_nothing(bench: Bench, cause: str) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
@@ -336,6 +345,7 @@ def test_bad_data_are_degraded_with_their_reason_and_move_nothing(bench: Bench, 
     assert bench.health == "healthy"
 
 
+@pytest.mark.fault("a history that was tampered with", "health says so, and it is kept aside")
 def test_a_chain_that_was_tampered_with_is_told_and_kept_aside(bench: Bench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 90)
     path = bench.folder / "history-front.jsonl"
@@ -352,6 +362,7 @@ def test_a_chain_that_was_tampered_with_is_told_and_kept_aside(bench: Bench) -> 
     assert bench.store.damage is None
 
 
+@pytest.mark.fault("a forged state", "it is never served, and health says so")
 def test_a_forged_state_is_never_served_and_said_in_health(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "state")
     bench.drive(BEGIN_S, STEP_S)

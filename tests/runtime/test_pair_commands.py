@@ -111,6 +111,7 @@ def test_each_command_in_each_state(tmp_path: Path, situation: str, order: int) 
         assert bench.store.state.frozen is (code == "held")
 
 
+@pytest.mark.fault("a `calibrate` that is refused as busy", "it changes nothing")
 def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 30)
@@ -124,6 +125,7 @@ def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, mon
     assert bench.answers.status().commands == {"calibrate_refused": 1}
 
 
+@pytest.mark.fault("more commands than a book of the history holds", "`rollback` and `commission` find what they need")
 def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limit, "BURST", 10_000)
     bench = Bench(tmp_path / "state")
@@ -146,6 +148,7 @@ def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, m
     assert bench.do("commission") == "commissioning"
 
 
+@pytest.mark.fault("commands faster than a person gives them", "they are answered, and do nothing")
 def test_commands_that_come_too_fast_are_answered_and_do_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,6 +179,7 @@ def route_of(bench: Bench, command: str) -> Route:
     return route
 
 
+@pytest.mark.fault("a command whose sender has given up", "it is not done")
 @pytest.mark.parametrize("name", ["hold", "calibrate"])
 def test_what_its_sender_has_given_up_on_is_not_done(tmp_path: Path, name: str) -> None:
     bench = Bench(tmp_path / "state")

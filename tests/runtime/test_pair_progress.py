@@ -29,6 +29,7 @@ def test_a_drive_played_three_times_is_looked_at_each_time(bench: Bench) -> None
     assert ("monitor", "not_awaited") not in bench.losses
 
 
+@pytest.mark.fault("stamps an hour ahead, then back", "the old time goes on at once")
 def test_after_stamps_an_hour_ahead_the_old_time_goes_on_at_once(bench: Bench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 30)
     bench.drive(BEGIN_S + 3600, BEGIN_S + 3660)
@@ -68,6 +69,7 @@ def test_while_the_vehicle_stands_it_is_checked_and_nothing_adds_up(bench: Bench
     assert "miscalibrated" in [entry.code for entry in bench.entries("state")]
 
 
+@pytest.mark.fault("windows that come to nothing", "three in a row are said in health")
 def test_a_window_that_is_lost_is_answered_for_and_three_in_a_row_are_said(bench: Bench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 45)
     bench.recorder.loses = True
@@ -89,6 +91,7 @@ def test_a_window_that_comes_to_nothing_is_no_check(bench: Bench) -> None:
     assert (told.state, told.age_s, told.evaluated_ns) == ("unknown", None, None)
 
 
+@pytest.mark.fault("checks that never complete, for whatever reason", "after three periods nothing is green")
 def test_without_a_completed_check_in_three_periods_nothing_is_green(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,6 +113,7 @@ def test_without_a_completed_check_in_three_periods_nothing_is_green(
     assert (stuck.state, stuck.reasons[-1].code) == ("degraded", "service_stuck")
 
 
+@pytest.mark.fault("a state from the future", "it is not green")
 @pytest.mark.parametrize("setback_s", [400 * 86_400, -100 * 86_400, -3600])
 def test_a_state_from_another_time_is_not_green(bench: Bench, monkeypatch: pytest.MonkeyPatch, setback_s: int) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)

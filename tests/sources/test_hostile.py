@@ -46,6 +46,7 @@ HEADERS = {
 }
 
 
+@pytest.mark.fault("a damaged or hostile `.npy` or `.npz`", "an error of ours that names the file")
 @pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS)
 @pytest.mark.parametrize("suffix", ["npy", "npz"])
 def test_the_header_of_a_numpy_file_may_say_anything(tmp_path: Path, suffix: str, header: str) -> None:
@@ -56,6 +57,7 @@ def test_the_header_of_a_numpy_file_may_say_anything(tmp_path: Path, suffix: str
         load_cloud(0, "lidar", path)
 
 
+@pytest.mark.fault("an `.npz` that unpacks to gigabytes", "it is refused before it is unpacked")
 def test_an_archive_that_promises_more_than_it_holds_is_refused_before_it_is_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -84,6 +86,7 @@ def test_doubles_that_no_float_holds_go_with_their_point(tmp_path: Path) -> None
     assert load_cloud(0, "lidar", path).xyz_m.tolist() == [[1, 2, 3]]
 
 
+@pytest.mark.fault("a PCD with fields `_1 _`", "it is read")
 @pytest.mark.parametrize(
     "fields", ["_1 _ x y z", "_ _0 x y z", "_ _ x y z", "_1 _2 x y z", "x x x y z", "_0 _ x _ y z"]
 )
@@ -94,6 +97,7 @@ def test_padding_fields_may_have_any_name(fields: str) -> None:
     assert parse_pcd(data)["xyz"].tolist() == [places]
 
 
+@pytest.mark.fault("the header of a PCD that promises gigabytes", "it is refused without their memory")
 @pytest.mark.parametrize(
     "data",
     [
@@ -125,6 +129,7 @@ def test_no_header_of_a_pcd_makes_it_large(data: bytes) -> None:
         tracemalloc.stop()
 
 
+@pytest.mark.fault("a compressed PCD that grows a hundredfold", "memory stays within its bound")
 def test_much_of_a_small_compressed_file_stays_within_its_bound() -> None:
     """References of 264 bytes for three of the file: the most that LZF can."""
     points = 2 * MB // 12
@@ -151,6 +156,7 @@ def test_text_rows_are_read_in_blocks_with_the_right_place_of_a_complaint(monkey
         parse_pcd(head + "\n".join(rows[:49]).encode() + b"\n\n")
 
 
+@pytest.mark.fault("a cloud of gigabytes", "it is not read")
 @pytest.mark.parametrize("suffix", ["bin", "pcd", "npy"])
 def test_files_larger_than_a_file_may_be_are_not_read(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"cloud.{suffix}"
@@ -185,6 +191,9 @@ YAML = {
 }
 
 
+@pytest.mark.fault(
+    "YAML nested 100,000 deep, a billion laughs, numbers of 5,000 digits", "an error of ours that names the file"
+)
 @pytest.mark.parametrize("text", YAML.values(), ids=YAML)
 def test_yaml_is_refused_by_an_error_of_ours(tmp_path: Path, text: str) -> None:
     path = tmp_path / "dataset.yaml"

@@ -74,6 +74,7 @@ def test_unknown_network_without_card_says_what_to_write(tmp_path: Path) -> None
         find_card(tmp_path / "net.onnx", "0" * 64)
 
 
+@pytest.mark.fault("another network under the name of a known one", "it is refused by its sha256")
 def test_card_of_another_file_is_refused(tmp_path: Path) -> None:
     _card(tmp_path, CARD + f"sha256: {'a' * 64}\n")
     with pytest.raises(ModelError, match=f"sha256 {'b' * 64}, but its card tiny is for {'a' * 64}"):

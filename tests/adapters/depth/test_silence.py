@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 INFER = """
 import numpy as np
 from coec.adapters.depth.maps import open_depth
@@ -15,6 +17,7 @@ open_depth(DepthConfig(), LimitsConfig())
 """
 
 
+@pytest.mark.fault("an inference library that reports to its vendor", "opening a network leaves nothing to be sent")
 def test_opening_a_network_leaves_no_report_to_be_sent(tmp_path: Path) -> None:
     quiet = {name: value for name, value in os.environ.items() if not name.startswith(("ORT_", "XDG_"))}
     subprocess.run([sys.executable, "-c", INFER], env={**quiet, "HOME": str(tmp_path)}, check=True, timeout=120)

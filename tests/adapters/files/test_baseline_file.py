@@ -57,6 +57,7 @@ def test_absent(tmp_path: Path) -> None:
     assert load_baseline(tmp_path / "rig.json", "left") is None
 
 
+@pytest.mark.fault("a digit of a commissioned baseline changed", "it is refused by its checksum")
 def test_a_flipped_digit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "rig.json"
     save_baseline(path, a_baseline())
@@ -83,6 +84,9 @@ def test_a_matrix_that_is_not_rigid_is_refused() -> None:
         baseline_from_json(document)
 
 
+@pytest.mark.fault(
+    "a forged baseline with the right checksum", "it is refused where its form is not what the monitor compares"
+)
 @pytest.mark.parametrize(("part", "short"), [("gradient", [[1.0], []]), ("bands", [1.0]), ("sectors", [])])
 def test_a_scene_of_other_parts_than_the_monitor_looks_at_is_refused(part: str, short: object) -> None:
     document = baseline_to_json(a_baseline())

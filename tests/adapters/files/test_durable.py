@@ -169,6 +169,7 @@ def test_what_somebody_else_took_is_written_again_though_the_disk_refuses_at_fir
             assert (root / "log").read_bytes() == b"one\ntwo\nthree\nfour\n"
 
 
+@pytest.mark.fault("a power cut at any byte of a line that is appended", "no line that was acknowledged is lost")
 def test_a_power_cut_takes_no_line_that_was_written(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(root, monkeypatch)
     lines: list[bytes] = []
@@ -181,6 +182,9 @@ def test_a_power_cut_takes_no_line_that_was_written(root: Path, monkeypatch: pyt
         assert [int(line) for line in whole][-1:] >= list(cut.acknowledged)[-1:]
 
 
+@pytest.mark.fault(
+    "a disk that stays full for long", "memory stays bounded, and the newest is written when there is room"
+)
 def test_a_disk_that_stays_full_gets_the_newest_in_the_end(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(root, monkeypatch)
     disk.refuses = EVERYTHING
@@ -206,6 +210,7 @@ def test_a_file_that_cannot_be_read_is_written_anew(root: Path) -> None:
     assert (root / "log").read_bytes() == b"one\n"
 
 
+@pytest.mark.fault("a disk that refuses calls in any order", "no line is lost, torn or out of order")
 @pytest.mark.parametrize("length", [1, 2, 5, 40])
 def test_whatever_is_refused_no_line_is_lost_torn_or_out_of_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int

@@ -40,6 +40,7 @@ def test_what_was_saved_last_is_loaded(tmp_path: Path) -> None:
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["state.json", "state.json.previous"]
 
 
+@pytest.mark.fault("any bit of the state file flipped", "it is found, and the previous good copy is served")
 def test_any_flipped_bit_is_found_and_the_previous_copy_served(tmp_path: Path) -> None:
     path = saved(tmp_path, FIRST, SECOND)
     good = path.read_bytes()
@@ -53,6 +54,7 @@ def test_any_flipped_bit_is_found_and_the_previous_copy_served(tmp_path: Path) -
             assert len(loaded.damage) == 1
 
 
+@pytest.mark.fault("a state file cut off at any byte", "it is found; nothing is served without a good copy")
 def test_any_cut_is_found_and_nothing_is_served_without_a_good_copy(tmp_path: Path) -> None:
     path = saved(tmp_path, FIRST)
     good = path.read_bytes()
@@ -81,6 +83,7 @@ def test_another_schema_version_is_named(tmp_path: Path) -> None:
     assert "schema version" in loaded.damage[0]
 
 
+@pytest.mark.fault("a state that a newer version of the service wrote", "it is kept aside, not overwritten")
 def test_a_state_of_a_newer_service_is_kept_aside_and_not_overwritten(tmp_path: Path) -> None:
     path = saved(tmp_path, FIRST)
     newer = path.read_bytes().replace(b'"schema_version":1', b'"schema_version":2')
@@ -121,6 +124,7 @@ def test_a_save_waits_until_what_cannot_be_used_is_kept_aside(tmp_path: Path, mo
     assert (tmp_path / "state.json.broken").read_bytes() == b"junk"
 
 
+@pytest.mark.fault("a state file of gigabytes", "it is not read whole")
 def test_a_file_larger_than_any_state_is_not_read_whole(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
     with path.open("wb") as stream:
@@ -178,6 +182,7 @@ def test_a_failed_write_is_an_error_and_keeps_the_old_copy(tmp_path: Path, monke
     assert [entry.name for entry in tmp_path.iterdir()] == ["state.json"]
 
 
+@pytest.mark.fault("a power cut at any byte of a save of the state", "what was saved last, or is being saved, is there")
 def test_a_power_cut_at_any_byte_of_the_saves_leaves_what_was_saved_last_or_is_being_saved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -198,6 +203,9 @@ def test_a_power_cut_at_any_byte_of_the_saves_leaves_what_was_saved_last_or_is_b
     assert count > 400
 
 
+@pytest.mark.fault(
+    "a disk that refuses any call of a save of the state", "a good copy is there, and the next save works"
+)
 @pytest.mark.parametrize("length", [1, 3])
 def test_whatever_the_disk_refuses_a_good_copy_is_there_and_the_next_save_works(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int

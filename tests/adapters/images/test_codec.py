@@ -93,6 +93,7 @@ def test_segments_before_the_frame_header_and_fill_bytes_are_walked() -> None:
     assert reason_of(data[: len(data) // 2 + len(thumbnail) // 2]) == "image_truncated"
 
 
+@pytest.mark.fault("an image that was cut off on its way", "it is refused, never filled with grey")
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9, 0.99])
 @pytest.mark.parametrize("encode", [encode_jpeg, encode_png])
 def test_a_truncated_image_is_refused(encode: Encoder, share: float) -> None:
@@ -110,9 +111,13 @@ def test_padding_behind_the_end_is_tolerated(encode: Encoder) -> None:
     assert decode_bgr(image, LIMITS).shape == (120, 160, 3)
 
 
-def test_a_small_png_that_would_inflate_to_gigabytes_is_refused_by_its_header() -> None:
+@pytest.mark.fault("a PNG of 48 kB that inflates to gigabytes", "it is refused by its header")
+def test_a_small_png_that_would_inflate_to_gigabytes_is_refused_by_its_header(
+    record_property: Callable[[str, object], None],
+) -> None:
     bomb = SIGNATURE + chunk(b"IHDR", struct.pack(">IIBBBBB", 20_000, 20_000, 16, 6, 0, 0, 0))
     bomb += chunk(b"IDAT", zlib.compress(bytes(48_000_000), 9)) + chunk(b"IEND", b"")
+    record_property("figure", f"{len(bomb)} bytes that claim {20_000 * 20_000 * 8 / 1e9:.1f} GB")
     assert len(bomb) < 50_000
 
     assert reason_of(bomb) == "image_too_large"
@@ -129,6 +134,9 @@ def test_a_jpeg_that_claims_a_huge_size_is_refused() -> None:
     assert reason_of(bytes(data)) == "image_too_large"
 
 
+@pytest.mark.fault(
+    "a small JPEG of thousands of scans that keeps a decoder busy for hours", "it is refused before it is decoded"
+)
 def test_a_jpeg_of_many_scans_is_refused() -> None:
     data = encode_jpeg(scene())
 
@@ -194,6 +202,7 @@ def test_no_bytes_raise_anything_else(tail: bytes, head: bytes) -> None:
         probe(head + tail, LIMITS)
 
 
+@pytest.mark.fault("flipped bits in an image", "a picture or a refusal with its reason")
 @given(st.data())
 def test_flipped_bits_raise_nothing_else(data: st.DataObject) -> None:
     whole = st.sampled_from([encode_jpeg(scene(24, 32)), encode_png(scene(24, 32))])

@@ -8,7 +8,7 @@ import sys
 import textwrap
 import tracemalloc
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -317,6 +317,7 @@ def topics(path: Path) -> list[str]:
         return [channel.topic for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages()]
 
 
+@pytest.mark.fault("a result for a window that was damaged meanwhile", "the window is left as it is")
 def test_a_result_for_a_damaged_window_leaves_it_alone(tmp_path: Path) -> None:
     path = tmp_path / "w.mcap"
     a_window(path)
@@ -420,13 +421,16 @@ def test_a_window_that_another_tool_recompressed_and_sorted_is_still_the_window(
 # --- damage ---------------------------------------------------------------------------------------------------
 
 
-def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
+@pytest.mark.fault("any bit of a recorded window flipped", "it is noticed")
+def test_every_flipped_bit_is_noticed(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     path = tmp_path / "w.mcap"
     a_window(path, [a_pair(0, points=5)])
     write_result(path, a_result())
     whole = path.read_bytes()
     rng = np.random.default_rng(0)
-    for at in sorted({*range(60), *range(len(whole) - 400, len(whole)), *rng.integers(0, len(whole), 400).tolist()}):
+    places = sorted({*range(60), *range(len(whole) - 400, len(whole)), *rng.integers(0, len(whole), 400).tolist()})
+    record_property("figure", f"{len(places)} of {len(places)} bits")
+    for at in places:
         damaged = bytearray(whole)
         damaged[at] ^= 1 << int(rng.integers(8))
         path.write_bytes(damaged)
@@ -434,6 +438,7 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
             read_window(path)
 
 
+@pytest.mark.fault("a recorded window cut off at any byte", "it is noticed, and said where")
 def test_every_cut_is_noticed_and_says_so(tmp_path: Path) -> None:
     path = tmp_path / "w.mcap"
     a_window(path, [a_pair(0, points=5)])
@@ -491,6 +496,7 @@ def zstd_bomb(size: int) -> bytes:
     return b"".join(compressor.compress(piece) for piece in one_record(size)) + compressor.flush()
 
 
+@pytest.mark.fault("a window of 10 kB that unpacks to 600 MB", "it is refused before it is unpacked")
 @pytest.mark.parametrize("compression", ["lz4", "zstd"])
 @pytest.mark.parametrize("honest", [True, False])
 def test_a_chunk_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, compression: str, honest: bool) -> None:
@@ -508,6 +514,7 @@ def test_a_chunk_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, compressi
     assert peak < 20_000_000
 
 
+@pytest.mark.fault("a window of many small bombs", "they are bounded together")
 def test_many_chunks_that_are_small_by_themselves_are_refused_together(tmp_path: Path) -> None:
     packed = lz4_bomb(20_000_000)
     path = tmp_path / "bombs.mcap"
@@ -571,8 +578,11 @@ def part_file(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[int
     return data, sizes
 
 
+@pytest.mark.fault(
+    "the power goes while a window is recorded", "every pair that was written whole is saved at the next start"
+)
 def test_salvage_saves_every_whole_pair_of_a_part_cut_anywhere(
-    tmp_path: Path, part_file: tuple[bytes, list[int]]
+    tmp_path: Path, part_file: tuple[bytes, list[int]], record_property: Callable[[str, object], None]
 ) -> None:
     data, sizes = part_file
     part = tmp_path / ("w.mcap" + PART_SUFFIX)
@@ -593,6 +603,7 @@ def test_salvage_saves_every_whole_pair_of_a_part_cut_anywhere(
             assert_same_pair(got, a_pair(index, points=5000))
         recorded.path.unlink()
     counts = [pairs for _, pairs in saved_at]
+    record_property("figure", f"{len(counts)} cuts")
     assert counts == sorted(counts)
     # The last pair may still lie in an open chunk (CHUNK_BYTES); all before it are on the disk.
     for written, size in enumerate(sizes[1:], start=1):
@@ -663,6 +674,7 @@ print(*outcomes, *sorted(path.name for path in folder.iterdir()))
 """
 
 
+@pytest.mark.fault("a disk that becomes full at any point of a window", "a clear error, and no half file is left")
 @pytest.mark.parametrize("limit", [100, 3_000, 20_000])
 def test_a_full_disk_is_a_recording_error_and_leaves_nothing_behind(tmp_path: Path, limit: int) -> None:
     here = Path(__file__).resolve()

@@ -164,6 +164,7 @@ def test_a_time_before_the_stamp() -> None:
     assert frame.time_offset_s.tolist() == pytest.approx([-0.05, 0.05], abs=1e-6)
 
 
+@pytest.mark.fault("points timed by another clock than their sweep", "the sweep is refused with its reason")
 def test_a_time_of_another_clock_is_refused() -> None:
     payload = packed([*XYZ, ("timestamp", "<f8", [SEC - 3600.0, SEC - 3599.9])])
 
@@ -274,6 +275,7 @@ def test_a_message_beyond_the_limit_is_not_even_looked_at() -> None:
     assert reason_of(cdr.POINT_CLOUD, bytes(2**16 + 1), limits) == "message_too_large"
 
 
+@pytest.mark.fault("a ROS message cut off at any byte", "it is refused with a reason")
 @pytest.mark.parametrize(("type_name", "payload"), MESSAGES)
 def test_a_message_cut_at_any_byte_is_refused(type_name: str, payload: bytes) -> None:
     cdr.decode(type_name, payload, LIMITS)
@@ -281,6 +283,7 @@ def test_a_message_cut_at_any_byte_is_refused(type_name: str, payload: bytes) ->
         assert reason_of(type_name, payload[:size])
 
 
+@pytest.mark.fault("a length of 4 GB anywhere in a ROS message", "nothing is allocated for it")
 @pytest.mark.parametrize(("type_name", "payload"), MESSAGES)
 def test_a_huge_length_anywhere_allocates_nothing(type_name: str, payload: bytes) -> None:
     cdr.decode(type_name, payload, LIMITS)  # builds the decoder, which is not the sender's memory

@@ -6,6 +6,8 @@ import re
 import socket
 from pathlib import Path
 
+import pytest
+
 from coec.adapters.system.notify import Notifier
 
 
@@ -24,6 +26,7 @@ def test_the_manager_is_told_by_datagrams(tmp_path: Path) -> None:
         assert re.fullmatch(rb"MONOTONIC_USEC=\d+", stamp)
 
 
+@pytest.mark.fault("the service manager's socket vanishes", "no harm is done")
 def test_no_manager_and_a_vanished_one_do_no_harm(tmp_path: Path) -> None:
     Notifier.from_environment({}).ready()
     Notifier(str(tmp_path / "gone")).ready()

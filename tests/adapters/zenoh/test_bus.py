@@ -113,6 +113,7 @@ def test_errors_are_replies_in_the_format_asked_for(bus: Bus, client: zenoh.Sess
     assert msgpack.unpackb(too_long)["code"] == "bad_request"
 
 
+@pytest.mark.fault("more slow queries than are answered at once", "quick ones do not wait; too many are told so")
 def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: Bus, client: zenoh.Session) -> None:
     entered, release = threading.Event(), threading.Event()
 
@@ -151,6 +152,9 @@ def _note(heard: queue.SimpleQueue[int], number: int, _: zenoh.Sample) -> None:
     heard.put(number)
 
 
+@pytest.mark.fault(
+    "three subscribers that stopped reading", "publishing does not wait for them, and queries are answered"
+)
 def test_subscribers_that_stopped_reading_hold_nobody_up(
     bus: Bus, client: zenoh.Session, endpoint: str, record_property: Callable[[str, object], None]
 ) -> None:
@@ -186,6 +190,7 @@ def test_subscribers_that_stopped_reading_hold_nobody_up(
     assert max(answered_s, published_s) < SOON_S
 
 
+@pytest.mark.fault("the service ends while queries wait", "each gets an answer")
 def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Session) -> None:
     for thread in bus.threads:
         thread.request_stop()
@@ -202,6 +207,7 @@ def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Sessi
     assert msgpack.unpackb(error.payload.to_bytes())["code"] == "stopping"
 
 
+@pytest.mark.fault("a reader of samples that fails", "the samples behind it are read")
 def test_samples_arrive_with_their_encoding_and_a_failing_reader_does_no_harm(bus: Bus, client: zenoh.Session) -> None:
     got: queue.SimpleQueue[tuple[bytes, str]] = queue.SimpleQueue()
 
@@ -231,16 +237,19 @@ def test_a_published_value_and_the_liveliness_token_are_seen(bus: Bus, client: z
     watcher.undeclare()
 
 
+@pytest.mark.fault("the port is taken at the start", "a clear error")
 def test_a_port_in_use_is_a_clear_error(bus: Bus, endpoint: str) -> None:
     del bus
     with pytest.raises(UnavailableError, match="cannot open the Zenoh session"):
         open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig())
 
 
+@pytest.mark.fault("no router at the start", "the service starts and waits for it")
 def test_no_router_is_no_error(endpoint: str) -> None:
     open_session(ZenohConfig(connect=(endpoint,)), LimitsConfig()).close()
 
 
+@pytest.mark.fault("a Zenoh file with `mode: peer` and no `listen`", "nobody is listened to")
 @pytest.mark.parametrize("said", ['mode: "peer",', 'mode: "client",', ""])
 def test_a_file_that_names_no_door_opens_none(endpoint: str, bus: Bus, tmp_path: Path, said: str) -> None:
     del bus  # a client wants a router
@@ -279,6 +288,7 @@ def test_the_attachment_of_a_query_is_handed_on(bus: Bus, client: zenoh.Session)
     assert seen.get(timeout=DEADLINE_S) == b"me"
 
 
+@pytest.mark.fault("a picture that takes long to draw", "no other query waits for it")
 def test_a_picture_that_takes_long_keeps_no_other_query_waiting(bus: Bus, client: zenoh.Session) -> None:
     drawn = threading.Event()
 

@@ -44,6 +44,7 @@ def test_what_is_no_endpoint_on_any_network_is_a_mistake_in_the_configuration(te
         Endpoint.parse(text)
 
 
+@pytest.mark.fault("a key or password in an endpoint", "`config`, logs and errors show `***`")
 @pytest.mark.parametrize(
     ("text", "shown"),
     [

@@ -104,6 +104,7 @@ def test_a_pair_waits_for_its_motion() -> None:
     assert len(pairer.push(motion(10))) == 1
 
 
+@pytest.mark.fault("a single stamp an hour ahead", "it is refused, and the stream goes on")
 def test_a_single_stamp_an_hour_ahead_is_refused_and_the_stream_goes_on() -> None:
     hour_ms = 3_600_000
     pairs, pairer = run([sweep(0), camera(0), camera(hour_ms), sweep(100), camera(100), sweep(200), camera(200)])
@@ -117,6 +118,7 @@ def test_a_single_stamp_that_jumps_back_is_refused_and_the_stream_goes_on() -> N
     assert pairer.losses == {"lidar_stamp_back": 1}
 
 
+@pytest.mark.fault("a step of the sensors' clock that lasts", "it is followed")
 @pytest.mark.parametrize("step_ms", [-60_000, 3_600_000])
 def test_a_step_of_the_clock_that_lasts_is_followed(step_ms: int) -> None:
     before = [m for i in range(3) for m in (sweep(i * 100), camera(i * 100))]
@@ -129,6 +131,7 @@ def test_a_step_of_the_clock_that_lasts_is_followed(step_ms: int) -> None:
     assert pairer.losses[f"camera_stamp_{kind}"] == AGREEING_STAMPS - 1
 
 
+@pytest.mark.fault("a sensor that is off", "what waits for it stays bounded")
 def test_a_stream_without_partners_stays_bounded() -> None:
     pairs, pairer = run([sweep(i * 100) for i in range(1000)])
     assert pairs == []

@@ -109,6 +109,7 @@ def test_pairs_of_neighbouring_bins_keep_their_distance(street: Window) -> None:
     assert selected_s(drive(late, street, [0.0, 9.0, 10.5, 14.5])) == [9.0, 14.5]
 
 
+@pytest.mark.fault("pictures that are dark, blinded or blurred", "they are refused by their reason")
 @pytest.mark.parametrize(
     ("quality", "reason"),
     [
@@ -136,6 +137,9 @@ def test_unknown_motion_is_not_standing(street: Window) -> None:
     assert selected_s(drive(cutter, street, [0.0], speed=None)) == [0.0]
 
 
+@pytest.mark.fault(
+    "a camera that repeats its picture while the vehicle moves", "the pairs are refused, and the cause is told"
+)
 def test_a_frozen_image_of_a_moving_vehicle_is_refused(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(lambda _: SHARP))
     assert selected_s(drive(cutter, street, [0.0, 10.0, 20.0])) == [0.0]
@@ -159,6 +163,7 @@ def test_an_image_that_cannot_be_decoded_is_counted_by_its_reason(street: Window
     assert cutter.rejections == {"image_truncated": 2}
 
 
+@pytest.mark.fault("sensor time that steps back in a window", "the slice ends there")
 def test_sensor_time_that_steps_back_ends_the_slice(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector())
     events = drive(cutter, street, [0.0, 12.0, 24.0, -500.0])

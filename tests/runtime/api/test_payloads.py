@@ -56,6 +56,7 @@ def test_what_is_no_command_is_refused_without_echo(name: str, payload: bytes) -
     assert "dance" not in str(refused.value)
 
 
+@pytest.mark.fault("control characters and bombs as the name of a sender", "one harmless line in the log")
 @pytest.mark.parametrize(
     ("attachment", "told"),
     [

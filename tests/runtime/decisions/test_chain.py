@@ -63,6 +63,9 @@ def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
     assert again.entries() == history.entries()
 
 
+@pytest.mark.fault(
+    "an entry of the history changed, removed, swapped or put in", "it is noticed, and the file kept aside"
+)
 @pytest.mark.parametrize("what", ["text", "result", "removed", "swapped", "inserted"])
 def test_any_change_is_noticed_and_the_file_kept_aside(tmp_path: Path, what: str) -> None:
     path = tmp_path / "h"
@@ -85,6 +88,7 @@ def test_any_change_is_noticed_and_the_file_kept_aside(tmp_path: Path, what: str
     assert Chain(path, 100).damage is None, "what is left is sound"
 
 
+@pytest.mark.fault("the end of the history cut off", "it is noticed")
 def test_an_end_that_was_cut_off_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "h"
     head = written(path, 5).durable_head
@@ -97,6 +101,7 @@ def test_an_end_that_was_cut_off_is_noticed(tmp_path: Path) -> None:
     assert len(cut.entries()) == 3
 
 
+@pytest.mark.fault("a power cut in the middle of an entry", "it is not called tampering")
 def test_a_torn_last_line_of_a_power_cut_is_no_tampering(tmp_path: Path) -> None:
     path = tmp_path / "h"
     before = written(path, 3)
@@ -253,6 +258,10 @@ def test_a_history_that_cannot_be_read_is_damage(tmp_path: Path) -> None:
         history.flush()
 
 
+@pytest.mark.fault(
+    "a power cut at any byte of the history",
+    "no entry that was acknowledged is lost, and nothing is called tampered with",
+)
 def test_a_power_cut_at_any_byte_loses_nothing_and_is_no_tampering(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -41,6 +41,7 @@ def filled(folder: Path) -> tuple[History, CalibrationResult]:
     return history, result
 
 
+@pytest.mark.fault("thousands of commands in the history", "no result that a roll back needs is pushed out")
 @pytest.mark.parametrize(
     "flood",
     [
@@ -97,6 +98,7 @@ def test_a_book_that_was_cut_or_removed_is_noticed(tmp_path: Path, book: str) ->
     assert "cut off" in str(History(tmp_path, "front", LIMIT, history.durable_heads).damage)
 
 
+@pytest.mark.fault("a forged pose in the history, hashes right", "it is damage, and not used")
 def test_a_forged_pose_in_a_book_is_damage_whatever_its_hash(tmp_path: Path) -> None:
     history, result = filled(tmp_path)
     zero = transform_of(np.eye(4)).model_copy(update={"matrix": ((0.0,) * 4,) * 4})
@@ -107,6 +109,7 @@ def test_a_forged_pose_in_a_book_is_damage_whatever_its_hash(tmp_path: Path) -> 
     assert [kept.entry.code for kept in again.entries()] == ["accepted", "estimated"]
 
 
+@pytest.mark.fault("a full disk under all three books of the history", "each waits, and is written when there is room")
 def test_every_book_waits_for_a_full_disk_and_is_written_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(tmp_path, monkeypatch)
     history, _ = filled(tmp_path)

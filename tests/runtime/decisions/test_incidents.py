@@ -92,6 +92,7 @@ def test_damaged_and_foreign_folders_are_passed_over(tmp_path: Path) -> None:
     assert Incidents(tmp_path, "front", 2).events() == ()
 
 
+@pytest.mark.fault("a disk that takes no evidence", "it costs the evidence, not the service")
 def test_a_disk_that_cannot_be_written_costs_evidence_only(tmp_path: Path) -> None:
     (tmp_path / "evidence").write_text("a file")
     evidence = Incidents(tmp_path / "evidence", "front", 2)
@@ -138,6 +139,7 @@ def test_half_an_event_of_a_power_cut_is_removed_and_too_many_are_bounded_at_the
     ]
 
 
+@pytest.mark.fault("a power cut at any byte of evidence", "none that was written is lost")
 def test_a_power_cut_at_any_byte_takes_no_evidence_that_was_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -59,6 +59,7 @@ def test_a_replay_slower_than_the_drive_has_as_much_longer() -> None:
     assert begun().overdue(crawling, 100.0 + 150.1) is not None, "slower than a tenth is standing still"
 
 
+@pytest.mark.fault("a stream that stops", "health names the first thing that stands still")
 @pytest.mark.parametrize(
     ("now", "code", "word"),
     [

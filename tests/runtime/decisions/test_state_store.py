@@ -96,6 +96,7 @@ def test_pairs_do_not_touch_each_other(tmp_path: Path) -> None:
     assert back.status is Status.NOT_ACCEPTED
 
 
+@pytest.mark.fault("the state of another rig", "it is not used")
 def test_the_state_of_another_rig_is_not_used(tmp_path: Path) -> None:
     saved(StateStore(tmp_path, "test"), RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), {})
     assert restarted(tmp_path, replace(RIG, T_camera_lidar_nominal=np.eye(4))) is None
@@ -113,6 +114,7 @@ ZERO = [[0.0] * 4] * 4
 SHEARED = [[1.0, 0.1, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 
 
+@pytest.mark.fault("a state with a matrix that is no pose, checksum right", "it is not used")
 @pytest.mark.parametrize("rows", [ZERO, SHEARED], ids=["zero", "sheared"])
 @pytest.mark.parametrize("where", ["T_camera_lidar", "pending", "accepted", "track"])
 def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: str, rows: list[list[float]]) -> None:
@@ -142,6 +144,9 @@ def test_a_forged_pose_is_not_used_whatever_its_checksum(tmp_path: Path, where: 
     assert restarted(tmp_path) is not None
 
 
+@pytest.mark.fault(
+    "a forged state with numbers and shapes that nobody wrote", "an error of ours, and nominal is served"
+)
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -124,6 +124,7 @@ def test_what_does_not_fit_is_counted_by_reason(
     assert (desk.intake.counts(stream).received, desk.intake.counts(stream).accepted) == (1, 0)
 
 
+@pytest.mark.fault("rubbish on a sensor's key", "it is counted once, by its reason")
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80", b"\xdd\xff\xff\xff\xff", b"\x00\x01\x00\x00"])
 @pytest.mark.parametrize("encoding", [MSGPACK, CDR, f"{CDR};no_such/msg/Type", "", ";;;"])
 @pytest.mark.parametrize("stream", [CAMERA, LIDAR, EGO])
@@ -134,6 +135,7 @@ def test_rubbish_is_counted_once(desk: Desk, stream: str, payload: bytes, encodi
     assert reason != "decoder_fault"
 
 
+@pytest.mark.fault("a fault of our own in a decoder", "it costs the message only")
 def test_a_fault_of_a_decoder_costs_the_message_only(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(msgpack_frames, "decode_ego", lambda *_: 1 // 0)
     assert desk.take(EGO, b"", MSGPACK) is None
@@ -146,6 +148,7 @@ def test_gaps_in_the_numbers_are_loss_but_a_new_count_is_not(desk: Desk) -> None
     assert desk.losses.snapshot() == {(CAMERA, "sequence_gap"): 2}
 
 
+@pytest.mark.fault("a frame that is overtaken by another", "it is counted once")
 def test_a_frame_that_was_overtaken_is_counted_once(desk: Desk) -> None:
     """As out of order by the pairer, and not as missing by the decoder as well."""
     pairer = Pairer(PairingConfig(), expects_motion=False)
@@ -158,6 +161,7 @@ def test_a_frame_that_was_overtaken_is_counted_once(desk: Desk) -> None:
     assert pairer.losses["camera_stamp_back"] == 1
 
 
+@pytest.mark.fault("a flood of bad messages", "the log grows with their logarithm")
 def test_losses_are_logged_first_and_then_ever_more_rarely(caplog: pytest.LogCaptureFixture) -> None:
     losses = LossCounter(logging.getLogger("test"), "front")
     for _ in range(1000):
@@ -169,6 +173,7 @@ def test_losses_are_logged_first_and_then_ever_more_rarely(caplog: pytest.LogCap
 # --- the inbox ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.fault("more samples than can be read", "the newest are read, and the lost ones counted")
 def test_samples_are_taken_in_the_order_of_arrival_and_the_oldest_go_first() -> None:
     overruns: list[str] = []
     inbox = Inbox({CAMERA: 2, EGO: 8}, 100, lambda parcel: overruns.append(parcel.stream))

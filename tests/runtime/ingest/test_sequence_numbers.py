@@ -39,6 +39,7 @@ def test_a_new_count_is_no_loss() -> None:
     assert lost(1000, 1002, 0, *range(1, 300)) == 1, "what the old one left out does not come any more"
 
 
+@pytest.mark.fault("samples lost, doubled and out of order", "each is received or lost, never both")
 @pytest.mark.parametrize("seed", range(5))
 def test_what_is_sent_is_received_or_lost_in_whatever_order_it_comes(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -103,6 +103,9 @@ def test_closing_leaves_the_window_unread(store: WindowStore) -> None:
     assert store.unread("front") == (path.stem,)
 
 
+@pytest.mark.fault(
+    "gigabytes of unknown windows on a slow disk", "the list is there at once, and reading never blocks the beat"
+)
 def test_on_a_slow_disk_a_round_is_short_and_the_list_is_there_at_once(
     store: WindowStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,6 +139,7 @@ def test_on_a_slow_disk_a_round_is_short_and_the_list_is_there_at_once(
     assert digests(store) == {"front-1": sha256(path)}
 
 
+@pytest.mark.fault("a disk that hangs while the index is written", "the list of windows does not wait")
 def test_the_list_does_not_wait_for_the_index_to_be_written(
     store: WindowStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

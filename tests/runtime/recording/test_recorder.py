@@ -182,6 +182,7 @@ def test_a_stop_abandons_an_open_window_with_too_few_pairs(bench: Bench) -> None
     assert bench.files() == []
 
 
+@pytest.mark.fault("a disk too slow for what is recorded", "pairs beyond the queue are counted, and the window ends")
 def test_pairs_beyond_the_queue_are_counted_and_the_end_still_comes(bench: Bench) -> None:
     bench.window("front-1", list(range(1, PAIRS_WAITING + 4)))
     with bench.running():
@@ -190,6 +191,7 @@ def test_pairs_beyond_the_queue_are_counted_and_the_end_still_comes(bench: Bench
     assert bench.losses.snapshot() == {("window", "recorder_overrun"): 3}
 
 
+@pytest.mark.fault("the disk becomes full while a window is recorded", "it costs one window, and the next is tried")
 def test_a_full_disk_costs_one_window_and_the_next_is_tried(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     real = WindowWriter.add
 
@@ -213,6 +215,7 @@ def test_a_full_disk_costs_one_window_and_the_next_is_tried(bench: Bench, monkey
     assert bench.lost == ["front-10"]
 
 
+@pytest.mark.fault("a disk that is nearly full", "no window begins below the free space asked for")
 def test_no_window_starts_below_the_free_space_asked_for(tmp_path: Path) -> None:
     bench = Bench(store_of(tmp_path, min_free_bytes=2**62))
     with bench.running():
@@ -221,6 +224,7 @@ def test_no_window_starts_below_the_free_space_asked_for(tmp_path: Path) -> None
     assert bench.losses.snapshot() == {("window", "recording_failed"): 1}
 
 
+@pytest.mark.fault("windows that a killed service left behind", "they are salvaged and solved, the newest first")
 def test_leftovers_are_salvaged_and_unsolved_windows_resumed_newest_first(tmp_path: Path) -> None:
     folder = store_of(tmp_path)
     for start in range(100, 100 * (UNSOLVED_RESUMED + 2), 100):
@@ -249,6 +253,7 @@ def test_leftovers_are_salvaged_and_unsolved_windows_resumed_newest_first(tmp_pa
     assert bench.losses.snapshot()["window", "too_few_pairs_salvaged"] == 2
 
 
+@pytest.mark.fault("a disk that refuses a window", "health says why until one can be written again")
 def test_trouble_is_told_in_the_words_of_the_disk_until_what_follows_can_be_written(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -315,6 +320,7 @@ def test_windows_that_nobody_reported_are_read_beside_the_work(tmp_path: Path) -
         assert info.sha256 == hashlib.sha256(store.path(info.window_id).read_bytes()).hexdigest()
 
 
+@pytest.mark.fault("the service is stopped while gigabytes are hashed", "it does not wait for that")
 def test_a_stop_does_not_wait_for_windows_that_are_being_read(tmp_path: Path) -> None:
     store = store_of(tmp_path)
     store.path("front-1").write_bytes(bytes(64 * 2**20))
@@ -324,6 +330,7 @@ def test_a_stop_does_not_wait_for_windows_that_are_being_read(tmp_path: Path) ->
     assert store.unread("front") == ("front-1",)
 
 
+@pytest.mark.fault("a disk that never lets go of the recorder", "it is told, and the stop goes on")
 def test_a_thread_that_the_disk_does_not_let_go_is_told(tmp_path: Path) -> None:
     recorder = Bench(store_of(tmp_path)).recorder
     assert recorder.trouble is None

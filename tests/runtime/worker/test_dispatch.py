@@ -61,6 +61,7 @@ def test_a_question_that_nobody_knows_is_refused() -> None:
     assert "'sing'" in told["refused"]["text"]
 
 
+@pytest.mark.fault("a fault of our own in the worker", "it is an answer, and the worker goes on")
 @pytest.mark.parametrize("message", [CHECK, OVERLAY])
 def test_a_fault_of_the_program_is_an_answer(message: dict[str, Any]) -> None:
     told = answer(ZeroDivisionError("division by zero"), message)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import pytest
@@ -535,9 +535,11 @@ class QueueMachine(RuleBasedStateMachine):
 CHECKS = [HealthCheck.too_slow, HealthCheck.filter_too_much]
 
 
-def test_whatever_happens_every_job_ends_once() -> None:
+@pytest.mark.fault("any sequence of crashes, deadlines and floods of jobs", "every job ends exactly once")
+def test_whatever_happens_every_job_ends_once(record_property: Callable[[str, object], None]) -> None:
     short = settings(max_examples=150, stateful_step_count=40, deadline=None, derandomize=True, database=None)
     run_state_machine_as_test(QueueMachine, settings=short)
+    record_property("figure", f"{short.max_examples} sequences of {short.stateful_step_count} steps")
 
 
 @pytest.mark.slow

@@ -188,6 +188,7 @@ IN_A_JOB = {
 }
 
 
+@pytest.mark.fault("a worker that crashes, hangs, grows too large or sends rubbish", "another one solves the window")
 @pytest.mark.parametrize(("fault", "counted"), IN_A_JOB.items())
 def test_after_one_fault_another_worker_solves_the_window(
     tmp_path: Path, fault: str, counted: Fault, monkeypatch: pytest.MonkeyPatch
@@ -216,6 +217,7 @@ def test_a_check_on_which_the_worker_fails_is_answered_once_and_the_next_one_is_
         assert it.faults() == {IN_A_JOB[fault]: 1}
 
 
+@pytest.mark.fault("a window that kills every worker", "it is given up, and the service goes on")
 @pytest.mark.parametrize(
     ("fault", "word"), [("crash", "signal 9"), ("drop", "no answer"), ("other", "another question")]
 )
@@ -244,6 +246,7 @@ def test_what_is_said_twice_answers_no_other_question(tmp_path: Path) -> None:
         assert it.faults() == {Fault.STRAY_ANSWER: 1}
 
 
+@pytest.mark.fault("a worker that talks without being asked", "it is replaced")
 def test_a_worker_that_babbles_is_replaced(tmp_path: Path) -> None:
     with running("babble-once", tmp_path) as it:
         wait_until(lambda: it.worker.status().starts == 2, "a second worker")
@@ -303,6 +306,7 @@ def test_a_job_that_cannot_be_put_into_bytes_fails_alone(tmp_path: Path) -> None
         assert it.faults() == {Fault.UNSENDABLE_JOB: 1}
 
 
+@pytest.mark.fault("checks that kill every worker", "windows are solved all the same")
 def test_checks_that_kill_do_not_keep_the_worker_from_its_windows(tmp_path: Path) -> None:
     with waiting("crash", tmp_path, at="check") as it:
         for name in ("c0", "c1", "c2"):
@@ -331,6 +335,7 @@ def test_an_answer_that_is_late_is_no_fault_and_the_worker_goes_on(tmp_path: Pat
         assert it.worker.status().losses == {"deadline_passed": 1, "late_answer": 1}
 
 
+@pytest.mark.fault("a worker that hangs", "what waits behind it is answered in time")
 def test_what_waits_behind_a_worker_that_hangs_is_answered_in_time(tmp_path: Path) -> None:
     with running("hang", tmp_path) as it:
         it.solve("a")
@@ -351,6 +356,7 @@ def test_a_worker_may_have_less_time_for_one_job_than_for_others(tmp_path: Path)
         assert it.faults() == {Fault.TIMED_OUT: 1}
 
 
+@pytest.mark.fault("a worker that cannot start", "its jobs are answered in time")
 def test_jobs_for_a_worker_that_cannot_start_are_answered_in_time(tmp_path: Path) -> None:
     with running("stillborn", tmp_path) as it:
         it.overlay("a", deadline_s=0.3)
@@ -362,6 +368,7 @@ def test_jobs_for_a_worker_that_cannot_start_are_answered_in_time(tmp_path: Path
         assert "exit code 3" in failure.text
 
 
+@pytest.mark.fault("the service is stopped while it solves", "it does not wait, and all that waits is answered")
 def test_a_stop_does_not_wait_for_a_solve_and_answers_all_that_waits(tmp_path: Path) -> None:
     with running("hang", tmp_path) as it:
         it.solve("a")

@@ -10,7 +10,7 @@ import numpy as np
 from coec.calibration.confidence.budget import systematic
 from coec.calibration.confidence.grain import grain_of
 from coec.calibration.confidence.landscape import Landscape
-from coec.calibration.confidence.loosened import LENS_FREE, Loosened
+from coec.calibration.confidence.loosened import Loosened
 from coec.calibration.confidence.modes import Rivals, with_modes
 from coec.calibration.confidence.noise import measure_noise
 from coec.calibration.confidence.ridges import widened
@@ -43,7 +43,6 @@ def measure_uncertainty(
     axis_of_sweep = pose[:3, 2]  # the third axis of the LiDAR
     shared = systematic(landscape.cells.sight, grain_of(window, pose, held_m), axes, axis_of_sweep)
     for one in loosened:
-        # Another lens refuses the window, and is no width of its pose.
-        if one.contradicts and one.name != LENS_FREE:
+        if one.contradicts:
             shared[one.name] = np.where(np.isin(np.arange(6), axes), one.shift, 0.0)
     return Uncertainty(whole, shared, noise.looks)
