@@ -95,7 +95,9 @@ class Vehicle:
         self._shift_ns += round(seconds * NS_PER_S)
 
     def put(self, stream: str, payload: bytes) -> None:
-        """Whatever it is, it counts as sent. From the thread of who sends it; it is no frame of the vehicle's."""
+        """Whatever it is, it counts as sent. From the thread of who sends it; it is no frame of the vehicle's and has
+        no number: nobody could know of one that was sent while the router was away."""
+        wait_until(lambda: is_heard(self._publishers[stream]), "the router back")
         self._publishers[stream].put(payload, encoding=MSGPACK)
         self.sent[f"{stream} of others"] += 1
 
