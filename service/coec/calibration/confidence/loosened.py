@@ -32,6 +32,10 @@ reaches it once in ten windows, and then moves the pose by a few hundredths of a
 to its width. An offset of the clocks that looks like a shift along the way gains little more than that and moves the
 pose by decimetres."""
 
+LENS_CERTAIN = 1.5
+"""Likewise for the lens: three standard deviations. Its centre is nearly a turn of the pose, so that what chance gains
+by it moves the pose by half a degree."""
+
 LEAST_PX = 0.4
 """Another lens has to move the sharpest edges by so much, root mean square, beside what the pose can do: corners of a
 target are found to a tenth of a pixel, and edges are drawn aside by blur by as much. In 48 windows of twelve simulated
@@ -64,7 +68,7 @@ class Loosened:
     @property
     def contradicts(self) -> bool:
         """Whether the window contradicts what it was told."""
-        return self.certainty >= CERTAIN
+        return self.certainty >= (LENS_CERTAIN if self.name == LENS_FREE else CERTAIN)
 
 
 def loosen(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4, held: Sequence[int]) -> tuple[Loosened, ...]:
