@@ -462,9 +462,9 @@ def _state_seeds() -> list[bytes]:
         state = initial_state(RIG)
         for window in (1, 2):
             state = after_estimate(state, estimate(window), 0, RULES)
-        StateStore(folder, VEHICLE).remember(
-            RIG, restored(state), Clocks(77, 88, 99), lambda: {"results": f"3 {'a' * 64}"}
-        )
+        store = StateStore(folder, VEHICLE)
+        store.remember(RIG, restored(state), Clocks(77, 88, 99), lambda: {"results": f"3 {'a' * 64}"})
+        store.flush()
         return [(folder / "state.json").read_bytes(), with_checksum(b'{"pairs":{}}')]
 
 

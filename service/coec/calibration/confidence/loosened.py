@@ -21,7 +21,7 @@ from coec.calibration.confidence.ways import Ways, climbed
 from coec.calibration.objective.cells import COLUMNS, ROWS, sectors
 from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
-from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, frame_alignment
+from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, alignment_of_parts
 
 HELD_FREE, CLOCKS_FREE, LENS_FREE = "held_free", "clocks_free", "lens_free"
 """Names of what is set free."""
@@ -35,6 +35,9 @@ pose by decimetres."""
 LENS_CERTAIN = 1.5
 """Likewise for the lens: three standard deviations. Its centre is nearly a turn of the pose, so that what chance gains
 by it moves the pose by half a degree."""
+
+UNSEEN = COLUMNS * ROWS
+"""Sector of what is outside the image."""
 
 LEAST_PX = 0.4
 """Another lens has to move the sharpest edges by so much, root mean square, beside what the pose can do: corners of a
@@ -100,17 +103,16 @@ def loosen(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4, held: Seq
 
 def _judged(name: str, sharp: Told, ways: Ways, before: NDArray[np.float64], after: NDArray[np.float64]) -> Loosened:
     uv_px, seen = sharp.pixels(after)
-    sector = np.full(len(uv_px), -1)
+    sector = np.full(len(uv_px), UNSEEN, np.uint8)
     sector[seen] = sectors(uv_px[seen])
-    parts = [np.flatnonzero(sector == number) for number in range(COLUMNS * ROWS)]
     shift = se3.difference(sharp.otherwise(after)[1], sharp.otherwise(before)[1])
-    gained = certainty(_cells(sharp, after, parts) - _cells(sharp, before, parts))
+    gained = certainty(_cells(sharp, after, sector) - _cells(sharp, before, sector))
     return Loosened(name, gained, ways.moved_px(after - before), after, shift)
 
 
-def _cells(sharp: Told, deviation: NDArray[np.float64], parts: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
-    """(F, B) what each frame adds to the significance in each part of the range edges."""
+def _cells(sharp: Told, deviation: NDArray[np.float64], sector: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(F, B) what each frame adds to the significance in each sector; `sector` (E,) is where each range edge lies."""
     frames, pose = sharp.otherwise(deviation)
-    of_parts = [frame_alignment(frames.of_points(part), pose) for part in parts]
-    square = float(np.sum([part.square for part in of_parts]))
-    return np.stack([part.strength for part in of_parts], axis=1) / sqrt(max(square, LEAST_SQUARE))
+    of_parts = alignment_of_parts(frames, sector, UNSEEN + 1, pose)
+    square = float(of_parts.square[:, :UNSEEN].sum())
+    return np.asarray(of_parts.strength[:, :UNSEEN] / sqrt(max(square, LEAST_SQUARE)))

@@ -36,6 +36,7 @@ from coec.calibration.types import (
 from coec.config import CalibrationConfig, Config, DepthConfig
 from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.cameras import scaled
+from coec.geometry.edges.alignment import EdgeFrames, alignment_of_parts
 from coec.geometry.projection import project
 from coec.reports.overlay import draw
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Solved, WrittenFile
@@ -85,9 +86,10 @@ class Solver:
             search = pair.calibration.search.model_copy(update={"max_evaluations": WARM_UP_EVALUATIONS})
             configuration = pair.calibration.model_copy(update={"search": search})
             rig = _small(self._rigs[pair.name])
-            # A check runs every kernel that a calibration runs but one, which its uncertainty takes. An invented one
+            # A check runs every kernel that a calibration runs but two, which its uncertainty takes. An invented one
             # need not lead anywhere.
             project(rig.camera, np.ones((1, 3)))
+            alignment_of_parts(_one_edge(rig), np.zeros(1, np.uint8), 1, np.eye(4))
             with contextlib.suppress(CalibrationError, DecodeError):
                 observe(_invented_window(rig), _Ramp(), self._images, configuration, None)
 
@@ -223,6 +225,12 @@ def _small(rig: Rig) -> Rig:
     camera = scaled(rig.camera, scale, scale)
     mask = None if rig.mask is None else np.ones((camera.height, camera.width), np.bool_)
     return replace(rig, camera=camera, mask=mask)
+
+
+def _one_edge(rig: Rig) -> EdgeFrames:
+    """A range edge, and an image without any."""
+    maps = np.zeros((1, rig.camera.height, rig.camera.width), np.int8)
+    return EdgeFrames(rig.camera, np.ones((3, 1), np.float32), np.ones(1, np.float32), np.array([0, 1]), maps)
 
 
 def _invented_window(rig: Rig) -> Window:
