@@ -13,8 +13,10 @@ from certificates import TestAuthority, make_authority
 from coec.adapters.tls import conversation
 from coec.adapters.tls.conversation import (
     CONVERSATIONS,
+    LEFT_S,
     WAITED_S,
     Credentials,
+    CrowdedError,
     Heard,
     Listener,
     NotProvenError,
@@ -170,14 +172,27 @@ def test_what_takes_too_long_is_not_heard(authority: TestAuthority) -> None:
         listener.hear("1", last)
 
 
-@pytest.mark.fault("conversations that are begun and never ended", "their number is bounded, and new ones are heard")
-def test_conversations_that_never_end_keep_nobody_out(authority: TestAuthority, listener: Listener) -> None:
+@pytest.mark.fault(
+    "conversations that are begun and never ended", "their number is bounded; who was let in is heard to the end"
+)
+def test_conversations_that_never_end_keep_nobody_out(authority: TestAuthority) -> None:
     credentials = authority.credentials("operator")
     hello = Speaker(credentials, "vehicle").hello()
-    for number in range(CONVERSATIONS + 10):
+    clock = Clock()
+    listener = Listener(authority.credentials("vehicle"), clock)
+    let_in = Speaker(credentials, "vehicle")
+    answer = flight(listener.hear("let in", let_in.hello()))
+    for number in range(CONVERSATIONS - 1):
         flight(listener.hear(f"flood {number}", hello))
+    with pytest.raises(CrowdedError):
+        listener.hear("one more", hello)
+    heard = listener.hear("let in", let_in.say(answer, TEXT))
+    assert isinstance(heard, Heard)
+    assert heard.said == TEXT
+    clock.now_s = LEFT_S + 0.1
+    for number in range(10):
+        flight(listener.hear(f"later {number}", hello))
     assert len(listener._begun) == CONVERSATIONS
-    assert said(listener, credentials)[0].said == TEXT
 
 
 def test_files_that_cannot_be_used_are_named_and_not_shown(authority: TestAuthority, tmp_path: Path) -> None:

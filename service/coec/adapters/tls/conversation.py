@@ -29,17 +29,27 @@ WAITED_S = 5.0
 """For the second question: what comes later is not heard. A carrier that keeps it back gains no more than this."""
 
 CONVERSATIONS = 256
-"""Begun and not ended, some 36 kB each. The oldest makes room: whoever begins many without end can cut a conversation
-short that is longer under way than theirs, and no more."""
+"""Begun and not ended, some 36 kB each. The oldest makes room, once it has had the time to end."""
 
 MAX_SAID = 16_384
 """Bytes of what is said: one record of TLS."""
+
+
+LEFT_S = 1.0
+"""For so long nobody's conversation is given up for another's: two queries take some milliseconds, and a busy computer
+a hundred times that."""
 
 
 class NotProvenError(CoecError):
     """Who speaks has not shown a certificate that is taken here."""
 
     reply_code = "not_proven"
+
+
+class CrowdedError(CoecError):
+    """Too many conversations have begun just now; a beginning does nothing, and may be tried again."""
+
+    reply_code = "busy"
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +147,7 @@ class Listener:
 
         Raises:
             NotProvenError: whoever speaks cannot prove who he is, or took too long.
+            CrowdedError: it would begin, and there is no room.
         """
         now_s = self._clock()
         while self._begun and next(iter(self._begun.values()))[1] < now_s:
@@ -149,13 +160,16 @@ class Listener:
         return Heard(line.peer(), line.read(), _sealing(line))
 
     def _begin(self, conversation: str, came: bytes, now_s: float) -> bytes:
+        if len(self._begun) >= CONVERSATIONS:
+            # Who was let in is left the time to go on: a flood of beginnings makes others wait, and ends none of them.
+            if next(iter(self._begun.values()))[1] > now_s + WAITED_S - LEFT_S:
+                raise CrowdedError("too many conversations have begun; begin again in a moment")
+            self._begun.popitem(last=False)
         line = _Line(self._context, server_side=True)
         line.shake_hands(came)
         flight = line.goes()
         if not flight:
             raise NotProvenError("this is no beginning of a TLS conversation")
-        if len(self._begun) >= CONVERSATIONS:
-            self._begun.popitem(last=False)
         self._begun[conversation] = line, now_s + WAITED_S
         return flight
 
