@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from typing import Any
 
-import numpy as np
-
 from coec.adapters.depth.maps import open_depth
+from coec.adapters.files.conversions import degrees_or_null
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.search.mount_prior import MOUNT_RAD
@@ -17,7 +16,7 @@ from coec.config import LimitsConfig
 from coec.errors import CalibrationError
 from coec.evaluation.fitness import Cadence, Fitness, Remark, fitness_of
 from coec.reports import console
-from coec.sources import open_source, windows
+from coec.sources import Recording, open_source, windows
 
 PAIRS = 6
 """Of the trial, evenly chosen: as many as a check of the monitor has."""
@@ -37,7 +36,7 @@ def run(source: str, *, depth: str | None, as_json: bool) -> int:
         seen = fitness_of(recording)
         times.step("look", 1, 1)
         failed = any(remark.level == "fail" for remark in seen.remarks)
-        trial = None if failed else _trial(source, depth, times)
+        trial = None if failed else _trial(recording, depth, times)
     remarks = (*seen.remarks, *_of_trial(trial))
     if as_json:
         console.print_json(_document(source, replace(seen, remarks=remarks), trial))
@@ -46,10 +45,10 @@ def run(source: str, *, depth: str | None, as_json: bool) -> int:
     return int(failed or isinstance(trial, CalibrationError))
 
 
-def _trial(source: str, depth: str | None, times: calibrate_command.StageTimes) -> Estimate | CalibrationError:
+def _trial(recording: Recording, depth: str | None, times: calibrate_command.StageTimes) -> Estimate | CalibrationError:
     """A calibration of a few pairs about the recording's own extrinsic: how sharply this scene tells the pose."""
-    loaded = windows.load(source, PAIRS, PAIRS, lambda done, total: times.step("load", done, total))
-    options = calibrate_command.Options(source=source, depth=depth)
+    loaded = windows.chosen_from(recording, PAIRS, lambda done, total: times.step("load", done, total))
+    options = calibrate_command.Options(source=recording.name, depth=depth)
     configuration = calibrate_command.configuration_of(options, loaded.configuration)
     limits = LimitsConfig()
     window = replace(loaded.window, start_known_to_rad=MOUNT_RAD)
@@ -73,8 +72,8 @@ def _document(source: str, seen: Fitness, trial: Estimate | CalibrationError | N
         document["trial"] = {
             "pairs": trial.pairs,
             "decision": trial.verdict.decision.value,
-            "correction": _in_degrees(trial.correction),
-            "sigma": _in_degrees(trial.sigma),
+            "correction": degrees_or_null(trial.correction),
+            "sigma": degrees_or_null(trial.sigma),
         }
     return document
 
@@ -98,7 +97,7 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
     console.show(f"{seen.paired:.0%} of the camera frames have a sweep{sync}; {seen.in_view:.0%} of its points in view")
     if isinstance(trial, Estimate):
         axes = console.table("axis", "from the recording's own", "± σ", "unit", right=(1, 2))
-        correction, sigma = _in_degrees(trial.correction), _in_degrees(trial.sigma)
+        correction, sigma = degrees_or_null(trial.correction), degrees_or_null(trial.sigma)
         for axis, axis_name in enumerate(console.AXIS_NAMES):
             if sigma[axis] is not None:
                 found = console.figure(correction[axis], sign=True)
@@ -125,8 +124,3 @@ def _motion_text(seen: Fitness) -> str:
         f"{seen.speed_mps[0]:.1f} m/s ({seen.speed_mps[1]:.1f} at most), "
         f"{seen.turn_degps[0]:.1f} deg/s ({seen.turn_degps[1]:.1f})"
     )
-
-
-def _in_degrees(rad_m: np.ndarray[Any, np.dtype[np.float64]]) -> list[float | None]:
-    values = [*np.degrees(rad_m[:3]).tolist(), *rad_m[3:].tolist()]
-    return [value if np.isfinite(value) else None for value in values]

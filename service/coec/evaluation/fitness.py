@@ -16,6 +16,7 @@ from coec.calibration.frames.pairing import Pairer
 from coec.calibration.monitor.check_verdict import MIN_PAIRS
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Rig
 from coec.config import PairingConfig, WindowConfig
+from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
 from coec.geometry.vectors import lengths
 from coec.sources.recording import Recording
@@ -159,8 +160,7 @@ def in_view(sweep: LidarFrame, rig: Rig) -> float:
     T = rig.T_camera_lidar_nominal
     p_camera: NDArray[np.float64] = sweep.xyz_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     uv_px, valid = project(rig.camera, p_camera)
-    inside = valid & (uv_px > -0.5).all(axis=1)
-    inside &= (uv_px[:, 0] < rig.camera.width - 0.5) & (uv_px[:, 1] < rig.camera.height - 0.5)
+    inside = valid & in_image(rig.camera, uv_px)
     return float(inside.mean()) if len(inside) else 0.0
 
 

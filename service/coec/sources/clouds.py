@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from coec.calibration.types import LidarFrame
+from coec.calibration.frames.origin import apparent_origin, from_origin
+from coec.calibration.types import LidarFrame, Matrix4
 from coec.errors import SourceError
 from coec.sources.pcd import MAX_POINTS, Columns, PcdError, parse_pcd
 from coec.sources.reading import read_bytes, read_npy, read_npz
@@ -36,6 +37,19 @@ def load_cloud(stamp_ns: int, frame_id: str, path: Path) -> LidarFrame:
     # A double that no float holds becomes infinite, and its point is dropped.
     with np.errstate(over="ignore", invalid="ignore"):
         return _frame(stamp_ns, frame_id, path, columns)
+
+
+def measured_from(cloud: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str, where: Path, advice: str) -> LidarFrame:
+    """A sweep in the LiDAR's own frame, see `from_origin`.
+
+    Raises:
+        SourceError: its points contradict that they were measured from there; `advice` says how to state it.
+    """
+    sweep = from_origin(cloud, T_cloud_lidar, frame_id)
+    contradiction = apparent_origin(sweep)
+    if contradiction is not None:
+        raise SourceError(f"{where}: {contradiction.sentence} {advice}")
+    return sweep
 
 
 def _frame(stamp_ns: int, frame_id: str, path: Path, columns: Columns) -> LidarFrame:

@@ -17,11 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.images.codec import encode_depth_png, probe, raw_image
-from coec.calibration.frames.origin import apparent_origin, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Name, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
-from coec.sources.clouds import load_cloud
+from coec.sources.clouds import load_cloud, measured_from
 from coec.sources.kitti_files import load_image
 from coec.sources.reading import read_bytes, read_npy
 from coec.sources.recording import FramewiseRecording, RecordedFrame
@@ -148,11 +147,8 @@ def _recorded(folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_li
 
 
 def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: Matrix4) -> LidarFrame:
-    sweep = from_origin(load_cloud(stamp_ns, LIDAR_FRAME, path), T_cloud_lidar, LIDAR_FRAME)
-    contradiction = apparent_origin(sweep)
-    if contradiction is not None:
-        raise SourceError(f"{path}: {contradiction.sentence} State the LiDAR's pose there as `T_cloud_lidar`.")
-    return sweep
+    advice = "State the LiDAR's pose there as `T_cloud_lidar`."
+    return measured_from(load_cloud(stamp_ns, LIDAR_FRAME, path), T_cloud_lidar, LIDAR_FRAME, path, advice)
 
 
 def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> CameraFrame:

@@ -16,7 +16,7 @@ from coec.calibration.types import FramePair, Matrix4, Window
 from coec.config import CalibrationConfig, Config, PairingConfig
 from coec.errors import SourceError, UsageError
 from coec.geometry import se3
-from coec.sources import open_source
+from coec.sources import Recording, open_source
 from coec.sources.spec import parse_spec
 
 WHOLE = (0.0, math.inf)
@@ -65,9 +65,19 @@ def load(
         and is_window(spec.path)
     ):
         return _recorded(spec.path, frames, between_s)
-    recording = open_source(source)
+    return chosen_from(open_source(source), frames or default_frames, heard, between_s)
+
+
+def chosen_from(
+    recording: Recording, frames: int, heard: Callable[[int, int], None], between_s: tuple[float, float] = WHOLE
+) -> Loaded:
+    """Likewise of a recording that is open: at most so many of its camera frames, evenly chosen, and paired.
+
+    Raises:
+        SourceError: a file cannot be read; no camera frame found a sweep.
+    """
     within = _within(recording.camera_stamps_ns, between_s)
-    chosen = [within[index] for index in evenly(len(within), frames or default_frames)]
+    chosen = [within[index] for index in evenly(len(within), frames)]
     pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
     pairs: list[FramePair] = []
     for message in recording.messages(chosen):

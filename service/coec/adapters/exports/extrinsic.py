@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.adapters.files.conversions import number_or_null
 from coec.config import CameraIntrinsics
 from coec.geometry import se3
 
@@ -105,7 +106,7 @@ class Extrinsic:
             "direction": direction,
             "accepted": not origin.objections,
             "objections": list(origin.objections),
-            "covariance_rad_m": [[_or_none(value) for value in row] for row in self.covariance.tolist()],
+            "covariance_rad_m": [[number_or_null(value) for value in row] for row in self.covariance.tolist()],
             "vehicle": origin.vehicle,
             "pair": origin.pair,
             "provenance": origin.provenance,
@@ -175,7 +176,3 @@ def _one_line(text: str) -> str:
 
 def _numbers(values: Matrix) -> str:
     return " ".join("?" if math.isnan(value) else f"{value:.6g}" for value in values.tolist())
-
-
-def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else value

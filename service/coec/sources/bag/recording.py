@@ -11,13 +11,13 @@ from pathlib import Path
 
 from coec.adapters.mcap.windows import is_window, read_window
 from coec.adapters.ros import cdr
-from coec.calibration.frames.origin import apparent_origin, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.errors import DecodeError, SourceError
 from coec.sources.bag.index import CLOUD_TYPES, IMAGE_TYPES, MOTION_TYPES, Place, index_of
 from coec.sources.bag.rig import rig_of_bag
 from coec.sources.bag.storage import Reader, Storage, open_storage
+from coec.sources.clouds import measured_from
 from coec.sources.recording import (
     MOTION_REACH_NS,
     FramewiseRecording,
@@ -150,12 +150,8 @@ class BagRecording:
                 yield self._from_origin(message) if isinstance(message, LidarFrame) else message
 
     def _from_origin(self, cloud: LidarFrame) -> LidarFrame:
-        sweep = from_origin(cloud, self.T_cloud_lidar, self.rig.lidar_frame)
-        contradiction = apparent_origin(sweep)
-        if contradiction is not None:
-            advice = "Name the LiDAR's frame with ?lidar_frame=..., if /tf_static has it."
-            raise SourceError(f"{self.storage.path}: {contradiction.sentence} {advice}")
-        return sweep
+        advice = "Name the LiDAR's frame with ?lidar_frame=..., if /tf_static has it."
+        return measured_from(cloud, self.T_cloud_lidar, self.rig.lidar_frame, self.storage.path, advice)
 
 
 def _load(storage: Storage, reader: Reader, place: Place) -> Message:
