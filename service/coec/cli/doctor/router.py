@@ -33,6 +33,9 @@ CONNECT_S = 3.0
 
 CLOSE_S = 3.0
 
+ASK_AGAIN_S = 0.05
+"""Between two questions for a token that the router has yet to hand on: nobody announces that it did not."""
+
 SEEN_S = 3.0
 """For the own liveliness token to come back from the router."""
 
@@ -119,7 +122,7 @@ def rules_finding(config: Config, session: zenoh.Session) -> Finding:
             while time.monotonic() < deadline_s:
                 if any(reply.ok is not None for reply in other.liveliness().get(token_key, timeout=1.0)):
                     return ok("rules", keys.root, "the router hands on what is said there")
-                time.sleep(0.05)
+                time.sleep(ASK_AGAIN_S)
         finally:
             token.undeclare()
     finally:
