@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from e2e.processes import added_to_environment
+
 WELL, FULL, READ_ONLY, SLOW = "well", "full", "read-only", "slow 100000"
 
 
@@ -30,13 +32,5 @@ class BrokenDisk:
         """Processes that are started meanwhile have it."""
         path = os.pathsep.join(filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
         names = {"PYTHONPATH": path, "COEC_BROKEN_DISK": str(self._root), "COEC_BROKEN_DISK_IS": str(self._file)}
-        before = {name: os.environ.get(name) for name in names}
-        os.environ.update(names)
-        try:
+        with added_to_environment(names):
             yield
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name)
-                else:
-                    os.environ[name] = value

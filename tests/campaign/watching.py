@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +24,15 @@ from coec.errors import CoecError
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
 from coec.sources import open_source
-from e2e.processes import COMMAND, Service, environment, free_endpoint, service, write_configuration
+from e2e.processes import (
+    COMMAND,
+    Service,
+    added_to_environment,
+    environment,
+    free_endpoint,
+    service,
+    write_configuration,
+)
 
 PERIOD_S = 5.0
 """One check per so much sensor time."""
@@ -224,7 +231,7 @@ def watching(
     program: Sequence[str] = COMMAND,
 ) -> Iterator[Watch]:
     """A service with this configuration whose worker is ready, and one who watches it. `program` stands for `coec`."""
-    with _environment(extra_environment or {}), service(path, None, program=program) as running:
+    with added_to_environment(extra_environment or {}), service(path, None, program=program) as running:
         watch = Watch(running, running.session, running.config, path, truth)
         ego = running.config.pairs[0].ego
         assert ego is not None
@@ -236,20 +243,6 @@ def watching(
             subscriber.undeclare()
             if running.process.poll() is None:
                 running.terminate()
-
-
-@contextmanager
-def _environment(extra: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in extra}
-    os.environ.update(extra)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name)
-            else:
-                os.environ[name] = value
 
 
 @dataclass(frozen=True, slots=True)

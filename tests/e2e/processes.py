@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -60,6 +60,21 @@ def environment() -> dict[str, str]:
     """That of this process, with the package on its path."""
     path = os.pathsep.join(filter(None, [str(REPOSITORY / "service"), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path}
+
+
+@contextmanager
+def added_to_environment(extra: Mapping[str, str]) -> Iterator[None]:
+    """Processes that are started meanwhile have these variables, too."""
+    before = {name: os.environ.get(name) for name in extra}
+    os.environ.update(extra)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name)
+            else:
+                os.environ[name] = value
 
 
 def coec(*arguments: object, timeout_s: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
