@@ -28,7 +28,7 @@ from coec.adapters.files.rig import rig_of, rig_to_json
 from coec.adapters.frames.msgpack_frames import decode_camera, decode_ego, decode_lidar
 from coec.adapters.images.codec import Inspector, decode_depth, encode_depth_png, encode_png
 from coec.adapters.mcap.windows import PART_SUFFIX, is_window, read_result, read_window, salvage
-from coec.adapters.ros import cdr
+from coec.adapters.ros import incoming, messages, outgoing
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.settings import mode_of, settings_of
 from coec.calibration.lifecycle import Rules, after_estimate, initial_state, restored
@@ -132,13 +132,20 @@ def _ego_seeds() -> list[bytes]:
     return [msgpack.packb(motion)]
 
 
-MESSAGES: Final = (cdr.COMPRESSED_IMAGE, cdr.IMAGE, cdr.POINT_CLOUD, cdr.ODOMETRY, cdr.TWIST, "other/msg/Type")
+MESSAGES: Final = (
+    messages.COMPRESSED_IMAGE,
+    messages.IMAGE,
+    messages.POINT_CLOUD,
+    messages.ODOMETRY,
+    messages.TWIST,
+    "other/msg/Type",
+)
 
 
 def _cdr(data: bytes, folder: Path) -> None:
     """The first byte chooses the type of the message."""
     del folder
-    _inspected(cdr.decode(MESSAGES[data[0] % len(MESSAGES) if data else 0], data[1:], LIMITS))
+    _inspected(incoming.decode(MESSAGES[data[0] % len(MESSAGES) if data else 0], data[1:], LIMITS))
 
 
 XYZ: list[tuple[str, str, list[float]]] = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
@@ -292,15 +299,15 @@ def _recorded(topics: Sequence[tuple[str, str, bytes]], sequence: int = 0) -> li
 
 def _bag_seeds() -> list[bytes]:
     topics = [
-        ("/image", cdr.COMPRESSED_IMAGE, compressed()),
-        ("/points", cdr.POINT_CLOUD, SWEEP),
-        ("/odom", cdr.ODOMETRY, odometry()),
-        ("/info", cdr.CAMERA_INFO, _camera_info()),
-        ("/tf_static", cdr.TF, _tf()),
+        ("/image", messages.COMPRESSED_IMAGE, compressed()),
+        ("/points", messages.POINT_CLOUD, SWEEP),
+        ("/odom", messages.ODOMETRY, odometry()),
+        ("/info", messages.CAMERA_INFO, _camera_info()),
+        ("/tf_static", messages.TF, _tf()),
     ]
     header = (Opcode.HEADER, struct.pack("<I", 5) + b"ros2\0" + bytes(4))
     records = _recorded(topics)
-    twisted = _recorded([topics[0], topics[1], ("/twist", cdr.TWIST, twist()), *topics[3:]])
+    twisted = _recorded([topics[0], topics[1], ("/twist", messages.TWIST, twist()), *topics[3:]])
     return [mcap_file([header, *records]), mcap_file([(Opcode.CHUNK, chunk(packed_records(twisted)))])]
 
 
@@ -333,10 +340,10 @@ def _window_seeds() -> list[bytes]:
     result = to_json(result_of(estimate(1), RIG, VEHICLE))
     mask = encode_png(np.full((48, 64), 255, np.uint8))
     topics = [
-        ("/coec/front/lidar/points", cdr.POINT_CLOUD, SWEEP),
-        ("/coec/front/odometry", cdr.ODOMETRY, odometry()),
-        ("/coec/front/camera/depth/compressed", cdr.COMPRESSED_IMAGE, compressed(DEPTH, cdr.DEPTH_FORMAT)),
-        ("/coec/front/camera/image/compressed", cdr.COMPRESSED_IMAGE, compressed()),
+        ("/coec/front/lidar/points", messages.POINT_CLOUD, SWEEP),
+        ("/coec/front/odometry", messages.ODOMETRY, odometry()),
+        ("/coec/front/camera/depth/compressed", messages.COMPRESSED_IMAGE, compressed(DEPTH, outgoing.DEPTH_FORMAT)),
+        ("/coec/front/camera/image/compressed", messages.COMPRESSED_IMAGE, compressed()),
     ]
     attachments = [("rig.json", canonical(head)), ("configuration.json", to_json(CalibrationConfig()))]
     first = [(int(Opcode.ATTACHMENT), attachment(name, data)) for name, data in attachments]

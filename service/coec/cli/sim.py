@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from coec.adapters.files.output import OutputError, write
 from coec.adapters.mcap.bag_writer import Frame, write_bag
-from coec.adapters.ros import cdr
+from coec.adapters.ros import messages, outgoing
 from coec.calibration.types import CameraFrame
 from coec.errors import UsageError
 from coec.reports import console
@@ -119,8 +119,8 @@ def _truth(made: SimulatedDrive, frame: Frame) -> list[tuple[str, str, bytes]]:
     if not isinstance(frame, CameraFrame):
         return []
     stamp_ns = frame.stamp_ns
-    extrinsic = cdr.encode_tf_static(made.rig, made.truth(stamp_ns), stamp_ns)
-    pose = cdr.encode_tf_static(
+    extrinsic = outgoing.encode_tf_static(made.rig, made.truth(stamp_ns), stamp_ns)
+    pose = outgoing.encode_tf_static(
         replace(made.rig, camera_frame="world", lidar_frame="ego"), made.true_pose(stamp_ns), stamp_ns
     )
-    return [(TRUTH_TOPIC, cdr.TF, extrinsic), (TRUTH_TOPIC, cdr.TF, pose)]
+    return [(TRUTH_TOPIC, messages.TF, extrinsic), (TRUTH_TOPIC, messages.TF, pose)]

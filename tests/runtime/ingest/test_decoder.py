@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from coec.adapters.frames import msgpack_frames
-from coec.adapters.ros import cdr
+from coec.adapters.ros import outgoing
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
@@ -68,12 +68,12 @@ def desk() -> Desk:
 
 
 def test_the_samples_encoding_is_believed(desk: Desk) -> None:
-    type_name, image = cdr.encode_image(camera())
+    type_name, image = outgoing.encode_image(camera())
     assert desk.take(CAMERA, msgpack_frames.encode_camera(camera()), MSGPACK) == camera()
     assert desk.take(CAMERA, image, f"{CDR};{type_name}") == camera()
     assert desk.take(CAMERA, image, CDR) == camera(), "the type of the configuration"
     assert isinstance(desk.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK), LidarFrame)
-    assert isinstance(desk.take(EGO, cdr.encode_odometry(MOTION, "base"), CDR), EgoMotion)
+    assert isinstance(desk.take(EGO, outgoing.encode_odometry(MOTION, "base"), CDR), EgoMotion)
     assert not desk.losses.snapshot()
 
 
@@ -102,7 +102,7 @@ def test_a_cloud_that_contradicts_its_origin_is_refused(desk: Desk, caplog: pyte
 
 def test_else_the_configurations(desk: Desk) -> None:
     assert desk.take(CAMERA, msgpack_frames.encode_camera(camera())) == camera()
-    assert isinstance(desk.take(LIDAR, cdr.encode_cloud(CLOUD)), LidarFrame)
+    assert isinstance(desk.take(LIDAR, outgoing.encode_cloud(CLOUD)), LidarFrame)
     assert desk.take(EGO, msgpack_frames.encode_ego(MOTION), "text/plain") == MOTION
     assert desk.intake.counts(EGO).accepted == 1
 
@@ -112,7 +112,7 @@ def test_else_the_configurations(desk: Desk) -> None:
     [
         (CAMERA, msgpack_frames.encode_camera(camera(frame_id="other")), MSGPACK, "frame_id"),
         (CAMERA, msgpack_frames.encode_camera(camera(width=5)), MSGPACK, "image_size"),
-        (CAMERA, cdr.encode_cloud(CLOUD), f"{CDR};sensor_msgs/msg/PointCloud2", "wrong_type"),
+        (CAMERA, outgoing.encode_cloud(CLOUD), f"{CDR};sensor_msgs/msg/PointCloud2", "wrong_type"),
         (LIDAR, bytes(33 * 2**20), CDR, "message_too_large"),
     ],
 )

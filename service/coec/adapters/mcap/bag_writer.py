@@ -10,7 +10,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from coec import __version__
-from coec.adapters.ros import cdr
+from coec.adapters.ros import messages, outgoing
 from coec.calibration.frames.motion_compensation import azimuth_offsets_s
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 
@@ -48,7 +48,7 @@ def write_bag(
         for frame in frames:
             for child, joint in _joints(rig, T_camera_lidar, frame):
                 if child not in joined:
-                    topics.write("/tf_static", cdr.TF, frame.stamp_ns, joint)
+                    topics.write("/tf_static", messages.TF, frame.stamp_ns, joint)
                     joined.add(child)
             for topic, type_name, data in _messages(rig, frame):
                 topics.write(topic, type_name, frame.stamp_ns, data)
@@ -71,7 +71,7 @@ class _Topics:
         """Adds a message."""
         if topic not in self._channels:
             if type_name not in self._schemas:
-                definition = cdr.definition(type_name).encode()
+                definition = messages.definition(type_name).encode()
                 self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", definition)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[type_name])
         self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, self._sequence)
@@ -80,25 +80,25 @@ class _Topics:
 
 def _joints(rig: Rig, T_camera_lidar: Matrix4, frame: Frame) -> list[tuple[str, bytes]]:
     """The static transforms that a frame needs, by the name of their child."""
-    joints = [(rig.lidar_frame, cdr.encode_tf_static(rig, T_camera_lidar, frame.stamp_ns))]
+    joints = [(rig.lidar_frame, outgoing.encode_tf_static(rig, T_camera_lidar, frame.stamp_ns))]
     if isinstance(frame, EgoMotion) and frame.frame_id != rig.lidar_frame:
         # The ego frame as a child of the LiDAR's, written by the same rule: child to parent.
         below = replace(rig, camera_frame=rig.lidar_frame, lidar_frame=frame.frame_id)
-        joints.append((frame.frame_id, cdr.encode_tf_static(below, rig.T_lidar_ego, frame.stamp_ns)))
+        joints.append((frame.frame_id, outgoing.encode_tf_static(below, rig.T_lidar_ego, frame.stamp_ns)))
     return joints
 
 
 def _messages(rig: Rig, frame: Frame) -> list[tuple[str, str, bytes]]:
     match frame:
         case CameraFrame():
-            type_name, data = cdr.encode_image(frame)
-            topic = f"/{rig.pair}/camera/image" + ("/compressed" if type_name == cdr.COMPRESSED_IMAGE else "")
-            info = cdr.encode_camera_info(rig, frame.stamp_ns)
-            return [(f"/{rig.pair}/camera/camera_info", cdr.CAMERA_INFO, info), (topic, type_name, data)]
+            type_name, data = outgoing.encode_image(frame)
+            topic = f"/{rig.pair}/camera/image" + ("/compressed" if type_name == messages.COMPRESSED_IMAGE else "")
+            info = outgoing.encode_camera_info(rig, frame.stamp_ns)
+            return [(f"/{rig.pair}/camera/camera_info", messages.CAMERA_INFO, info), (topic, type_name, data)]
         case LidarFrame():
-            return [(f"/{rig.pair}/lidar/points", cdr.POINT_CLOUD, cdr.encode_cloud(_timed(rig, frame)))]
+            return [(f"/{rig.pair}/lidar/points", messages.POINT_CLOUD, outgoing.encode_cloud(_timed(rig, frame)))]
         case EgoMotion():
-            return [(f"/{rig.pair}/odometry", cdr.ODOMETRY, cdr.encode_odometry(frame, frame.frame_id))]
+            return [(f"/{rig.pair}/odometry", messages.ODOMETRY, outgoing.encode_odometry(frame, frame.frame_id))]
 
 
 def _timed(rig: Rig, sweep: LidarFrame) -> LidarFrame:

@@ -42,7 +42,7 @@ from coec.adapters.mcap.files import (
     read_attachment,
     read_records,
 )
-from coec.adapters.ros import cdr
+from coec.adapters.ros import incoming, messages, outgoing
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
@@ -262,18 +262,18 @@ class WindowWriter:
                 self.abandon()
                 raise RecordingError(f"stamp {frame.stamp_ns} ns does not fit the 32-bit seconds of ROS 2")
         if self.pairs == 0:
-            self._cdr(TF_STATIC, cdr.TF, stamp_ns, cdr.encode_tf_static(self._rig, self._T_start, stamp_ns))
-        self._cdr(self._topic(POINTS), cdr.POINT_CLOUD, pair.lidar.stamp_ns, cdr.encode_cloud(pair.lidar))
+            self._cdr(TF_STATIC, messages.TF, stamp_ns, outgoing.encode_tf_static(self._rig, self._T_start, stamp_ns))
+        self._cdr(self._topic(POINTS), messages.POINT_CLOUD, pair.lidar.stamp_ns, outgoing.encode_cloud(pair.lidar))
         if pair.motion is not None:
-            odometry = cdr.encode_odometry(pair.motion, pair.motion.frame_id)
-            self._cdr(self._topic(ODOMETRY), cdr.ODOMETRY, pair.motion.stamp_ns, odometry)
+            odometry = outgoing.encode_odometry(pair.motion, pair.motion.frame_id)
+            self._cdr(self._topic(ODOMETRY), messages.ODOMETRY, pair.motion.stamp_ns, odometry)
         if pair.camera.depth is not None:
-            depth = cdr.encode_depth(stamp_ns, pair.camera.frame_id, pair.camera.depth)
-            self._cdr(self._topic(DEPTH), cdr.COMPRESSED_IMAGE, stamp_ns, depth)
-        info = cdr.encode_camera_info(self._rig, stamp_ns)
-        self._cdr(self._topic(CAMERA_INFO), cdr.CAMERA_INFO, stamp_ns, info)
-        image_type, image = cdr.encode_image(pair.camera)
-        topic = self._topic(IMAGE if image_type == cdr.IMAGE else COMPRESSED)
+            depth = outgoing.encode_depth(stamp_ns, pair.camera.frame_id, pair.camera.depth)
+            self._cdr(self._topic(DEPTH), messages.COMPRESSED_IMAGE, stamp_ns, depth)
+        info = outgoing.encode_camera_info(self._rig, stamp_ns)
+        self._cdr(self._topic(CAMERA_INFO), messages.CAMERA_INFO, stamp_ns, info)
+        image_type, image = outgoing.encode_image(pair.camera)
+        topic = self._topic(IMAGE if image_type == messages.IMAGE else COMPRESSED)
         self._cdr(topic, image_type, stamp_ns, image)
         self._file.sync()
         self.pairs += 1
@@ -309,7 +309,7 @@ def write_result(path: Path, result: CalibrationResult) -> RecordedWindow:
     try:
         window_id, pairs = _copy(path, file, without=(DIAGNOSTICS, _topic(result.pair, RESULT_TOPIC)))
         stamp_ns, document = result.data_stamp_ns, to_json(result)
-        file.message(DIAGNOSTICS, _ros_schema(cdr.DIAGNOSTICS), "cdr", stamp_ns, 0, _diagnostics(result))
+        file.message(DIAGNOSTICS, _ros_schema(messages.DIAGNOSTICS), "cdr", stamp_ns, 0, _diagnostics(result))
         file.message(_topic(result.pair, RESULT_TOPIC), None, "json", stamp_ns, 0, document)
         file.attach(RESULT, _JSON, document)
     except WindowError:
@@ -478,7 +478,7 @@ class _Content:
         if channel is None or schema is None or schema.name not in _FRAME_TYPES:
             return None
         try:
-            frame = cdr.decode(schema.name, message.data, _LIMITS)
+            frame = incoming.decode(schema.name, message.data, _LIMITS)
         except DecodeError as error:
             raise WindowError(f"a message on {channel.topic} cannot be decoded: {error}") from error
         parts = self.parts.setdefault(message.sequence, _Parts())
@@ -601,7 +601,7 @@ def _size(path: Path) -> int:
 _JSON = "application/json"
 _METADATA = "coec"
 _KEPT = "coec_kept"
-_FRAME_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE, cdr.POINT_CLOUD, cdr.ODOMETRY)
+_FRAME_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY)
 
 _OK, _WARN = 0, 1
 """diagnostic_msgs/DiagnosticStatus.level: an accepted calibration, one that failed."""
@@ -613,14 +613,14 @@ def _topic(pair: str, name: str) -> str:
 
 @lru_cache(maxsize=16)
 def _ros_schema(type_name: str) -> Schema:
-    return Schema(0, type_name, "ros2msg", cdr.definition(type_name).encode())
+    return Schema(0, type_name, "ros2msg", messages.definition(type_name).encode())
 
 
 def _diagnostics(result: CalibrationResult) -> bytes:
     """The verdict with its figures, as ROS tools show it."""
     reasons = result.verdict.reasons
     values = {name: f"{metric.value} (limit {metric.limit})" for name, metric in result.metrics.items()}
-    return cdr.encode_diagnostics(
+    return outgoing.encode_diagnostics(
         result.data_stamp_ns,
         f"coec/{result.pair}",
         _WARN if reasons else _OK,

@@ -12,7 +12,7 @@ from typing import Literal, cast
 import zenoh
 
 from coec.adapters.frames import msgpack_frames
-from coec.adapters.ros import cdr
+from coec.adapters.ros import messages, outgoing
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import PairConfig
 
@@ -173,8 +173,8 @@ def _msgpack(frame: Frame) -> bytes:
 def _cdr(frame: Frame) -> tuple[str, bytes]:
     match frame:
         case CameraFrame():
-            return cdr.encode_image(frame)
+            return outgoing.encode_image(frame)
         case LidarFrame():
-            return cdr.POINT_CLOUD, cdr.encode_cloud(frame)
+            return messages.POINT_CLOUD, outgoing.encode_cloud(frame)
         case EgoMotion():
-            return cdr.ODOMETRY, cdr.encode_odometry(frame, frame.frame_id)
+            return messages.ODOMETRY, outgoing.encode_odometry(frame, frame.frame_id)

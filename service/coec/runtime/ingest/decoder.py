@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coec.adapters.frames import msgpack_frames
-from coec.adapters.ros import cdr
+from coec.adapters.ros import incoming
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.origin import OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
@@ -94,7 +94,7 @@ class Decoder:
         if encoding not in ("application/msgpack", "application/cdr"):
             encoding = f"application/{self._configured_encoding(parcel.stream)}"
         if encoding == "application/cdr":
-            return cdr.decode(schema or self._configured_type(parcel.stream), parcel.payload, self._limits)
+            return incoming.decode(schema or self._configured_type(parcel.stream), parcel.payload, self._limits)
         if parcel.stream == CAMERA:
             return msgpack_frames.decode_camera(parcel.payload, self._limits)
         if parcel.stream == LIDAR:

@@ -14,15 +14,15 @@ import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
-from coec.adapters.ros import cdr
+from coec.adapters.ros import messages
 from coec.calibration.types import Matrix4
 from coec.errors import SourceError
 from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
 from coec.sources.bag.storage import Entry, Storage
 
-IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
-CLOUD_TYPES = (cdr.POINT_CLOUD,)
-MOTION_TYPES = (cdr.ODOMETRY, cdr.TWIST)
+IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
+CLOUD_TYPES = (messages.POINT_CLOUD,)
+MOTION_TYPES = (messages.ODOMETRY, messages.TWIST)
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -116,9 +116,9 @@ class Index:
             if stamp_ns is None:
                 raise SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
             stream.places.append(Place(stamp_ns, entry.place, name))
-        elif name == cdr.CAMERA_INFO and entry.topic not in self.infos:
+        elif name == messages.CAMERA_INFO and entry.topic not in self.infos:
             self.infos[entry.topic] = self._decoded(entry)
-        elif name == cdr.TF and entry.topic == "/tf_static":
+        elif name == messages.TF and entry.topic == "/tf_static":
             for joint in self._decoded(entry).transforms:
                 self._join(entry.topic, joint)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coec.adapters.mcap.windows import is_window, read_window
-from coec.adapters.ros import cdr
+from coec.adapters.ros import incoming
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.errors import DecodeError, SourceError
@@ -157,6 +157,6 @@ class BagRecording:
 def _load(storage: Storage, reader: Reader, place: Place) -> Message:
     data = reader.read(place.at)
     try:
-        return cdr.decode(place.type_name, data, LimitsConfig())
+        return incoming.decode(place.type_name, data, LimitsConfig())
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error

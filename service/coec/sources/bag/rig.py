@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
-from coec.adapters.ros import cdr
+from coec.adapters.ros import outgoing
 from coec.calibration.types import CameraFrame, EgoMotion, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, SourceError
@@ -93,7 +93,7 @@ def _info(index: Index, asked: str | None, camera_frame: str) -> Any:
 
 
 def _camera_of_info(info: Any) -> cameras.Camera:
-    """The camera of a `CameraInfo`, by the names in `cdr.DISTORTION` and ROS 1's `fisheye`.
+    """The camera of a `CameraInfo`, by the names in `outgoing.DISTORTION` and ROS 1's `fisheye`.
 
     Raises:
         ValueError: another model, or too few parameters.
@@ -107,11 +107,11 @@ def _camera_of_info(info: Any) -> cameras.Camera:
         return cameras.build("pinhole", **size, **focal)
     if model == "rational_polynomial" and not any(d[5:]):
         model = "plumb_bob"
-    for name, (distortion, parameters) in cdr.DISTORTION.items():
+    for name, (distortion, parameters) in outgoing.DISTORTION.items():
         if distortion == model and parameters:
             values = [*d, 0.0][: len(parameters)] if model == "plumb_bob" else d[: len(parameters)]
             if len(values) < len(parameters):
                 raise ValueError(f"{model} has the parameters {' '.join(parameters)}, the camera info only {len(d)}")
             return cameras.build(name, **size, **focal, **dict(zip(parameters, values, strict=True)))
-    known = ", ".join(sorted({distortion for distortion, _ in cdr.DISTORTION.values()}))
+    known = ", ".join(sorted({distortion for distortion, _ in outgoing.DISTORTION.values()}))
     raise ValueError(f"distortion model {model!r} is not known ({known} are); give ?intrinsics=FILE")

@@ -13,7 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import encode_depth_png, probe
-from coec.adapters.ros import cdr
+from coec.adapters.ros import incoming, messages, outgoing
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
@@ -27,23 +27,23 @@ NAN = math.nan
 XYZ: list[tuple[str, str, list[float]]] = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
 REASONS_OR_NONE = {None, *Refusal}
 MESSAGES = [
-    (cdr.COMPRESSED_IMAGE, compressed()),
-    (cdr.IMAGE, image("rgb8", 2, 2, 8, bytes(16))),
-    (cdr.POINT_CLOUD, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 9])])),
-    (cdr.ODOMETRY, odometry()),
-    (cdr.TWIST, twist()),
+    (messages.COMPRESSED_IMAGE, compressed()),
+    (messages.IMAGE, image("rgb8", 2, 2, 8, bytes(16))),
+    (messages.POINT_CLOUD, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 9])])),
+    (messages.ODOMETRY, odometry()),
+    (messages.TWIST, twist()),
 ]
 
 
 def sweep(payload: bytes) -> LidarFrame:
-    frame = cdr.decode(cdr.POINT_CLOUD, payload, LIMITS)
+    frame = incoming.decode(messages.POINT_CLOUD, payload, LIMITS)
     assert isinstance(frame, LidarFrame)
     return frame
 
 
 def reason_of(type_name: str, payload: bytes, limits: LimitsConfig = LIMITS) -> str:
     with pytest.raises(DecodeError) as refused:
-        cdr.decode(type_name, payload, limits)
+        incoming.decode(type_name, payload, limits)
     assert refused.value.reason in set(Refusal)
     return refused.value.reason
 
@@ -51,7 +51,7 @@ def reason_of(type_name: str, payload: bytes, limits: LimitsConfig = LIMITS) -> 
 def refusal_or_none(type_name: str, payload: bytes) -> str | None:
     """The reason, or None for what was read; any other exception fails the test."""
     try:
-        cdr.decode(type_name, payload, LIMITS)
+        incoming.decode(type_name, payload, LIMITS)
     except DecodeError as error:
         return error.reason
     return None
@@ -62,7 +62,7 @@ def refusal_or_none(type_name: str, payload: bytes) -> str | None:
 
 @pytest.mark.parametrize("form", ["jpeg", "", "bgr8; jpeg compressed bgr8", "rgb8; png compressed "])
 def test_a_compressed_image_is_known_by_its_bytes(form: str) -> None:
-    frame = cdr.decode(cdr.COMPRESSED_IMAGE, compressed(form=form), LIMITS)
+    frame = incoming.decode(messages.COMPRESSED_IMAGE, compressed(form=form), LIMITS)
 
     assert frame == CameraFrame(STAMP, "camera", EncodedImage(ImageFormat.JPEG, 64, 48, JPEG))
 
@@ -70,7 +70,7 @@ def test_a_compressed_image_is_known_by_its_bytes(form: str) -> None:
 def test_the_padding_of_rows_is_removed() -> None:
     data = bytes(range(6)) + b"\xaa\xaa" + bytes(range(6, 12)) + b"\xaa\xaa"
     for sent in (data, data[:-2]):  # some drivers leave out the padding of the last row
-        frame = cdr.decode(cdr.IMAGE, image("bgr8", 2, 2, 8, sent), LIMITS)
+        frame = incoming.decode(messages.IMAGE, image("bgr8", 2, 2, 8, sent), LIMITS)
 
         assert isinstance(frame, CameraFrame)
         assert frame.image == EncodedImage(ImageFormat.BGR8, 2, 2, bytes(range(12)))
@@ -89,11 +89,11 @@ def test_the_padding_of_rows_is_removed() -> None:
     ],
 )
 def test_a_wrong_raw_image_is_refused_by_reason(payload: bytes, reason: str) -> None:
-    assert reason_of(cdr.IMAGE, payload) == reason
+    assert reason_of(messages.IMAGE, payload) == reason
 
 
 def test_a_truncated_jpeg_is_refused() -> None:
-    assert reason_of(cdr.COMPRESSED_IMAGE, compressed(JPEG[:-9])) == "image_truncated"
+    assert reason_of(messages.COMPRESSED_IMAGE, compressed(JPEG[:-9])) == "image_truncated"
 
 
 # --- clouds -------------------------------------------------------------------------------------------------
@@ -168,7 +168,7 @@ def test_a_time_before_the_stamp() -> None:
 def test_a_time_of_another_clock_is_refused() -> None:
     payload = packed([*XYZ, ("timestamp", "<f8", [SEC - 3600.0, SEC - 3599.9])])
 
-    assert reason_of(cdr.POINT_CLOUD, payload) == "cloud_time"
+    assert reason_of(messages.POINT_CLOUD, payload) == "cloud_time"
 
 
 def test_points_that_are_none_go_with_their_row_whatever_their_other_columns_hold() -> None:
@@ -223,7 +223,7 @@ MAX = 2**32 - 1
 )
 def test_a_wrong_cloud_is_refused_by_reason(payload: bytes, reason: str) -> None:
     if reason:
-        assert reason_of(cdr.POINT_CLOUD, payload) == reason
+        assert reason_of(messages.POINT_CLOUD, payload) == reason
     else:  # a field of an unknown type that nobody asked for
         assert len(sweep(payload).xyz_m) == 1
 
@@ -234,20 +234,20 @@ def test_a_wrong_cloud_is_refused_by_reason(payload: bytes, reason: str) -> None
 @pytest.mark.parametrize(
     ("type_name", "payload", "frame_id"),
     [
-        (cdr.ODOMETRY, odometry(), "base_link"),  # the twist is expressed in the child frame
-        (cdr.ODOMETRY, odometry(""), "odom"),
-        (cdr.TWIST, twist(), "base_link"),
+        (messages.ODOMETRY, odometry(), "base_link"),  # the twist is expressed in the child frame
+        (messages.ODOMETRY, odometry(""), "odom"),
+        (messages.TWIST, twist(), "base_link"),
     ],
 )
 def test_ego_motion(type_name: str, payload: bytes, frame_id: str) -> None:
     motion = EgoMotion(STAMP, frame_id, (1.5, 0.0, -0.25), (0.0, 0.5, 0.125))
 
-    assert cdr.decode(type_name, payload, LIMITS) == motion
+    assert incoming.decode(type_name, payload, LIMITS) == motion
 
 
 @pytest.mark.parametrize("value", [NAN, math.inf, -1e30])
 def test_a_velocity_that_is_none_is_refused(value: float) -> None:
-    assert reason_of(cdr.TWIST, twist(angular=(0.0, value, 0.0))) == "motion_invalid"
+    assert reason_of(messages.TWIST, twist(angular=(0.0, value, 0.0))) == "motion_invalid"
 
 
 # --- headers and hostility ----------------------------------------------------------------------------------
@@ -262,7 +262,7 @@ def test_a_velocity_that_is_none_is_refused(value: float) -> None:
     ],
 )
 def test_a_wrong_header_is_refused_by_reason(header: dict[str, Any], reason: str) -> None:
-    assert reason_of(cdr.COMPRESSED_IMAGE, compressed(**header)) == reason
+    assert reason_of(messages.COMPRESSED_IMAGE, compressed(**header)) == reason
 
 
 def test_a_type_that_is_not_read_is_refused() -> None:
@@ -272,13 +272,13 @@ def test_a_type_that_is_not_read_is_refused() -> None:
 def test_a_message_beyond_the_limit_is_not_even_looked_at() -> None:
     limits = LimitsConfig(max_message_bytes=2**16)
 
-    assert reason_of(cdr.POINT_CLOUD, bytes(2**16 + 1), limits) == "message_too_large"
+    assert reason_of(messages.POINT_CLOUD, bytes(2**16 + 1), limits) == "message_too_large"
 
 
 @pytest.mark.fault("a ROS message cut off at any byte", "it is refused with a reason")
 @pytest.mark.parametrize(("type_name", "payload"), MESSAGES)
 def test_a_message_cut_at_any_byte_is_refused(type_name: str, payload: bytes) -> None:
-    cdr.decode(type_name, payload, LIMITS)
+    incoming.decode(type_name, payload, LIMITS)
     for size in range(0, len(payload) - 1, max(1, len(payload) // 400)):
         assert reason_of(type_name, payload[:size])
 
@@ -286,7 +286,7 @@ def test_a_message_cut_at_any_byte_is_refused(type_name: str, payload: bytes) ->
 @pytest.mark.fault("a length of 4 GB anywhere in a ROS message", "nothing is allocated for it")
 @pytest.mark.parametrize(("type_name", "payload"), MESSAGES)
 def test_a_huge_length_anywhere_allocates_nothing(type_name: str, payload: bytes) -> None:
-    cdr.decode(type_name, payload, LIMITS)  # builds the decoder, which is not the sender's memory
+    incoming.decode(type_name, payload, LIMITS)  # builds the decoder, which is not the sender's memory
     tracemalloc.start()
     try:
         for at in range(4, min(len(payload) - 4, 300)):
@@ -358,7 +358,7 @@ def read_by_others(type_name: str, payload: bytes) -> Any:
     """Decoded by mcap_ros2, which shares nothing with our decoder but the definition."""
     from mcap.records import Schema
 
-    schema = Schema(id=1, name=type_name, encoding="ros2msg", data=cdr.definition(type_name).encode())
+    schema = Schema(id=1, name=type_name, encoding="ros2msg", data=messages.definition(type_name).encode())
     decode = DecoderFactory().decoder_for("cdr", schema)
     assert decode is not None
     return decode(payload)
@@ -375,21 +375,21 @@ def read_by_others(type_name: str, payload: bytes) -> Any:
 def test_an_image_there_and_back(encoded: EncodedImage) -> None:
     frame = CameraFrame(STAMP, "camera", encoded)
 
-    type_name, payload = cdr.encode_image(frame)
+    type_name, payload = outgoing.encode_image(frame)
 
-    assert cdr.decode(type_name, payload, LIMITS) == frame
+    assert incoming.decode(type_name, payload, LIMITS) == frame
     assert bytes(read_by_others(type_name, payload).data) == encoded.data
 
 
 def test_a_depth_map_there_and_back() -> None:
     depth = probe(encode_depth_png(np.full((12, 16), 7, np.uint16)), LIMITS)
 
-    payload = cdr.encode_depth(STAMP, "camera", depth)
+    payload = outgoing.encode_depth(STAMP, "camera", depth)
 
-    frame = cdr.decode(cdr.COMPRESSED_IMAGE, payload, LIMITS)
+    frame = incoming.decode(messages.COMPRESSED_IMAGE, payload, LIMITS)
     assert isinstance(frame, CameraFrame)
     assert frame.image == depth
-    assert read_by_others(cdr.COMPRESSED_IMAGE, payload).format == "16UC1; png"
+    assert read_by_others(messages.COMPRESSED_IMAGE, payload).format == "16UC1; png"
 
 
 @pytest.mark.parametrize("names", [(), ("time_offset_s",), ("intensity", "ring", "time_offset_s")])
@@ -403,7 +403,7 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
     xyz_m = rng.normal(size=(500, 3)).astype(np.float32)
     frame = LidarFrame(STAMP, "lidar", xyz_m, **{name: columns[name] for name in names})
 
-    back = sweep(cdr.encode_cloud(frame))
+    back = sweep(outgoing.encode_cloud(frame))
 
     assert (back.stamp_ns, back.frame_id) == (STAMP, "lidar")
     assert back.xyz_m.tobytes() == xyz_m.tobytes()
@@ -415,17 +415,17 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
 def test_an_odometry_there_and_back() -> None:
     motion = EgoMotion(STAMP, "base_link", (1 / 3, 0.0, -2.0), (1e-9, 0.5, 3.0))
 
-    payload = cdr.encode_odometry(motion, "base_link")
+    payload = outgoing.encode_odometry(motion, "base_link")
 
-    assert cdr.decode(cdr.ODOMETRY, payload, LIMITS) == motion
-    assert read_by_others(cdr.ODOMETRY, payload).child_frame_id == "base_link"
+    assert incoming.decode(messages.ODOMETRY, payload, LIMITS) == motion
+    assert read_by_others(messages.ODOMETRY, payload).child_frame_id == "base_link"
 
 
 @pytest.mark.parametrize("model", CAMERAS)
 def test_camera_info(model: str) -> None:
     camera, distortion_model, d = CAMERAS[model]
 
-    message = read_by_others(cdr.CAMERA_INFO, cdr.encode_camera_info(rig(camera), STAMP))
+    message = read_by_others(messages.CAMERA_INFO, outgoing.encode_camera_info(rig(camera), STAMP))
 
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (SEC, NSEC)
     assert (message.width, message.height, message.header.frame_id) == (640, 480, "camera")
@@ -437,15 +437,15 @@ def test_camera_info(model: str) -> None:
 def test_every_camera_model_has_a_distortion_model() -> None:
     from coec.geometry.cameras import MODELS
 
-    assert set(cdr.DISTORTION) == set(MODELS)
-    for name, (_, parameters) in cdr.DISTORTION.items():
+    assert set(outgoing.DISTORTION) == set(MODELS)
+    for name, (_, parameters) in outgoing.DISTORTION.items():
         assert set(parameters) == set(MODELS[name].parameters) - {"width", "height", "fx", "fy", "cx", "cy"}
 
 
 def test_tf_maps_the_child_to_the_parent() -> None:
-    payload = cdr.encode_tf_static(rig(CAMERAS["pinhole"][0]), T_CAMERA_LIDAR, STAMP)
+    payload = outgoing.encode_tf_static(rig(CAMERAS["pinhole"][0]), T_CAMERA_LIDAR, STAMP)
 
-    (transform,) = read_by_others(cdr.TF, payload).transforms
+    (transform,) = read_by_others(messages.TF, payload).transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("camera", "lidar")
     moved, turned = transform.transform.translation, transform.transform.rotation
     assert (moved.x, moved.y, moved.z) == (0.1, 0.2, 0.3)
@@ -453,9 +453,9 @@ def test_tf_maps_the_child_to_the_parent() -> None:
 
 
 def test_diagnostics() -> None:
-    payload = cdr.encode_diagnostics(STAMP, "coec/front", 3, "not looked yet", {"mi": "0.5"}, "truck-7")
+    payload = outgoing.encode_diagnostics(STAMP, "coec/front", 3, "not looked yet", {"mi": "0.5"}, "truck-7")
 
-    (status,) = read_by_others(cdr.DIAGNOSTICS, payload).status
+    (status,) = read_by_others(messages.DIAGNOSTICS, payload).status
     assert (status.name, status.message, status.hardware_id) == ("coec/front", "not looked yet", "truck-7")
     assert ord(status.level) if isinstance(status.level, bytes) else status.level == 3
     assert [(item.key, item.value) for item in status.values] == [("mi", "0.5")]

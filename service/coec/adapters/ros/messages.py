@@ -1,0 +1,57 @@
+"""The types of ROS 2 messages that are known here, and CDR to and from them. Definitions are those of Humble; for these
+types they are the same up to Lyrical."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, Final, TypeVar
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from coec.adapters.frames.incoming import Refusal
+from coec.errors import DecodeError
+
+COMPRESSED_IMAGE: Final = "sensor_msgs/msg/CompressedImage"
+IMAGE: Final = "sensor_msgs/msg/Image"
+POINT_CLOUD: Final = "sensor_msgs/msg/PointCloud2"
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+TWIST: Final = "geometry_msgs/msg/TwistStamped"
+CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+TF: Final = "tf2_msgs/msg/TFMessage"
+DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
+
+_STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+T = TypeVar("T")
+
+
+def definition(type_name: str) -> str:
+    """The message definition in ros2msg text, with those it refers to, as an MCAP schema wants it."""
+    text, _ = _STORE.generate_msgdef(type_name, ros_version=2)
+    return text
+
+
+def deserialized(message_type: type[T], payload: bytes) -> T:
+    """The message in CDR, of either byte order.
+
+    Raises:
+        DecodeError: it is not one, or is cut off.
+    """
+    try:
+        message = _STORE.deserialize_cdr(payload, message_type.__msgtype__)  # type: ignore[attr-defined]
+    except (SerdeError, ValueError, IndexError, struct.error) as error:
+        raise DecodeError(Refusal.MESSAGE_MALFORMED, "not this message in CDR, or cut off") from error
+    if not isinstance(message, message_type):
+        raise TypeError(f"the type store made {type(message)} of {message_type}")
+    return message
+
+
+def serialized(message: Any, type_name: str) -> bytes:
+    """CDR, little endian, with its encapsulation header."""
+    return bytes(_STORE.serialize_cdr(message, type_name, little_endian=True))
+
+
+def type_hash(type_name: str) -> str:
+    """`RIHS01_` and 64 hexadecimal digits: how ROS 2 tells definitions of one name apart (REP 2016)."""
+    return str(_STORE.hash_rihs01(type_name))
