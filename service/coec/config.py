@@ -447,6 +447,18 @@ class ZenohConfig(Stage):
         return self.listen if self.embedded_router else self.connect
 
 
+class RosConfig(Stage):
+    """ROS 2 on the bus, where `middleware` is one of its."""
+
+    domain: int = Field(default=0, ge=0, le=232, description="ROS_DOMAIN_ID (rmw_zenoh)")
+    namespace: str = Field(
+        default="",
+        pattern=r"^(/?[A-Za-z_][A-Za-z0-9_]*)*$",
+        max_length=128,
+        description="of the bridge, where it has one (ros2dds)",
+    )
+
+
 CommonName = Annotated[str, Field(pattern=r"^[A-Za-z0-9 ._:/@+=,-]{1,64}$")]
 """Of a certificate; X.509 allows 64 characters."""
 
@@ -540,6 +552,10 @@ class Config(Stage):
     vehicle: Name = "vehicle"
     prefix: KeyExpression = "coec"
     zenoh: ZenohConfig = ZenohConfig()
+    middleware: Literal["native", "rmw_zenoh", "ros2dds"] = Field(
+        default="native", description="how topics lie on the bus: native keys, or as ROS 2 nodes or a bridge put them"
+    )
+    ros: RosConfig = RosConfig()
     authority: AuthorityConfig = AuthorityConfig()
     state: StateConfig = StateConfig()
     worker: WorkerConfig = WorkerConfig()

@@ -1,0 +1,1 @@
+"""How ROS 2 speaks on Zenoh: keys, tokens and attachments as text and bytes; no session."""
