@@ -7,6 +7,7 @@ import math
 import shlex
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -18,26 +19,13 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from coec.adapters.exports import FORMATS
-from coec.adapters.exports.extrinsic import Extrinsic, Origin, roll_pitch_yaw
+from coec.adapters.exports.extrinsic import roll_pitch_yaw
 from coec.adapters.files.output import OutputError
-from coec.config import CameraIntrinsics
-from coec.geometry import se3
+from exported import extrinsic
 
 Matrix = NDArray[np.float64]
 
 TOLERANCE = 1e-12
-CAMERA = CameraIntrinsics(
-    model="double_sphere", width=1400, height=1300, fx=700.5, fy=701.5, cx=699.5, cy=650.5, xi=-0.2, alpha=0.6
-)
-
-
-def extrinsic(xi: Matrix, objections: tuple[str, ...] = (), camera: CameraIntrinsics | None = CAMERA) -> Extrinsic:
-    """A camera that looks forward, turned and moved by a vector (6,), in a parent 1.7 m below the LiDAR."""
-    forward = np.array([[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.3], [1.0, 0.0, 0.0, -0.2], [0.0, 0.0, 0.0, 1.0]])
-    T_parent_lidar = se3.exp(np.array([0.02, -0.3, 0.5, 0.9, 0.1, 1.7]))
-    origin = Origin("vehicle", "front", "0.1.0", "estimated", "front-12", 12_000_000_000, "ab12", objections)
-    covariance = np.diag([1e-7, 2e-7, 3e-7, 1e-4, 2e-4, 3e-4])
-    return Extrinsic(se3.exp(xi) @ forward, covariance, "base_link", "cam0", T_parent_lidar, camera, origin)
 
 
 def rotation_of(wxyz: list[float]) -> Matrix:
@@ -127,7 +115,7 @@ def read_openlabel(text: str) -> Matrix:
 
 
 def read_colmap(text: str) -> Matrix:
-    camera = json.loads(text)[0]["cameras"][0]
+    _, camera = json.loads(text)[-1]["cameras"]
     return pose(rotation_of(camera["cam_from_rig_rotation"]), camera["cam_from_rig_translation"])
 
 
@@ -241,6 +229,16 @@ def test_of_a_document_in_json_the_rest_is_kept(name: str, before: str, kept: st
 def test_a_file_that_is_something_else_is_refused(name: str, existing: str) -> None:
     with pytest.raises(OutputError):
         FORMATS[name].text(extrinsic(np.zeros(6)), existing)
+
+
+def test_colmap_means_poses_from_the_reference_of_a_rig() -> None:
+    ours = FORMATS["colmap"].text(extrinsic(np.zeros(6)), None)
+    rear = replace(extrinsic(np.full(6, 0.2)), child="cam1")
+    (rig,) = json.loads(FORMATS["colmap"].text(rear, ours))  # the same parent: the same rig
+    assert [camera["image_prefix"] for camera in rig["cameras"]] == ["base_link/", "cam0/", "cam1/"]
+    others = json.dumps([{"cameras": [{"image_prefix": "cam0/", "ref_sensor": True}]}])
+    with pytest.raises(OutputError, match="in a rig whose reference is"):
+        FORMATS["colmap"].text(extrinsic(np.zeros(6)), others)
 
 
 def test_a_parent_that_holds_no_entries_is_refused() -> None:

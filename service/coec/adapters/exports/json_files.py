@@ -68,31 +68,41 @@ def openlabel_text(extrinsic: Extrinsic, existing: str | None) -> str:
 
 
 def colmap_text(extrinsic: Extrinsic, existing: str | None) -> str:
-    """The rigs with this camera, found by `image_prefix` (the child and a slash); a new one joins the first rig.
+    """The rigs with this camera, found by `image_prefix` (the child and a slash) in the rig whose reference sensor is
+    the parent; a rig of its own where there is none.
 
-    COLMAP knows cameras alone: one camera of a rig is its reference (`ref_sensor`), and the others' poses are meant
-    from it. Here the rig is the parent, so that none of the cameras may be the reference.
+    COLMAP takes a rig only with a reference sensor, and means all poses of its cameras from that. Here it is the
+    parent, under a prefix that no image has.
 
     Raises:
-        OutputError: what exists is no such list.
+        OutputError: what exists is no such list, or has this camera in a rig with another reference.
     """
-    rigs = [{"cameras": []}] if existing is None else _parsed(existing)
-    pose = {
+    rigs = [] if existing is None else _parsed(existing)
+    reference, prefix = f"{extrinsic.parent}/", f"{extrinsic.child}/"
+    camera = {
+        "image_prefix": prefix,
         "cam_from_rig_rotation": quaternion_wxyz(extrinsic.T_child_parent),
         "cam_from_rig_translation": translation_m(extrinsic.T_child_parent),
         "coec": extrinsic.document(COLMAP_DIRECTION),
     }
-    prefix = f"{extrinsic.child}/"
     try:
-        cameras = [camera for rig in rigs for camera in rig["cameras"]]
-        same = [camera for camera in cameras if camera["image_prefix"] == prefix]
-        if same:
-            same[0].update(pose)
-        else:
-            rigs[0]["cameras"].append({"image_prefix": prefix, **pose})
-    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        for rig in rigs:
+            references = [one["image_prefix"] for one in rig["cameras"] if one.get("ref_sensor")]
+            same = [one for one in rig["cameras"] if one["image_prefix"] == prefix]
+            if references == [reference]:
+                if same:
+                    same[0].update(camera)
+                else:
+                    rig["cameras"].append(camera)
+                return _written(rigs)
+            if same:
+                raise OutputError(
+                    f"camera {prefix!r} is in a rig whose reference is {references}: its pose there is not one from "
+                    f"{reference!r}; write into another file, or name that reference with --parent and --parent-pose"
+                )
+        return _written([*rigs, {"cameras": [{"image_prefix": reference, "ref_sensor": True}, camera]}])
+    except (AttributeError, KeyError, TypeError) as error:
         raise OutputError("the file is no rig configuration of COLMAP") from error
-    return _written(rigs)
 
 
 def plain_text(extrinsic: Extrinsic, existing: str | None) -> str:  # noqa: ARG001  the file holds this one transform

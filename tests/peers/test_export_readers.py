@@ -1,0 +1,31 @@
+"""What `coec export` writes, read by programs that are not ours: the same transform."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from coec.adapters.exports import FORMATS
+from exported import extrinsic
+from peers.environments import Peer, peer
+
+TOLERANCE = 1e-12
+
+OURS = {"tf", "json"}
+"""A command line, which tf2's publisher reads, and a format of our own: nobody else has a reader."""
+
+
+@pytest.fixture(scope="module")
+def readers() -> Iterator[Peer]:
+    with peer("readers", "export_reader.py") as readers:
+        yield readers
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS.keys() - OURS))
+def test_others_read_the_same_transform(readers: Peer, name: str) -> None:
+    for seed in range(20):
+        told = extrinsic(np.random.default_rng(seed).uniform(-2.0, 2.0, 6))
+        read = readers.ask(format=name, text=FORMATS[name].text(told, None))
+        np.testing.assert_allclose(read["T_child_parent"], told.T_child_parent, atol=TOLERANCE, rtol=0)
