@@ -1,0 +1,36 @@
+"""The relay that stands for a bridge: what a node publishes comes to the key of its topic, and back."""
+
+from __future__ import annotations
+
+import zenoh
+
+from coec.adapters.ros import messages
+from e2e.processes import routing
+from peers.nodes import Inbox, Topic, node, relay
+from ros_messages import compressed, twist
+
+IMAGE, SPEED = "/front/image/compressed", "/speed"
+WITHIN_S = 60.0
+
+
+def test_messages_go_both_ways() -> None:
+    image, speed = compressed(), twist()
+    inbox, keys = Inbox(), Inbox()
+    with routing() as router:
+        subscriber = router.session.declare_subscriber(
+            "front/image/compressed",
+            zenoh.handlers.Callback(
+                lambda sample: keys.hear(str(sample.key_expr), sample.payload.to_bytes()), indirect=False
+            ),
+        )
+        camera, motion = {IMAGE: Topic(messages.COMPRESSED_IMAGE)}, {SPEED: Topic(messages.TWIST, latched=True)}
+        with relay(router.session, camera, motion), node("vehicle", camera, motion, inbox.hear) as vehicle:
+            vehicle.wait_for_peers(IMAGE, SPEED)
+            vehicle.publish(IMAGE, image)
+            (came,) = keys.until("front/image/compressed", lambda found: len(found) == 1, "an image", WITHIN_S)
+            router.session.put("speed", speed)
+            (back,) = inbox.until(SPEED, lambda found: len(found) == 1, "a speed", WITHIN_S)
+        subscriber.undeclare()
+    assert came[:4] == b"\0\1\0\0"
+    assert image[-40:] in came
+    assert len(back) - len(speed) in range(-3, 4)
