@@ -17,12 +17,11 @@ def test_messages_go_both_ways() -> None:
     image, speed = compressed(), twist()
     inbox, keys = Inbox(), Inbox()
     with routing() as router:
-        subscriber = router.session.declare_subscriber(
-            "front/image/compressed",
-            zenoh.handlers.Callback(
-                lambda sample: keys.hear(str(sample.key_expr), sample.payload.to_bytes()), indirect=False
-            ),
-        )
+
+        def heard(sample: zenoh.Sample) -> None:
+            keys.hear(str(sample.key_expr), sample.payload.to_bytes())
+
+        subscriber = router.session.declare_subscriber("front/image/compressed", heard)
         camera, motion = {IMAGE: Topic(messages.COMPRESSED_IMAGE)}, {SPEED: Topic(messages.TWIST, latched=True)}
         with relay(router.session, camera, motion), node("vehicle", camera, motion, inbox.hear) as vehicle:
             vehicle.wait_for_peers(IMAGE, SPEED)
