@@ -100,7 +100,7 @@ def node(name: str, publish: Mapping[str, Topic], subscribe: Mapping[str, Topic]
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
     }
-    command = [python_of("ros2"), PEERS / "ros2" / "node_worker.py", json.dumps(told)]
+    command = [str(python_of("ros2")), str(PEERS / "ros2" / "node_worker.py"), json.dumps(told)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment) as process:
         running = Node(process, heard)
