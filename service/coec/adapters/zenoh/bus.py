@@ -142,6 +142,8 @@ class Bus:
             except Exception:
                 _log.exception("a subscription failed", extra={"fields": {"key": stream.expressions[0]}})
 
+        if stream.token is not None:
+            self.declare_alive(stream.token)
         for expression in stream.expressions:
             self._subscribers.append(self._session.declare_subscriber(expression, _direct(receive)))
 
