@@ -30,6 +30,7 @@ from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.presence import Presence, told
 from coec.adapters.zenoh.reach import Reach
+from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
@@ -48,7 +49,6 @@ from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.api.status import worker_status_of
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.runtime.ingest.stream import Stream
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
@@ -131,13 +131,23 @@ class Daemon:
         listener = None if credentials is None else Listener(credentials)
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
+        self._ros = RosSide(session, config)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         others = () if mode_of(settings) == "router" else connected_of(settings)
         self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
         self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
         store = StateStore(config.state.directory, config.vehicle)
         self._scribe = Scribe(config.state.directory)
-        outside = Outside(self._keys, store, self._scribe, self._folder, self._worker, self._publish, self._troubles)
+        outside = Outside(
+            self._keys,
+            store,
+            self._scribe,
+            self._folder,
+            self._worker,
+            self._publish,
+            self._troubles,
+            self._ros.topics,
+        )
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         commands = {name: pair.commands for name, pair in self._pairs.items()}
         self._reception = Reception(authority, listener, commands)
@@ -189,10 +199,8 @@ class Daemon:
         for pair_config in self._config.pairs:
             pair = self._pairs[pair_config.name]
             pair.stream.thread.start()
-            streams = {CAMERA: pair_config.camera, LIDAR: pair_config.lidar, EGO: pair_config.ego}
-            for stream, stream_config in streams.items():
-                if stream_config is not None:
-                    self._bus.subscribe(stream_config.key, partial(pair.take_sample, stream))
+            for name, stream in pair_config.streams.items():
+                self._bus.subscribe(self._ros.input_of(stream), partial(pair.take_sample, name))
             self._bus.declare_alive(self._keys.alive(pair.name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
         _log.info("serving", extra={"fields": {**fields, "pairs": list(self._pairs)}})
@@ -238,6 +246,7 @@ class Daemon:
             ("announce", self._notifier.stopping),
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
+            ("be no node of ROS", self._ros.close),
             ("end the streams", lambda: self._end(pairs, lambda pair: pair.stream, INGEST_STOP_S)),
             ("finish the open windows", self._finish_windows),
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from coec.adapters.files.scribe import Scribe
 from coec.adapters.zenoh.bus import Answer
+from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.types import Reason
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.recording.window_store import WindowStore
@@ -16,7 +17,8 @@ from coec.schemas.keys import Keys
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """Everything that a pair shares. `publish(key, answer)` and `vehicle_troubles()` may be called from any thread."""
+    """Everything that a pair shares. `publish(key, answer)`, `vehicle_troubles()` and `topics()`, those that the
+    vehicle's ROS publishes now, may be called from any thread."""
 
     keys: Keys
     store: StateStore
@@ -25,3 +27,4 @@ class Outside:
     worker: Worker
     publish: Callable[[str, Answer], None]
     vehicle_troubles: Callable[[], tuple[Reason, ...]]
+    topics: Callable[[], Topics]

@@ -7,14 +7,16 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, cast
+from typing import Literal
 
 import zenoh
 
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import messages, outgoing
+from coec.adapters.zenoh.matching import is_heard
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import PairConfig
+from coec.errors import UsageError
 
 NS_PER_S = 1_000_000_000
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
@@ -32,8 +34,15 @@ class Streams:
 
     @classmethod
     def of_pair(cls, pair: PairConfig) -> Streams:
-        """Those of a configuration."""
-        return cls(pair.camera.key, pair.lidar.key, pair.ego.key if pair.ego else None)
+        """Those of a configuration.
+
+        Raises:
+            UsageError: it names topics of ROS.
+        """
+        topics = [stream.topic for stream in pair.streams.values() if stream.topic]
+        if topics:
+            raise UsageError(f"{', '.join(topics)}: frames of a pair are played on keys, and these are topics of ROS")
+        return cls(pair.camera.place, pair.lidar.place, pair.ego.place if pair.ego else None)
 
     @classmethod
     def default(cls, pair: str) -> Streams:
@@ -152,12 +161,6 @@ def repeated(passes: Callable[[], Iterable[Frame]], shift_ns: int, pause_ns: int
         if not forever or first_ns is None:
             return
         shift_ns += last_ns - first_ns + pause_ns
-
-
-def is_heard(publisher: zenoh.Publisher) -> bool:
-    """Whether somebody subscribes to what it publishes."""
-    # The stubs of eclipse-zenoh 1.10 call it a bool; it is a `MatchingStatus`, which is always true.
-    return cast("zenoh.MatchingStatus", publisher.matching_status).matching
 
 
 def _msgpack(frame: Frame) -> bytes:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import xxhash
 
+from coec.adapters.ros.wire.publisher import Publisher
 from coec.adapters.ros.wire.qos import Qos
 from coec.errors import UsageError
 
@@ -25,10 +27,19 @@ HASHLESS: Final = "TypeHashNotSupported"
 CPU_BACKEND: Final = "/backends:cpu:"
 """Behind a subscriber's token: without it Lyrical sends messages with large arrays to a key of the token's own."""
 
+CPU_KEY: Final = "/_buf_cpu"
+"""Behind the key of a topic: there Lyrical's publishers put messages with large arrays for such subscribers."""
+
 MAX_TOKEN: Final = 1024
 """Characters of a token that is read; those of real nodes have some 200."""
 
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
+
+MAX_ATTACHMENT: Final = _ATTACHMENT.size
+"""Bytes; a longer one is none."""
+
+_TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_NODE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+|/")
 
 _TYPE: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]{0,127})::(msg|srv|action)::dds_::([A-Za-z][A-Za-z0-9_]{0,127})_")
 
@@ -55,15 +66,17 @@ class TopicKey:
         Raises:
             UsageError: not the key of a topic.
         """
-        chunks = key.removesuffix("/_buf_cpu").split("/")
+        chunks = key.removesuffix(CPU_KEY).split("/")
         if len(chunks) < 4 or not chunks[0].isdecimal() or len(chunks[0]) > 3:
             raise UsageError("not the key of a topic of rmw_zenoh: expected domain/topic/type/hash")
         return cls(int(chunks[0]), "/" + "/".join(chunks[1:-2]), ros_type(chunks[-2]), chunks[-1])
 
 
-def topic_expression(domain: int, topic: str) -> str:
-    """A key expression that matches the topic in whatever type and of whatever release."""
-    return f"{domain}/{topic.strip('/')}/*/*/**"
+def topic_expressions(domain: int, topic: str) -> tuple[str, str]:
+    """Key expressions that match the topic in whatever type, and no other topic; the second one where Lyrical's
+    publishers put messages with large arrays."""
+    key = f"{domain}/{topic.strip('/')}/*/*"
+    return key, key + CPU_KEY
 
 
 def dds_type(type_name: str) -> str:
@@ -116,25 +129,53 @@ class Node:
         return f"{mangled(self.namespace)}/{self.name}"
 
 
+def publisher_tokens(domain: int) -> str:
+    """A key expression that matches the tokens of all publishers."""
+    return f"{TOKENS}/{domain}/*/*/*/MP/**"
+
+
+def publisher_of(token: str) -> Publisher | None:
+    """The publisher that a token tells of; None where it tells of none, or of one that no ROS could have."""
+    chunks = token.split("/") if len(token) <= MAX_TOKEN else []
+    if len(chunks) < 13 or chunks[0] != TOKENS or chunks[5] != "MP":
+        return None
+    topic, described = unmangled(chunks[9]), chunks[10]
+    node = f"{unmangled(chunks[7]).rstrip('/')}/{chunks[8]}"
+    if not (_TOPIC.fullmatch(topic) and _NODE.fullmatch(node) and _TYPE.fullmatch(described)):
+        return None
+    return Publisher(topic, ros_type(described), node, gid_of(token))
+
+
 @dataclass(frozen=True, slots=True)
-class Endpoint:
-    """A publisher or subscriber that a token tells of."""
+class RmwZenoh:
+    """The dialect of a session that is one node; `type_hash` gives the RIHS01 of a type by its name."""
 
-    kind: str
-    node: str
-    topic: TopicKey
+    node: Node
+    type_hash: Callable[[str], str]
 
-    @classmethod
-    def parse(cls, token: str) -> Endpoint | None:
-        """What a token tells; None for nodes, services and whatever else is not an endpoint of a topic."""
-        chunks = token.split("/")
-        if len(token) > MAX_TOKEN or len(chunks) < 13 or chunks[0] != TOKENS or chunks[5] not in ("MP", "MS"):
-            return None
-        domain, topic, described, type_hash = chunks[1], chunks[9], chunks[10], chunks[11]
-        if not domain.isdecimal() or len(domain) > 3 or _TYPE.fullmatch(described) is None:
-            return None
-        name = f"{unmangled(chunks[7]).rstrip('/')}/{chunks[8]}"
-        return cls(chunks[5], name, TopicKey(int(domain), unmangled(topic), ros_type(described), type_hash))
+    @property
+    def node_token(self) -> str:
+        """See `Dialect`."""
+        return self.node.token
+
+    def key(self, topic: str, type_name: str) -> str:
+        """See `Dialect`."""
+        return self._topic(topic, type_name).key
+
+    def publisher_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str:
+        """See `Dialect`."""
+        return self.node.publisher(number, self._topic(topic, type_name), qos)
+
+    def subscriber_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str:
+        """See `Dialect`."""
+        return self.node.subscriber(number, self._topic(topic, type_name), qos)
+
+    def attachment(self, token: str, sequence: int, source_ns: int) -> bytes:
+        """See `Dialect`."""
+        return Attachment(sequence, source_ns, gid_of(token)).packed
+
+    def _topic(self, topic: str, type_name: str) -> TopicKey:
+        return TopicKey(self.node.domain, topic, type_name, self.type_hash(type_name))
 
 
 def mangled(name: str) -> str:
