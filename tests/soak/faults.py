@@ -19,7 +19,7 @@ import zenoh
 
 from broken_disk import FULL, READ_ONLY, SLOW, WELL, BrokenDisk
 from campaign import stepping_clock
-from coec.adapters.zenoh.bus import open_session
+from coec.adapters.zenoh.settings import settings_of
 from coec.config import LimitsConfig, ZenohConfig
 from coec.schemas.keys import Keys
 from e2e.processes import environment
@@ -42,14 +42,15 @@ with zenoh.open(settings) as session:
 
 @dataclass
 class Router:
-    """The router of the vehicle, which goes and comes back."""
+    """The router of the vehicle, which goes and comes back. It hands over in shared memory, as Zenoh's own does."""
 
     endpoint: str
     _open: ExitStack = field(default_factory=ExitStack)
 
     def come(self) -> None:
-        settings = ZenohConfig(embedded_router=True, listen=(self.endpoint,))
-        self._open.enter_context(open_session(settings, LimitsConfig()))
+        settings = settings_of(ZenohConfig(embedded_router=True, listen=(self.endpoint,)), LimitsConfig())
+        settings.insert_json5("transport/shared_memory/enabled", "true")
+        self._open.enter_context(zenoh.open(settings))
 
     def go(self) -> None:
         self._open.close()

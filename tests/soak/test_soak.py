@@ -105,13 +105,6 @@ def soak(folder: Path, seconds: float, scale: float, seed: int) -> dict[str, Any
     return {**figures, "faults": dict(done), "commands": bench.answers}
 
 
-def own_bytes(process: psutil.Process) -> int:
-    """Resident memory that is the service's own. Zenoh never unmaps the 16 MiB of shared memory of a session that has
-    gone, here those of each router that goes: the soak tells them apart (`shared_mib`)."""
-    memory = process.memory_info()
-    return int(memory.rss - memory.shared)
-
-
 def _throw(bench: Bench, process: psutil.Process, seconds: float, done: Counter[str]) -> dict[str, Any]:
     begin_s = time.monotonic()
     settled_bytes = 0
@@ -119,7 +112,7 @@ def _throw(bench: Bench, process: psutil.Process, seconds: float, done: Counter[
     while (passed_s := time.monotonic() - begin_s) < seconds or len(done) < len(faults.ALL):
         if not settled_bytes and passed_s > SETTLED_SHARE * seconds and len(done) == len(faults.ALL):
             bench.passes(5.0, 5.0)
-            settled_bytes = own_bytes(process)
+            settled_bytes = process.memory_info().rss
         every = every or [faults.ALL[index] for index in bench.rng.permutation(len(faults.ALL))]
         fault = every.pop()
         fault(bench)
@@ -127,12 +120,8 @@ def _throw(bench: Bench, process: psutil.Process, seconds: float, done: Counter[
         bench.passes(0.5, 4.0)
         assert process.status() != psutil.STATUS_ZOMBIE, f"the service has ended after {fault.__name__}"
     bench.passes(5.0, 5.0)
-    own, memory = own_bytes(process), process.memory_info()
-    return {
-        "rss_mib": memory.rss / MIB,
-        "shared_mib": memory.shared / MIB,
-        "grown_mib": (own - (settled_bytes or own)) / MIB,
-    }
+    rss_bytes = process.memory_info().rss
+    return {"rss_mib": rss_bytes / MIB, "grown_mib": (rss_bytes - (settled_bytes or rss_bytes)) / MIB}
 
 
 def _account(running: Service, vehicle: Vehicle) -> dict[str, Any]:
@@ -178,7 +167,7 @@ def test_everything_once_and_every_message_is_accounted_for(tmp_path: Path) -> N
 @pytest.mark.slow
 @pytest.mark.fault(
     "half an hour of every fault at full rate (three minutes in the gate)",
-    "every message is accounted for; memory of its own at the end within 30 MiB of minute five",
+    "every message is accounted for; memory (RSS) at the end within 30 MiB of minute five",
 )
 def test_a_long_soak(tmp_path: Path, record_property: Any) -> None:
     figures = soak(tmp_path, LONG_S, min(LONG_S / 600.0, 1.0), 2)

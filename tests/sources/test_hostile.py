@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from ruamel.yaml.scanner import Scanner
 
 from cloud_files import npy, npz, pcd, with_header
-from coec.config import MAX_YAML_BYTES, load_config, load_yaml
+from coec.config import MAX_YAML_BYTES, load_config, load_yaml, parse_yaml
 from coec.errors import CoecError, ConfigError, SourceError
 from coec.sources import open_source, reading
 from coec.sources.clouds import load_cloud
@@ -188,6 +189,7 @@ YAML = {
     "keys": "? [1, {a: b}]\n: 3\n? {a: 1}\n: 3",
     "large": "#" * (MAX_YAML_BYTES + 1),
     "hex": "vehicle: 0x" + "f" * DEEP,
+    "merged": "a0: &a0 {k0: 1}\n" + "".join(f"a{i + 1}: &a{i + 1} {{<<: *a{i}, k{i + 1}: 1}}\n" for i in range(9)),
 }
 
 
@@ -201,6 +203,23 @@ def test_yaml_is_refused_by_an_error_of_ours(tmp_path: Path, text: str) -> None:
     for read in (load_config, lambda path: open_source(str(path))) if len(text) < DEEP else (load_config,):
         with pytest.raises(CoecError, match=r"dataset\.yaml"):
             read(path)
+
+
+@pytest.mark.fault("YAML of a megabyte of empty lists", "it is given up before all of its values are read")
+@pytest.mark.parametrize("value", ["[]", "{}", "1"])
+def test_yaml_is_given_up_before_all_of_its_values_are_read(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = []
+    one_more = Scanner.fetch_flow_entry
+
+    def counted(scanner: Scanner) -> None:
+        read.append(scanner)
+        one_more(scanner)
+
+    monkeypatch.setattr(Scanner, "fetch_flow_entry", counted)
+    monkeypatch.setattr("coec.config.MAX_YAML_VALUES", 1000)
+    with pytest.raises(ConfigError, match="more than 1000 values"):
+        parse_yaml("[" + f"{value}," * 10_000 + "]")
+    assert 900 < len(read) < 1100
 
 
 @pytest.mark.parametrize("name", ["a\\0b", "x" * 300, "é" * 200, "../" * 2000])

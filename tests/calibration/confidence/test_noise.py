@@ -82,6 +82,22 @@ def test_without_a_maximum_or_with_too_few_frames_nothing_is_known(
     assert measure_noise(landscape(paraboloids(square, moving(rng)[:frames]))) is None
 
 
+@pytest.mark.fault(
+    "frames that repeat one another", "no certainty is made of them, and no number that ends the service"
+)
+@pytest.mark.parametrize(("views", "axes"), [(1, 3), (2, 3), (3, 3), (5, 6)])
+def test_views_that_come_again_settle_no_more_axes_than_they_are(
+    views: int, axes: int, rng: np.random.Generator
+) -> None:
+    """In one sector, as an objective without sectors has it; so many views differ along one axis less."""
+    seen = rng.normal(0.0, SPREAD, (views, 1, axes))
+    repeated = np.tile(seen, (FRAMES // views, 1, 1))
+    centred = repeated - repeated.mean(axis=(0, 1))
+    assert measure_noise(landscape(paraboloids(np.eye(axes), centred), axes)) is None
+    one_more = centred + rng.normal(0.0, 0.01 * SPREAD, centred.shape)
+    assert measure_noise(landscape(paraboloids(np.eye(axes), one_more), axes)) is not None
+
+
 def test_a_dent_at_the_top_of_a_hill_is_looked_past(rng: np.random.Generator) -> None:
     """A ripple as narrow as the first step makes the top a saddle; the hill is told all the same."""
     hill = paraboloids(np.eye(3), moving(rng))

@@ -69,8 +69,8 @@ def scatter(cells: NDArray[np.float64], fitted: int = 0) -> list[list[float]]:
     """(n, n) covariance of the sums of n figures (n, F, B) over their cells, as frames and as sectors differ.
 
     Cluster-robust both ways (Cameron, Gelbach, Miller 2011), `fitted` degrees of freedom having been used up
-    (MacKinnon, White 1985, "HC1"). The term of single cells, which would be subtracted, is left in: so the matrix is
-    positive definite, and where frames and sectors are independent the standard deviation is √2 too wide, which the few
+    (MacKinnon, White 1985, "HC1"). The term of single cells, which would be subtracted, is left in: so no variance
+    is negative, and where frames and sectors are independent the standard deviation is √2 too wide, which the few
     sectors need for their tails. One sector alone tells nothing by itself.
     """
     figures = len(cells)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from math import fsum
+from math import fsum, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from coec.calibration.confidence.landscape import Landscape, scatter
 from coec.calibration.objective.differences import across, along
 from coec.calibration.steps import of_both
-from coec.geometry.linear import congruent, inverted
+from coec.geometry.linear import Rows, congruent, eigen, inverted
 
 WIDER = (1.0, 2.0, 4.0)
 """Difference steps that are tried until the objective has a maximum, in those of the cells: a ripple may dent the top
 of a hill."""
+
+SAME = 1e-9
+"""Of the scatter's largest axis, each figure in its own standard deviation, what the smallest has at least where frames
+differ: those that repeat one another leave 1e-16, the rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +45,8 @@ class Noise:
 
 
 def measure_noise(landscape: Landscape) -> Noise | None:
-    """By central differences; None where the objective has no maximum or the frames are too few to tell."""
+    """By central differences; None where the objective has no maximum, or the frames that differ are too few to tell:
+    two views in turn, however often, scatter along one line and would settle the other axes without any error."""
     fitted = len(landscape.moved)
     if landscape.frames <= fitted:
         return None
@@ -51,8 +56,10 @@ def measure_noise(landscape: Landscape) -> Noise | None:
             inverse = inverted(information)
         except ValueError:
             continue
-        covariance = congruent(inverse, scatter(gradients, fitted))
-        return Noise(covariance, information, independent_looks(gradients, inverse))
+        scattered = scatter(gradients, fitted)
+        if not _is_of_full_rank(scattered):
+            return None
+        return Noise(congruent(inverse, scattered), information, independent_looks(gradients, inverse))
     return None
 
 
@@ -71,6 +78,16 @@ def _derivatives(landscape: Landscape, step_rad: float) -> tuple[NDArray[np.floa
     for i, j in combinations(range(count), 2):
         information[i][j] = information[j][i] = -fsum(across(at, steps, i, j).tolist())
     return gradients.reshape(count, *shape), information
+
+
+def _is_of_full_rank(covariance: Rows) -> bool:
+    """Whether every combination of the figures scatters."""
+    deviations = [sqrt(row[i]) for i, row in enumerate(covariance)]
+    if min(deviations) == 0.0:
+        return False
+    of_all = range(len(covariance))
+    values = eigen([[covariance[i][j] / deviations[i] / deviations[j] for j in of_all] for i in of_all])
+    return values[-1][0] > SAME * values[0][0]
 
 
 def independent_looks(gradients: NDArray[np.float64], inverse: list[list[float]]) -> float:
