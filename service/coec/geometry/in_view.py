@@ -21,12 +21,12 @@ class InView(NamedTuple):
     Attributes:
         uv_px: (n, 2) pixels, their centres at integers.
         range_m: (n,) from the LiDAR.
-        index: (n,) into all points.
+        which: (n,) indices into all points.
     """
 
     uv_px: NDArray[np.float64]
     range_m: NDArray[np.float64]
-    index: NDArray[np.int64]
+    which: NDArray[np.int64]
 
 
 def points_in_view(
@@ -56,5 +56,5 @@ def points_in_view(
     if mask is not None:
         nearest = np.rint(uv_px[seen]).astype(np.int64)
         seen[np.flatnonzero(seen)[~mask[nearest[:, 1], nearest[:, 0]]]] = False
-    index = measured[seen]
-    return InView(uv_px[seen], range_m[index], index)
+    which = measured[seen]
+    return InView(uv_px[seen], range_m[which], which)
