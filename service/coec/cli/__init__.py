@@ -541,6 +541,58 @@ def _watch(
     raise typer.Exit(command.run(options))
 
 
+@app.command("view")
+def _view(
+    source: Annotated[
+        str | None, typer.Argument(metavar="SOURCE", help=f"Play this: {SOURCE_HELP}", show_default=False)
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Instead, watch the running vehicle of this configuration.", metavar="FILE"),
+    ] = None,
+    pair: Annotated[str | None, typer.Option(help="Which pair of the configuration, where there are several.")] = None,
+    connect: Connect = None,
+    zenoh: Annotated[
+        Path | None,
+        typer.Option(help="Zenoh configuration of the session (JSON5): endpoint, certificate.", metavar="FILE"),
+    ] = None,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait for the router.", min=0.01)] = 5.0,
+    result: Annotated[
+        Path | None, typer.Option(help="Of `calibrate --json`: drawn as the candidate.", metavar="FILE")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Times recorded speed.", min=0.01, max=100)] = 1.0,
+    repeat: Annotated[bool, typer.Option("--repeat", help="Again and again; sensor time goes on.")] = False,
+    listen: Annotated[
+        str, typer.Option(help="Where viewers are served; port 0 is any that is free.", metavar="HOST:PORT")
+    ] = "127.0.0.1:8765",
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Also where other computers get in: without a certificate they see all.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the address and what is served as one JSON document.")
+    ] = False,
+) -> None:
+    """Show a vehicle or a recording live in Foxglove or Lichtblick: image with points, cloud, frames, health.
+
+    Needs the optional extra `foxglove`. Gives no command, and asks the vehicle for frames only while somebody looks.
+    """
+    from coec.cli import query
+    from coec.cli import view as command
+
+    place = command.place_of(listen, insecure=insecure)
+    if (source is None) == (config is None):
+        raise UsageError("coec view: give a SOURCE, or --config FILE, and not both")
+    if config is not None:
+        if result is not None or repeat or rate != 1.0:
+            raise UsageError("--result, --rate and --repeat are about a SOURCE: a vehicle has its own")
+        watched = command.VehicleOptions(config, query.asked_of(config, None, None, connect, zenoh), pair, timeout)
+        raise typer.Exit(command.show_vehicle(watched, place, as_json=as_json))
+    if pair is not None or connect is not None or zenoh is not None:
+        raise UsageError("--pair, --connect and --zenoh are about a vehicle: they need --config FILE")
+    played = command.RecordingOptions(source or "", result, rate, repeat)
+    raise typer.Exit(command.show_recording(played, place, as_json=as_json))
+
+
 @app.command("router")
 def _router(
     config: Annotated[

@@ -13,7 +13,8 @@ from coec.adapters.files import output
 from coec.adapters.files.rig import intrinsics_config
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.types import Matrix4
-from coec.config import CameraIntrinsics, Config, PairConfig, load_config
+from coec.cli.one_pair import pair_named
+from coec.config import CameraIntrinsics, Config, load_config
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.reports import console
 from coec.runtime.api.exports import exported
@@ -94,7 +95,7 @@ def _read(options: Options) -> Extrinsic:
         return _of_state(source if source.is_dir() else source.parent, options.pair, config, frames)
     if source.suffix == ".mcap":
         return _of_window(source, frames)
-    return _of_document(source, None if config is None else _pair_of(config, options.pair).camera.intrinsics, frames)
+    return _of_document(source, None if config is None else pair_named(config, options.pair).camera.intrinsics, frames)
 
 
 def _of_window(path: Path, frames: Frames) -> Extrinsic:
@@ -127,22 +128,13 @@ def _of_state(folder: Path, name: str | None, config: Config | None, frames: Fra
         raise UsageError(f"{folder} holds no pair {chosen}; it holds {', '.join(sorted(pairs))}")
     stored, state = pairs[chosen]
     if config is not None:
-        pair = _pair_of(config, chosen)
+        pair = pair_named(config, chosen)
         own = (pair.lidar.frame_id, pair.camera.frame_id)
         return exported(state, config.vehicle, chosen, own, pair.camera.intrinsics, frames)
     if stored.accepted is None:
         raise UsageError(f"{folder}: nothing was accepted yet; --config says which frames the nominal calibration has")
     own = (stored.accepted.lidar_frame, stored.accepted.camera_frame)
     return exported(state, stored.accepted.vehicle, chosen, own, None, frames)
-
-
-def _pair_of(config: Config, name: str | None) -> PairConfig:
-    pairs = {pair.name: pair for pair in config.pairs}
-    if name is None and len(pairs) == 1:
-        return config.pairs[0]
-    if name not in pairs:
-        raise UsageError(f"--pair: the configuration has the pairs {', '.join(pairs)}; choose one")
-    return pairs[name]
 
 
 def _pose(text: str | None) -> Matrix4 | None:

@@ -6,13 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.adapters.images.range_colours import FURTHEST_M, NEAREST_M, colours_bgr, share_of
 from coec.calibration.types import Matrix4
-from coec.geometry.cameras import Camera, in_image
-from coec.geometry.projection import project
-from coec.geometry.vectors import lengths
-
-NEAREST_M, FURTHEST_M = 2.0, 80.0
-"""Ranges at the two ends of the colours, metres: those of the objective. The scale is logarithmic."""
+from coec.geometry.cameras import Camera
+from coec.geometry.in_view import points_in_view
 
 TICKS_M = (2, 5, 10, 20, 40, 80)
 
@@ -52,24 +49,11 @@ def draw(
     """
     factor = max(1, -(-MIN_WIDTH_PX // image_bgr.shape[1]))
     picture = np.asarray(np.repeat(np.repeat(image_bgr, factor, axis=0), factor, axis=1), dtype=np.uint8)
-    uv_px, range_m = _visible(camera, T_camera_lidar, xyz_m, mask)
+    uv_px, range_m, _ = points_in_view(camera, T_camera_lidar, xyz_m, mask, NEAREST_M)
     # Pixel centres are integers: the middle of an enlarged pixel is not at factor · u.
     centres = np.rint((uv_px + 0.5) * factor - 0.5).astype(np.int64)
     _stamp(picture, centres, range_m, radius_px=picture.shape[1] * POINT_SHARE)
     return np.vstack([_title(picture.shape[1], title), picture, _bar(picture.shape[1])])
-
-
-def _visible(
-    camera: Camera, T_camera_lidar: Matrix4, xyz_m: NDArray[np.floating], mask: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels (N, 2) and ranges from the LiDAR (N,), metres, of the points in view."""
-    uv_px, valid = project(camera, xyz_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
-    range_m = lengths(np.asarray(xyz_m, dtype=np.float64))
-    seen = valid & in_image(camera, uv_px) & (range_m >= NEAREST_M)
-    if mask is not None:
-        nearest = np.rint(uv_px[seen]).astype(np.int64)
-        seen[np.flatnonzero(seen)[~mask[nearest[:, 1], nearest[:, 0]]]] = False
-    return uv_px[seen], range_m[seen]
 
 
 def _stamp(picture: Pixels, centres: NDArray[np.int64], range_m: NDArray[np.float64], radius_px: float) -> None:
@@ -88,17 +72,7 @@ def _stamp(picture: Pixels, centres: NDArray[np.int64], range_m: NDArray[np.floa
     at = at[inside]
     # Of equal indices NumPy keeps the last value assigned.
     order = np.argsort(-range_m[point], kind="stable")
-    picture[at[order, 1], at[order, 0]] = _colours(range_m)[point[order]]
-
-
-def _colours(range_m: NDArray[np.float64]) -> Pixels:
-    """(N, 3) BGR: near is red, far is blue (turbo, reversed)."""
-    share = np.log(np.clip(range_m, NEAREST_M, FURTHEST_M) / NEAREST_M) / np.log(FURTHEST_M / NEAREST_M)
-    # The outermost tenths of turbo are nearly black.
-    level = np.rint(255 * (0.95 - 0.85 * share)).astype(np.uint8)
-    turbo = np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO))
-    colours: Pixels = turbo.astype(np.uint8).reshape(-1, 3)[level]
-    return colours
+    picture[at[order, 1], at[order, 0]] = colours_bgr(range_m)[point[order]]
 
 
 def _title(width: int, title: str) -> Pixels:
@@ -111,11 +85,11 @@ def _bar(width: int) -> Pixels:
     """The colours of the ranges, with a figure where each of `TICKS_M` is."""
     height = round(width * BAR_SHARE)
     range_m = NEAREST_M * (FURTHEST_M / NEAREST_M) ** np.linspace(0.0, 1.0, width)
-    ramp = np.repeat(_colours(range_m)[None], max(2, height // 4), axis=0)
+    ramp = np.repeat(colours_bgr(range_m)[None], max(2, height // 4), axis=0)
     scale = np.full((height - len(ramp), width, 3), PAPER, dtype=np.uint8)
     for tick_m in TICKS_M:
-        share = np.log(tick_m / NEAREST_M) / np.log(FURTHEST_M / NEAREST_M)
-        _write(scale, f"{tick_m} m", min(max(share - 0.01, 0.005), 0.965) * width, scale.shape[0])
+        place = min(max(float(share_of(tick_m)) - 0.01, 0.005), 0.965)
+        _write(scale, f"{tick_m} m", place * width, scale.shape[0])
     return np.vstack([ramp, scale])
 
 

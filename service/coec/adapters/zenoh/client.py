@@ -66,8 +66,9 @@ def connected(endpoints: Sequence[str], wait_s: float) -> Iterator[zenoh.Session
 
 
 @contextmanager
-def connected_by(way: Way, wait_s: float) -> Iterator[zenoh.Session]:
-    """A client session on the first of the routers that answers, closed at the end.
+def connected_by(way: Way, wait_s: float, max_message_bytes: int | None = None) -> Iterator[zenoh.Session]:
+    """A client session on the first of the routers that answers, closed at the end. `max_message_bytes`: the largest
+    message that it takes in; None: as the file says, or a gigabyte.
 
     Raises:
         UsageError: an endpoint is malformed.
@@ -86,6 +87,8 @@ def connected_by(way: Way, wait_s: float) -> Iterator[zenoh.Session]:
     settings.insert_json5("scouting/multicast/enabled", "false")
     settings.insert_json5("connect/timeout_ms", str(round(wait_s * 1000)))
     settings.insert_json5("connect/exit_on_failure", "true")
+    if max_message_bytes is not None:
+        settings.insert_json5("transport/link/rx/max_message_size", str(max_message_bytes))
     try:
         settings.insert_json5("connect/endpoints", json.dumps(way.endpoints))
         session = zenoh.open(settings)

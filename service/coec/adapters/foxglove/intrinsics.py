@@ -1,0 +1,33 @@
+"""Cameras as viewers describe them: `foxglove.CameraCalibration`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from coec.geometry.cameras import Camera, intrinsics_of, name_of
+
+
+@dataclass(frozen=True, slots=True)
+class Counterpart:
+    """The viewers' model of a camera: its name and its coefficients, in their order."""
+
+    distortion_model: str
+    coefficients: tuple[float, ...]
+
+
+COUNTERPARTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "pinhole": ("plumb_bob", ()),
+    "radtan": ("plumb_bob", ("k1", "k2", "p1", "p2", "k3")),
+    "kannala_brandt": ("kannala_brandt", ("k1", "k2", "k3", "k4")),
+}
+"""The viewers' name of a model, and its coefficients by our names. Points on the image need none of it."""
+
+
+def counterpart_of(camera: Camera) -> Counterpart | None:
+    """None where the viewers know no such model."""
+    found = COUNTERPARTS.get(name_of(camera))
+    if found is None:
+        return None
+    model, names = found
+    values = intrinsics_of(camera)
+    return Counterpart(model, tuple(float(values[name]) for name in names) or (0.0,) * 5)

@@ -1,0 +1,205 @@
+"""The WebSocket that viewers open. The only module that needs the library of the optional extra `foxglove`."""
+
+from __future__ import annotations
+
+import logging
+from typing import Literal
+
+import foxglove
+import numpy as np
+from foxglove import Channel, Context, channels, messages
+
+from coec.adapters.foxglove import topics
+from coec.adapters.foxglove.intrinsics import counterpart_of
+from coec.adapters.foxglove.shown import Marks, Picture
+from coec.adapters.foxglove.timeline import Moment, schema
+from coec.adapters.foxglove.topics import Pose, frame_of
+from coec.calibration.types import EncodedImage
+from coec.errors import UnavailableError
+from coec.geometry.se3 import inverse, quaternion_xyzw_from_rotation
+
+NS_PER_S = 1_000_000_000
+
+BACKLOG = 32
+"""Messages that wait for a viewer who is slow, some four pictures; the oldest go first."""
+
+FLOAT_BYTES = 4
+
+TITLE_SHARE = 1 / 60
+"""Height of what is written on the image, as a share of its width."""
+
+
+_LOG_LEVELS = (
+    messages.LogLevel.Info,
+    messages.LogLevel.Warning,
+    messages.LogLevel.Error,
+    messages.LogLevel.Warning,
+)
+"""By ROS level: OK, WARN, ERROR, STALE."""
+
+
+class Screen:
+    """What viewers see. One thread uses it; who sends and how fast they read is the library's own threads' business."""
+
+    def __init__(self, host: str, port: int, name: str) -> None:
+        """Listen at a host, without brackets, and a port; 0: one that is free. `name` is shown to viewers.
+
+        Raises:
+            UnavailableError: nobody can listen there.
+        """
+        # Whoever goes without a word, or says what is none, is no fault here.
+        logging.getLogger("foxglove").addHandler(logging.NullHandler())
+        context = self._context = Context()  # its channels close when it goes
+        self._image = channels.CompressedImageChannel(topics.IMAGE, context=context)
+        self._marks = {
+            pose: channels.ImageAnnotationsChannel(topic, context=context) for pose, topic in topics.POINTS.items()
+        }
+        self._cloud = channels.PointCloudChannel(topics.CLOUD, context=context)
+        self._transforms = channels.FrameTransformsChannel(topics.TRANSFORMS, context=context)
+        self._calibration = channels.CameraCalibrationChannel(topics.CALIBRATION, context=context)
+        self._health = Channel(topics.HEALTH, schema=schema(), context=context)
+        self._log = channels.LogChannel(topics.LOG, context=context)
+        pictures = (self._image, *self._marks.values(), self._cloud, self._transforms, self._calibration)
+        self._all = (*pictures, self._health, self._log)
+        try:
+            self._server = foxglove.start_server(
+                name=name, host=host, port=port, context=context, message_backlog_size=BACKLOG
+            )
+        except RuntimeError as error:
+            cause = str(error).rpartition(": ")[2]
+            raise UnavailableError(f"viewers cannot be served at {_address(host, port)}: {cause}") from error
+        self.url = f"ws://{_address(host, self._server.port)}"
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Topics that somebody looks at."""
+        return frozenset(str(channel.topic()) for channel in self._all if channel.has_sinks())
+
+    def show(self, picture: Picture) -> None:
+        """A pair, with all that it holds, to whom it may concern. Its parts carry the stamp of its image."""
+        stamp = _stamp(picture.stamp_ns)
+        if picture.image is not None:
+            self._image.log(_image(picture, picture.image, stamp))
+        for row, pose in enumerate(Pose):
+            if pose in picture.marks:
+                self._marks[pose].log(_annotations(picture.marks[pose], row, picture.rig.camera.width, stamp))
+        if picture.cloud is not None:
+            self._cloud.log(_cloud(picture, picture.cloud, stamp))
+        self._transforms.log(_transforms(picture, stamp))
+        calibration = _calibration(picture, stamp)
+        if calibration is not None:
+            self._calibration.log(calibration)
+
+    def tell(self, moment: Moment) -> None:
+        """A line of the timeline."""
+        self._health.log(moment.document())
+
+    def remark(self, ros_level: Literal[0, 1, 2, 3], text: str, source: str) -> None:
+        """A line of the log, now."""
+        now = messages.Timestamp.now()
+        self._log.log(messages.Log(timestamp=now, level=_LOG_LEVELS[ros_level], message=text, name=source))
+
+    def close(self) -> None:
+        """Viewers are told that it ends."""
+        self._server.stop()
+
+
+def _address(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def _stamp(stamp_ns: int) -> messages.Timestamp:
+    return messages.Timestamp(*divmod(stamp_ns, NS_PER_S))
+
+
+def _image(picture: Picture, image: EncodedImage, stamp: messages.Timestamp) -> messages.CompressedImage:
+    frame = frame_of(picture.rig.camera_frame, Pose.SERVED)
+    return messages.CompressedImage(timestamp=stamp, frame_id=frame, data=image.data, format=str(image.format))
+
+
+def _annotations(marks: Marks, row: int, width_px: int, stamp: messages.Timestamp) -> messages.ImageAnnotations:
+    """Points, and a line of text that is there even where no point is in view: viewers wait for what has the stamp of
+    the image."""
+    size_px = max(8.0, width_px * TITLE_SHARE)
+    title = messages.TextAnnotation(
+        timestamp=stamp,
+        position=messages.Point2(x=0.5 * size_px, y=1.6 * size_px * (row + 1)),
+        text=marks.title,
+        font_size=size_px,
+        text_color=messages.Color(r=1.0, g=1.0, b=1.0, a=1.0),
+        background_color=messages.Color(r=0.0, g=0.0, b=0.0, a=0.6),
+    )
+    points = [
+        messages.PointsAnnotation(
+            timestamp=stamp,
+            type=messages.PointsAnnotationType.Points,
+            points=[messages.Point2(x=u, y=v) for u, v in band.uv_corner_px.tolist()],
+            outline_color=messages.Color(r=band.rgb[0], g=band.rgb[1], b=band.rgb[2], a=1.0),
+            thickness=band.radius_px,
+        )
+        for band in marks.bands
+    ]
+    return messages.ImageAnnotations(timestamp=stamp, points=points, texts=[title])
+
+
+def _cloud(picture: Picture, cloud: np.ndarray, stamp: messages.Timestamp) -> messages.PointCloud:
+    names = ("x", "y", "z", "range")
+    kind = messages.PackedElementFieldNumericType.Float32
+    fields = [
+        messages.PackedElementField(name=name, offset=FLOAT_BYTES * at, type=kind) for at, name in enumerate(names)
+    ]
+    return messages.PointCloud(
+        timestamp=stamp,
+        frame_id=picture.rig.lidar_frame,
+        pose=messages.Pose(
+            position=messages.Vector3(x=0.0, y=0.0, z=0.0),
+            orientation=messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+        ),
+        point_stride=FLOAT_BYTES * len(names),
+        fields=fields,
+        data=cloud.astype("<f4").tobytes(),
+    )
+
+
+def _transforms(picture: Picture, stamp: messages.Timestamp) -> messages.FrameTransforms:
+    return messages.FrameTransforms(
+        transforms=[
+            _pose_in_lidar(picture, pose, extrinsic.T_camera_lidar, stamp)
+            for pose, extrinsic in picture.extrinsics.items()
+            if extrinsic.T_camera_lidar is not None
+        ]
+    )
+
+
+def _pose_in_lidar(
+    picture: Picture, pose: Pose, T_camera_lidar: np.ndarray, stamp: messages.Timestamp
+) -> messages.FrameTransform:
+    """The value of a transform is the pose of the child in the parent: T_camera_lidar the other way round."""
+    T_lidar_camera = inverse(T_camera_lidar)
+    x, y, z = T_lidar_camera[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_xyzw_from_rotation(T_lidar_camera[:3, :3]).tolist()
+    return messages.FrameTransform(
+        timestamp=stamp,
+        parent_frame_id=picture.rig.lidar_frame,
+        child_frame_id=frame_of(picture.rig.camera_frame, pose),
+        translation=messages.Vector3(x=x, y=y, z=z),
+        rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
+    )
+
+
+def _calibration(picture: Picture, stamp: messages.Timestamp) -> messages.CameraCalibration | None:
+    camera = picture.rig.camera
+    counterpart = counterpart_of(camera)
+    if counterpart is None:
+        return None
+    return messages.CameraCalibration(
+        timestamp=stamp,
+        frame_id=frame_of(picture.rig.camera_frame, Pose.SERVED),
+        width=camera.width,
+        height=camera.height,
+        distortion_model=counterpart.distortion_model,
+        D=list(counterpart.coefficients),
+        K=[camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0],
+        R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        P=[camera.fx, 0.0, camera.cx, 0.0, 0.0, camera.fy, camera.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )

@@ -1,0 +1,176 @@
+"""The WebSocket, by a real client: what comes out of it is what was shown, to the pixel."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import psutil
+import pytest
+
+pytest.importorskip("foxglove", reason="needs the optional extra `foxglove`")
+
+from adapters.foxglove.test_shown import EXTRINSICS, places, projected
+from adapters.foxglove.test_timeline import FULL
+from boards import LENSES, MOVED, NOMINAL, pair_with, rig_with, sweep
+from coec.adapters.foxglove import topics
+from coec.adapters.foxglove.server import Screen
+from coec.adapters.foxglove.shown import Picture, picture_of
+from coec.adapters.foxglove.timeline import schema
+from coec.adapters.foxglove.topics import PICTURES, POINTS, TOPICS, Pose
+from coec.adapters.images.codec import encode_png, probe
+from coec.calibration.types import Rig
+from coec.config import LimitsConfig
+from coec.errors import UnavailableError
+from coec.geometry import se3
+from fakes import wait_until
+from foxglove_viewer import Viewer
+
+Record = Callable[[str, object], None]
+"""pytest's `record_property`."""
+
+HOST = "127.0.0.1"
+NOISY_BYTES = 700_000
+PICTURES_SENT = 150
+KEPT_MB = 60.0
+"""What may be kept for a viewer who reads nothing, of some 100 MB that were shown: 32 messages, and what the allocator
+and the kernel hold of them."""
+
+
+@pytest.fixture
+def screen() -> Iterator[Screen]:
+    screen = Screen(HOST, 0, "coec test")
+    yield screen
+    screen.close()
+
+
+def picture(lens: str = "double_sphere") -> tuple[Picture, Rig]:
+    rig = rig_with(LENSES[lens])
+    pair = replace(pair_with(rig.camera), lidar=replace(sweep(), xyz_m=sweep().xyz_m[::16], ring=None))
+    return picture_of(pair, rig, EXTRINSICS, PICTURES, LimitsConfig(), compensated=True), rig
+
+
+def shown_to(viewer: Viewer, screen: Screen, picture: Picture, *wanted: str) -> None:
+    """Subscribe, and show it as soon as that is known."""
+    viewer.subscribe(wanted)
+    wait_until(lambda: set(wanted) <= screen.wanted, f"subscriptions to {', '.join(wanted)}")
+    screen.show(picture)
+
+
+def test_pixels_arrive_as_the_projection_puts_them(screen: Screen) -> None:
+    told, rig = picture()
+    with Viewer(screen.url) as viewer:
+        shown_to(viewer, screen, told, *POINTS.values())
+        for pose, T_camera_lidar in ((Pose.SERVED, MOVED), (Pose.NOMINAL, NOMINAL)):
+            message = viewer.next_on(POINTS[pose])
+            assert viewer.channels[POINTS[pose]]["schemaName"] == "foxglove.ImageAnnotations"
+            assert {band.type for band in message.points} == {1}, "points, not lines"
+            assert {stamp_ns(band) for band in [message, *message.points, *message.texts]} == {told.stamp_ns}
+            # Viewers count from the corner of the first pixel, which is not where its centre is.
+            came = np.array([(point.x - 0.5, point.y - 0.5) for band in message.points for point in band.points])
+            assert places(came) == places(projected(rig.camera, T_camera_lidar, sweep().xyz_m[::16]))
+            assert [text.text for text in message.texts] == [EXTRINSICS[pose].title]
+        nothing = viewer.next_on(POINTS[Pose.CANDIDATE])
+        assert ([text.text for text in nothing.texts], len(nothing.points)) == (["none"], 0)
+        assert stamp_ns(nothing.texts[0]) == told.stamp_ns, "who synchronises waits for it"
+
+
+def stamp_ns(message: object) -> int:
+    timestamp = message.timestamp  # type: ignore[attr-defined]  # of a schema that came over the wire
+    return int(timestamp.seconds * 10**9 + timestamp.nanos)
+
+
+def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: Screen) -> None:
+    told, rig = picture("kannala_brandt")
+    assert told.image is not None
+    assert told.cloud is not None
+    with Viewer(screen.url) as viewer:
+        shown_to(viewer, screen, told, topics.IMAGE, topics.CLOUD, topics.TRANSFORMS, topics.CALIBRATION)
+        image = viewer.next_on(topics.IMAGE)
+        assert (image.format, image.data, image.frame_id) == ("jpeg", told.image.data, "cam_served")
+        cloud = viewer.next_on(topics.CLOUD)
+        assert [(field.name, field.offset, field.type) for field in cloud.fields] == [
+            ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("range", 12, 7),
+        ]  # fmt: skip
+        assert (cloud.frame_id, cloud.point_stride) == ("velo", 16)
+        np.testing.assert_array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 4), told.cloud)
+        transforms = viewer.next_on(topics.TRANSFORMS).transforms
+        assert [(one.parent_frame_id, one.child_frame_id) for one in transforms] == [
+            ("velo", "cam_served"), ("velo", "cam_nominal"),
+        ]  # fmt: skip
+        for one, T_camera_lidar in zip(transforms, (MOVED, NOMINAL), strict=True):
+            place, turn = one.translation, one.rotation
+            R = se3.rotation_from_quaternion_xyzw(np.array([turn.x, turn.y, turn.z, turn.w]))
+            T_lidar_camera = se3.transform_from(R, np.array([place.x, place.y, place.z]))
+            np.testing.assert_allclose(T_lidar_camera @ T_camera_lidar, np.eye(4), atol=1e-12)
+        calibration = viewer.next_on(topics.CALIBRATION)
+        camera = rig.camera
+        assert (calibration.distortion_model, calibration.width, calibration.height) == ("kannala_brandt", 640, 400)
+        assert list(calibration.K) == [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
+        assert len(calibration.D) == 4
+
+
+def test_the_timeline_arrives_with_its_schema_and_remarks_with_their_level(screen: Screen) -> None:
+    with Viewer(screen.url) as viewer:
+        viewer.subscribe([topics.HEALTH, topics.LOG])
+        wait_until(lambda: len(screen.wanted) == 2, "subscriptions")
+        screen.tell(FULL)
+        screen.remark(2, "It has moved.", "front")
+        assert viewer.next_on(topics.HEALTH) == FULL.document()
+        channel = viewer.channels[topics.HEALTH]
+        assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
+        assert json.loads(channel["schema"]) == schema()
+        remark = viewer.next_on(topics.LOG)
+        assert (remark.message, remark.name, remark.level) == ("It has moved.", "front", 4)
+        assert set(viewer.channels) == set(TOPICS)
+        assert viewer.info["capabilities"] == [], "viewers change nothing"
+
+
+def test_what_nobody_looks_at_is_known(screen: Screen) -> None:
+    assert screen.wanted == frozenset()
+    with Viewer(screen.url) as viewer:
+        viewer.subscribe([topics.IMAGE])
+        wait_until(lambda: screen.wanted == {topics.IMAGE}, "one subscription")
+    wait_until(lambda: screen.wanted == frozenset(), "its end with the viewer's")
+
+
+def test_a_port_that_is_taken_is_said_and_may_be_free_later(screen: Screen) -> None:
+    port = int(screen.url.rpartition(":")[2])
+    with pytest.raises(UnavailableError, match=f"{HOST}:{port}: Address already in use"):
+        Screen(HOST, port, "another")
+
+
+def test_an_address_of_the_sixth_version_is_written_in_brackets() -> None:
+    screen = Screen("::1", 0, "coec test")
+    try:
+        assert screen.url.startswith("ws://[::1]:")
+    finally:
+        screen.close()
+
+
+@pytest.mark.fault(
+    "a viewer who reads nothing",
+    "others see everything, at once; what is kept for him is bounded",
+)
+def test_who_does_not_read_costs_nothing(screen: Screen, record_property: Record) -> None:
+    told, _ = picture()
+    noise = np.frombuffer(np.random.default_rng(1).bytes(640 * 400 * 3), np.uint8).reshape(400, 640, 3)
+    large = replace(told, image=probe(encode_png(noise), LimitsConfig()), marks={}, cloud=None)
+    assert large.image is not None
+    assert len(large.image.data) > NOISY_BYTES
+    process = psutil.Process(os.getpid())
+    with Viewer(screen.url) as deaf, Viewer(screen.url) as other:
+        deaf.subscribe([topics.IMAGE])
+        wait_until(lambda: topics.IMAGE in screen.wanted, "his subscription")
+        other.subscribe([topics.IMAGE, topics.HEALTH])
+        wait_until(lambda: topics.HEALTH in screen.wanted, "the other's")
+        before = process.memory_info().rss
+        for number in range(PICTURES_SENT):
+            screen.show(replace(large, stamp_ns=number))
+            assert stamp_ns(other.next_on(topics.IMAGE)) == number
+        grown_mb = (process.memory_info().rss - before) / 1e6
+    assert grown_mb < KEPT_MB < PICTURES_SENT * NOISY_BYTES / 1e6
+    record_property("figure", f"{grown_mb:.0f} MB of {PICTURES_SENT * len(large.image.data) / 1e6:.0f} MB shown")

@@ -1,0 +1,60 @@
+"""Lines of the timeline: their schema is one that viewers read, and they keep to it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from coec.adapters.foxglove.timeline import Ages, Axes, Figure, Missed, Moment, schema
+
+FULL = Moment(
+    pair="front",
+    state="suspect",
+    level=1,
+    why="It may have moved.",
+    reasons=("moved",),
+    needs=("9 more pairs",),
+    provenance="estimated",
+    status="accepted",
+    percent_complete=40.0,
+    candidate=True,
+    ages=Ages(camera_s=0.1, lidar_s=0.1, ego_s=0.1, answer_s=0.5),
+    pair_rate_hz=10.0,
+    sync_error_s=0.01,
+    correction=Axes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
+    sigma=Axes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
+    step=Axes(rx_deg=0.1, ry_deg=0.2, rz_deg=0.3, tx_m=0.0, ty_m=0.0, tz_m=0.0),
+    figures=(Figure(name="mi", value=0.5, limit=0.1, passed=True),),
+    not_shown=(Missed(stream="camera", cause="frame_id", count=3),),
+)
+BARE = Moment(pair="front", state="not_served", level=3, why="Nobody serves the pair.")
+
+
+def fits(value: Any, node: dict[str, Any]) -> bool:
+    """As viewers read a schema: a type for every field that comes, nothing else (Lichtblick's parseJsonSchema)."""
+    match node["type"]:
+        case "object":
+            known = node["properties"]
+            return set(value) <= set(known) and all(fits(one, known[name]) for name, one in value.items())
+        case "array":
+            return all(fits(one, node["items"]) for one in value)
+        case "string":
+            return isinstance(value, str)
+        case "boolean":
+            return isinstance(value, bool)
+        case "number" | "integer":
+            return isinstance(value, int | float)
+    return False
+
+
+def test_what_is_told_fits_the_schema_that_is_advertised() -> None:
+    told = FULL.document()
+    assert fits(told, schema())
+    assert set(told) == set(schema()["properties"]), "every field was tried"
+    assert not fits({**told, "state": None}, schema())
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    told = BARE.document()
+    assert fits(told, schema())
+    assert told["ages"] == {} == told["correction"]
+    assert "provenance" not in told

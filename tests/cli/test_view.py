@@ -1,0 +1,407 @@
+"""`coec view` by a real viewer: a recording, and a vehicle whose service comes, changes and goes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+pytest.importorskip("foxglove", reason="needs the optional extra `foxglove`")
+
+from adapters.foxglove.test_shown import places, projected
+from boards import LENSES, MOVED, NOMINAL, pair_with, rig_with
+from cli.conftest import SMALL, Coec, Outcome
+from coec.adapters.files.conversions import result_of, transform_of
+from coec.adapters.files.rig import intrinsics_config
+from coec.adapters.foxglove import topics
+from coec.adapters.foxglove.topics import POINTS, TOPICS, Pose
+from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
+from coec.adapters.zenoh.bus import MSGPACK
+from coec.adapters.zenoh.player import is_heard
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.types import Rig
+from coec.config import Config
+from coec.errors import ConfigError, SourceError, UnavailableError, UsageError
+from coec.geometry import se3
+from coec.reports import console
+from coec.reports.commented_yaml import commented_yaml
+from coec.schemas.base import to_json, to_msgpack
+from coec.schemas.keys import Keys
+from coec.schemas.replies import (
+    ROS_LEVELS,
+    Axes,
+    AxisReply,
+    Candidate,
+    DataQuality,
+    ExtrinsicReply,
+    HealthReply,
+    HealthState,
+    Reason,
+)
+from coec.sources.windows import chosen_from
+from drives import drawn_source
+from e2e.processes import Router
+from estimates import estimate
+from fakes import wait_until
+from foxglove_viewer import Viewer
+
+Record = Callable[[str, object], None]
+"""pytest's `record_property`."""
+
+ANYWHERE = "127.0.0.1:0"
+RIG = rig_with(LENSES["double_sphere"])
+PAIR = pair_with(RIG.camera)
+PAIR = replace(PAIR, lidar=replace(PAIR.lidar, xyz_m=PAIR.lidar.xyz_m[::16], ring=None))
+KEYS = Keys("coec", "vehicle")
+CANDIDATE = se3.perturb(NOMINAL, np.radians([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+PERIOD_S = 0.05
+
+
+@pytest.fixture
+def viewing(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Outcome]:
+    """Runs `coec view ARGS --json`, and `look(url)` beside it as soon as it is served; then tells it to end."""
+
+    def run(look: Callable[[str], None], *arguments: object) -> Outcome:
+        shown = console.print_json
+        with ThreadPoolExecutor(1) as beside:
+            looked: list[Any] = []
+
+            def print_json(document: Any) -> None:
+                shown(document)
+                looked.append(beside.submit(ended_by, look, document["url"]))
+
+            monkeypatch.setattr(console, "print_json", print_json)
+            outcome = coec("view", *arguments, "--listen", ANYWHERE, "--json")
+            for one in looked:
+                one.result()
+        assert looked, outcome.err
+        return outcome
+
+    return run
+
+
+def ended_by(look: Callable[[str], None], url: str) -> None:
+    """Ctrl-C, when whoever looks has seen enough or has failed."""
+    try:
+        look(url)
+    finally:
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def stamp_ns(message: Any) -> int:
+    return int(message.timestamp.seconds * 10**9 + message.timestamp.nanos)
+
+
+def came(message: Any) -> np.ndarray:
+    """Pixels, their centres at integers."""
+    return np.array([(point.x - 0.5, point.y - 0.5) for band in message.points for point in band.points])
+
+
+# ----------------------------------------------------------------------------------------------------- a recording
+
+
+def result_file(folder: Path, rig: Rig, T_camera_lidar: np.ndarray) -> Path:
+    """As `coec calibrate --json` would have printed it."""
+    found = estimate(3)
+    found = replace(found, optimum=replace(found.optimum, T_camera_lidar=T_camera_lidar))
+    path = folder / "result.json"
+    path.write_bytes(to_json(result_of(found, rig, "vehicle")))
+    return path
+
+
+def test_a_recording_is_shown_and_stays_to_be_seen(viewing: Callable[..., Outcome], tmp_path: Path) -> None:
+    recording = drawn_source(SMALL)
+    rig = recording.rig
+    turned = se3.perturb(rig.T_camera_lidar_nominal, np.radians([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    last = chosen_from(recording, len(recording.camera_stamps_ns), lambda *_: None).window.pairs[-1]
+    xyz_m = compensate(last, rig, enabled=True)
+    stamps: list[int] = []
+
+    def look(url: str) -> None:
+        with Viewer(url) as viewer:
+            viewer.subscribe([topics.IMAGE, topics.HEALTH, *POINTS.values()])
+            while len(stamps) < len(recording.camera_stamps_ns):
+                stamps.append(stamp_ns(viewer.next_on(topics.IMAGE)))
+            for pose, T_camera_lidar in (
+                (Pose.SERVED, rig.T_camera_lidar_nominal), (Pose.NOMINAL, rig.T_camera_lidar_nominal),
+                (Pose.CANDIDATE, turned),
+            ):  # fmt: skip
+                drawn = places(came(viewer.next_on(POINTS[pose])))
+                assert len(drawn) > 500
+                assert drawn <= places(projected(rig.camera, T_camera_lidar, xyz_m))
+            moment = viewer.next_on(topics.HEALTH)
+        assert (moment["state"], moment["status"], moment["candidate"]) == ("recorded", "accepted", True)
+        assert moment["step"]["rx_deg"] == pytest.approx(3.0)
+        with Viewer(url) as late:
+            late.subscribe([topics.IMAGE])
+            assert stamp_ns(late.next_on(topics.IMAGE)) == stamps[-1], "who comes late sees the last pair"
+
+    outcome = viewing(look, SMALL, "--rate", "20", "--result", result_file(tmp_path, rig, turned))
+    assert outcome.status == 0
+    assert stamps == list(recording.camera_stamps_ns)
+    told = outcome.document
+    assert set(told["topics"]) == set(TOPICS)
+    assert told["frames"]["served"] == f"{rig.camera_frame}_served"
+    assert told["url"].startswith("ws://127.0.0.1:")
+
+
+def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Outcome]) -> None:
+    stamps: list[int] = []
+
+    def look(url: str) -> None:
+        with Viewer(url) as viewer:
+            viewer.subscribe([topics.IMAGE])
+            while len(stamps) < 9:
+                stamps.append(stamp_ns(viewer.next_on(topics.IMAGE)))
+
+    assert viewing(look, SMALL, "--rate", "100", "--repeat").status == 0
+    recorded = list(drawn_source(SMALL).camera_stamps_ns)
+    assert len(recorded) == 6
+    assert stamps[:6] == recorded
+    assert np.diff(stamps).min() > 0
+
+
+# ------------------------------------------------------------------------------------------------------- a vehicle
+
+
+class Service:
+    """Answers and publishes as a service does, of one pair."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._said = {KEYS.health("front"): health("healthy"), KEYS.extrinsic("front"): extrinsic(MOVED)}
+        self._queryables = [session.declare_queryable(key, self._answer) for key in self._said]
+        self._token = session.liveliness().declare_token(KEYS.alive("front"))
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            key = str(query.key_expr)
+            query.reply(key, self._said[key], encoding=MSGPACK)
+
+    def say(self, key: str, document: bytes) -> None:
+        """From now on."""
+        self._said[key] = document
+        self._session.put(key, document, encoding=MSGPACK)
+
+    def end(self) -> None:
+        for queryable in self._queryables:
+            queryable.undeclare()
+        self._token.undeclare()
+
+
+AXIS = AxisReply(status="accepted", sigma=0.05, correction=2.0, unit="deg")
+AXES = Axes(rx=AXIS, ry=AXIS, rz=AXIS, tx=AXIS, ty=AXIS, tz=AXIS)
+
+
+def health(state: HealthState) -> bytes:
+    why = (Reason(code="moved", text="It has moved."),) if state == "miscalibrated" else ()
+    reply = HealthReply(
+        vehicle="vehicle", pair="front", state=state, level=ROS_LEVELS[state], reasons=why, metrics={}, axes=AXES,
+        needs=(), data_quality=DataQuality(), since_ns=0, evaluated_ns=None, age_s=None,
+    )  # fmt: skip
+    return to_msgpack(reply)
+
+
+def extrinsic(T_camera_lidar: np.ndarray) -> bytes:
+    waits = Candidate(window_id="front-7", data_stamp_ns=7, camera_from_lidar=transform_of(CANDIDATE))
+    reply = ExtrinsicReply(
+        vehicle="vehicle", pair="front", camera_frame="cam", lidar_frame="velo", provenance="estimated",
+        camera_from_lidar=transform_of(T_camera_lidar), status="accepted", percent_complete=40.0, axes=AXES,
+        valid_from_ns=0, data_stamp_ns=None, window_id=None, config_hash="0", pending=waits,
+    )  # fmt: skip
+    return to_msgpack(reply)
+
+
+def configuration(folder: Path, endpoint: str) -> Path:
+    pair = {
+        "name": "front",
+        "camera": {"key": "in/camera", "frame_id": "cam", "intrinsics": intrinsics_config(RIG.camera).model_dump()},
+        "lidar": {"key": "in/lidar", "frame_id": "velo"},
+        "T_camera_lidar": NOMINAL.tolist(),
+    }
+    zenoh_config = {"connect": [endpoint], "listen": [endpoint]}
+    path = folder / "coec.yaml"
+    path.write_text(commented_yaml(Config.model_validate({"zenoh": zenoh_config, "pairs": [pair]})))
+    return path
+
+
+class Sensors:
+    """A camera and a LiDAR that send, whether somebody listens or not."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._publishers = {stream: session.declare_publisher(f"in/{stream}") for stream in ("camera", "lidar")}
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._send)
+
+    def __enter__(self) -> Sensors:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._end.set()
+        self._thread.join()
+        for publisher in self._publishers.values():
+            publisher.undeclare()
+
+    @property
+    def are_heard(self) -> bool:
+        return any(is_heard(publisher) for publisher in self._publishers.values())
+
+    def _send(self) -> None:
+        number = 0
+        while not self._end.wait(PERIOD_S):
+            number += 1
+            stamp_ns = 10**18 + round(number * PERIOD_S * 1e9)
+            camera, lidar = replace(PAIR.camera, stamp_ns=stamp_ns), replace(PAIR.lidar, stamp_ns=stamp_ns)
+            self._publishers["camera"].put(encode_camera(camera), encoding=MSGPACK)
+            self._publishers["lidar"].put(encode_lidar(lidar), encoding=MSGPACK)
+
+
+def until(viewer: Viewer, condition: Callable[[Any], bool]) -> Any:
+    """The first line of the timeline for which it holds."""
+    while not condition(moment := viewer.next_on(topics.HEALTH)):
+        pass
+    return moment
+
+
+@pytest.mark.fault("the service dies while somebody looks", "the timeline says so; the picture goes on")
+def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
+    viewing: Callable[..., Outcome], router: Router, tmp_path: Path, record_property: Record
+) -> None:
+    def look(url: str) -> None:
+        with Viewer(url) as viewer, Sensors(router.session) as sensors:
+            viewer.subscribe([topics.HEALTH, topics.LOG])
+            assert viewer.next_on(topics.HEALTH)["state"] == "not_served"
+            service = Service(router.session)
+            moment = until(viewer, lambda moment: moment["state"] == "healthy" and "provenance" in moment)
+            assert (moment["provenance"], moment["level"], moment["candidate"]) == ("estimated", 0, True)
+            assert moment["correction"]["rx_deg"] == 2.0
+            assert "camera_s" not in moment["ages"]
+            assert not sensors.are_heard, "nobody looks at pictures"
+
+            viewer.subscribe([topics.IMAGE, *POINTS.values()])
+            image = viewer.next_on(topics.IMAGE)
+            expected = {Pose.SERVED: MOVED, Pose.NOMINAL: NOMINAL, Pose.CANDIDATE: CANDIDATE}
+            for pose, T_camera_lidar in expected.items():
+                marks = viewer.next_on(POINTS[pose])
+                assert stamp_ns(marks) == stamp_ns(image)
+                assert places(came(marks)) == places(projected(RIG.camera, T_camera_lidar, PAIR.lidar.xyz_m))
+            assert marks.texts[0].text == "candidate: waits for apply"
+            assert sensors.are_heard
+            assert until(viewer, lambda moment: "camera_s" in moment["ages"])["ages"]["camera_s"] < 60.0
+
+            service.say(KEYS.health("front"), health("miscalibrated"))
+            moment = until(viewer, lambda moment: moment["state"] == "miscalibrated")
+            assert (moment["level"], moment["reasons"], moment["why"]) == (2, ["moved"], "It has moved.")
+
+            died_s = time.monotonic()
+            service.end()
+            moment = until(viewer, lambda moment: moment["state"] == "not_served")
+            record_property("figure", f"{time.monotonic() - died_s:.1f} s")
+            assert moment["level"] == 3
+            assert moment["provenance"] == "estimated", "the last that is known"
+            while "not_served" not in viewer.next_on(POINTS[Pose.SERVED]).texts[0].text:
+                pass
+            wait_until(lambda: sensors.are_heard, "frames, still")
+        with Viewer(url) as other, Sensors(router.session) as sensors:
+            other.subscribe([topics.HEALTH])
+            wait_until(lambda: not sensors.are_heard, "the end of the subscriptions")
+
+    assert viewing(look, "--config", configuration(tmp_path, router.endpoint)).status == 0
+
+
+@pytest.mark.fault(
+    "rubbish under the service's keys and the sensors'", "it is counted by cause, and nothing else happens"
+)
+def test_rubbish_is_counted(
+    viewing: Callable[..., Outcome], router: Router, tmp_path: Path, record_property: Record
+) -> None:
+    def look(url: str) -> None:
+        service = Service(router.session)
+        with Viewer(url) as viewer, Sensors(router.session) as sensors:
+            viewer.subscribe([topics.HEALTH, topics.IMAGE])
+            until(viewer, lambda moment: moment["state"] == "healthy")
+            wait_until(lambda: sensors.are_heard, "subscriptions")
+            key = KEYS.extrinsic("front")
+            for rubbish in (b"\xc1", bytes(2**20 + 1), extrinsic(np.diag([2.0, 1.0, 1.0, 1.0]))):
+                router.session.put(key, rubbish, encoding=MSGPACK)
+            router.session.put("in/camera", b"\xc1", encoding=MSGPACK)
+            stranger = replace(PAIR.lidar, frame_id="elsewhere")
+            router.session.put("in/lidar", encode_lidar(stranger), encoding=MSGPACK)
+            refused = {
+                ("service", "message_malformed"), ("service", "message_too_large"), ("service", "message_fields"),
+                ("camera", "message_malformed"), ("lidar", "frame_id"),
+            }  # fmt: skip
+            moment = until(viewer, lambda moment: refused <= counted(moment))
+            assert moment["provenance"] == "estimated", "what was served is served"
+            viewer.next_on(topics.IMAGE)
+            record_property("figure", f"{len(refused)} causes")
+        service.end()
+
+    assert viewing(look, "--config", configuration(tmp_path, router.endpoint)).status == 0
+
+
+def counted(moment: Any) -> set[tuple[str, str]]:
+    return {(one["stream"], one["cause"]) for one in moment["not_shown"]}
+
+
+# --------------------------------------------------------------------------------------------------------- refusals
+
+
+def test_other_computers_get_in_only_if_that_is_said(coec: Coec) -> None:
+    outcome = coec("view", SMALL, "--listen", "0.0.0.0:8765")
+    assert outcome.status == UsageError.exit_code
+    assert "--insecure" in outcome.err
+    assert coec("view", SMALL, "--listen", "8765").status == UsageError.exit_code
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        (SMALL, "--config", "coec.yaml"),
+        (SMALL, "--pair", "front"),
+        ("--config", "coec.yaml", "--repeat"),
+        ("--config", "coec.yaml", "--result", "result.json"),
+    ],
+)
+def test_what_does_not_go_together_is_said(coec: Coec, arguments: tuple[str, ...]) -> None:
+    assert coec("view", *arguments).status == UsageError.exit_code
+
+
+def test_what_is_not_there_is_said(coec: Coec, tmp_path: Path, router: Router) -> None:
+    assert coec("view", tmp_path / "absent").status == SourceError.exit_code
+    assert coec("view", "--config", tmp_path / "absent.yaml").status == ConfigError.exit_code
+    rubbish = tmp_path / "result.json"
+    rubbish.write_text("[]")
+    outcome = coec("view", SMALL, "--result", rubbish)
+    assert (outcome.status, "coec calibrate --json" in outcome.err) == (SourceError.exit_code, True)
+    result_file(tmp_path, drawn_source(SMALL).rig, np.diag([2.0, 1.0, 1.0, 1.0]))
+    outcome = coec("view", SMALL, "--result", rubbish)
+    assert (outcome.status, "no rotation" in outcome.err) == (SourceError.exit_code, True)
+    path = configuration(tmp_path, router.endpoint)
+    assert coec("view", "--config", path, "--pair", "rear").status == UsageError.exit_code
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        outcome = coec("view", "--config", path, "--listen", f"127.0.0.1:{port}")
+    assert outcome.status == UnavailableError.exit_code
+
+
+def test_without_the_extra_it_says_what_to_install(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    outcome = coec("view", SMALL)
+    assert outcome.status == UsageError.exit_code
+    assert outcome.err.splitlines() == [
+        "coec: coec view needs the optional extra `foxglove`: pip install 'coec[foxglove]'"
+    ]
