@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coec.adapters.frames import msgpack_frames
-from coec.adapters.ros import incoming
+from coec.adapters.frames.incoming import Refusal
+from coec.adapters.ros import incoming, messages
+from coec.adapters.ros.moving_frames import MovingFrame
 from coec.adapters.ros.wire.rmw_zenoh import Attachment
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
@@ -33,7 +35,17 @@ ORIGIN_PERIOD_NS = 10**9
 WRONG_TYPE = "wrong_type"
 """Cause of a loss: a message that makes no frame of the stream."""
 
-EXPLAINED = frozenset({CLOUD_ORIGIN, WRONG_TYPE})
+EXPLAINED = frozenset(
+    {
+        CLOUD_ORIGIN,
+        WRONG_TYPE,
+        Refusal.MESSAGE_TYPE,
+        Refusal.CLOUD_FIELDS,
+        Refusal.CLOUD_TIME,
+        Refusal.CLOUD_TIME_AMBIGUOUS,
+        Refusal.IMAGE_UNKNOWN_FORMAT,
+    }
+)
 """Causes that the log explains by the sentence of the error, which is ours."""
 
 NUMBERED = b"\xa8sequence"
@@ -78,6 +90,7 @@ class Decoder:
         self._origin = OriginCheck()
         self._looked_in: int | None = None
         self._contradicted = False
+        self._moving = MovingFrame(*(("", "") if pair.ego is None else (pair.ego.parent, pair.ego.child)))
 
     def counts(self, stream: str) -> StreamCounts:
         """Counters of a stream since the start."""
@@ -99,7 +112,8 @@ class Decoder:
             self._overruns.append((parcel.stream, NOBODY))
 
     def frame(self, parcel: Parcel) -> Frame | None:
-        """The frame in a sample, or None when it was refused (and counted). Never raises for what a sender sent."""
+        """The frame in a sample, or None when it was refused (and counted), or holds none: transforms of other frames
+        than the vehicle's. Never raises for what a sender sent."""
         stream = parcel.stream
         self._received[stream] += 1
         while self._overruns:
@@ -110,6 +124,8 @@ class Decoder:
             if len(parcel.sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
             frame = self._decode(stream, parcel.sample)
+            if frame is None:
+                return None
             if told is None and frame.sequence is not None:
                 self._number(stream, NOBODY, frame.sequence)
             frame = self._checked(self._stamped(stream, frame, told))
@@ -144,7 +160,7 @@ class Decoder:
         self._stamped_by_sender[stream] = without
         return replace(frame, stamp_ns=told.source_ns) if told is not None and without else frame
 
-    def _decode(self, stream: str, sample: Sample) -> Frame:
+    def _decode(self, stream: str, sample: Sample) -> Frame | None:
         configured = self._streams[stream]
         encoding, _, schema = sample.encoding.partition(";")
         if encoding not in ("application/msgpack", CDR):
@@ -153,8 +169,13 @@ class Decoder:
             type_name = schema or configured.assumed_type
             if type_name not in configured.types:
                 expected = " or ".join(configured.types)
-                raise DecodeError(WRONG_TYPE, f"a message of another type on {configured.place}: expected {expected}")
-            return incoming.decode(type_name, sample.payload, self._limits)
+                told = incoming.REFUSED.get(type_name, "a message of another type")
+                raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
+            if type_name == messages.TF:
+                return self._moving.motion(sample.payload)
+            frame = incoming.decode(type_name, sample.payload, self._limits, self._pair.lidar.time)
+            self._check_times(frame)
+            return frame
         if stream == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
         if stream == LIDAR:
@@ -188,6 +209,12 @@ class Decoder:
         found = self._origin.look(sweep)
         self._contradicted = found is not None
         return found
+
+    def _check_times(self, frame: Frame) -> None:
+        time = self._pair.lidar.time
+        if time is not None and isinstance(frame, LidarFrame) and frame.time_offset_s is None:
+            what = f"the cloud has no field {time.field} of one number a point, which `lidar.time` names"
+            raise DecodeError(Refusal.CLOUD_FIELDS, what)
 
     def _check_camera(self, frame: CameraFrame) -> None:
         camera = self._pair.camera
