@@ -28,7 +28,7 @@ from coec.adapters.foxglove import topics
 from coec.adapters.foxglove.topics import POINTS, TOPICS, Pose
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.player import is_heard
+from coec.adapters.zenoh.matching import is_heard
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Rig
 from coec.config import Config

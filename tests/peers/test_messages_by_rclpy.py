@@ -34,7 +34,7 @@ SWEEP = LidarFrame(
     time_offset_s=np.linspace(-0.1, 0, 101, dtype=np.float32),
 )
 MOTION = EgoMotion(STAMP, "base_link", (12.5, -1e-9, 0.0), (1 / 3, 0.0, -0.25))
-FRAMES = {messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY}
+FRAMES = {messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY, messages.IMU}
 
 IMAGES = [
     EncodedImage(ImageFormat.JPEG, 64, 48, JPEG),
@@ -77,7 +77,7 @@ def written() -> list[tuple[str, bytes]]:
         *(outgoing.encode_image(CameraFrame(STAMP, "camera", image)) for image in IMAGES),
         (messages.COMPRESSED_IMAGE, outgoing.encode_depth(STAMP, "camera", IMAGES[0])),
         (messages.POINT_CLOUD, outgoing.encode_cloud(SWEEP)),
-        (messages.ODOMETRY, outgoing.encode_odometry(MOTION, "base_link")),
+        *(outgoing.encode_motion(motion) for motion in (MOTION, replace(MOTION, linear_mps=None))),
         *((messages.CAMERA_INFO, outgoing.encode_camera_info(rig(model), STAMP)) for model in MODELS),
         (messages.TF, outgoing.encode_tf_static(rig("pinhole"), T_CAMERA_LIDAR, STAMP)),
         *(
@@ -126,7 +126,7 @@ def test_values_arrive_where_a_node_looks_for_them(rclpy: Peer) -> None:
     x = next(field for field in cloud["fields"] if field["name"] == "x")
     assert (x["offset"], x["datatype"], x["count"]) == (0, 7, 1)
     assert bytes(cloud["data"][:12]) == SWEEP.xyz_m[0].tobytes()
-    odometry = told_by(rclpy, messages.ODOMETRY, outgoing.encode_odometry(MOTION, "base_link"))
+    odometry = told_by(rclpy, messages.ODOMETRY, outgoing.encode_motion(MOTION)[1])
     assert odometry["twist"]["twist"]["linear"] == {"x": 12.5, "y": -1e-9, "z": 0.0}
 
 
@@ -160,4 +160,4 @@ def test_every_message_of_a_window_is_read_by_rclpy(rclpy: Peer, tmp_path: Path)
             theirs = told_by(rclpy, schema.name, message.data)
             assert theirs == plain(STORE.deserialize_cdr(message.data, schema.name)), channel.topic
             read.add(schema.name)
-    assert read >= FRAMES | {messages.CAMERA_INFO}
+    assert read >= FRAMES - {messages.IMU} | {messages.CAMERA_INFO}

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.player import is_heard
+from coec.adapters.zenoh.matching import is_heard
 from e2e.processes import environment
 from fakes import wait_until
 from ports import free_port

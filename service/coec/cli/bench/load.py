@@ -85,7 +85,7 @@ def _ros(session: zenoh.Session) -> Callable[[Frame], None]:
             case LidarFrame():
                 streams["lidar"].put(outgoing.encode_cloud(frame), frame.stamp_ns)
             case EgoMotion():
-                streams["ego"].put(outgoing.encode_odometry(frame, frame.frame_id), frame.stamp_ns)
+                streams["ego"].put(outgoing.encode_motion(frame)[1], frame.stamp_ns)
 
     return send
 
