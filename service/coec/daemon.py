@@ -131,7 +131,7 @@ class Daemon:
         listener = None if credentials is None else Listener(credentials)
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
-        self._ros = RosSide(session, config)
+        self._ros_side = RosSide(session, config)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         others = () if mode_of(settings) == "router" else connected_of(settings)
         self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
@@ -146,7 +146,7 @@ class Daemon:
             self._worker,
             self._publish,
             self._troubles,
-            self._ros.topics,
+            self._ros_side.topics,
         )
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         commands = {name: pair.commands for name, pair in self._pairs.items()}
@@ -200,7 +200,7 @@ class Daemon:
             pair = self._pairs[pair_config.name]
             pair.stream.thread.start()
             for name, stream in pair_config.streams.items():
-                self._bus.subscribe(self._ros.input_of(stream), partial(pair.take_sample, name))
+                self._bus.subscribe(self._ros_side.input_of(stream), partial(pair.take_sample, name))
             self._bus.declare_alive(self._keys.alive(pair.name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
         _log.info("serving", extra={"fields": {**fields, "pairs": list(self._pairs)}})
@@ -246,7 +246,7 @@ class Daemon:
             ("announce", self._notifier.stopping),
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
-            ("be no node of ROS", self._ros.close),
+            ("be no node of ROS", self._ros_side.close),
             ("end the streams", lambda: self._end(pairs, lambda pair: pair.stream, INGEST_STOP_S)),
             ("finish the open windows", self._finish_windows),
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
