@@ -15,7 +15,7 @@ from coec.adapters.zenoh.settings import settings_of
 from coec.config import AuthorityConfig, LimitsConfig, ZenohConfig
 from coec.runtime.api.authority import Authority
 from coec.runtime.api.configuration import shown
-from coec.runtime.api.reception import Reception
+from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.schemas.keys import Keys
@@ -51,11 +51,11 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
     """Declare all that a vehicle answers, as the daemon does."""
     pair, authority = bench.pair, bench.config.authority
     credentials = credentials_of(authority)
-    reception = Reception(
+    rules = Rules(
         Authority(authority, Reach(settings_of(config, LIMITS)).outside),
         None if credentials is None else Listener(credentials),
-        {pair.name: pair.commands},
     )
+    reception = Reception(rules, {pair.name: pair.commands})
     document = Snapshot.of_document({"schema_version": 1, "config_hash": "0", "config": shown(bench.config)})
 
     def status() -> Snapshot:

@@ -33,7 +33,7 @@ from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
-from coec.config import Config, config_hash
+from coec.config import AuthorityConfig, Config, config_hash
 from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
 from coec.runtime.api.authority import Authority
@@ -42,7 +42,7 @@ from coec.runtime.api.health import reasons_of
 from coec.runtime.api.http_door import HttpDoor
 from coec.runtime.api.metrics import Took, View
 from coec.runtime.api.pages import pages
-from coec.runtime.api.reception import Reception
+from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.router_watch import RouterWatch
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
@@ -72,6 +72,9 @@ TOKENS_HIDDEN = Reason(
     "The router hides the liveliness tokens of this vehicle: a second daemon could serve it unseen. Its rules must "
     "allow the service `liveliness_token` and `liveliness_query` (deploy/router.json5).",
 )
+
+CERTIFICATE = "authority.certificate"
+"""Place of what is read from files, which change while the configuration does not."""
 
 TICK_S = 1.0
 STALLED_S = 20.0
@@ -127,8 +130,8 @@ class Daemon:
         self._worker = Worker(config.worker, config.model_dump_json())
         settings = settings_of(config.zenoh, config.limits)
         self._insecure = _insecure(unguarded(settings))
-        authority, credentials = Authority(config.authority, Reach(settings).outside), credentials_of(config.authority)
-        listener = None if credentials is None else Listener(credentials)
+        self._reach = Reach(settings)
+        self._rules = self._rules_of(config.authority, None)
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
         self._ros_side = RosSide(session, config)
@@ -150,7 +153,7 @@ class Daemon:
         )
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         commands = {name: pair.commands for name, pair in self._pairs.items()}
-        self._reception = Reception(authority, listener, commands)
+        self._reception = Reception(self._rules, commands)
         self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
         self._answers = VehicleAnswers(
             self._keys,
@@ -291,30 +294,44 @@ class Daemon:
         told = self._configuration
         try:
             fresh = reload_of(self._config, reread())
+            rules = self._rules_of(fresh.config.authority, self._rules.listener)
         except Exception as error:  # whatever is wrong with a file, what runs goes on
             self._configuration = told.model_copy(update={"read_ns": time.time_ns(), "refused": str(error)})
             expected = isinstance(error, CoecError)
             _log.error(f"the configuration on the disk is refused, the old one stays: {error}", exc_info=not expected)
         else:
+            taken = fresh.taken
+            if rules.digest != self._rules.digest and CERTIFICATE not in taken:
+                taken = (*taken, CERTIFICATE)
             self._configuration = replies.ConfigurationStatus(
-                read_ns=time.time_ns(),
-                reloads=told.reloads + bool(fresh.taken),
-                taken=fresh.taken,
-                waiting=fresh.waiting,
+                read_ns=time.time_ns(), reloads=told.reloads + bool(taken), taken=taken, waiting=fresh.waiting
             )
-            self._take(fresh.config)
-            changed = "it is taken" if fresh.taken else "it changes nothing that runs"
+            self._take(fresh.config, rules)
+            changed = "it is taken" if taken else "it changes nothing that runs"
             waits = "; what differs besides waits for a restart" if fresh.waiting else ""
-            places = {"taken": list(fresh.taken), "waiting": list(fresh.waiting)}
+            places = {"taken": list(taken), "waiting": list(fresh.waiting)}
             fields = {**places, "config_hash": config_hash(self._config)}
             _log.info(f"the configuration on the disk is valid; {changed}{waits}", extra={"fields": fields})
         self._renew()
         if self._state == "running":
             self._notifier.ready()
 
-    def _take(self, config: Config) -> None:
-        """Go on with another configuration, in which only what can be taken differs."""
+    def _rules_of(self, config: AuthorityConfig, before: Listener | None) -> Rules:
+        """Who may give commands, by the files as they are now; conversations begun `before` go on.
+
+        Raises:
+            ConfigError: a file cannot be used.
+        """
+        credentials, authority = credentials_of(config), Authority(config, self._reach.outside)
+        if credentials is None:
+            return Rules(authority, None)
+        return Rules(authority, Listener(credentials) if before is None else before.renewed(credentials))
+
+    def _take(self, config: Config, rules: Rules) -> None:
+        """Go on with another configuration, in which only what can be taken differs, and with these rules of it."""
         before, self._config = self._config, config
+        self._rules = rules
+        self._reception.use(rules)  # also where nothing differs: certificates are renewed in place
         self._door.use(config.metrics)  # also where nothing differs: its port may be free by now
         if config == before:
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import shutil
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -14,11 +15,15 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from coec.adapters.zenoh.bus import open_session
+from certificates import TestAuthority, make_authority
+from coec.adapters.tls.conversation import NotProvenError, Speaker
+from coec.adapters.zenoh.bus import JSON, open_session
+from coec.adapters.zenoh.client import RemoteError, ask_one
+from coec.adapters.zenoh.proven import give
 from coec.cli.check_config import template
 from coec.cli.doctor import examine
-from coec.config import LimitsConfig, ZenohConfig, load_config
-from e2e.processes import COMMAND, PATIENCE_S, Service, environment
+from coec.config import LimitsConfig, SenderConfig, ZenohConfig, load_config
+from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment
 from fakes import wait_until
 from open_metrics import parse
 from ports import free_port
@@ -89,6 +94,60 @@ def test_no_router_then_one_then_other_settings(tmp_path: Path) -> None:
             assert f"the router at {endpoint} is there" in log.read_text()
             _reload(running, path, endpoint, port)
             assert running.terminate() == 0
+
+
+@pytest.mark.fault(
+    "certificates that expire on a vehicle that runs for months, and one that cannot be read",
+    "they are renewed by SIGHUP; what cannot be read changes nothing, and status says why",
+)
+def test_who_may_give_commands_is_read_again(
+    tmp_path: Path, router: Router, authority: TestAuthority, record_property: Any
+) -> None:
+    path, ours = tmp_path / "coec.yaml", tmp_path / "tls"
+    others = make_authority(tmp_path / "others")
+    shutil.copytree(authority.folder, ours)
+    written(path, router.endpoint)
+    with process(path) as started:
+        running = Service(started, router.session, load_config(path), tmp_path / "coec.log")
+        hold = f"{running.keys.command(PAIR, 'hold')}?format=json"
+
+        def after(signals: int) -> dict[str, Any]:
+            running.process.send_signal(signal.SIGHUP)
+            told = running.until(
+                lambda: running.status()["configuration"],
+                lambda told: told["reloads"] == signals or told["refused"] is not None,
+                "the reload",
+            )
+            return dict(told)
+
+        def may_hold(by: TestAuthority | None) -> bool:
+            try:
+                if by is None:
+                    ask_one(router.session, hold, PATIENCE_S)
+                else:
+                    speaker = Speaker(by.credentials("operator"), "vehicle")
+                    give(router.session, hold, None, PATIENCE_S, speaker, JSON)
+            except (NotProvenError, RemoteError):
+                return False
+            return True
+
+        running.until(running.status, bool, "an answer")
+        assert may_hold(None)
+        own = TestAuthority(ours).of_service(SenderConfig(name="operator", commands=("hold",)))
+        written(path, router.endpoint, authority=own.model_dump(mode="json"))
+        assert set(after(1)["taken"]) == {f"authority.{name}" for name in type(own).model_fields}
+        assert (may_hold(None), may_hold(authority), may_hold(others)) == (False, True, False)
+
+        for file in ("vehicle.pem", "vehicle-key.pem", "ca.pem"):
+            shutil.copy(others.folder / file, ours / file)
+        assert after(2)["taken"] == ["authority.certificate"]
+        assert (may_hold(None), may_hold(authority), may_hold(others)) == (False, False, True)
+
+        (ours / "vehicle.pem").write_text("no certificate")
+        refused = after(3)
+        assert (refused["reloads"], "vehicle.pem" in refused["refused"]) == (2, True)
+        assert (may_hold(None), may_hold(authority), may_hold(others)) == (False, False, True)
+        record_property("figure", "3 reloads, 9 commands")
 
 
 def _reload(running: Service, path: Path, endpoint: str, port: int) -> None:

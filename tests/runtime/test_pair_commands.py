@@ -21,7 +21,7 @@ from coec.config import AuthorityConfig
 from coec.geometry import se3
 from coec.runtime.api import commands, rate_limit
 from coec.runtime.api.authority import Authority
-from coec.runtime.api.reception import Reception
+from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
@@ -169,7 +169,7 @@ def route_of(bench: Bench, command: str) -> Route:
     """Who answers the command."""
     keys, pair, unasked = Keys("coec", "test"), bench.pair, Snapshot(b"", b"")
     bus = create_autospec(Bus, instance=True)
-    reception = Reception(Authority(AuthorityConfig(), lambda: None), None, {pair.name: pair.commands})
+    reception = Reception(Rules(Authority(AuthorityConfig(), lambda: None), None), {pair.name: pair.commands})
     VehicleAnswers(keys, {pair.name: pair.answers}, reception, lambda: unasked, lambda: b"", lambda: unasked).declare(
         bus
     )

@@ -16,7 +16,6 @@ from coec.adapters.zenoh.inputs import Sample
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
-from coec.runtime.api.payloads import proven_sender
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.incident_pictures import IncidentPictures
 from coec.runtime.decisions.mailbox import Mailbox
@@ -84,7 +83,6 @@ class Pair:
             self.recorder,
             folder,
             questions,
-            [proven_sender(sender.name) for sender in config.authority.senders],
         )
         self._chooser, self._questions, self._mailbox = chooser, questions, mailbox
         self.decider.tell_now()

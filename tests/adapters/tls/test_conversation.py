@@ -215,6 +215,30 @@ def test_files_that_cannot_be_used_are_named_and_not_shown(authority: TestAuthor
         assert "c2VjcmV0" not in str(refused.value)
 
 
+@pytest.mark.fault(
+    "certificates are renewed while a conversation is under way",
+    "it ends as it began; whoever comes next is held to the new",
+)
+def test_certificates_are_renewed_while_a_conversation_is_under_way(
+    authority: TestAuthority, listener: Listener, foreign: TestAuthority
+) -> None:
+    speaker = Speaker(authority.credentials("operator"), "vehicle")
+    last = speaker.say(flight(listener.hear("before", speaker.hello())), TEXT)
+    renewed = listener.renewed(foreign.credentials("vehicle"))
+    assert end(renewed.hear("before", last)).name == "operator"
+    assert said(renewed, foreign.credentials("operator"))[0].name == "operator"
+    with pytest.raises(NotProvenError):
+        said(renewed, authority.credentials("operator"))
+    assert renewed.digest != listener.digest == Listener(authority.credentials("vehicle")).digest
+
+
+def test_certificates_that_cannot_be_used_renew_nothing(authority: TestAuthority, listener: Listener) -> None:
+    absent = Credentials(authority.folder / "absent.pem", authority.folder / "absent.pem", authority.root)
+    with pytest.raises(ConfigError, match=r"absent\.pem"):
+        listener.renewed(absent)
+    assert said(listener, authority.credentials("operator"))[0].name == "operator"
+
+
 def test_more_than_one_record_is_not_said(authority: TestAuthority, listener: Listener) -> None:
     speaker = Speaker(authority.credentials("operator"), "vehicle")
     came = flight(listener.hear("1", speaker.hello()))

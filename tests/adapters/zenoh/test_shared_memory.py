@@ -16,7 +16,7 @@ from e2e.processes import environment
 from fakes import wait_until
 from ports import free_port
 
-ROUTERS, MESSAGES = 4, 8
+ROUTERS, MESSAGES = 3, 8
 PAYLOAD = bytes(2_000_000)
 POOL_MIB = 16
 """Of a session of Zenoh that hands over in shared memory."""

@@ -52,9 +52,19 @@ def test_invented_names_gain_little_and_take_no_memory() -> None:
 
 
 def test_who_has_proven_his_name_has_a_bucket_of_his_own_however_many_others_there_are() -> None:
-    limit = RateLimit(["operator (certificate)"], clock=Clock())
+    limit = RateLimit(clock=Clock())
+    limit.reserve_for(["operator (certificate)"])
     for number in range(10 * SENDERS):
         for _ in range(BURST):
             limit.take(f"invented {number}")
     assert limit.take("invented anew") > 0.0
     assert limit.take("operator (certificate)") == 0.0
+
+
+def test_who_is_named_again_keeps_what_is_left_to_him() -> None:
+    limit = RateLimit(clock=Clock())
+    limit.reserve_for(["operator", "fleet"])
+    assert accepted(limit, "operator", BURST) == BURST
+    limit.reserve_for(["operator"])
+    assert limit.take("operator") > 0.0
+    assert set(limit._reserved) == {"operator"}

@@ -110,6 +110,20 @@ def test_an_intact_file_of_another_form_is_an_error(tmp_path: Path) -> None:
         StateStore(tmp_path, "test").recall(RIG)
 
 
+@pytest.mark.fault(
+    "a state with a pair that the service does not know, in a form that nobody wrote",
+    "it stays as it is, and the state is written",
+)
+@pytest.mark.parametrize("foreign", [2, None, [], "x", {"history_heads": 1}])
+def test_what_is_there_of_an_unknown_pair_stays(tmp_path: Path, foreign: object) -> None:
+    StateStore(tmp_path, "test")._file.save({"pairs": {"": foreign}})
+    saved(StateStore(tmp_path, "test"), RIG, initial_state(RIG), HEADS)
+    assert restarted(tmp_path) is not None
+    body = StateFile(tmp_path / "state.json").load().body
+    assert body is not None
+    assert body["pairs"][""] == foreign
+
+
 ZERO = [[0.0] * 4] * 4
 SHEARED = [[1.0, 0.1, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 

@@ -14,6 +14,7 @@ the common names of the certificates, both signed by one authority. (RFC 8446; `
 
 from __future__ import annotations
 
+import hashlib
 import ssl
 import time
 from collections import OrderedDict
@@ -128,7 +129,11 @@ class _Line:
 
 
 class Listener:
-    """The end of the service: takes part in many conversations at once. One thread."""
+    """The end of the service: takes part in many conversations at once. One thread.
+
+    Attributes:
+        digest: SHA-256 of what its files held.
+    """
 
     def __init__(self, credentials: Credentials, clock: Callable[[], float] = time.monotonic) -> None:
         """`clock` tells seconds.
@@ -139,8 +144,20 @@ class Listener:
         self._context = _context(credentials, ssl.PROTOCOL_TLS_SERVER)
         self._context.verify_mode = ssl.CERT_REQUIRED
         self._context.num_tickets = 0  # no conversation is taken up again
+        self.digest = _digest(credentials)
         self._clock = clock
         self._begun: OrderedDict[str, tuple[_Line, float]] = OrderedDict()
+
+    def renewed(self, credentials: Credentials) -> Listener:
+        """One that goes on with what has begun here, and holds who begins from now on to these files, read now. For any
+        thread; this one is not to be asked any more.
+
+        Raises:
+            ConfigError: as at first; this one goes on.
+        """
+        fresh = Listener(credentials, self._clock)
+        fresh._begun = self._begun
+        return fresh
 
     def hear(self, conversation: str, came: bytes) -> bytes | Heard:
         """The next bytes of a conversation, which its speaker named: what to send back, or its end.
@@ -237,6 +254,16 @@ def _context(credentials: Credentials, protocol: int) -> ssl.SSLContext:
         both = f"{credentials.certificate} and {credentials.private_key}"
         raise ConfigError(f"{both} are no certificate and its unencrypted key in PEM: {_reason(error)}") from None
     return context
+
+
+def _digest(credentials: Credentials) -> str:
+    digest = hashlib.sha256()
+    for path in (credentials.certificate, credentials.private_key, credentials.root_ca):
+        try:
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+        except OSError as error:
+            raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    return digest.hexdigest()
 
 
 def _nobody_types() -> str:

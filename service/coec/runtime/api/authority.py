@@ -24,6 +24,11 @@ class Authority:
         self._allowed = {sender.name: frozenset(sender.commands) for sender in config.senders}
         self._reached_from_outside = reached_from_outside
 
+    @property
+    def senders(self) -> tuple[str, ...]:
+        """The names that may give commands once they are proven."""
+        return tuple(self._allowed)
+
     def require(self, name: str | None, command: str) -> None:
         """That the sender with this name, which he has proven, may give the command; None: he has proven none.
 

@@ -58,9 +58,7 @@ class Commands:
         recorder: Recorder,
         folder: WindowStore,
         questions: Questions,
-        proven: Iterable[str] = (),
     ) -> None:
-        """`proven` are the senders who can prove who they are, as `payloads.proven_sender` writes them."""
         self._pair = pair
         self._vehicle = vehicle
         self._rig = rig
@@ -73,13 +71,17 @@ class Commands:
         self._recorder = recorder
         self._folder = folder
         self._questions = questions
-        self._rate = RateLimit(proven)
+        self._rate = RateLimit()
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
 
     def use(self, pair: PairConfig) -> None:
         """Carry out by these settings from now on."""
         self._pair, self._rules = pair, lifecycle.Rules(pair.policy, pair.tracker, pair.monitor)
+
+    def reserve_for(self, proven: Iterable[str]) -> None:
+        """Let others take nothing from senders who can prove who they are, as `payloads.proven_sender` writes them."""
+        self._rate.reserve_for(proven)
 
     @property
     def counts(self) -> dict[str, int]:

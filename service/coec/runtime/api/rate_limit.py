@@ -32,13 +32,20 @@ class _Bucket:
 class RateLimit:
     """Of one pair. Safe to use from several threads."""
 
-    def __init__(self, proven: Iterable[str] = (), clock: Callable[[], float] = time.monotonic) -> None:
-        """`proven` are senders whom nobody can pass himself off as; `clock` tells seconds."""
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """`clock` tells seconds."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._reserved = {sender: _Bucket(BURST, clock()) for sender in proven}
+        self._reserved: dict[str, _Bucket] = {}
         self._buckets: dict[str, _Bucket] = {}
         self._others = _Bucket(BURST, clock())
+
+    def reserve_for(self, proven: Iterable[str]) -> None:
+        """These senders, whom nobody can pass himself off as, and no others, have buckets of their own for good. Who
+        had one keeps what is in it."""
+        with self._lock:
+            before, now_s = self._reserved, self._clock()
+            self._reserved = {sender: before.get(sender, _Bucket(BURST, now_s)) for sender in proven}
 
     def take(self, sender: str) -> float:
         """0 when `sender` may give a command now, which is counted; else how many seconds he has to wait for that."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from pydantic import BaseModel
 
@@ -21,14 +22,33 @@ SEALED = "application/octet-stream"
 """Bytes of a TLS conversation."""
 
 
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """Who may give commands. `listener` is None where the service has no certificate; then nobody can prove who he
+    is."""
+
+    authority: Authority
+    listener: Listener | None
+
+    @property
+    def digest(self) -> str | None:
+        """Of the files of the certificate; None: there is none."""
+        return None if self.listener is None else self.listener.digest
+
+
 class Reception:
     """Of all pairs of a vehicle."""
 
-    def __init__(self, authority: Authority, listener: Listener | None, commands: Mapping[str, Commands]) -> None:
-        """`listener` is None where the service has no certificate; then nobody can prove who he is."""
-        self._authority = authority
-        self._listener = listener
+    def __init__(self, rules: Rules, commands: Mapping[str, Commands]) -> None:
         self._commands = commands
+        self.use(rules)
+
+    def use(self, rules: Rules) -> None:
+        """Hold every command to these rules from the next one on. For any thread."""
+        proven = [payloads.proven_sender(name) for name in rules.authority.senders]
+        for commands in self._commands.values():
+            commands.reserve_for(proven)
+        self._rules = rules
 
     def take(self, pair: str, name: str, request: Request) -> Answer:
         """The answer to a query for `command/<name>`.
@@ -38,35 +58,36 @@ class Reception:
             NotAllowedError: its sender may not give it.
             NotProvenError: he has not shown who he is, though he meant to.
         """
-        chosen = parse_command_selector(request.parameters)
+        chosen, rules = parse_command_selector(request.parameters), self._rules
         if chosen.conversation is None:
             claimed = payloads.sender_of(request.attachment)
-            done = self._done(pair, name, None, claimed, request.payload, request.received_s, chosen)
+            done = self._done(rules, pair, name, None, claimed, request.payload, request.received_s, chosen)
             return answer_of(done, chosen.format)
-        if self._listener is None:
+        if rules.listener is None:
             raise NotProvenError(
                 "this service has no certificate (`authority.certificate`), so that nobody can prove his name to it: "
                 "give the command as `--anonymous`, if that is allowed here"
             )
         try:
-            heard = self._listener.hear(chosen.conversation, request.payload)
+            heard = rules.listener.hear(chosen.conversation, request.payload)
         except NotProvenError as error:
             self._commands[pair].note_refused(name, payloads.sender_of(request.attachment), error)
             raise
-        return Answer(heard, SEALED) if isinstance(heard, bytes) else self._proven(pair, name, heard, request)
+        return Answer(heard, SEALED) if isinstance(heard, bytes) else self._proven(rules, pair, name, heard, request)
 
-    def _proven(self, pair: str, name: str, heard: Heard, request: Request) -> Answer:
+    def _proven(self, rules: Rules, pair: str, name: str, heard: Heard, request: Request) -> Answer:
         call = from_json(ProvenCommand, heard.said)
         key, _, parameters = call.selector.partition("?")
         if key != request.key:
             raise UsageError("what was said in the conversation is not the command that was asked for")
         chosen = parse_command_selector(parameters)
         sender = payloads.proven_sender(heard.name)
-        done = self._done(pair, name, heard.name, sender, call.payload.encode(), request.received_s, chosen)
+        done = self._done(rules, pair, name, heard.name, sender, call.payload.encode(), request.received_s, chosen)
         return Answer(heard.sealed(answer_of(done, chosen.format).payload), SEALED)
 
     def _done(
         self,
+        rules: Rules,
         pair: str,
         name: str,
         proven: str | None,
@@ -78,7 +99,7 @@ class Reception:
         commands = self._commands[pair]
         arguments = payloads.parse(name, payload)
         try:
-            self._authority.require(proven, name)
+            rules.authority.require(proven, name)
         except NotAllowedError as error:
             commands.note_refused(name, sender, error)
             raise

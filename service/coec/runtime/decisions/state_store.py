@@ -185,8 +185,9 @@ class StateStore:
         with self._writing:
             with self._lock:
                 pairs, heads = dict(self._pairs), dict(self._heads)
-            told = {pair: {"history_heads": dict(of_pair())} for pair, of_pair in heads.items()}
-            self._file.save({"pairs": {pair: {**stored, **told.get(pair, {})} for pair, stored in pairs.items()}})
+            # What the file holds of pairs that this service does not know may be of any form, and stays as it is.
+            told = {pair: {**pairs[pair], "history_heads": dict(of_pair())} for pair, of_pair in heads.items()}
+            self._file.save({"pairs": {**pairs, **told}})
 
     def _candidate(self, pending: Candidate, rig: Rig) -> StoredCandidate:
         return StoredCandidate(
