@@ -15,10 +15,12 @@ from cli.vehicle_on_screen import PAIR, RIG, configuration, extrinsic, health
 from coec.adapters.foxglove.topics import Pose
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
+from coec.cli.view import Place, place_of
 from coec.cli.view import streams as streams_module
 from coec.cli.view.moments import SILENT_S, Said, extrinsics_of_service, moment_of_service
 from coec.cli.view.streams import DEPTHS, Streams
 from coec.config import LimitsConfig, load_config
+from coec.errors import UsageError
 from coec.schemas.base import from_msgpack
 from coec.schemas.replies import ExtrinsicReply, HealthReply
 from e2e.processes import Router
@@ -75,9 +77,7 @@ def send(router: Router, number: int) -> None:
     router.session.put("in/lidar", encode_lidar(replace(PAIR.lidar, stamp_ns=stamp_ns)), encoding=MSGPACK)
 
 
-@pytest.mark.fault(
-    "more frames than can be shown", "the newest are; memory stays bounded; the vehicle waits for nobody"
-)
+@pytest.mark.fault("more frames than can be shown", "the newest are; the others are passed over, and counted")
 def test_the_newest_pair_is_shown_and_older_ones_are_passed_over(
     router: Router, streams: Streams, record_property: Record
 ) -> None:
@@ -102,3 +102,23 @@ def test_keys_on_which_nothing_comes_are_told(
     wait_until(lambda: streams.mute == ("in/camera",), "what came")
     streams.listen(wanted=False)
     assert not streams.mute, "nobody looks"
+
+
+@pytest.mark.parametrize(
+    ("address", "host"), [("127.0.0.1:8765", "127.0.0.1"), ("localhost:0", "localhost"), ("[::1]:8765", "::1")]
+)
+def test_loopback_is_served_without_a_word(address: str, host: str) -> None:
+    assert place_of(address, insecure=False) == Place(host, int(address.rpartition(":")[2]))
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0:8765", "[::]:8765", "10.0.0.5:8765", "vehicle.local:8765"])
+def test_other_addresses_are_served_only_if_that_is_said(address: str) -> None:
+    with pytest.raises(UsageError, match="--insecure"):
+        place_of(address, insecure=False)
+    assert place_of(address, insecure=True).port == 8765
+
+
+@pytest.mark.parametrize("address", ["8765", "127.0.0.1", "127.0.0.1:65536", "127.0.0.1:-1", "::1:8765", "a b:1"])
+def test_what_is_no_address_is_refused(address: str) -> None:
+    with pytest.raises(UsageError, match="HOST:PORT"):
+        place_of(address, insecure=True)
