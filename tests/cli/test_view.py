@@ -26,6 +26,7 @@ from coec.adapters.foxglove import topics
 from coec.adapters.foxglove.topics import POINTS, TOPICS, Pose
 from coec.adapters.frames.msgpack_frames import encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
+from coec.adapters.zenoh.client import ConnectionFailedError
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Rig
 from coec.errors import ConfigError, SourceError, UnavailableError, UsageError
@@ -34,7 +35,7 @@ from coec.reports import console
 from coec.schemas.base import to_json
 from coec.sources.windows import chosen_from
 from drives import drawn_source
-from e2e.processes import Router
+from e2e.processes import Router, free_endpoint
 from estimates import estimate
 from fakes import wait_until
 from foxglove_viewer import Viewer
@@ -142,9 +143,10 @@ def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Out
 
     def look(url: str) -> None:
         with Viewer(url) as viewer:
-            viewer.subscribe([topics.IMAGE])
+            viewer.subscribe([topics.IMAGE, topics.HEALTH])
             while len(stamps) < 9:
                 stamps.append(stamp_ns(viewer.next_on(topics.IMAGE)))
+            assert viewer.next_on(topics.HEALTH)["state"] == "recorded", "however fast it is played"
 
     assert viewing(look, SMALL, "--rate", "100", "--repeat").status == 0
     recorded = list(drawn_source(SMALL).camera_stamps_ns)
@@ -282,6 +284,8 @@ def test_what_is_not_there_is_said(coec: Coec, tmp_path: Path, router: Router) -
         port = taken.getsockname()[1]
         outcome = coec("view", "--config", path, "--listen", f"127.0.0.1:{port}")
     assert outcome.status == UnavailableError.exit_code
+    alone = configuration(tmp_path, free_endpoint())
+    assert coec("view", "--config", alone, "--timeout", "0.2").status == ConnectionFailedError.exit_code
 
 
 def test_without_the_extra_it_says_what_to_install(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
