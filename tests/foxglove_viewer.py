@@ -53,7 +53,13 @@ class Viewer:
         begin = len(self._topics)
         self._topics |= {begin + at: topic for at, topic in enumerate(wanted)}
         subscriptions = [{"id": begin + at, "channelId": self.channels[topic]["id"]} for at, topic in enumerate(wanted)]
-        self._send(TEXT, json.dumps({"op": "subscribe", "subscriptions": subscriptions}).encode())
+        self.say(json.dumps({"op": "subscribe", "subscriptions": subscriptions}).encode())
+
+    def say(self, data: bytes, code: int = TEXT) -> None:
+        """Send a message, whatever it is. Clients mask what they send; a mask of zeros leaves it as it is."""
+        size = len(data)
+        length = struct.pack("!B", 0x80 | size) if size < 126 else struct.pack("!BQ", 0x80 | 127, size)
+        self._socket.sendall(bytes([0x80 | code]) + length + bytes(4) + data)
 
     def next(self) -> tuple[str, Any]:
         """The next message on any topic that was subscribed to: a document, or a protobuf message."""
@@ -117,18 +123,13 @@ class Viewer:
             data = self._take(length)
             code = first & 0x0F
             if code == PING:
-                self._send(PONG, data)
+                self.say(data, PONG)
             elif code == CLOSE:
                 raise EOFError("the server has closed the connection")
             elif code != PONG:
                 kind, whole = code or kind, whole + data
                 if first & 0x80:
                     return kind, whole
-
-    def _send(self, code: int, data: bytes) -> None:
-        """Clients mask what they send; a mask of zeros leaves it as it is."""
-        size = struct.pack("!B", 0x80 | len(data)) if len(data) < 126 else struct.pack("!BH", 0x80 | 126, len(data))
-        self._socket.sendall(bytes([0x80 | code]) + size + bytes(4) + data)
 
     def _take(self, count: int) -> bytes:
         while len(self._waiting) < count:

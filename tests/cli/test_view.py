@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,43 +14,28 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zenoh
 
 pytest.importorskip("foxglove", reason="needs the optional extra `foxglove`")
 
 from adapters.foxglove.test_shown import places, projected
-from boards import LENSES, MOVED, NOMINAL, pair_with, rig_with
+from boards import MOVED, NOMINAL
 from cli.conftest import SMALL, Coec, Outcome
-from coec.adapters.files.conversions import result_of, transform_of
-from coec.adapters.files.rig import intrinsics_config
+from cli.vehicle_on_screen import CANDIDATE, KEYS, PAIR, RIG, Sensors, Service, configuration, extrinsic, health
+from coec.adapters.files.conversions import result_of
 from coec.adapters.foxglove import topics
 from coec.adapters.foxglove.topics import POINTS, TOPICS, Pose
-from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
+from coec.adapters.frames.msgpack_frames import encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.matching import is_heard
+from coec.adapters.zenoh.client import ConnectionFailedError
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Rig
-from coec.config import Config
 from coec.errors import ConfigError, SourceError, UnavailableError, UsageError
 from coec.geometry import se3
 from coec.reports import console
-from coec.reports.commented_yaml import commented_yaml
-from coec.schemas.base import to_json, to_msgpack
-from coec.schemas.keys import Keys
-from coec.schemas.replies import (
-    ROS_LEVELS,
-    Axes,
-    AxisReply,
-    Candidate,
-    DataQuality,
-    ExtrinsicReply,
-    HealthReply,
-    HealthState,
-    Reason,
-)
+from coec.schemas.base import to_json
 from coec.sources.windows import chosen_from
 from drives import drawn_source
-from e2e.processes import Router
+from e2e.processes import Router, free_endpoint
 from estimates import estimate
 from fakes import wait_until
 from foxglove_viewer import Viewer
@@ -59,18 +43,16 @@ from foxglove_viewer import Viewer
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""
 
+OFTEN_S = 0.2
 ANYWHERE = "127.0.0.1:0"
-RIG = rig_with(LENSES["double_sphere"])
-PAIR = pair_with(RIG.camera)
-PAIR = replace(PAIR, lidar=replace(PAIR.lidar, xyz_m=PAIR.lidar.xyz_m[::16], ring=None))
-KEYS = Keys("coec", "vehicle")
-CANDIDATE = se3.perturb(NOMINAL, np.radians([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-PERIOD_S = 0.05
 
 
 @pytest.fixture
 def viewing(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Outcome]:
-    """Runs `coec view ARGS --json`, and `look(url)` beside it as soon as it is served; then tells it to end."""
+    """Runs `coec view ARGS --json`, and `look(url)` beside it as soon as it is served; then tells it to end. What is
+    done every second or other is done more often."""
+    for name in ("live.TELL_S", "service.ASK_S", "recorded.AGAIN_S"):
+        monkeypatch.setattr(f"coec.cli.view.{name}", OFTEN_S)
 
     def run(look: Callable[[str], None], *arguments: object) -> Outcome:
         shown = console.print_json
@@ -161,9 +143,10 @@ def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Out
 
     def look(url: str) -> None:
         with Viewer(url) as viewer:
-            viewer.subscribe([topics.IMAGE])
+            viewer.subscribe([topics.IMAGE, topics.HEALTH])
             while len(stamps) < 9:
                 stamps.append(stamp_ns(viewer.next_on(topics.IMAGE)))
+            assert viewer.next_on(topics.HEALTH)["state"] == "recorded", "however fast it is played"
 
     assert viewing(look, SMALL, "--rate", "100", "--repeat").status == 0
     recorded = list(drawn_source(SMALL).camera_stamps_ns)
@@ -173,99 +156,6 @@ def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Out
 
 
 # ------------------------------------------------------------------------------------------------------- a vehicle
-
-
-class Service:
-    """Answers and publishes as a service does, of one pair."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
-        self._said = {KEYS.health("front"): health("healthy"), KEYS.extrinsic("front"): extrinsic(MOVED)}
-        self._queryables = [session.declare_queryable(key, self._answer) for key in self._said]
-        self._token = session.liveliness().declare_token(KEYS.alive("front"))
-
-    def _answer(self, query: zenoh.Query) -> None:
-        with query:
-            key = str(query.key_expr)
-            query.reply(key, self._said[key], encoding=MSGPACK)
-
-    def say(self, key: str, document: bytes) -> None:
-        """From now on."""
-        self._said[key] = document
-        self._session.put(key, document, encoding=MSGPACK)
-
-    def end(self) -> None:
-        for queryable in self._queryables:
-            queryable.undeclare()
-        self._token.undeclare()
-
-
-AXIS = AxisReply(status="accepted", sigma=0.05, correction=2.0, unit="deg")
-AXES = Axes(rx=AXIS, ry=AXIS, rz=AXIS, tx=AXIS, ty=AXIS, tz=AXIS)
-
-
-def health(state: HealthState) -> bytes:
-    why = (Reason(code="moved", text="It has moved."),) if state == "miscalibrated" else ()
-    reply = HealthReply(
-        vehicle="vehicle", pair="front", state=state, level=ROS_LEVELS[state], reasons=why, metrics={}, axes=AXES,
-        needs=(), data_quality=DataQuality(), since_ns=0, evaluated_ns=None, age_s=None,
-    )  # fmt: skip
-    return to_msgpack(reply)
-
-
-def extrinsic(T_camera_lidar: np.ndarray) -> bytes:
-    waits = Candidate(window_id="front-7", data_stamp_ns=7, camera_from_lidar=transform_of(CANDIDATE))
-    reply = ExtrinsicReply(
-        vehicle="vehicle", pair="front", camera_frame="cam", lidar_frame="velo", provenance="estimated",
-        camera_from_lidar=transform_of(T_camera_lidar), status="accepted", percent_complete=40.0, axes=AXES,
-        valid_from_ns=0, data_stamp_ns=None, window_id=None, config_hash="0", pending=waits,
-    )  # fmt: skip
-    return to_msgpack(reply)
-
-
-def configuration(folder: Path, endpoint: str) -> Path:
-    pair = {
-        "name": "front",
-        "camera": {"key": "in/camera", "frame_id": "cam", "intrinsics": intrinsics_config(RIG.camera).model_dump()},
-        "lidar": {"key": "in/lidar", "frame_id": "velo"},
-        "T_camera_lidar": NOMINAL.tolist(),
-    }
-    zenoh_config = {"connect": [endpoint], "listen": [endpoint]}
-    path = folder / "coec.yaml"
-    path.write_text(commented_yaml(Config.model_validate({"zenoh": zenoh_config, "pairs": [pair]})))
-    return path
-
-
-class Sensors:
-    """A camera and a LiDAR that send, whether somebody listens or not."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self._publishers = {stream: session.declare_publisher(f"in/{stream}") for stream in ("camera", "lidar")}
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._send)
-
-    def __enter__(self) -> Sensors:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self._end.set()
-        self._thread.join()
-        for publisher in self._publishers.values():
-            publisher.undeclare()
-
-    @property
-    def are_heard(self) -> bool:
-        return any(is_heard(publisher) for publisher in self._publishers.values())
-
-    def _send(self) -> None:
-        number = 0
-        while not self._end.wait(PERIOD_S):
-            number += 1
-            stamp_ns = 10**18 + round(number * PERIOD_S * 1e9)
-            camera, lidar = replace(PAIR.camera, stamp_ns=stamp_ns), replace(PAIR.lidar, stamp_ns=stamp_ns)
-            self._publishers["camera"].put(encode_camera(camera), encoding=MSGPACK)
-            self._publishers["lidar"].put(encode_lidar(lidar), encoding=MSGPACK)
 
 
 def until(viewer: Viewer, condition: Callable[[Any], bool]) -> Any:
@@ -322,7 +212,7 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
 
 
 @pytest.mark.fault(
-    "rubbish under the service's keys and the sensors'", "it is counted by cause, and nothing else happens"
+    "rubbish under the service's keys and the sensors'", "it is counted by cause; what was served is shown on"
 )
 def test_rubbish_is_counted(
     viewing: Callable[..., Outcome], router: Router, tmp_path: Path, record_property: Record
@@ -359,11 +249,9 @@ def counted(moment: Any) -> set[tuple[str, str]]:
 # --------------------------------------------------------------------------------------------------------- refusals
 
 
-def test_other_computers_get_in_only_if_that_is_said(coec: Coec) -> None:
+def test_other_computers_do_not_get_in_by_mistake(coec: Coec) -> None:
     outcome = coec("view", SMALL, "--listen", "0.0.0.0:8765")
-    assert outcome.status == UsageError.exit_code
-    assert "--insecure" in outcome.err
-    assert coec("view", SMALL, "--listen", "8765").status == UsageError.exit_code
+    assert (outcome.status, "--insecure" in outcome.err) == (UsageError.exit_code, True)
 
 
 @pytest.mark.parametrize(
@@ -396,6 +284,8 @@ def test_what_is_not_there_is_said(coec: Coec, tmp_path: Path, router: Router) -
         port = taken.getsockname()[1]
         outcome = coec("view", "--config", path, "--listen", f"127.0.0.1:{port}")
     assert outcome.status == UnavailableError.exit_code
+    alone = configuration(tmp_path, free_endpoint())
+    assert coec("view", "--config", alone, "--timeout", "0.2").status == ConnectionFailedError.exit_code
 
 
 def test_without_the_extra_it_says_what_to_install(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:

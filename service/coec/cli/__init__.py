@@ -575,6 +575,7 @@ def _view(
     """Show a vehicle or a recording live in Foxglove or Lichtblick: image with points, cloud, frames, health.
 
     Needs the optional extra `foxglove`. Gives no command, and asks the vehicle for frames only while somebody looks.
+    Whoever reaches the address sees all, and so does every web page that a browser of this computer has open.
     """
     from coec.cli import query
     from coec.cli import view as command

@@ -18,7 +18,8 @@ def test_the_counterpart_projects_as_the_camera_does(name: str) -> None:
     camera = LENSES[name]
     counterpart = counterpart_of(camera)
     assert counterpart is not None
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    told = counterpart.camera
+    K = np.array([[told.fx, 0, told.cx], [0, told.fy, told.cy], [0, 0, 1]])
     D = np.array(counterpart.coefficients)
     still = np.zeros(3)
     if counterpart.distortion_model == "kannala_brandt":

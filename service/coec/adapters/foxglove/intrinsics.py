@@ -9,8 +9,10 @@ from coec.geometry.cameras import Camera, intrinsics_of, name_of
 
 @dataclass(frozen=True, slots=True)
 class Counterpart:
-    """The viewers' model of a camera: its name and its coefficients, in their order."""
+    """A camera in the viewers' words: the name of its model, its coefficients in their order, and the camera itself,
+    whose size, focal lengths and centre are told as they are."""
 
+    camera: Camera
     distortion_model: str
     coefficients: tuple[float, ...]
 
@@ -30,4 +32,4 @@ def counterpart_of(camera: Camera) -> Counterpart | None:
         return None
     model, names = found
     values = intrinsics_of(camera)
-    return Counterpart(model, tuple(float(values[name]) for name in names) or (0.0,) * 5)
+    return Counterpart(camera, model, tuple(float(values[name]) for name in names) or (0.0,) * 5)

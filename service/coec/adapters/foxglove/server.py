@@ -188,10 +188,10 @@ def _pose_in_lidar(
 
 
 def _calibration(picture: Picture, stamp: messages.Timestamp) -> messages.CameraCalibration | None:
-    camera = picture.rig.camera
-    counterpart = counterpart_of(camera)
+    counterpart = counterpart_of(picture.rig.camera)
     if counterpart is None:
         return None
+    camera = counterpart.camera
     return messages.CameraCalibration(
         timestamp=stamp,
         frame_id=frame_of(picture.rig.camera_frame, Pose.SERVED),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import dataclass
@@ -27,6 +28,10 @@ TELL_S = 1.0
 WAIT_S = 0.05
 """For frames, between two looks at everything else."""
 
+MUTE = (
+    "Nothing comes on {}: see that somebody publishes it, and that the router's rules let this session subscribe to it."
+)
+
 SERVICE = "service"
 """Where refused documents of the service are counted."""
 
@@ -43,10 +48,10 @@ class Vehicle:
 
 def watch(session: zenoh.Session, vehicle: Vehicle, screen: Screen, stop: threading.Event) -> None:
     """Show the pair until told to stop."""
+    name = vehicle.pair.name
     streams = Streams(session, vehicle.pair, vehicle.limits)
-    service = ServiceWatch(session, vehicle.keys, vehicle.pair.name, lambda cause: streams.refused(SERVICE, cause))
-    told: Moment | None = None
-    told_s = float("-inf")
+    service = ServiceWatch(session, vehicle.keys, name, lambda cause: streams.refused(SERVICE, cause))
+    teller = _Teller(screen, name)
     try:
         with service.listening():
             while not stop.is_set():
@@ -54,13 +59,7 @@ def watch(session: zenoh.Session, vehicle: Vehicle, screen: Screen, stop: thread
                 streams.listen(wanted=bool(wanted & PICTURES))
                 pair = streams.newest(WAIT_S)
                 said = service.look()
-                moment = moment_of_service(vehicle.pair.name, said, streams.ages_s, streams.not_shown)
-                changed = told is None or _essence(told) != _essence(moment)
-                if changed or time.monotonic() - told_s >= TELL_S:
-                    screen.tell(moment)
-                    told, told_s = moment, time.monotonic()
-                if changed:
-                    screen.remark(moment.level, f"{moment.state}: {moment.why}", vehicle.pair.name)
+                teller.tell(moment_of_service(name, said, streams.ages_s, streams.not_shown), streams.mute)
                 if pair is not None:
                     try:
                         screen.show(_picture(pair, vehicle, said, wanted))
@@ -68,6 +67,29 @@ def watch(session: zenoh.Session, vehicle: Vehicle, screen: Screen, stop: thread
                         streams.refused(CAMERA, error.reason)
     finally:
         streams.close()
+
+
+class _Teller:
+    """The timeline and the log: what has changed at once, what has not once a second."""
+
+    def __init__(self, screen: Screen, pair: str) -> None:
+        self._screen = screen
+        self._pair = pair
+        self._told: Moment | None = None
+        self._told_s = -math.inf
+        self._mute: tuple[str, ...] = ()
+
+    def tell(self, moment: Moment, mute: tuple[str, ...]) -> None:
+        """How things are; `mute`: keys on which nothing comes that is looked for."""
+        changed = self._told is None or _essence(self._told) != _essence(moment)
+        if changed or time.monotonic() - self._told_s >= TELL_S:
+            self._screen.tell(moment)
+            self._told, self._told_s = moment, time.monotonic()
+        if changed:
+            self._screen.remark(moment.level, f"{moment.state}: {moment.why}", self._pair)
+        if mute and mute != self._mute:
+            self._screen.remark(1, MUTE.format(", ".join(mute)), self._pair)
+        self._mute = mute
 
 
 def _picture(pair: FramePair, vehicle: Vehicle, said: Said, wanted: frozenset[str]) -> Picture:

@@ -68,13 +68,15 @@ class Stage:
 
     def rest(self, until: Callable[[], bool], stop: threading.Event) -> None:
         """Until something holds, or told to stop: tell and show again what is to be seen, now and then."""
-        while not (stop.is_set() or until()):
+        while not stop.is_set():
             now_s = time.monotonic()
             if now_s - self._told_s >= AGAIN_S:
                 self._told_s = now_s
                 self._screen.tell(self._moment)
             if now_s - self._drawn_s >= AGAIN_S:
                 self._draw()
+            if until():
+                break
             stop.wait(LOOK_S)
 
     def rest_until(self, due_s: float, stop: threading.Event) -> None:

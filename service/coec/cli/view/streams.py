@@ -19,6 +19,9 @@ from coec.runtime.ingest.inbox import Inbox, Parcel
 DEPTHS = {CAMERA: 4, LIDAR: 4, EGO: 512}
 """Samples that may wait; the oldest go. A pair needs its neighbours in time, and two seconds of ego-motion."""
 
+PATIENCE_S = 5.0
+"""After which a stream on which nothing came is worth a word."""
+
 BUSY_S = 0.2
 """After which what was found is shown, however much more there is."""
 
@@ -43,6 +46,7 @@ class Streams:
     def _begin(self) -> None:
         self._decoder = Decoder(self._pair, self._limits, self._losses)
         self._pairer = Pairer(self._pair.pairing, expects_motion=self._pair.ego is not None)
+        self._since_s = time.monotonic()
         self._inbox = Inbox(DEPTHS, self._limits.max_waiting_bytes, self._decoder.overrun)
 
     @property
@@ -57,9 +61,18 @@ class Streams:
 
     @property
     def ages_s(self) -> dict[str, float | None]:
-        """By stream, since a sample came; None: none did since somebody looks."""
+        """By stream, since a sample came; None: none did since somebody looks. Empty while nobody does."""
+        if not self._subscribers:
+            return {}
         arrivals = self._inbox.arrivals(time.monotonic())
         return {stream: arrivals[stream].age_s for stream in self._keys}
+
+    @property
+    def mute(self) -> tuple[str, ...]:
+        """Keys on which nothing has come although somebody has looked for `PATIENCE_S`."""
+        if time.monotonic() - self._since_s < PATIENCE_S:
+            return ()
+        return tuple(self._keys[stream] for stream, age_s in self.ages_s.items() if age_s is None)
 
     def listen(self, *, wanted: bool) -> None:
         """Subscribe, or no longer."""
