@@ -74,7 +74,11 @@ class StreamCounts:
 
 
 class Decoder:
-    """Decodes and checks the samples of one pair's streams."""
+    """Decodes and checks the samples of one pair's streams.
+
+    Attributes:
+        timed_by: of the latest sweep, see `LidarFrame`.
+    """
 
     def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:
         self._pair = pair
@@ -90,6 +94,7 @@ class Decoder:
         self._origin = OriginCheck()
         self._looked_in: int | None = None
         self._contradicted = False
+        self.timed_by = ""
         self._moving = MovingFrame(*(("", "") if pair.ego is None else (pair.ego.parent, pair.ego.child)))
 
     def counts(self, stream: str) -> StreamCounts:
@@ -138,6 +143,8 @@ class Decoder:
             self._losses.add(stream, "decoder_fault")
             return None
         self._accepted[stream] += 1
+        if isinstance(frame, LidarFrame):
+            self.timed_by = frame.timed_by
         return frame
 
     def _told(self, stream: str, sample: Sample) -> Attachment | None:
