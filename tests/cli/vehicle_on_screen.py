@@ -15,7 +15,7 @@ from coec.adapters.files.conversions import transform_of
 from coec.adapters.files.rig import intrinsics_config
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.player import is_heard
+from coec.adapters.zenoh.matching import is_heard
 from coec.config import Config
 from coec.geometry import se3
 from coec.reports.commented_yaml import commented_yaml
