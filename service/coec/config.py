@@ -67,7 +67,7 @@ class Stage(BaseModel):
 class CameraIntrinsics(Stage):
     """Intrinsics as in `dataset.yaml`; which of the optional parameters are needed depends on `model`."""
 
-    model: Literal["pinhole", "radtan", "kannala_brandt", "mei", "eucm", "double_sphere"]
+    model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"]
     width: int = Field(gt=0, le=16384, description="image width, px")
     height: int = Field(gt=0, le=16384, description="image height, px")
     fx: float = Field(gt=0, description="focal length, px")
@@ -81,6 +81,8 @@ class CameraIntrinsics(Stage):
     k2: float | None = None
     k3: float | None = None
     k4: float | None = None
+    k5: float | None = None
+    k6: float | None = None
     p1: float | None = None
     p2: float | None = None
 
