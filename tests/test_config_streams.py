@@ -30,7 +30,7 @@ def read(folder: Path, text: str) -> Config:
 
 def test_topics_by_their_short_forms(tmp_path: Path) -> None:
     config = read(tmp_path, ROS_VEHICLE)
-    (pair,) = config.pairs
+    (pair,) = config.every_pair
     assert {name: stream.topic for name, stream in pair.streams.items()} == {
         "camera": "/front/image_raw/compressed",
         "lidar": "/top/points",
@@ -58,14 +58,14 @@ def test_the_effective_configuration_shows_the_long_form(tmp_path: Path) -> None
     ],
 )
 def test_the_name_of_a_topic_tells_the_type_of_images(tmp_path: Path, topic: str, type_name: str) -> None:
-    (pair,) = read(tmp_path, ROS_VEHICLE.replace("/front/image_raw/compressed", topic)).pairs
+    (pair,) = read(tmp_path, ROS_VEHICLE.replace("/front/image_raw/compressed", topic)).every_pair
     assert pair.camera.assumed_type == type_name
     assert set(pair.camera.types) == {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"}
 
 
 def test_a_type_that_is_set_is_the_only_one_on_a_topic(tmp_path: Path) -> None:
     chosen = ROS_VEHICLE.replace("compressed,", "compressed, type: sensor_msgs/msg/Image,")
-    (pair,) = read(tmp_path, chosen).pairs
+    (pair,) = read(tmp_path, chosen).every_pair
     assert pair.camera.assumed_type == "sensor_msgs/msg/Image"
     assert pair.camera.types == ("sensor_msgs/msg/Image",)
 
@@ -96,10 +96,10 @@ def test_what_cannot_be_a_stream_is_refused_with_what_to_do(
 
 def test_keys_go_beside_topics(tmp_path: Path) -> None:
     config = read(tmp_path, ROS_VEHICLE.replace("ego: /odometry", "ego: {key: odometry}"))
-    assert config.pairs[0].streams["ego"].place == "odometry"
-    assert config.pairs[0].streams["ego"].encoding == "msgpack"
+    assert config.every_pair[0].streams["ego"].place == "odometry"
+    assert config.every_pair[0].streams["ego"].encoding == "msgpack"
 
 
 def test_a_pair_without_ego_motion_has_two_streams(tmp_path: Path) -> None:
-    (pair,) = read(tmp_path, ROS_VEHICLE.replace("    ego: /odometry\n", "")).pairs
+    (pair,) = read(tmp_path, ROS_VEHICLE.replace("    ego: /odometry\n", "")).every_pair
     assert list(pair.streams) == ["camera", "lidar"]

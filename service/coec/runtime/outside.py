@@ -9,14 +9,22 @@ from coec.adapters.files.scribe import Scribe
 from coec.adapters.zenoh.bus import Answer
 from coec.calibration.types import Reason
 from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.nominal.watch import Nominal
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.keys import Keys
 
 
+def given(pair: str) -> Nominal:
+    """Of a pair whose configuration gives its nominal calibration."""
+    del pair
+    return Nominal()
+
+
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """Everything that a pair shares. `publish(key, answer)` and `vehicle_troubles()` may be called from any thread."""
+    """Everything that a pair shares. `publish(key, answer)`, `vehicle_troubles()` and `nominal(pair)` may be called
+    from any thread; the last one tells where a pair's nominal calibration comes from."""
 
     keys: Keys
     store: StateStore
@@ -25,3 +33,4 @@ class Outside:
     worker: Worker
     publish: Callable[[str, Answer], None]
     vehicle_troubles: Callable[[], tuple[Reason, ...]]
+    nominal: Callable[[str], Nominal] = given

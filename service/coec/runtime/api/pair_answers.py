@@ -78,15 +78,16 @@ class PairAnswers:
         accepted = None if known.state.accepted is None else result_of(known.state.accepted, rig, self._vehicle)
         extrinsic = extrinsic_of(self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash)
         own = () if self._recorder.trouble is None else (self._recorder.trouble,)
-        troubles = (*own, *self._outside.vehicle_troubles())
+        changed = self._outside.nominal(self.name).changed
+        troubles = (*own, *self._outside.vehicle_troubles(), *(() if changed is None else (changed,)))
         health = health_of(known, report, self._losses.snapshot(), troubles, self._pair, rig, self._vehicle)
         self._known, self._health = known, Told(health, time.monotonic())
         self._snapshots = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
-        changed = {
+        essences = {
             "extrinsic": extrinsic.model_copy(update={"percent_complete": 0.0}),
             "health": (health.state, tuple(reason.code for reason in health.reasons), health.needs, known.solved),
         }
-        for name, essence in changed.items():
+        for name, essence in essences.items():
             if self._published.get(name) != essence:
                 self._published[name] = essence
                 key = f"{self._outside.keys.root}/{self.name}/{name}"
@@ -213,7 +214,7 @@ class PairAnswers:
 
     def status(self) -> replies.PairStatus:
         """Counters since the start."""
-        return pair_status_of(
+        counted = pair_status_of(
             self.name,
             self._known,
             self._stream.report,
@@ -224,3 +225,4 @@ class PairAnswers:
             self._recorder.waiting,
             has_ego=self._pair.ego is not None,
         )
+        return counted.model_copy(update={"found": dict(self._outside.nominal(self.name).origins)})

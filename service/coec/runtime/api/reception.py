@@ -11,6 +11,7 @@ from coec.adapters.zenoh.bus import Answer, Request
 from coec.errors import UsageError
 from coec.runtime.api import payloads
 from coec.runtime.api.authority import Authority, NotAllowedError
+from coec.runtime.api.awaited import AwaitedCommands
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.snapshots import answer_of
 from coec.schemas.base import from_json
@@ -24,8 +25,11 @@ SEALED = "application/octet-stream"
 class Reception:
     """Of all pairs of a vehicle."""
 
-    def __init__(self, authority: Authority, listener: Listener | None, commands: Mapping[str, Commands]) -> None:
-        """`listener` is None where the service has no certificate; then nobody can prove who he is."""
+    def __init__(
+        self, authority: Authority, listener: Listener | None, commands: Mapping[str, Commands | AwaitedCommands]
+    ) -> None:
+        """`listener` is None where the service has no certificate; then nobody can prove who he is. `commands` of a
+        pair may be replaced while queries come."""
         self._authority = authority
         self._listener = listener
         self._commands = commands

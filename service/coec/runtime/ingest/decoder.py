@@ -14,7 +14,7 @@ from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.frames.origin import OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.config import LimitsConfig, PairConfig
+from coec.config import AnyStreamConfig, LimitsConfig, PairConfig
 from coec.errors import DecodeError
 from coec.runtime.ingest.inbox import Parcel
 from coec.runtime.ingest.sequence_numbers import SequenceNumbers
@@ -81,7 +81,7 @@ class Decoder:
         try:
             if len(parcel.sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
-            frame = self._decode(stream, parcel.sample)
+            frame = decoded(stream, self._streams[stream], parcel.sample, self._limits)
             if frame.sequence is not None and (lost := self._numbers[stream].lost_by(frame.sequence)):
                 self._losses.add(stream, "sequence_gap", lost)
             frame = self._checked(frame)
@@ -95,23 +95,6 @@ class Decoder:
             return None
         self._accepted[stream] += 1
         return frame
-
-    def _decode(self, stream: str, sample: Sample) -> Frame:
-        configured = self._streams[stream]
-        encoding, _, schema = sample.encoding.partition(";")
-        if encoding not in ("application/msgpack", CDR):
-            encoding = f"application/{configured.encoding}"
-        if encoding == CDR:
-            type_name = schema or configured.assumed_type
-            if type_name not in configured.types:
-                expected = " or ".join(configured.types)
-                raise DecodeError(WRONG_TYPE, f"a message of another type on {configured.place}: expected {expected}")
-            return incoming.decode(type_name, sample.payload, self._limits)
-        if stream == CAMERA:
-            return msgpack_frames.decode_camera(sample.payload, self._limits)
-        if stream == LIDAR:
-            return msgpack_frames.decode_lidar(sample.payload, self._limits)
-        return msgpack_frames.decode_ego(sample.payload, self._limits)
 
     def _checked(self, frame: Frame) -> Frame:
         if isinstance(frame, CameraFrame):
@@ -136,3 +119,25 @@ class Decoder:
             raise DecodeError("frame_id", "not the frame id of the configuration")
         if (frame.image.width, frame.image.height) != (camera.intrinsics.width, camera.intrinsics.height):
             raise DecodeError("image_size", "not the size of the intrinsics")
+
+
+def decoded(stream: str, configured: AnyStreamConfig, sample: Sample, limits: LimitsConfig) -> Frame:
+    """The frame in a sample on a stream, `CAMERA`, `LIDAR` or `EGO`, that is configured so.
+
+    Raises:
+        DecodeError: there is none, or one of another kind.
+    """
+    encoding, _, schema = sample.encoding.partition(";")
+    if encoding not in ("application/msgpack", CDR):
+        encoding = f"application/{configured.encoding}"
+    if encoding == CDR:
+        type_name = schema or configured.assumed_type
+        if type_name not in configured.types:
+            expected = " or ".join(configured.types)
+            raise DecodeError(WRONG_TYPE, f"a message of another type on {configured.place}: expected {expected}")
+        return incoming.decode(type_name, sample.payload, limits)
+    if stream == CAMERA:
+        return msgpack_frames.decode_camera(sample.payload, limits)
+    if stream == LIDAR:
+        return msgpack_frames.decode_lidar(sample.payload, limits)
+    return msgpack_frames.decode_ego(sample.payload, limits)
