@@ -15,6 +15,7 @@ from coec.adapters.files.conversions import result_of
 from coec.adapters.files.rig import rig_of
 from coec.adapters.files.scribe import Book, Scribe
 from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.frames.window import SliceEnded
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
@@ -303,6 +304,7 @@ class Bench:
             cast("Worker", self.worker),
             lambda key, _: self.published.append(key),
             lambda: (),
+            Topics,
         )
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)

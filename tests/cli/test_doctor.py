@@ -26,6 +26,7 @@ from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encod
 from coec.adapters.system import clock
 from coec.adapters.zenoh.bus import MSGPACK, open_session
 from coec.adapters.zenoh.endpoints import Endpoint
+from coec.adapters.zenoh.ros_topics import Topics
 from coec.adapters.zenoh.tls import CertificateError, Material, host_and_port, material_of, read_certificate
 from coec.calibration.types import LidarFrame
 from coec.cli.doctor import examine, machine, router
@@ -189,7 +190,7 @@ def test_a_rate_is_judged_by_what_a_check_wants(tmp_path: Path, rate_hz: float, 
     for number in range(count):
         camera.arrivals_s.append(number / rate_hz)
         camera.sizes.append(1000)
-    found = list(stream_findings(pair, {"camera": camera, "lidar": silent}, config, 5.0))
+    found = list(stream_findings(pair, {"camera": camera, "lidar": silent}, config, 5.0, Topics()))
     assert of(found, "stream", pair.camera.place)[0] == level
     assert of(found, "stream", pair.lidar.place)[0] == "fail"
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from coec.adapters.files.scribe import Scribe
 from coec.adapters.zenoh.bus import Answer
+from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.types import Reason
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.nominal.watch import Nominal
@@ -23,8 +24,9 @@ def given(pair: str) -> Nominal:
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """Everything that a pair shares. `publish(key, answer)`, `vehicle_troubles()` and `nominal(pair)` may be called
-    from any thread; the last one tells where a pair's nominal calibration comes from."""
+    """Everything that a pair shares. `publish(key, answer)`, `vehicle_troubles()`, `topics()`, those that the vehicle's
+    ROS publishes now, and `nominal(pair)`, where a pair's nominal calibration comes from, may be called from any
+    thread."""
 
     keys: Keys
     store: StateStore
@@ -33,4 +35,5 @@ class Outside:
     worker: Worker
     publish: Callable[[str, Answer], None]
     vehicle_troubles: Callable[[], tuple[Reason, ...]]
+    topics: Callable[[], Topics]
     nominal: Callable[[str], Nominal] = given

@@ -14,9 +14,9 @@ from pathlib import Path
 from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import input_of
+from coec.adapters.zenoh.inputs import Input, input_of
 from coec.calibration.types import Reason
-from coec.config import Config, PairConfig, StreamConfig
+from coec.config import AnyStreamConfig, Config, PairConfig, StreamConfig
 from coec.errors import ConfigError
 from coec.runtime.api.awaited import AwaitedAnswers
 from coec.runtime.nominal.findings import TF_STATIC, Found, info_topic_of, needs_transforms
@@ -75,8 +75,9 @@ class WaitingRoom:
         self.answers = {pair.name: AwaitedAnswers(pair, config.vehicle, outside) for pair in config.awaited}
         return self.answers
 
-    def listen(self, bus: Bus) -> None:
-        """Listen for what is left out; to `/tf_static` and `CameraInfo` for as long as the service runs."""
+    def listen(self, bus: Bus, input_of_stream: Callable[[AnyStreamConfig], Input]) -> None:
+        """Listen for what is left out; to `/tf_static` and `CameraInfo` for as long as the service runs.
+        `input_of_stream` tells how to listen to the streams of a pair."""
         for thread in self.threads:
             thread.start()
         if any(needs_transforms(pair) for pair in self._asked.values()):
@@ -89,7 +90,7 @@ class WaitingRoom:
                 bus.subscribe_latched(input_of(stream, self._read), partial(self._watch.take_info, name))
             if name in self.answers:
                 self._ends[name] = [
-                    bus.subscribe(input_of(stream, self._read), partial(self._watch.take_frame, name, place))
+                    bus.subscribe(input_of_stream(stream), partial(self._watch.take_frame, name, place))
                     for place, stream in pair.streams.items()
                 ]
 

@@ -146,6 +146,8 @@ class Bus:
     def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
         """Call `on_sample` for every put on the stream, on Zenoh's thread. Returns what ends it."""
         receive = self._receiver(stream, on_sample)
+        token = None if stream.token is None else self._session.liveliness().declare_token(stream.token)
+        self._tokens += [] if token is None else [token]
         declared = [self._session.declare_subscriber(each, _direct(receive)) for each in stream.expressions]
         self._subscribers += declared
 
@@ -153,6 +155,9 @@ class Bus:
             for subscriber in declared:
                 self._subscribers.remove(subscriber)
                 subscriber.undeclare()
+            if token is not None:
+                self._tokens.remove(token)
+                token.undeclare()
 
         return end
 

@@ -34,10 +34,15 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """How to listen to one stream: key expressions to subscribe to, and how to read what comes."""
+    """How to listen to one stream: key expressions to subscribe to, and how to read what comes.
+
+    Attributes:
+        token: liveliness token that says so to others; None where nobody wants to know.
+    """
 
     expressions: tuple[str, ...]
     read: Callable[[zenoh.Sample], Sample]
+    token: str | None = None
 
 
 def input_of(stream: StreamConfig, config: Config) -> Input:

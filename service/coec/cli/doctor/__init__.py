@@ -16,8 +16,9 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files.rig import rig_of
 from coec.adapters.zenoh.bus import closed
 from coec.adapters.zenoh.endpoints import Endpoint
+from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.settings import connected_of, listened_of, settings_of
-from coec.cli.doctor import machine, router, service, streams
+from coec.cli.doctor import machine, router, service, streams, topics
 from coec.cli.doctor.found import fail, ok
 from coec.cli.doctor.listening import listen
 from coec.config import Config, load_config
@@ -80,11 +81,16 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
         return
     try:
         yield router.rules_finding(config, session)
+        ros = RosSide(session, config)
         with console.progress(counted=False) as progress:
             task = progress.add_task("listening", total=seconds, note=f"{len(config.pairs)} pairs")
-            heard = listen(session, config, seconds, lambda passed_s: progress.update(task, completed=passed_s))
+            heard = listen(session, ros, config, seconds, lambda passed_s: progress.update(task, completed=passed_s))
+        there = ros.topics()
+        ros.close()
+        if config.middleware != "native":
+            yield from topics.topic_findings(there, config)
         for pair, streams_heard in zip(config.pairs, heard, strict=True):
-            yield from streams.stream_findings(pair, streams_heard, config, seconds)
+            yield from streams.stream_findings(pair, streams_heard, config, seconds, there)
         yield from service.service_findings(session, config)
     finally:
         closed(session, router.CLOSE_S)

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 import zenoh
 
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.zenoh.inputs import Sample, input_of
+from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.ros_side import RosSide
 from coec.config import Config, PairConfig
-from coec.runtime.ingest.decoder import EGO, Decoder, Frame
+from coec.runtime.ingest.decoder import EGO, Decoder, Frame, StreamCounts
 from coec.runtime.ingest.inbox import Parcel
 
 SAMPLES_WAITING = 8
@@ -41,6 +42,7 @@ class Heard:
         stamps: of the frames: sensor time, and the wall clock when the sample came, ns, in the order of coming.
         refused: samples of which no frame could be made, by reason.
         latest: the last frame.
+        counts: what there is to say of the senders at the end.
     """
 
     place: str
@@ -49,6 +51,7 @@ class Heard:
     stamps: list[tuple[int, int]] = field(default_factory=list)
     refused: Counter[str] = field(default_factory=Counter)
     latest: Frame | None = None
+    counts: StreamCounts | None = None
 
     @property
     def rate_hz(self) -> float | None:
@@ -60,10 +63,10 @@ class Heard:
 
 
 def listen(
-    session: zenoh.Session, config: Config, seconds: float, heard: Callable[[float], None]
+    session: zenoh.Session, ros: RosSide, config: Config, seconds: float, heard: Callable[[float], None]
 ) -> list[dict[str, Heard]]:
     """What comes on the streams of each pair; `heard` is told the seconds that have passed, now and then."""
-    ears = [_Ear(session, pair, config) for pair in config.pairs]
+    ears = [_Ear(session, ros, pair, config) for pair in config.pairs]
     begun_s = time.monotonic()
     try:
         while (passed_s := time.monotonic() - begun_s) < seconds:
@@ -79,8 +82,8 @@ def listen(
 class _Ear:
     """Of one pair."""
 
-    def __init__(self, session: zenoh.Session, pair: PairConfig, config: Config) -> None:
-        inputs = {name: input_of(stream, config) for name, stream in pair.streams.items()}
+    def __init__(self, session: zenoh.Session, ros: RosSide, pair: PairConfig, config: Config) -> None:
+        inputs = {name: ros.input_of(stream) for name, stream in pair.streams.items()}
         self.heard = {name: Heard(stream.place) for name, stream in pair.streams.items()}
         self._waiting: dict[str, deque[tuple[int, Sample]]] = {
             name: deque(maxlen=MOTIONS_WAITING if name == EGO else SAMPLES_WAITING) for name in self.heard
@@ -92,13 +95,19 @@ class _Ear:
             for name, stream in inputs.items()
             for expression in stream.expressions
         ]
+        tokens = [stream.token for stream in inputs.values() if stream.token is not None]
+        self._tokens = [session.liveliness().declare_token(token) for token in tokens]
 
     def close(self) -> None:
         """Hear no more, and look into what waits."""
+        for token in self._tokens:
+            token.undeclare()
         for subscriber in self._subscribers:
             subscriber.undeclare()
         while self.take():
             pass
+        for name, heard in self.heard.items():
+            heard.counts = self._decoder.counts(name)
 
     def take(self) -> bool:
         """Look into the next sample of each stream; whether there was one."""

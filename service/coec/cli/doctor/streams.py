@@ -10,11 +10,14 @@ import numpy as np
 
 from coec.adapters.depth.maps import STEREO
 from coec.adapters.images.codec import Inspector
+from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.cli.doctor.found import fail, ok, warn
 from coec.cli.doctor.listening import Heard
 from coec.config import Config, PairConfig
 from coec.errors import DecodeError
+from coec.runtime.api.streams import troubles_of
+from coec.runtime.api.troubles import TROUBLES
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.schemas.doctor import Finding
 
@@ -36,10 +39,15 @@ LARGE = 0.8
 """Share of the largest message that is taken at all."""
 
 
-def stream_findings(pair: PairConfig, heard: Mapping[str, Heard], config: Config, seconds: float) -> Iterator[Finding]:
+def stream_findings(
+    pair: PairConfig, heard: Mapping[str, Heard], config: Config, seconds: float, topics: Topics
+) -> Iterator[Finding]:
     """Of one pair."""
     for name, one in heard.items():
-        yield from _stream(pair, name, one, config, seconds)
+        yield from _stream(pair, name, one, config, seconds, topics)
+    counts = {name: one.counts for name, one in heard.items() if one.counts is not None}
+    for reason in troubles_of(counts, pair, topics):
+        yield warn("senders", pair.name, reason.text, TROUBLES[reason.code].advice)
     camera, lidar, ego = heard[CAMERA], heard[LIDAR], heard.get(EGO)
     if camera.stamps and lidar.stamps:
         yield _in_step(pair, camera.stamps, lidar.stamps)
@@ -51,14 +59,11 @@ def stream_findings(pair: PairConfig, heard: Mapping[str, Heard], config: Config
         yield from _image(pair, camera.latest, config)
 
 
-def _stream(pair: PairConfig, name: str, heard: Heard, config: Config, seconds: float) -> Iterator[Finding]:
+def _stream(
+    pair: PairConfig, name: str, heard: Heard, config: Config, seconds: float, topics: Topics
+) -> Iterator[Finding]:
     if not heard.arrivals_s:
-        text = f"{name}: nothing came in {seconds:g} s"
-        advice = (
-            "see that its publisher runs, on this router, with this key; and that the router's rules let this "
-            "certificate subscribe to it"
-        )
-        yield fail("stream", heard.place, text, advice)
+        yield _silent(pair, name, heard, seconds, topics)
         return
     yield _rate(pair, name, heard, seconds)
     largest, limit = max(heard.sizes), config.limits.max_message_bytes
@@ -74,6 +79,18 @@ def _stream(pair: PairConfig, name: str, heard: Heard, config: Config, seconds: 
             yield warn("decoding", heard.place, f"{name}: some samples make no frame: {causes}", advice)
     if heard.stamps:
         yield _clock(name, heard)
+
+
+def _silent(pair: PairConfig, name: str, heard: Heard, seconds: float, topics: Topics) -> Finding:
+    text = f"{name}: nothing came in {seconds:g} s"
+    stream = pair.streams[name]
+    if stream.topic is not None and (absent := topics.absent(stream.topic, stream.types)):
+        return fail("stream", heard.place, f"{text}: {absent}", "start its node, or name the topic that is meant")
+    advice = (
+        "see that its publisher runs, on this router, with this key or topic; and that the router's rules let this "
+        "certificate subscribe to it"
+    )
+    return fail("stream", heard.place, text, advice)
 
 
 def _rate(pair: PairConfig, name: str, heard: Heard, seconds: float) -> Finding:

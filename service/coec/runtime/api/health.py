@@ -49,6 +49,7 @@ def health_of(
     report: StreamStatistics,
     losses: Mapping[tuple[str, str], int],
     troubles: tuple[Reason, ...],
+    missed: tuple[str, ...],
     pair: PairConfig,
     rig: Rig,
     vehicle: str,
@@ -56,7 +57,8 @@ def health_of(
     """
     Args:
         losses: of the pair, by place and cause.
-        troubles: what ails more than this pair, or the part that writes its windows.
+        troubles: what ails more than this pair, its streams, or the part that writes its windows.
+        missed: sentences on streams that nobody sends.
     """
     latest = known.state.latest
     result = None if latest is None else result_of(latest, rig, vehicle)
@@ -75,7 +77,7 @@ def health_of(
         result_drift=_value(result_drift),
         result_drift_sigma=_sigma(result_drift),
         check=known.check,
-        needs=needs_of(report, pair, latest),
+        needs=(*missed, *needs_of(report, pair, latest)),
         data_quality=data_quality_of(report, losses),
         since_ns=known.since_ns,
         evaluated_ns=known.completed_stamp_ns,

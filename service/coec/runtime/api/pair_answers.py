@@ -14,6 +14,7 @@ from coec.calibration.lifecycle import Health, HealthState
 from coec.calibration.types import Reason, Rig
 from coec.config import Config, PairConfig, config_hash
 from coec.errors import NotFoundError
+from coec.runtime.api import streams
 from coec.runtime.api.exports import exported
 from coec.runtime.api.extrinsic import extrinsic_of
 from coec.runtime.api.health import Told, health_of, reasons_of, with_troubles
@@ -78,9 +79,12 @@ class PairAnswers:
         accepted = None if known.state.accepted is None else result_of(known.state.accepted, rig, self._vehicle)
         extrinsic = extrinsic_of(self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash)
         own = () if self._recorder.trouble is None else (self._recorder.trouble,)
+        topics, arrivals = self._outside.topics(), self._stream.inbox.arrivals(time.monotonic())
         changed = self._outside.nominal(self.name).changed
-        troubles = (*own, *self._outside.vehicle_troubles(), *(() if changed is None else (changed,)))
-        health = health_of(known, report, self._losses.snapshot(), troubles, self._pair, rig, self._vehicle)
+        ailing = (*streams.troubles_of(report.streams, self._pair, topics), *(() if changed is None else (changed,)))
+        troubles = (*own, *ailing, *self._outside.vehicle_troubles())
+        missed = streams.missed_of(arrivals, self._pair, topics)
+        health = health_of(known, report, self._losses.snapshot(), troubles, missed, self._pair, rig, self._vehicle)
         self._known, self._health = known, Told(health, time.monotonic())
         self._snapshots = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
         essences = {

@@ -22,6 +22,14 @@ TROUBLES: Mapping[str, Trouble] = {
         "There is no router: no frames come in, and nobody is answered.",
         "Start it, or see to the network; `coec doctor` tells how far one gets. The service connects by itself.",
     ),
+    "two_senders": Trouble(
+        "Two publishers send on one topic at a time; their frames are taken as one sensor's.",
+        "End one of the two, or name the topic of the one that is meant; `coec doctor` lists topics and nodes.",
+    ),
+    "sender_clock": Trouble(
+        "Messages of a stream have no stamp; the time at which they were sent, not that of the sensor, stands for it.",
+        "Have the driver stamp its messages by the clock of the sensors.",
+    ),
     "insecure": Trouble(
         "The service listens where whoever comes is let in without a certificate.",
         "Listen on loopback or on TLS with client certificates, and take `zenoh.insecure` out.",

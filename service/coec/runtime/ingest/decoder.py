@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, defaultdict, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import incoming
+from coec.adapters.ros.wire.rmw_zenoh import Attachment
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.frames.origin import OriginCheck, from_origin
@@ -17,7 +18,7 @@ from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import AnyStreamConfig, LimitsConfig, PairConfig
 from coec.errors import DecodeError
 from coec.runtime.ingest.inbox import Parcel
-from coec.runtime.ingest.sequence_numbers import SequenceNumbers
+from coec.runtime.ingest.senders import Senders
 
 _log = logging.getLogger(__name__)
 
@@ -36,15 +37,25 @@ NUMBERED = b"\xa8sequence"
 """How a native frame that has a number is told from what is no frame without decoding it: the name of the field, found
 in some 10 ms in the largest message. One that is not recognised is counted as lost on its way, too."""
 
+NOBODY = b""
+"""Id of whoever does not say who it is."""
+
 Frame = CameraFrame | LidarFrame | EgoMotion
 
 
 @dataclass(frozen=True, slots=True)
 class StreamCounts:
-    """Samples that came, and frames that were made of them."""
+    """Samples that came, and frames that were made of them.
+
+    Attributes:
+        taking_turns: ids of several senders that send at a time; none where it is one, or nobody says who it is.
+        stamped_by_sender: the latest frame had no stamp, and has that of the clock of whoever sent it.
+    """
 
     received: int
     accepted: int
+    taking_turns: tuple[bytes, ...] = ()
+    stamped_by_sender: bool = False
 
 
 class Decoder:
@@ -55,8 +66,9 @@ class Decoder:
         self._streams = pair.streams
         self._limits = limits
         self._losses = losses
-        self._numbers: defaultdict[str, SequenceNumbers] = defaultdict(SequenceNumbers)
-        self._overruns: deque[str] = deque()
+        self._senders: defaultdict[str, Senders] = defaultdict(Senders)
+        self._overruns: deque[tuple[str, bytes]] = deque()
+        self._stamped_by_sender: dict[str, bool] = {}
         self._received: Counter[str] = Counter()
         self._accepted: Counter[str] = Counter()
         self._T_cloud_lidar = np.array(pair.lidar.T_cloud_lidar, dtype=np.float64)
@@ -64,27 +76,38 @@ class Decoder:
 
     def counts(self, stream: str) -> StreamCounts:
         """Counters of a stream since the start."""
-        return StreamCounts(self._received[stream], self._accepted[stream])
+        return StreamCounts(
+            self._received[stream],
+            self._accepted[stream],
+            self._senders[stream].taking_turns,
+            self._stamped_by_sender.get(stream, False),
+        )
 
     def overrun(self, parcel: Parcel) -> None:
         """A sample went before it was decoded. Any thread."""
         self._losses.add(parcel.stream, "overrun")
-        if NUMBERED in parcel.sample.payload:
-            self._overruns.append(parcel.stream)
+        sample = parcel.sample
+        told = Attachment.parse(sample.attachment)
+        if told is not None:
+            self._overruns.append((parcel.stream, told.gid))
+        elif sample.attachment is None and NUMBERED in sample.payload:
+            self._overruns.append((parcel.stream, NOBODY))
 
     def frame(self, parcel: Parcel) -> Frame | None:
         """The frame in a sample, or None when it was refused (and counted). Never raises for what a sender sent."""
         stream = parcel.stream
         self._received[stream] += 1
         while self._overruns:
-            self._numbers[self._overruns.popleft()].counted()
+            overrun, sender = self._overruns.popleft()
+            self._senders[overrun].counted(sender)
+        told = self._told(stream, parcel.sample)
         try:
             if len(parcel.sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
             frame = decoded(stream, self._streams[stream], parcel.sample, self._limits)
-            if frame.sequence is not None and (lost := self._numbers[stream].lost_by(frame.sequence)):
-                self._losses.add(stream, "sequence_gap", lost)
-            frame = self._checked(frame)
+            if told is None and frame.sequence is not None:
+                self._number(stream, NOBODY, frame.sequence)
+            frame = self._checked(self._stamped(stream, frame, told))
         except DecodeError as error:
             self._losses.add(stream, error.reason, detail=str(error) if error.reason in EXPLAINED else "")
             return None
@@ -95,6 +118,26 @@ class Decoder:
             return None
         self._accepted[stream] += 1
         return frame
+
+    def _told(self, stream: str, sample: Sample) -> Attachment | None:
+        """What the sender tells beside the message; a message beside which something else lies is taken, too."""
+        told = Attachment.parse(sample.attachment)
+        if told is not None:
+            self._number(stream, told.gid, told.sequence)
+        elif sample.attachment is not None:
+            self._losses.add(stream, "attachment_malformed")
+        return told
+
+    def _number(self, stream: str, sender: bytes, number: int) -> None:
+        lost = self._senders[stream].lost_by(sender, number)
+        if lost:
+            self._losses.add(stream, "sequence_gap", lost)
+
+    def _stamped(self, stream: str, frame: Frame, told: Attachment | None) -> Frame:
+        """A frame without a stamp gets the sender's: when it was sent, not when the sensor saw."""
+        without = frame.stamp_ns == 0 and told is not None and told.source_ns > 0
+        self._stamped_by_sender[stream] = without
+        return replace(frame, stamp_ns=told.source_ns) if told is not None and without else frame
 
     def _checked(self, frame: Frame) -> Frame:
         if isinstance(frame, CameraFrame):

@@ -21,6 +21,9 @@ class Dialect(Protocol):
     def publisher_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str:
         """Liveliness token of a publisher; `number` counts the session's entities."""
 
+    def subscriber_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str | None:
+        """Liveliness token of a subscriber; None where subscribing is enough."""
+
     def attachment(self, token: str, sequence: int, source_ns: int) -> bytes | None:
         """What a message carries, the `sequence`-th (from 1) of the publisher of `token`; `source_ns` is the sender's
         wall clock. None: nothing."""

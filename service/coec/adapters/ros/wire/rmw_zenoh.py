@@ -14,6 +14,7 @@ from typing import Final
 
 import xxhash
 
+from coec.adapters.ros.wire.publisher import Publisher
 from coec.adapters.ros.wire.qos import Qos
 from coec.errors import UsageError
 
@@ -36,6 +37,9 @@ _ATTACHMENT: Final = struct.Struct("<qqB16s")
 
 MAX_ATTACHMENT: Final = _ATTACHMENT.size
 """Bytes; a longer one is none."""
+
+_TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_NODE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+|/")
 
 _TYPE: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]{0,127})::(msg|srv|action)::dds_::([A-Za-z][A-Za-z0-9_]{0,127})_")
 
@@ -125,25 +129,21 @@ class Node:
         return f"{mangled(self.namespace)}/{self.name}"
 
 
-@dataclass(frozen=True, slots=True)
-class Endpoint:
-    """A publisher or subscriber that a token tells of."""
+def publisher_tokens(domain: int) -> str:
+    """A key expression that matches the tokens of all publishers."""
+    return f"{TOKENS}/{domain}/*/*/*/MP/**"
 
-    kind: str
-    node: str
-    topic: TopicKey
 
-    @classmethod
-    def parse(cls, token: str) -> Endpoint | None:
-        """What a token tells; None for nodes, services and whatever else is not an endpoint of a topic."""
-        chunks = token.split("/")
-        if len(token) > MAX_TOKEN or len(chunks) < 13 or chunks[0] != TOKENS or chunks[5] not in ("MP", "MS"):
-            return None
-        domain, topic, described, type_hash = chunks[1], chunks[9], chunks[10], chunks[11]
-        if not domain.isdecimal() or len(domain) > 3 or _TYPE.fullmatch(described) is None:
-            return None
-        name = f"{unmangled(chunks[7]).rstrip('/')}/{chunks[8]}"
-        return cls(chunks[5], name, TopicKey(int(domain), unmangled(topic), ros_type(described), type_hash))
+def publisher_of(token: str) -> Publisher | None:
+    """The publisher that a token tells of; None where it tells of none, or of one that no ROS could have."""
+    chunks = token.split("/") if len(token) <= MAX_TOKEN else []
+    if len(chunks) < 13 or chunks[0] != TOKENS or chunks[5] != "MP":
+        return None
+    topic, described = unmangled(chunks[9]), chunks[10]
+    node = f"{unmangled(chunks[7]).rstrip('/')}/{chunks[8]}"
+    if not (_TOPIC.fullmatch(topic) and _NODE.fullmatch(node) and _TYPE.fullmatch(described)):
+        return None
+    return Publisher(topic, ros_type(described), node, gid_of(token))
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +165,10 @@ class RmwZenoh:
     def publisher_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str:
         """See `Dialect`."""
         return self.node.publisher(number, self._topic(topic, type_name), qos)
+
+    def subscriber_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str:
+        """See `Dialect`."""
+        return self.node.subscriber(number, self._topic(topic, type_name), qos)
 
     def attachment(self, token: str, sequence: int, source_ns: int) -> bytes:
         """See `Dialect`."""

@@ -5,13 +5,18 @@ Read in the source of zenoh-plugin-ros2dds 1.10.0.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Final
 
+from coec.adapters.ros.wire.publisher import Publisher
 from coec.adapters.ros.wire.qos import Qos
 
 SLASH: Final = "§"
 """Stands for `/` where a key or a type is one chunk of a token."""
+
+_TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
 
 
 def topic_key(namespace: str, topic: str) -> str:
@@ -43,10 +48,35 @@ class Ros2dds:
         key, type_chunk = (name.replace("/", SLASH) for name in (self.key(topic, type_name), type_name))
         return f"@/{self.session}/@ros2_lv/MP/{key}/{type_chunk}/{qos_text(qos)}"
 
+    def subscriber_token(self, number: int, topic: str, type_name: str, qos: Qos) -> None:
+        """See `Dialect`: a bridge reads what somebody subscribes to."""
+        del number, topic, type_name, qos
+
     def attachment(self, token: str, sequence: int, source_ns: int) -> bytes | None:
         """Nothing: the bridge reads none."""
         del token, sequence, source_ns
         return None
+
+
+PUBLISHER_TOKENS: Final = "@/*/@ros2_lv/MP/*/*/*"
+"""A key expression that matches the tokens of all publishers, of every bridge."""
+
+MAX_TOKEN: Final = 1024
+"""Characters of a token that is read; those of real bridges have some 150."""
+
+
+def publisher_of(token: str, namespace: str) -> Publisher | None:
+    """The publisher behind a bridge that a token tells of; None where it tells of none, of one of another namespace, or
+    of one that no ROS could have."""
+    chunks = token.split("/") if len(token) <= MAX_TOKEN else []
+    if len(chunks) != 7 or chunks[0] != "@" or chunks[2:4] != ["@ros2_lv", "MP"]:
+        return None
+    key, type_name = (chunk.replace(SLASH, "/") for chunk in chunks[4:6])
+    within = topic_key(namespace, "")
+    topic = f"/{key}".removeprefix(f"/{within}" if within else "")
+    if not (_TOPIC.fullmatch(topic) and _TYPE.fullmatch(type_name)):
+        return None
+    return Publisher(topic, type_name, None, None)
 
 
 def qos_text(qos: Qos) -> str:

@@ -1,0 +1,129 @@
+"""What the vehicle's ROS publishes, as liveliness tokens tell it: who is there, on which topics, of which types.
+
+Whoever reaches the router may declare tokens: what tells of no publisher is counted and left out, and so is what
+exceeds `MAX_PUBLISHERS`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+
+import zenoh
+
+from coec.adapters.ros.wire import rmw_zenoh, ros2dds
+from coec.adapters.ros.wire.publisher import Publisher
+from coec.config import Config
+
+_log = logging.getLogger(__name__)
+
+MAX_PUBLISHERS = 4096
+"""Twenty times those of a large vehicle; 2 MB."""
+
+SHOWN = 8
+"""Topics that a sentence names; the rest is a number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """Publishers at one moment.
+
+    Attributes:
+        left_out: tokens that told of no publisher (`malformed`), or of one too many (`too_many`).
+    """
+
+    publishers: tuple[Publisher, ...] = ()
+    left_out: Counter[str] = field(default_factory=Counter)
+
+    def of(self, topic: str) -> tuple[Publisher, ...]:
+        """Those of a topic."""
+        return tuple(one for one in self.publishers if one.topic == topic)
+
+    def types(self) -> dict[str, tuple[str, ...]]:
+        """The types of each topic, both in the order of their names."""
+        found: dict[str, set[str]] = {}
+        for one in self.publishers:
+            found.setdefault(one.topic, set()).add(one.type_name)
+        return {topic: tuple(sorted(found[topic])) for topic in sorted(found)}
+
+    def nodes_of(self, gids: Iterable[bytes]) -> tuple[str, ...]:
+        """Names of the nodes whose publishers have these ids, as far as they are known."""
+        wanted = frozenset(gids)
+        return tuple(sorted({one.node for one in self.publishers if one.node and one.gid in wanted}))
+
+    def absent(self, topic: str, types: Collection[str]) -> str | None:
+        """A sentence where nobody publishes a topic: which ones of these types there are instead."""
+        if self.of(topic):
+            return None
+        there = self.types()
+        fitting = [name for name, known in there.items() if not set(known).isdisjoint(types)]
+        if fitting:
+            return f"no publisher of {topic}; there are: {listed(fitting)}"
+        kinds = " or ".join(name.rpartition("/")[2] for name in types)
+        return f"no publisher of {topic}; of {len(there)} topics that are there none is of type {kinds}"
+
+
+def listed(names: Collection[str]) -> str:
+    """The first of them, and how many more."""
+    shown = ", ".join(list(names)[:SHOWN])
+    return shown if len(names) <= SHOWN else f"{shown} and {len(names) - SHOWN} more"
+
+
+class RosTopics:
+    """Follows the tokens of publishers. `now` is for any thread."""
+
+    def __init__(self, session: zenoh.Session, config: Config) -> None:
+        """Those who are there come as those who come later do, within milliseconds of a router that answers."""
+        self._lock = threading.Lock()
+        self._publishers: dict[str, Publisher] = {}
+        self._left_out: Counter[str] = Counter()
+        self._changed = True
+        self._now = Topics()
+        tokens, self._read = _tokens_of(config)
+        self._subscriber: zenoh.Subscriber[None] | None = session.liveliness().declare_subscriber(
+            tokens, zenoh.handlers.Callback(self._receive, indirect=False), history=True
+        )
+
+    def now(self) -> Topics:
+        """Who is there."""
+        with self._lock:
+            if self._changed:
+                self._now = Topics(tuple(self._publishers.values()), self._left_out.copy())
+                self._changed = False
+            return self._now
+
+    def close(self) -> None:
+        """Follow them no more."""
+        if self._subscriber is not None:
+            self._subscriber.undeclare()
+            self._subscriber = None
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        try:
+            self._take(str(sample.key_expr), there=sample.kind == zenoh.SampleKind.PUT)
+        except Exception:
+            _log.exception("a liveliness token could not be read")
+
+    def _take(self, token: str, *, there: bool) -> None:
+        publisher = self._read(token) if there else None
+        with self._lock:
+            if not there:
+                self._changed |= self._publishers.pop(token, None) is not None
+                return
+            self._changed = True
+            if publisher is None:
+                self._left_out["malformed"] += 1
+            elif len(self._publishers) >= MAX_PUBLISHERS:
+                self._left_out["too_many"] += 1
+            else:
+                self._publishers[token] = publisher
+
+
+def _tokens_of(config: Config) -> tuple[str, Callable[[str], Publisher | None]]:
+    """The key expression of tokens of publishers, and what reads one."""
+    if config.middleware == "ros2dds":
+        return ros2dds.PUBLISHER_TOKENS, lambda token: ros2dds.publisher_of(token, config.ros.namespace)
+    return rmw_zenoh.publisher_tokens(config.ros.domain), rmw_zenoh.publisher_of

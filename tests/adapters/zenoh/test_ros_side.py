@@ -1,0 +1,186 @@
+"""The service as a node of ROS, and what it sees of the others, against tokens written by hand."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+import zenoh
+
+from coec.adapters.ros.dialects import namespace_of
+from coec.adapters.zenoh import ros_topics
+from coec.adapters.zenoh.bus import Bus, open_session
+from coec.adapters.zenoh.ros_side import RosSide
+from coec.adapters.zenoh.ros_topics import Topics, listed
+from coec.config import Config, LimitsConfig, ZenohConfig
+from fakes import wait_until
+from ports import free_port
+
+OTHER = "aa0ba1fb1b3a2e2c9d8f5e6c3b4a5d6e"
+IMAGE_HASH = "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"
+DRIVER = (
+    f"@ros2_lv/0/{OTHER}/0/10/MP/%/%sensing/camera_driver/%front%image_raw/"
+    f"sensor_msgs::msg::dds_::Image_/{IMAGE_HASH}/2::,5:,:,:,,"
+)
+POINTS = DRIVER.replace("/10/", "/11/").replace("%front%image_raw", "%top%points").replace("Image_", "PointCloud2_")
+BRIDGE = f"@/{OTHER}/@ros2_lv/MP/shuttle§front§image_raw/sensor_msgs§msg§Image/:0:0:0,5"
+TIMEOUT_S = 20.0
+
+
+def configured(middleware: str, vehicle: str = "vehicle", **ros: object) -> Config:
+    pair = {
+        "name": "front",
+        "camera": {
+            "topic": "/front/image_raw",
+            "intrinsics": {"model": "pinhole", "width": 8, "height": 6, "fx": 4, "fy": 4, "cx": 4, "cy": 3},
+        },
+        "points": "/top/points",
+        "ego": {"key": "ego"},
+        "T_camera_lidar": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+    }
+    return Config.model_validate({"vehicle": vehicle, "middleware": middleware, "ros": ros, "pairs": [pair]})
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture(scope="module")
+def session(endpoint: str) -> Iterator[zenoh.Session]:
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig()) as session:
+        yield session
+
+
+@pytest.fixture
+def side(session: zenoh.Session, stack: ExitStack) -> RosSide:
+    side = RosSide(session, configured("rmw_zenoh"))
+    stack.callback(side.close)
+    return side
+
+
+def seen(session: zenoh.Session, expression: str) -> set[str]:
+    replies = list(session.liveliness().get(expression, timeout=TIMEOUT_S))
+    return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+
+def test_the_service_shows_itself_as_a_node_that_subscribes(session: zenoh.Session, side: RosSide) -> None:
+    bus, own = Bus(session), str(session.info.zid())
+    for stream in configured("rmw_zenoh").pairs[0].streams.values():
+        bus.subscribe(side.input_of(stream), lambda _: None)
+    points = "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
+    node, described = f"@ros2_lv/0/{own}/0", "2::,5:,:,:,,/backends:cpu:"
+    assert seen(session, "@ros2_lv/**") == {
+        f"{node}/0/NN/%/%vehicle/coec",
+        f"{node}/1/MS/%/%vehicle/coec/%front%image_raw/sensor_msgs::msg::dds_::Image_/{IMAGE_HASH}/{described}",
+        f"{node}/2/MS/%/%vehicle/coec/%top%points/sensor_msgs::msg::dds_::PointCloud2_/{points}/{described}",
+    }
+    bus.undeclare_inputs()
+    side.close()
+    assert seen(session, "@ros2_lv/**") == set()
+
+
+@pytest.mark.parametrize("middleware", ["native", "ros2dds"])
+def test_elsewhere_subscribing_is_enough(session: zenoh.Session, stack: ExitStack, middleware: str) -> None:
+    config = configured("ros2dds")
+    side = RosSide(session, config.model_copy(update={"middleware": middleware}))
+    stack.callback(side.close)
+    assert [side.input_of(stream).token for stream in config.pairs[0].streams.values()] == [None] * 3
+    assert side.topics() == Topics()
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "namespace"), [("shuttle-7", "/shuttle_7"), ("7.up", "/v7_up"), ("bus_1", "/bus_1")]
+)
+def test_a_vehicle_has_a_name_that_ros_takes(vehicle: str, namespace: str) -> None:
+    assert namespace_of(vehicle) == namespace
+
+
+def test_publishers_are_seen_with_type_and_node_while_they_are_there(
+    session: zenoh.Session, side: RosSide, endpoint: str
+) -> None:
+    with open_session(ZenohConfig(connect=(endpoint,)), LimitsConfig()) as driver:
+        tokens = [driver.liveliness().declare_token(token) for token in (DRIVER, POINTS)]
+        wait_until(lambda: len(side.topics().publishers) == 2, "both are seen")
+        topics = side.topics()
+        assert topics.types() == {
+            "/front/image_raw": ("sensor_msgs/msg/Image",),
+            "/top/points": ("sensor_msgs/msg/PointCloud2",),
+        }
+        (publisher,) = topics.of("/front/image_raw")
+        assert publisher.node == "/sensing/camera_driver"
+        assert topics.nodes_of([publisher.gid or b"", bytes(16)]) == ("/sensing/camera_driver",)
+        late = RosSide(session, configured("rmw_zenoh"))
+        wait_until(lambda: len(late.topics().publishers) == 2, "who comes later sees them, too")
+        late.close()
+        for token in tokens:
+            token.undeclare()
+        wait_until(lambda: side.topics() == Topics(), "they are gone")
+
+
+def test_a_bridges_publishers_are_seen_in_its_namespace(session: zenoh.Session, stack: ExitStack) -> None:
+    token = session.liveliness().declare_token(BRIDGE)
+    stack.callback(token.undeclare)
+    inside, outside = (RosSide(session, configured("ros2dds", namespace=name)) for name in ("/shuttle", "/shut"))
+    for side in (inside, outside):
+        stack.callback(side.close)
+    wait_until(lambda: bool(outside.topics().left_out), "it is seen")
+    assert inside.topics().types() == {"/front/image_raw": ("sensor_msgs/msg/Image",)}
+    assert outside.topics().publishers == ()
+
+
+@pytest.mark.fault("liveliness tokens that no node of ROS would declare", "ignored and counted")
+@pytest.mark.parametrize(
+    "token",
+    [
+        DRIVER.replace("Image_", "Image"),
+        DRIVER.replace("%front", "front"),
+        DRIVER.replace("image_raw", "image\x1b[31mraw"),
+        DRIVER.replace("camera_driver", "[bold]x"),
+        DRIVER.replace("image_raw", "a" * 2000),
+        f"@ros2_lv/0/{OTHER}/0/10/MP/x",
+    ],
+)
+def test_a_token_that_tells_of_no_publisher_is_counted(session: zenoh.Session, side: RosSide, token: str) -> None:
+    declared = session.liveliness().declare_token(token)
+    wait_until(lambda: bool(side.topics().left_out), "it is seen")
+    assert side.topics() == Topics((), Counter(malformed=1))
+    declared.undeclare()
+
+
+@pytest.mark.fault("a flood of liveliness tokens", "as many are kept as a vehicle can have, the others counted")
+def test_of_too_many_tokens_the_first_are_kept(
+    session: zenoh.Session, side: RosSide, stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros_topics, "MAX_PUBLISHERS", 100)
+    for number in range(300):
+        declared = session.liveliness().declare_token(DRIVER.replace("/10/", f"/{number}/"))
+        stack.callback(declared.undeclare)
+    wait_until(lambda: side.topics().left_out["too_many"] == 200, "all of them are seen")
+    assert len(side.topics().publishers) == 100
+
+
+def test_who_is_missing_is_told_with_those_who_are_there(session: zenoh.Session, side: RosSide) -> None:
+    token = session.liveliness().declare_token(DRIVER)
+    wait_until(lambda: bool(side.topics().publishers), "it is seen")
+    topics = side.topics()
+    images = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+    assert topics.absent("/front/image_raw", images) is None
+    assert topics.absent("/rear", images) == "no publisher of /rear; there are: /front/image_raw"
+    assert topics.absent("/top", ("sensor_msgs/msg/PointCloud2",)) == (
+        "no publisher of /top; of 1 topics that are there none is of type PointCloud2"
+    )
+    token.undeclare()
+
+
+def test_a_sentence_names_a_few() -> None:
+    assert listed([f"/{number}" for number in range(3)]) == "/0, /1, /2"
+    assert listed([f"/{number}" for number in range(30)]) == "/0, /1, /2, /3, /4, /5, /6, /7 and 22 more"
