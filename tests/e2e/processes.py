@@ -154,7 +154,7 @@ class Service:
 
     @property
     def pair(self) -> str:
-        return self.config.pairs[0].name
+        return self.config.every_pair[0].name
 
     def ask(self, key: str, parameters: str = "", payload: bytes | None = None) -> Any:
         """The document of a query for one key; `parameters` as `;name=value`.
@@ -331,7 +331,7 @@ def _told_of_changes(running: Service) -> Iterator[None]:
 
 def _await_alive(running: Service) -> None:
     """Until every pair is announced, or the process has ended."""
-    missing = {running.keys.alive(pair.name) for pair in running.config.pairs}
+    missing = {running.keys.alive(pair.name) for pair in running.config.every_pair}
 
     def heard(token: zenoh.Sample) -> None:
         if token.kind == zenoh.SampleKind.PUT:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, Never
 
 from coec.adapters.exports.told import Frames
+from coec.adapters.ros.messages import CAMERA_INFO
 from coec.adapters.zenoh.bus import Answer
 from coec.calibration.lifecycle import HealthState, Status
 from coec.calibration.types import Reason
@@ -18,6 +19,7 @@ from coec.runtime.api.extrinsic import axes_of
 from coec.runtime.api.health import reasons_of
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.decisions.incidents import Side
+from coec.runtime.nominal.findings import info_topic_of
 from coec.runtime.nominal.watch import Nominal
 from coec.runtime.outside import Outside
 from coec.schemas import replies
@@ -38,7 +40,7 @@ class AwaitedAnswers:
         self.name = pair.name
         self._vehicle = vehicle
         self._outside = outside
-        self._has_ego = pair.ego is not None
+        self._pair = pair
         self._since_ns = time.time_ns()
         self._published: object = None
         self._fault: tuple[Reason, ...] = ()
@@ -61,7 +63,7 @@ class AwaitedAnswers:
             reasons=reasons_of(reasons),
             metrics={},
             axes=axes_of(None, Status.NOT_ACCEPTED),
-            needs=tuple(reason.text for reason in awaits),
+            needs=(*(reason.text for reason in awaits), *self._absent()),
             data_quality=replies.DataQuality(),
             since_ns=self._since_ns,
             evaluated_ns=None,
@@ -72,6 +74,14 @@ class AwaitedAnswers:
             self._published = reasons
             self._outside.publish(self._outside.keys.health(self.name), self._snapshot.answer("msgpack"))
 
+    def _absent(self) -> list[str]:
+        """Sentences on the topics that nobody publishes, with those that are there."""
+        topics, pair = self._outside.topics(), self._pair
+        wanted = [(stream.topic, stream.types) for stream in pair.streams.values()]
+        wanted.append((info_topic_of(pair), (CAMERA_INFO,)))
+        told = (None if topic is None else topics.absent(topic, types) for topic, types in wanted)
+        return [sentence for sentence in told if sentence is not None]
+
     def fail(self, reason: Reason) -> None:
         """The service is about to end, for this reason: say it."""
         self._fault = (reason,)
@@ -81,7 +91,7 @@ class AwaitedAnswers:
         """What is missing; there is nothing to count."""
         return replies.PairStatus(
             name=self.name,
-            ego=replies.StreamStatus() if self._has_ego else None,
+            ego=replies.StreamStatus() if self._pair.ego is not None else None,
             commands=self.commands.counts,
             awaits=reasons_of(self._nominal.awaits),
             found=dict(self._nominal.origins),
