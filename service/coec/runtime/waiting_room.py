@@ -19,7 +19,7 @@ from coec.calibration.types import Reason
 from coec.config import AnyStreamConfig, Config, PairConfig, StreamConfig
 from coec.errors import ConfigError
 from coec.runtime.api.awaited import AwaitedAnswers
-from coec.runtime.nominal.findings import TF_STATIC, Found, info_topic_of, needs_transforms
+from coec.runtime.nominal.findings import CANNOT_BE_BUILT, TF_STATIC, Found, info_topic_of, needs_transforms
 from coec.runtime.nominal.kept import KeptNominals, completed
 from coec.runtime.nominal.watch import Nominal, NominalWatch
 from coec.runtime.outside import Outside
@@ -120,7 +120,7 @@ class WaitingRoom:
     def refuse(self, name: str, why: str) -> None:
         """What was found of a pair cannot be used; it is awaited again, until something else is heard."""
         _log.error(f"what was found of a pair cannot be used: {why}", extra={"fields": {"pair": name}})
-        self._watch.end(name, Reason("cannot_be_built", f"What was found cannot be used: {why}."))
+        self._watch.end(name, Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {why}."))
 
     def renew(self) -> None:
         """Renew what is answered; once a second."""

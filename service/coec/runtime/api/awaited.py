@@ -93,6 +93,7 @@ class AwaitedAnswers:
             name=self.name,
             ego=replies.StreamStatus() if self._pair.ego is not None else None,
             commands=self.commands.counts,
+            losses=dict(self._nominal.losses),
             awaits=reasons_of(self._nominal.awaits),
             found=dict(self._nominal.origins),
         )

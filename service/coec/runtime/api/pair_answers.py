@@ -229,4 +229,6 @@ class PairAnswers:
             self._recorder.waiting,
             has_ego=self._pair.ego is not None,
         )
-        return counted.model_copy(update={"found": dict(self._outside.nominal(self.name).origins)})
+        nominal = self._outside.nominal(self.name)
+        losses = {**counted.losses, **nominal.losses}
+        return counted.model_copy(update={"losses": losses, "found": dict(nominal.origins)})

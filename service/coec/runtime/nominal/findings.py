@@ -12,12 +12,13 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
+from pydantic import ValidationError
 
 from coec.adapters.files.rig import matrix_rows
 from coec.adapters.ros.camera_info import Info, info_topic, is_rectified, lens_of
 from coec.adapters.ros.static_transforms import StaticTransforms, bare
 from coec.calibration.types import Matrix4, Reason
-from coec.config import IDENTITY, AnyStreamConfig, CameraIntrinsics, Matrix4x4, OpenPairConfig, PairConfig
+from coec.config import IDENTITY, AnyStreamConfig, CameraIntrinsics, Matrix4x4, OpenPairConfig, PairConfig, describe
 from coec.errors import SourceError
 from coec.geometry.se3 import difference
 
@@ -27,6 +28,9 @@ TF_STATIC = "/tf_static"
 
 CHANGED_RAD, CHANGED_M = 1e-6, 1e-6
 """Of a transform: more is another one. What is published anew is rounded to float64; a thousandth of what is found."""
+
+CANNOT_BE_BUILT = "cannot_be_built"
+"""Code of a reason: what was found makes no rig."""
 
 SHOWN_FRAMES = 24
 """Frames that a sentence lists at most."""
@@ -114,7 +118,10 @@ def found_of(pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -
         document["lidar"]["cloud_frame_id"] = cloud_frame
     if pair.ego is not None:
         document["ego"]["T_lidar_ego"] = T_lidar_ego
-    return Found(PairConfig.model_validate(document), search.origins)
+    try:
+        return Found(PairConfig.model_validate(document), search.origins)
+    except ValidationError as error:
+        return (Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {describe(error)}."),)
 
 
 class _MissingError(Exception):

@@ -11,8 +11,8 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from coec.adapters.ros import messages
@@ -52,11 +52,13 @@ class Nominal:
         awaits: what is missing, one reason each; empty for a pair that is built.
         origins: where what was found comes from, by its place in the configuration.
         changed: what the bus says otherwise by now.
+        losses: samples that could not be used, by place and cause; those of `/tf_static` are the vehicle's.
     """
 
     awaits: tuple[Reason, ...] = ()
     origins: Mapping[str, str] = field(default_factory=dict)
     changed: Reason | None = None
+    losses: Mapping[str, int] = field(default_factory=dict)
 
 
 NOT_HEARD = Nominal(awaits=(Reason("no_look_yet", "Nobody has looked yet for what the configuration leaves out."),))
@@ -75,6 +77,7 @@ class _Pair:
     built: bool = False
     refused: Reason | None = None
     news: bool = True
+    lost: Counter[str] = field(default_factory=Counter)
 
 
 class NominalWatch:
@@ -94,7 +97,7 @@ class NominalWatch:
         # Under the condition.
         self._waiting: deque[Sample] = deque()
         self._latest: dict[tuple[str, str], Sample] = {}
-        self._losses: Counter[tuple[str, str]] = Counter()
+        self._transforms_lost: Counter[str] = Counter()
         self._ready: dict[str, Found] = {}
         self._outcomes: dict[str, Found | Reason] = {}
         self._nominals: Mapping[str, Nominal] = MappingProxyType(
@@ -108,7 +111,7 @@ class NominalWatch:
         with self._condition:
             if len(self._waiting) == TRANSFORMS_WAITING:
                 self._waiting.popleft()
-                self._losses[TRANSFORMS, "overrun"] += 1
+                self._transforms_lost["overrun"] += 1
             self._waiting.append(sample)
 
     def take_info(self, pair: str, sample: Sample) -> None:
@@ -138,12 +141,6 @@ class NominalWatch:
         until something else is heard."""
         with self._condition:
             self._outcomes[pair] = outcome
-
-    @property
-    def losses(self) -> dict[str, int]:
-        """Messages that could not be used, by place and cause."""
-        with self._condition:
-            return {f"{place}_{cause}": count for (place, cause), count in sorted(self._losses.items())}
 
     # --- on the thread ----------------------------------------------------------------------------------------------
 
@@ -181,27 +178,32 @@ class NominalWatch:
             each.refused = outcome
 
     def _take_transforms(self, sample: Sample) -> None:
-        try:
-            self._transforms.take(decode_joints(_payload(sample, messages.TF)))
-        except DecodeError as error:
-            self._lose(TRANSFORMS, error)
+        cause = _attempt(lambda: self._transforms.take(decode_joints(_payload(sample, messages.TF))))
+        if cause is not None:
+            with self._condition:
+                self._transforms_lost[cause] += 1
+                count = self._transforms_lost[cause]
+            _tell_lost(TRANSFORMS, cause, count)
 
     def _take_latest(self, each: _Pair, stream: str, sample: Sample) -> None:
-        heard = each.heard
         if each.built and stream != INFO:
             return
-        try:
-            if stream == INFO:
-                info = decode_info(_payload(sample, messages.CAMERA_INFO))
-                each.news |= info != heard.info
-                heard.info = info
-            else:
-                self._take_frame(each, stream, sample)
-            each.news |= heard.refused.pop(stream, None) is not None
-        except DecodeError as error:
-            each.news |= heard.refused.get(stream) != error.reason
-            heard.refused[stream] = error.reason
-            self._lose(stream, error)
+        take = self._take_info if stream == INFO else self._take_frame
+        cause = _attempt(lambda: take(each, stream, sample))
+        refused = each.heard.refused
+        each.news |= cause is not None or stream in refused
+        if cause is None:
+            refused.pop(stream, None)
+            return
+        refused[stream] = cause
+        each.lost[f"{stream}_{cause}"] += 1
+        _tell_lost(stream, cause, each.lost[f"{stream}_{cause}"])
+
+    def _take_info(self, each: _Pair, stream: str, sample: Sample) -> None:
+        del stream
+        info = decode_info(_payload(sample, messages.CAMERA_INFO))
+        each.news |= info != each.heard.info
+        each.heard.info = info
 
     def _take_frame(self, each: _Pair, stream: str, sample: Sample) -> None:
         heard = each.heard
@@ -217,6 +219,9 @@ class NominalWatch:
 
     def _nominal(self, each: _Pair) -> Nominal:
         each.news = False
+        return replace(self._judged(each), losses=self._lost(each))
+
+    def _judged(self, each: _Pair) -> Nominal:
         if each.built and each.found is not None:
             return _of_built(each.found, changed(each.found, each.pair, each.heard, self._transforms))
         found = found_of(each.pair, each.heard, self._transforms)
@@ -229,12 +234,28 @@ class NominalWatch:
                 self._ready[each.pair.name] = found
         return Nominal(awaits=(each.refused or BEING_BUILT,), origins=found.origins)
 
-    def _lose(self, place: str, error: DecodeError) -> None:
+    def _lost(self, each: _Pair) -> dict[str, int]:
         with self._condition:
-            self._losses[place, error.reason] += 1
-            count = self._losses[place, error.reason]
-        if count & (count - 1) == 0:
-            _log.warning(f"lost: {error.reason}", extra={"fields": {"place": place, "count": count}})
+            of_transforms = {f"{TRANSFORMS}_{cause}": count for cause, count in self._transforms_lost.items()}
+        return {**of_transforms, **each.lost}
+
+
+def _attempt(take: Callable[[], None]) -> str | None:
+    """Take a sample; the cause for which it could not be. A fault of a decoder costs the sample, not the service."""
+    try:
+        take()
+    except DecodeError as error:
+        return error.reason
+    except Exception:
+        _log.exception("a decoder failed")
+        return "decoder_fault"
+    return None
+
+
+def _tell_lost(place: str, cause: str, count: int) -> None:
+    """The first of each kind, and then every 2^n-th."""
+    if count & (count - 1) == 0:
+        _log.warning(f"lost: {cause}", extra={"fields": {"place": place, "count": count}})
 
 
 def _of_built(found: Found, otherwise: Reason | None) -> Nominal:
