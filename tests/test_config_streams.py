@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from coec.config import Config, load_config
+from coec.config import IDENTITY, Config, load_config
 from coec.errors import ConfigError
 from coec.reports.commented_yaml import commented_yaml
 

@@ -16,7 +16,8 @@ TRANSFORM = [[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, 1 / 3], [1.0, 0.0, 0.0, -0.
 
 
 def configured(ros: dict[str, Any] | None = None, **of: Any) -> Config:
-    pair = {"name": "front", "camera": "/front/image", "points": "/top/points", **of}
+    given = {"name": "front", "camera": "/front/image", "points": "/top/points", **of}
+    pair = {name: value for name, value in given.items() if value is not None}
     return Config.model_validate({"middleware": "rmw_zenoh", "ros": ros or {}, "pairs": [pair]})
 
 
@@ -49,8 +50,12 @@ def test_a_restart_has_the_same_to_the_bit_and_says_since_when(tmp_path: Path) -
 
 def test_other_settings_are_taken_and_other_questions_are_not_answered(tmp_path: Path) -> None:
     keep(tmp_path, configured())
-    other = configured(window={"pairs": 12, "min_pairs": 4})
-    assert KeptNominals(tmp_path).found(other)["front"].pair.window.pairs == 12
+    lidar = {"topic": "/top/points", "sweep": {"period_s": 0.05}}
+    other = configured(window={"pairs": 12, "min_pairs": 4}, points=None, lidar=lidar)
+    again = KeptNominals(tmp_path).found(other)["front"].pair
+    assert again.window.pairs == 12
+    assert again.lidar.sweep is not None
+    assert again.T_camera_lidar == found().pair.T_camera_lidar
     for asked in (
         configured(camera="/rear/image"),
         configured(camera={"topic": "/front/image", "info_topic": "/calibration"}),

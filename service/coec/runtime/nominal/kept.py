@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from coec.adapters.files.rig import rig_of
 from coec.adapters.files.state_file import StateFile
-from coec.config import Config, OpenPairConfig, PairConfig, RosConfig, config_hash
+from coec.config import Config, OpenPairConfig, PairConfig, config_hash
 from coec.errors import ConfigError
 from coec.runtime.nominal.findings import Found
 from coec.schemas.base import Part
@@ -60,8 +61,13 @@ class KeptNominals:
             kept = self._pairs.get(pair.name)
         if kept is None or kept.asked != _asked(pair, config):
             return None
-        settings = pair.model_dump(exclude={"camera", "lidar", "ego", "T_camera_lidar"})
-        complete = PairConfig.model_validate({**kept.pair.model_dump(), **settings})
+        document, earlier = pair.model_dump(), kept.pair
+        document["T_camera_lidar"] = earlier.T_camera_lidar
+        document["camera"] |= earlier.camera.model_dump(include={"frame_id", "intrinsics"})
+        document["lidar"] |= earlier.lidar.model_dump(include={"frame_id", "T_cloud_lidar", "cloud_frame_id"})
+        if pair.ego is not None and earlier.ego is not None:
+            document["ego"]["T_lidar_ego"] = earlier.ego.T_lidar_ego
+        complete = PairConfig.model_validate(document)
         try:
             rig_of(complete)  # what it was read for may have changed on the disk: the mask
         except ConfigError as error:
@@ -88,10 +94,18 @@ class KeptNominals:
 
 
 def _asked(pair: OpenPairConfig, config: Config) -> str:
-    where: RosConfig = config.ros
-    streams = [pair.camera, pair.lidar, *([] if pair.ego is None else [pair.ego])]
-    matrix = "" if pair.T_camera_lidar is None else str(pair.T_camera_lidar)
-    return config_hash(*streams, f"{matrix} {config.middleware} {where.domain} {where.namespace}")
+    """Hash of what is given and where the rest is looked for; other settings may change."""
+    question = pair.model_dump(
+        mode="json",
+        include={
+            "camera": {"key", "topic", "info_topic", "frame_id", "intrinsics"},
+            "lidar": {"key", "topic", "frame_id", "T_cloud_lidar", "cloud_frame_id"},
+            "ego": {"key", "topic", "T_lidar_ego"},
+            "T_camera_lidar": True,
+        },
+    )
+    where = {"middleware": config.middleware, **config.ros.model_dump(include={"domain", "namespace"})}
+    return config_hash(json.dumps([question, where], sort_keys=True))
 
 
 def completed(config: Config, found: Mapping[str, PairConfig]) -> Config:
@@ -99,3 +113,11 @@ def completed(config: Config, found: Mapping[str, PairConfig]) -> Config:
     joined = tuple(found[pair.name] for pair in config.awaited if pair.name in found)
     still = tuple(pair for pair in config.awaited if pair.name not in found)
     return config.model_copy(update={"pairs": (*config.pairs, *joined), "awaited": still})
+
+
+def with_kept(config: Config) -> Config:
+    """A configuration with what a service found of its awaited pairs, and keeps in its state directory."""
+    if not config.awaited:
+        return config
+    kept = KeptNominals(config.state.directory).found(config)
+    return completed(config, {name: found.pair for name, found in kept.items()})
