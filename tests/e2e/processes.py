@@ -135,7 +135,8 @@ def write_configuration(
 
 @dataclass
 class Service:
-    """A running `coec run`, and what a client has of it. Questions are about its first pair where none is named.
+    """A running `coec run`, and what a client has of it. Questions are about its first pair where none is
+    named; those that are given whole come first.
 
     Attributes:
         sent: frames that were sent to it, by stream.

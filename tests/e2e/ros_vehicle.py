@@ -20,7 +20,7 @@ from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, decla
 from bags import a_joint
 from coec.adapters.ros import outgoing
 from coec.adapters.zenoh.player import Frame
-from coec.calibration.types import CameraFrame, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.geometry import cameras
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -84,24 +84,13 @@ class Vehicle:
     def latch(self, topic: str, payload: bytes) -> None:
         """A message that is kept for whoever comes later."""
         if topic not in self._latched:
-            self._latched[topic] = declare_advanced_publisher(
-                self._session,
-                f"0{topic}/{TYPES[topic]}",
-                cache=CacheConfig(1),
-                sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
-                publisher_detection=True,
-            )
+            self._latched[topic] = latched(self._session, f"0{topic}/{TYPES[topic]}")
         self._latched[topic].put(payload, attachment=self._attachment(topic))
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Frames as drivers send them: without depth, numbered by their attachments."""
         for frame in frames:
-            if isinstance(frame, CameraFrame):
-                self.put(CAMERA, outgoing.encode_image(frame)[1])
-            elif isinstance(frame, LidarFrame):
-                self.put(POINTS, outgoing.encode_cloud(frame))
-            else:
-                self.put(EGO, outgoing.encode_odometry(frame, "base_link"))
+            self.put(*message_of(frame))
 
     def close(self) -> None:
         """Be gone, with what was kept."""
@@ -114,6 +103,28 @@ class Vehicle:
         self._sequence[topic] += 1
         gid = hashlib.sha256(topic.encode()).digest()[:16]
         return struct.pack("<qqB16s", self._sequence[topic], 1_700_000_000_000_000_000, 16, gid)
+
+
+def latched(session: zenoh.Session, key: str) -> AdvancedPublisher:
+    """A publisher that keeps its last message for whoever comes later, as rmw_zenoh and the bridge declare it."""
+    return declare_advanced_publisher(
+        session,
+        key,
+        cache=CacheConfig(1),
+        sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+        publisher_detection=True,
+    )
+
+
+def message_of(frame: Frame) -> tuple[str, bytes]:
+    """The topic of a frame, and its message."""
+    match frame:
+        case CameraFrame():
+            return CAMERA, outgoing.encode_image(frame)[1]
+        case LidarFrame():
+            return POINTS, outgoing.encode_cloud(frame)
+        case EgoMotion():
+            return EGO, outgoing.encode_odometry(frame, "base_link")
 
 
 def camera_info(camera: cameras.Camera, frame_id: str) -> bytes:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,23 @@ import pytest
 import zenoh
 
 from coec.adapters.zenoh.client import RemoteError, connected
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.geometry import se3
 from e2e.drives import Drive, rendered
 from e2e.processes import PATIENCE_S, Router, Service, service
-from e2e.ros_vehicle import INFO, TF, Vehicle, camera_info, configured, transforms
+from e2e.ros_vehicle import (
+    CAMERA,
+    EGO,
+    INFO,
+    POINTS,
+    TF,
+    Vehicle,
+    camera_info,
+    configured,
+    latched,
+    message_of,
+    transforms,
+)
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -59,6 +74,9 @@ def refused(running: Service, key: str) -> tuple[str, str]:
     return error.value.reply_code, str(error.value)
 
 
+@pytest.mark.fault(
+    "/tf_static says something else after the pair was built", "told as nominal_changed; what is served stays"
+)
 def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, driver: zenoh.Session) -> None:
     rig = drive.recording.rig
     config = configured(tmp_path, router.endpoint, SETTINGS)
@@ -128,6 +146,65 @@ def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, dr
         running.until(running.health, lambda told: "nominal_changed" not in codes(told), "the change is taken back")
         assert running.terminate() == 0
         later.close()
+
+
+REAR = """  - name: rear
+    camera:
+      topic: /rear/image_raw
+      frame_id: rear
+      intrinsics: {model: pinhole, width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5}
+    lidar: {topic: /sensing/lidar/top/points, frame_id: lidar}
+    T_camera_lidar: [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
+"""
+"""A pair of which everything is given."""
+
+
+@pytest.mark.fault("rubbish and a flood on /tf_static and CameraInfo, by way of a bridge", "others run; it is counted")
+def test_rubbish_and_a_flood_keep_a_pair_waiting_and_no_other(
+    tmp_path: Path, drive: Drive, router: Router, driver: zenoh.Session, record_property: Callable[[str, object], None]
+) -> None:
+    rig, frames = drive.recording.rig, drive.frames
+    config = configured(tmp_path, router.endpoint, REAR + "state: {min_free_bytes: 0}\n")
+    config.write_text(config.read_text().replace("rmw_zenoh", "ros2dds"))
+    with service(config, router, warm=False) as running:
+        keys = running.keys
+        rear = running.ask(keys.extrinsic("rear"))
+        assert (rear["provenance"], rear["camera_frame"]) == ("nominal", "rear")
+        flood = 2000
+        for number in range(flood):
+            turned = se3.exp(np.array([0.0, 0.0, 1e-3 * number, 0.0, 0.0, 0.0]))
+            driver.put(TF[1:], transforms(("base_link", rig.lidar_frame, turned)))
+            if number % 10 == 0:
+                for topic in (TF, INFO, CAMERA, POINTS, EGO):
+                    driver.put(topic[1:], bytes(number))
+        front = partial(running.ask, keys.health("front"))
+        health = running.until(front, lambda told: "camera_info_refused" in codes(told), "what is refused")
+        assert (health["state"], health["level"]) == ("unknown", 3)
+        assert refused(running, keys.extrinsic("front"))[0] == "awaiting"
+        assert running.ask(keys.extrinsic("rear")) == rear
+
+        for name in ("camera", "lidar", "ego"):
+            of_stream = {"camera": CameraFrame, "lidar": LidarFrame, "ego": EgoMotion}[name]
+            frame = next(frame for frame in frames if isinstance(frame, of_stream))
+            topic, payload = message_of(frame)
+            driver.put(topic[1:], payload)
+        driver.put(INFO[1:], camera_info(rig.camera, rig.camera_frame))
+        latched(driver, TF[1:]).put(said(drive))
+        status = running.until(running.status, lambda told: awaits(told, "front") == [], "the pair is complete")
+        losses = next(pair for pair in status["pairs"] if pair["name"] == "front")["losses"]
+        record_property("figure", f"{sum(losses.values())} of {flood + flood // 2} messages counted as lost")
+        assert losses["tf_static_message_malformed"] > 0
+        expected = se3.perturb(rig.T_camera_lidar_nominal, OFF)
+        np.testing.assert_allclose(
+            running.ask(keys.extrinsic("front"))["camera_from_lidar"]["matrix"], expected, atol=1e-9
+        )
+        assert running.ask(keys.extrinsic("rear")) == rear
+        assert running.terminate() == 0
+
+
+def awaits(status: Any, name: str) -> list[str]:
+    pair = next(pair for pair in status["pairs"] if pair["name"] == name)
+    return [str(reason["code"]) for reason in pair["awaits"]]
 
 
 def codes(health: Any) -> list[str]:
