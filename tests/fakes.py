@@ -18,6 +18,9 @@ from coec.runtime.worker.link import Link
 RESULT = "result.msgpack"
 """File in the fake worker's folder: a `CalibrationResult`, the answer to every window but for the window's id."""
 
+SETTINGS = "settings"
+"""File in the fake worker's folder: a line for each configuration that it was told, behind the id of its process."""
+
 LET_GO = "let-go"
 """File in the fake worker's folder: a worker that is `late` waits for it."""
 
@@ -172,6 +175,11 @@ FAULTS: dict[str, Callable[[Link, dict[str, Any], Path], None]] = {
 }
 
 
+def _note_settings(folder: Path, start: dict[str, Any]) -> None:
+    with (folder / SETTINGS).open("a") as stream:
+        stream.write(f"{os.getpid()} {start['settings']}\n")
+
+
 def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
     once = fault.endswith("-once")
     fault, marker = fault.removesuffix("-once"), folder / "done"
@@ -181,7 +189,7 @@ def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
         marker.touch()
         return wrong
 
-    link.receive()
+    _note_settings(folder, link.receive())
     match fault:
         case "unusable":
             link.send({"kind": "unusable", "code": "bad_model", "text": "no such network"})
@@ -197,6 +205,10 @@ def _serve(fault: str, at: str, folder: Path, link: Link) -> None:
         signal.pause()
     while True:
         question = link.receive()
+        if question["kind"] == "start":
+            _note_settings(folder, question)
+            link.send({"kind": "ready"})
+            continue
         right = _answer(folder, question)
         if fault in FAULTS and question["kind"] == at and at_fault():
             FAULTS[fault](link, right, folder)

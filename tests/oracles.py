@@ -36,6 +36,15 @@ def radtan_pixels(c: Intrinsics, p: NDArray[np.float64]) -> NDArray[np.float64]:
     return _pixels(c, *_distorted(c, x / z, y / z))
 
 
+def rational_pixels(c: Intrinsics, p: NDArray[np.float64]) -> NDArray[np.float64]:
+    mx, my = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2]
+    s = mx**2 + my**2
+    g = (1 + c["k1"] * s + c["k2"] * s**2 + c["k3"] * s**3) / (1 + c["k4"] * s + c["k5"] * s**2 + c["k6"] * s**3)
+    x = mx * g + 2 * c["p1"] * mx * my + c["p2"] * (s + 2 * mx**2)
+    y = my * g + c["p1"] * (s + 2 * my**2) + 2 * c["p2"] * mx * my
+    return _pixels(c, x, y)
+
+
 def kannala_brandt_pixels(c: Intrinsics, p: NDArray[np.float64]) -> NDArray[np.float64]:
     x, y, z = p.T
     theta, azimuth = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
@@ -66,6 +75,7 @@ def double_sphere_pixels(c: Intrinsics, p: NDArray[np.float64]) -> NDArray[np.fl
 CAMERA_PIXELS: Mapping[str, Callable[[Intrinsics, NDArray[np.float64]], NDArray[np.float64]]] = {
     "pinhole": pinhole_pixels,
     "radtan": radtan_pixels,
+    "rational": rational_pixels,
     "kannala_brandt": kannala_brandt_pixels,
     "mei": mei_pixels,
     "eucm": eucm_pixels,

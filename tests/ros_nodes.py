@@ -37,7 +37,7 @@ def cdr(frame: Frame) -> bytes:
         case LidarFrame():
             return outgoing.encode_cloud(frame)
         case _:
-            return outgoing.encode_odometry(frame, frame.frame_id)
+            return outgoing.encode_motion(frame)[1]
 
 
 def described(type_name: str) -> str:

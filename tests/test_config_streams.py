@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from coec.config import Config, load_config
+from coec.config import IDENTITY, Config, load_config
 from coec.errors import ConfigError
 from coec.reports.commented_yaml import commented_yaml
 
@@ -30,7 +32,7 @@ def read(folder: Path, text: str) -> Config:
 
 def test_topics_by_their_short_forms(tmp_path: Path) -> None:
     config = read(tmp_path, ROS_VEHICLE)
-    (pair,) = config.pairs
+    (pair,) = config.every_pair
     assert {name: stream.topic for name, stream in pair.streams.items()} == {
         "camera": "/front/image_raw/compressed",
         "lidar": "/top/points",
@@ -58,14 +60,14 @@ def test_the_effective_configuration_shows_the_long_form(tmp_path: Path) -> None
     ],
 )
 def test_the_name_of_a_topic_tells_the_type_of_images(tmp_path: Path, topic: str, type_name: str) -> None:
-    (pair,) = read(tmp_path, ROS_VEHICLE.replace("/front/image_raw/compressed", topic)).pairs
+    (pair,) = read(tmp_path, ROS_VEHICLE.replace("/front/image_raw/compressed", topic)).every_pair
     assert pair.camera.assumed_type == type_name
     assert set(pair.camera.types) == {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"}
 
 
 def test_a_type_that_is_set_is_the_only_one_on_a_topic(tmp_path: Path) -> None:
     chosen = ROS_VEHICLE.replace("compressed,", "compressed, type: sensor_msgs/msg/Image,")
-    (pair,) = read(tmp_path, chosen).pairs
+    (pair,) = read(tmp_path, chosen).every_pair
     assert pair.camera.assumed_type == "sensor_msgs/msg/Image"
     assert pair.camera.types == ("sensor_msgs/msg/Image",)
 
@@ -96,10 +98,68 @@ def test_what_cannot_be_a_stream_is_refused_with_what_to_do(
 
 def test_keys_go_beside_topics(tmp_path: Path) -> None:
     config = read(tmp_path, ROS_VEHICLE.replace("ego: /odometry", "ego: {key: odometry}"))
-    assert config.pairs[0].streams["ego"].place == "odometry"
-    assert config.pairs[0].streams["ego"].encoding == "msgpack"
+    assert config.every_pair[0].streams["ego"].place == "odometry"
+    assert config.every_pair[0].streams["ego"].encoding == "msgpack"
 
 
 def test_a_pair_without_ego_motion_has_two_streams(tmp_path: Path) -> None:
-    (pair,) = read(tmp_path, ROS_VEHICLE.replace("    ego: /odometry\n", "")).pairs
+    (pair,) = read(tmp_path, ROS_VEHICLE.replace("    ego: /odometry\n", "")).every_pair
     assert list(pair.streams) == ["camera", "lidar"]
+
+
+EIGHT_LINES = """vehicle: shuttle-7
+zenoh: {connect: [tcp/127.0.0.1:7447]}
+middleware: rmw_zenoh
+pairs:
+  - name: front
+    camera: /sensing/camera/front/image_raw/compressed
+    points: /sensing/lidar/top/points
+"""
+
+
+def test_eight_lines_are_a_configuration_and_its_effective_form_is_the_same(tmp_path: Path) -> None:
+    config = read(tmp_path, EIGHT_LINES)
+    assert (config.pairs, [pair.name for pair in config.awaited]) == ((), ["front"])
+    assert read(tmp_path, commented_yaml(config)) == config
+
+
+WHOLE = {
+    "name": "front",
+    "camera": {
+        "topic": "/c",
+        "frame_id": "camera",
+        "intrinsics": {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0},
+    },
+    "lidar": {"topic": "/l", "frame_id": "lidar"},
+    "ego": {"topic": "/o", "T_lidar_ego": IDENTITY},
+    "T_camera_lidar": IDENTITY,
+}
+
+
+@pytest.mark.parametrize(
+    "left_out",
+    ["T_camera_lidar", "camera.frame_id", "camera.intrinsics", "lidar.frame_id", "ego.T_lidar_ego"],
+)
+def test_a_pair_is_awaited_where_something_is_left_out(left_out: str) -> None:
+    whole = Config.model_validate({"middleware": "ros2dds", "pairs": [WHOLE]})
+    assert (len(whole.pairs), len(whole.awaited)) == (1, 0)
+    place, _, name = left_out.rpartition(".")
+    lacking: dict[str, Any] = json.loads(json.dumps(WHOLE))
+    del (lacking[place] if place else lacking)[name]
+    config = Config.model_validate({"middleware": "ros2dds", "pairs": [{**WHOLE, "name": "rear"}, lacking]})
+    assert ([pair.name for pair in config.pairs], [pair.name for pair in config.awaited]) == (["rear"], ["front"])
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (EIGHT_LINES.replace("middleware: rmw_zenoh\n", ""), "intrinsics"),
+        (EIGHT_LINES.replace("front/image_raw", "front//image"), "topic"),
+        (EIGHT_LINES + "    speed: 3\n", "speed"),
+        (EIGHT_LINES + EIGHT_LINES[EIGHT_LINES.index("  - name") :], "pair names must be unique"),
+        (EIGHT_LINES[: EIGHT_LINES.index("pairs")] + "pairs: []\n", "give 1 to 32"),
+    ],
+)
+def test_an_awaited_pair_is_checked_as_any_other(tmp_path: Path, text: str, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        read(tmp_path, text)

@@ -12,7 +12,7 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from ruamel.yaml import YAML
@@ -68,7 +68,7 @@ class Stage(BaseModel):
 class CameraIntrinsics(Stage):
     """Intrinsics as in `dataset.yaml`; which of the optional parameters are needed depends on `model`."""
 
-    model: Literal["pinhole", "radtan", "kannala_brandt", "mei", "eucm", "double_sphere"]
+    model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"]
     width: int = Field(gt=0, le=16384, description="image width, px")
     height: int = Field(gt=0, le=16384, description="image height, px")
     fx: float = Field(gt=0, description="focal length, px")
@@ -82,6 +82,8 @@ class CameraIntrinsics(Stage):
     k2: float | None = None
     k3: float | None = None
     k4: float | None = None
+    k5: float | None = None
+    k6: float | None = None
     p1: float | None = None
     p2: float | None = None
 
@@ -162,16 +164,20 @@ class StreamConfig(Stage):
         return self
 
 
-class CameraConfig(StreamConfig):
-    """Camera stream of a pair."""
+class OpenCameraConfig(StreamConfig):
+    """Camera stream of a pair, which may leave its calibration to be found."""
 
-    frame_id: str = Field(default="camera", max_length=128, description="frames of another id are refused")
+    frame_id: str | None = Field(default=None, max_length=128, description="frames of another id are refused")
     type: CameraMessage | None = Field(
         default=None,
         description="of CDR that does not say its own; unless set CompressedImage, and Image where the name of a topic "
         "does not end with /compressed. What comes on a topic must have it, if it is set",
     )
-    intrinsics: CameraIntrinsics
+    intrinsics: CameraIntrinsics | None = Field(default=None, description="of the images as they come")
+    info_topic: TopicName | None = Field(
+        default=None,
+        description="of the `CameraInfo` that tells intrinsics left out; unless set, `camera_info` beside the images",
+    )
     mask: FilePath | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
 
     @property
@@ -188,12 +194,21 @@ class CameraConfig(StreamConfig):
         return _types(CameraMessage, self.type if self.topic else None)
 
 
-class LidarConfig(StreamConfig):
-    """LiDAR stream of a pair."""
+class CameraConfig(OpenCameraConfig):
+    """Camera stream of a pair."""
 
-    frame_id: str = Field(default="lidar", max_length=128, description="of the LiDAR; clouds of another id are refused")
-    T_cloud_lidar: Matrix4x4 = Field(
-        default=IDENTITY, description="pose of the LiDAR in the frame in which its driver gives the points"
+    frame_id: str = Field(default="camera", max_length=128, description="frames of another id are refused")
+    intrinsics: CameraIntrinsics
+
+
+class OpenLidarConfig(StreamConfig):
+    """LiDAR stream of a pair, which may leave its frames to be found."""
+
+    frame_id: str | None = Field(
+        default=None, max_length=128, description="of the LiDAR; clouds of another id are refused"
+    )
+    T_cloud_lidar: Matrix4x4 | None = Field(
+        default=None, description="pose of the LiDAR in the frame in which its driver gives the points"
     )
     cloud_frame_id: str | None = Field(
         default=None, max_length=128, description="of the clouds as they come, where it is not that of the LiDAR"
@@ -214,14 +229,23 @@ class LidarConfig(StreamConfig):
         return _types(LidarMessage, None)
 
 
-class EgoConfig(StreamConfig):
-    """Ego-motion stream of a pair."""
+class LidarConfig(OpenLidarConfig):
+    """LiDAR stream of a pair."""
+
+    frame_id: str = Field(default="lidar", max_length=128, description="of the LiDAR; clouds of another id are refused")
+    T_cloud_lidar: Matrix4x4 = Field(
+        default=IDENTITY, description="pose of the LiDAR in the frame in which its driver gives the points"
+    )
+
+
+class OpenEgoConfig(StreamConfig):
+    """Ego-motion stream of a pair, which may leave its place to be found."""
 
     type: EgoMessage | None = Field(
         default=None,
         description="of CDR that does not say its own; Odometry unless set. What comes on a topic must have it, if set",
     )
-    T_lidar_ego: Matrix4x4 = Field(default=IDENTITY, description="maps ego-frame to LiDAR coordinates")
+    T_lidar_ego: Matrix4x4 | None = Field(default=None, description="maps ego-frame to LiDAR coordinates")
     parent: str = Field(
         default="odom", min_length=1, max_length=128, description="frame in which the vehicle moves (TFMessage)"
     )
@@ -238,6 +262,15 @@ class EgoConfig(StreamConfig):
     def types(self) -> tuple[str, ...]:
         """Types of messages that this stream takes."""
         return _types(EgoMessage, self.type if self.topic else None)
+
+
+class EgoConfig(OpenEgoConfig):
+    """Ego-motion stream of a pair."""
+
+    T_lidar_ego: Matrix4x4 = Field(default=IDENTITY, description="maps ego-frame to LiDAR coordinates")
+
+
+AnyStreamConfig = OpenCameraConfig | OpenLidarConfig | OpenEgoConfig
 
 
 def _types(known: Any, only: str | None) -> tuple[str, ...]:
@@ -479,14 +512,16 @@ class PolicyConfig(Stage):
 # --- the daemon -----------------------------------------------------------------------------------------------------
 
 
-class PairConfig(Stage):
-    """One camera-LiDAR pair. `points: TEXT` is short for `lidar: {topic: TEXT}`."""
+class OpenPairConfig(Stage):
+    """One camera-LiDAR pair that may leave to be found what topics of ROS 2 tell: the frames of its sensors, the
+    intrinsics (`CameraInfo`) and how the sensors lie to one another (`/tf_static`). `points: TEXT` is short for
+    `lidar: {topic: TEXT}`."""
 
     name: Name
-    camera: CameraConfig
-    lidar: LidarConfig
-    ego: EgoConfig | None = None
-    T_camera_lidar: Matrix4x4 = Field(description="workshop calibration: LiDAR to camera")
+    camera: OpenCameraConfig
+    lidar: OpenLidarConfig
+    ego: OpenEgoConfig | None = None
+    T_camera_lidar: Matrix4x4 | None = Field(default=None, description="workshop calibration: LiDAR to camera")
     pairing: PairingConfig = PairingConfig()
     window: WindowConfig = WindowConfig()
     calibration: CalibrationConfig = CalibrationConfig()
@@ -495,7 +530,7 @@ class PairConfig(Stage):
     tracker: TrackerConfig = TrackerConfig()
 
     @property
-    def streams(self) -> dict[str, CameraConfig | LidarConfig | EgoConfig]:
+    def streams(self) -> dict[str, AnyStreamConfig]:
         """Those that it has, by the names under which they are counted."""
         streams = {"camera": self.camera, "lidar": self.lidar, "ego": self.ego}
         return {name: stream for name, stream in streams.items() if stream is not None}
@@ -509,6 +544,15 @@ class PairConfig(Stage):
         if not isinstance(points, str) or "lidar" in document:
             raise ValueError("`points` is the name of a topic, short for `lidar: {topic: ...}`: give one of the two")
         return {**{name: value for name, value in document.items() if name != "points"}, "lidar": points}
+
+
+class PairConfig(OpenPairConfig):
+    """One camera-LiDAR pair of which everything is known."""
+
+    camera: CameraConfig
+    lidar: LidarConfig
+    ego: EgoConfig | None = None
+    T_camera_lidar: Matrix4x4 = Field(description="workshop calibration: LiDAR to camera")
 
 
 class LimitsConfig(Stage):
@@ -671,6 +715,9 @@ class MetricsConfig(Stage):
         return 0 if self.address is None else self.address[1]
 
 
+MAX_PAIRS = 32
+
+
 class Config(Stage):
     """The one configuration file of a daemon."""
 
@@ -690,11 +737,40 @@ class Config(Stage):
     )
     log: LogConfig = LogConfig()
     metrics: MetricsConfig = MetricsConfig()
-    pairs: tuple[PairConfig, ...] = Field(min_length=1, max_length=32)
+    pairs: tuple[PairConfig, ...] = Field(default=(), max_length=MAX_PAIRS)
+    awaited: tuple[OpenPairConfig, ...] = Field(
+        default=(),
+        max_length=MAX_PAIRS,
+        description="entries of `pairs` that leave out what topics of ROS 2 tell; each joins them when it is found",
+    )
+
+    @property
+    def every_pair(self) -> tuple[OpenPairConfig, ...]:
+        """Those of which everything is known, and then those that are awaited."""
+        return (*self.pairs, *self.awaited)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _open_pairs_are_awaited(cls, document: Any) -> Any:
+        if not isinstance(document, dict) or document.get("middleware", "native") == "native":
+            return document
+        pairs, awaited = document.get("pairs", ()), document.get("awaited", ())
+        if not isinstance(pairs, list | tuple) or not isinstance(awaited, list | tuple):
+            return document
+        still = [pair for pair in pairs if _leaves_out(pair)]
+        return {**document, "pairs": [pair for pair in pairs if pair not in still], "awaited": [*still, *awaited]}
+
+    @model_validator(mode="after")
+    def _some_pairs(self) -> Config:
+        if not 0 < len(self.every_pair) <= MAX_PAIRS:
+            raise ValueError(f"pairs: give 1 to {MAX_PAIRS}")
+        if self.awaited and self.middleware == "native":
+            raise ValueError("awaited: nothing tells what a pair leaves out where `middleware` is `native`")
+        return self
 
     @model_validator(mode="after")
     def _names_unique(self) -> Config:
-        names = [pair.name for pair in self.pairs]
+        names = [pair.name for pair in self.every_pair]
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
         return self
@@ -710,6 +786,16 @@ class Config(Stage):
                 "it, or give the Zenoh `key` of native frames instead"
             )
         return self
+
+
+def _leaves_out(pair: Any) -> bool:
+    """Whether a pair, as it is written, leaves out what topics of ROS 2 tell."""
+    if not isinstance(pair, dict):
+        return False
+    lidar, ego = pair.get("lidar", pair.get("points")), pair.get("ego")
+    places = [(pair, "T_camera_lidar"), (pair.get("camera"), "intrinsics"), (pair.get("camera"), "frame_id")]
+    places += [(lidar, "frame_id"), *([] if ego is None else [(ego, "T_lidar_ego")])]
+    return any(isinstance(part, str) or (isinstance(part, dict) and part.get(name) is None) for part, name in places)
 
 
 def is_loopback(host: str) -> bool:
@@ -845,10 +931,16 @@ def _resolve_paths(config: Config, folder: Path) -> Config:
     authority = own.model_copy(update={name: None if path is None else folder / path for name, path in files.items()})
     state = config.state.model_copy(update={"directory": folder / config.state.directory})
     pairs = tuple(_resolve_pair_paths(pair, folder) for pair in config.pairs)
-    return config.model_copy(update={"pairs": pairs, "state": state, "zenoh": zenoh, "authority": authority})
+    awaited = tuple(_resolve_pair_paths(pair, folder) for pair in config.awaited)
+    return config.model_copy(
+        update={"pairs": pairs, "awaited": awaited, "state": state, "zenoh": zenoh, "authority": authority}
+    )
 
 
-def _resolve_pair_paths(pair: PairConfig, folder: Path) -> PairConfig:
+_P = TypeVar("_P", bound=OpenPairConfig)
+
+
+def _resolve_pair_paths(pair: _P, folder: Path) -> _P:
     camera, depth = pair.camera, pair.calibration.depth
     if camera.mask is not None:
         camera = camera.model_copy(update={"mask": folder / camera.mask})

@@ -33,15 +33,18 @@ from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
-from coec.config import AuthorityConfig, Config, config_hash
+from coec.config import AuthorityConfig, Config, PairConfig, config_hash
 from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
 from coec.runtime.api.authority import Authority
+from coec.runtime.api.awaited import AwaitedAnswers, AwaitedCommands
+from coec.runtime.api.commands import Commands
 from coec.runtime.api.configuration import shown
 from coec.runtime.api.health import reasons_of
 from coec.runtime.api.http_door import HttpDoor
 from coec.runtime.api.metrics import Took, View
 from coec.runtime.api.pages import pages
+from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.router_watch import RouterWatch
 from coec.runtime.api.routes import VehicleAnswers
@@ -50,11 +53,13 @@ from coec.runtime.api.status import worker_status_of
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.stream import Stream
+from coec.runtime.nominal.kept import completed
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.reload import reload_of, settings_hash
+from coec.runtime.waiting_room import WaitingRoom
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
@@ -120,7 +125,8 @@ class Daemon:
             UnavailableError: a port is taken.
             RecordingError: the state directory cannot be used.
         """
-        self._config = config
+        self._room = WaitingRoom(config, config.state.directory)
+        config = self._config = self._room.complete(config)
         self._notifier = notifier
         self._started_s, self._started_ns = time.monotonic(), time.time_ns()
         self._state: Literal["starting", "running", "stopping", "failing"] = "starting"
@@ -141,7 +147,7 @@ class Daemon:
         self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
         store = StateStore(config.state.directory, config.vehicle)
         self._scribe = Scribe(config.state.directory)
-        outside = Outside(
+        self._outside = Outside(
             self._keys,
             store,
             self._scribe,
@@ -150,14 +156,19 @@ class Daemon:
             self._publish,
             self._troubles,
             self._ros_side.topics,
+            self._room.nominal,
         )
-        self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
-        commands = {name: pair.commands for name, pair in self._pairs.items()}
-        self._reception = Reception(self._rules, commands)
+        self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
+        awaited = self._room.open(config, self._outside)
+        self._commands: dict[str, Commands | AwaitedCommands] = {
+            **{name: pair.commands for name, pair in self._pairs.items()},
+            **{name: answers.commands for name, answers in awaited.items()},
+        }
+        self._reception = Reception(self._rules, self._commands)
         self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
         self._answers = VehicleAnswers(
             self._keys,
-            {name: pair.answers for name, pair in self._pairs.items()},
+            {**{name: pair.answers for name, pair in self._pairs.items()}, **awaited},
             self._reception,
             lambda: self._status,
             self._metrics,
@@ -193,20 +204,46 @@ class Daemon:
     # --- start, tick, stop ------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
-        deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
-        for thread in (self._scribe.thread, self._presence.thread, *self._bus.threads, *deciding):
+        for thread in (self._scribe.thread, self._presence.thread, *self._bus.threads):
             thread.start()
         self._worker.start()
         self._answers.declare(self._bus)
         self._door.use(self._config.metrics)
-        for pair_config in self._config.pairs:
-            pair = self._pairs[pair_config.name]
-            pair.stream.thread.start()
-            for name, stream in pair_config.streams.items():
-                self._bus.subscribe(self._ros_side.input_of(stream), partial(pair.take_sample, name))
-            self._bus.declare_alive(self._keys.alive(pair.name))
+        for pair in self._config.pairs:
+            self._run(pair)
+        self._room.listen(self._bus, self._ros_side.input_of)
+        for name in (each.name for each in self._config.every_pair):
+            self._bus.declare_alive(self._keys.alive(name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
-        _log.info("serving", extra={"fields": {**fields, "pairs": list(self._pairs)}})
+        _log.info(
+            "serving", extra={"fields": {**fields, "pairs": list(self._pairs), "awaited": list(self._room.answers)}}
+        )
+
+    def _run(self, config: PairConfig) -> None:
+        """Start a pair that is built."""
+        pair = self._pairs[config.name]
+        for thread in (pair.decider.thread, pair.recorder.thread, pair.stream.thread):
+            thread.start()
+        for name, stream in config.streams.items():
+            self._bus.subscribe(self._ros_side.input_of(stream), partial(pair.take_sample, name))
+
+    def _admit(self) -> None:
+        """Build and start the pairs of which everything has been found."""
+        found = self._room.found()
+        if not found:
+            return
+        self._config = completed(self._config, found)
+        self._worker.use(self._config.model_dump_json())
+        for name, config in found.items():
+            pair = Pair(config, self._config, self._outside)
+            self._pairs = {**self._pairs, name: pair}
+            self._commands[name] = pair.commands
+            self._answers.replace(pair.answers)
+            self._run(config)
+        self._reception.use(self._rules)  # for the commands of new pairs, too
+        self._shown = self._shown_now()
+        fields = {"pairs": list(found), "config_hash": config_hash(self._config)}
+        _log.info("pairs that were awaited are served", extra={"fields": fields})
 
     def _tick(self) -> int:
         """Once a second: look at every thread, renew what is served, keep no memory that nobody uses. Returns an exit
@@ -224,11 +261,14 @@ class Daemon:
             self._state = "running"
             self._notifier.ready()
             _log.info("ready: the worker is warm")
-        if self._fault is not None:
+        if self._fault is None:
+            self._admit()
+        else:
             self._state = "failing"
             _log.error(self._fault.text, extra={"fields": {"code": self._fault.code}})
             for pair in self._pairs.values():
                 pair.answers.fail(self._fault)
+            self._room.fail(self._fault)
         self._router.look()
         self._renew()
         if self._fault is not None:
@@ -249,6 +289,7 @@ class Daemon:
             ("announce", self._notifier.stopping),
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
+            ("look for no more pairs", lambda: _stopped(self._room.threads, LOOK_OUT_STOP_S)),
             ("be no node of ROS", self._ros_side.close),
             ("end the streams", lambda: self._end(pairs, lambda pair: pair.stream, INGEST_STOP_S)),
             ("finish the open windows", self._finish_windows),
@@ -293,7 +334,7 @@ class Daemon:
         self._notifier.reloading()
         told = self._configuration
         try:
-            fresh = reload_of(self._config, reread())
+            fresh = reload_of(self._config, self._room.complete(reread()))
             rules = self._rules_of(fresh.config.authority, self._rules.listener)
         except Exception as error:  # whatever is wrong with a file, what runs goes on
             self._configuration = told.model_copy(update={"read_ns": time.time_ns(), "refused": str(error)})
@@ -371,9 +412,10 @@ class Daemon:
         """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
         restart would make it quicker, and none is asked for."""
         own = [thread for pair in self._pairs.values() for thread in pair.threads]
-        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *own]
+        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *self._room.threads, *own]
 
     def _renew(self) -> None:
+        self._room.renew()
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
 
@@ -389,7 +431,7 @@ class Daemon:
             uptime_s=time.monotonic() - self._started_s,
             config_hash=config_hash(self._config),
             configuration=self._configuration,
-            pairs=tuple(pair.answers.status() for pair in self._pairs.values()),
+            pairs=tuple(answers.status() for answers in self._answering()),
             worker=worker_status_of(self._worker),
             storage=replies.StorageStatus(
                 bytes_used=usage.used,
@@ -402,11 +444,20 @@ class Daemon:
     def _shown_now(self) -> Snapshot:
         """The configuration as it is served."""
         return Snapshot.of_document(
-            {"schema_version": 1, "config_hash": config_hash(self._config), "config": shown(self._config)}
+            {
+                "schema_version": 1,
+                "config_hash": config_hash(self._config),
+                "config": shown(self._config),
+                "found": self._room.origins(),
+            }
         )
 
     def _health(self) -> dict[str, replies.HealthReply]:
-        return {name: pair.answers.health_reply for name, pair in self._pairs.items()}
+        return {answers.name: answers.health_reply for answers in self._answering()}
+
+    def _answering(self) -> list[PairAnswers | AwaitedAnswers]:
+        """Those who answer for a pair, the ones that are awaited last."""
+        return [*(pair.answers for pair in self._pairs.values()), *self._room.answers.values()]
 
     def _metrics(self) -> bytes:
         pairs = self._pairs.items()

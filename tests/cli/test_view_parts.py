@@ -19,7 +19,7 @@ from coec.cli.view import Place, place_of
 from coec.cli.view import streams as streams_module
 from coec.cli.view.moments import SILENT_S, Said, extrinsics_of_service, moment_of_service
 from coec.cli.view.streams import DEPTHS, Streams
-from coec.config import LimitsConfig, load_config
+from coec.config import load_config
 from coec.errors import UsageError
 from coec.schemas.base import from_msgpack
 from coec.schemas.replies import ExtrinsicReply, HealthReply
@@ -64,8 +64,8 @@ def test_what_is_not_known_is_not_drawn_and_says_so() -> None:
 
 @pytest.fixture
 def streams(router: Router, tmp_path: Path) -> Iterator[Streams]:
-    (pair,) = load_config(configuration(tmp_path, router.endpoint)).pairs
-    streams = Streams(router.session, pair, LimitsConfig())
+    config = load_config(configuration(tmp_path, router.endpoint))
+    streams = Streams(router.session, config.pairs[0], config)
     streams.listen(wanted=True)
     yield streams
     streams.close()

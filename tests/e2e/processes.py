@@ -135,7 +135,8 @@ def write_configuration(
 
 @dataclass
 class Service:
-    """A running `coec run`, and what a client has of it. Questions are about its first pair where none is named.
+    """A running `coec run`, and what a client has of it. Questions are about its first pair where none is
+    named; those that are given whole come first.
 
     Attributes:
         sent: frames that were sent to it, by stream.
@@ -154,7 +155,7 @@ class Service:
 
     @property
     def pair(self) -> str:
-        return self.config.pairs[0].name
+        return self.config.every_pair[0].name
 
     def ask(self, key: str, parameters: str = "", payload: bytes | None = None) -> Any:
         """The document of a query for one key; `parameters` as `;name=value`.
@@ -339,7 +340,7 @@ def _told_of_changes(running: Service) -> Iterator[None]:
 
 def _await_alive(running: Service) -> None:
     """Until every pair is announced, or the process has ended."""
-    missing = {running.keys.alive(pair.name) for pair in running.config.pairs}
+    missing = {running.keys.alive(pair.name) for pair in running.config.every_pair}
 
     def heard(token: zenoh.Sample) -> None:
         if token.kind == zenoh.SampleKind.PUT:

@@ -16,7 +16,8 @@ import zenoh
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
 from coec.adapters.zenoh.client import connected
-from coec.adapters.zenoh.player import is_heard
+from coec.adapters.zenoh.inputs import on_key
+from coec.adapters.zenoh.matching import is_heard
 from coec.adapters.zenoh.settings import settings_of
 from coec.config import LimitsConfig, ZenohConfig
 from coec.schemas.replies import StreamStatus
@@ -67,7 +68,7 @@ def test_what_zenoh_drops_is_counted_as_far_as_it_can_be_known(
     ):
         publishers = {}
         for name in counted:
-            vehicle.bus.subscribe(f"in/{name}", partial(vehicle.bench.pair.take_sample, name))
+            vehicle.bus.subscribe(on_key(f"in/{name}"), partial(vehicle.bench.pair.take_sample, name))
             block = zenoh.CongestionControl.BLOCK
             publishers[name] = session.declare_publisher(f"in/{name}", congestion_control=block)
         wait_until(lambda: all(map(is_heard, publishers.values())), "the service", PATIENCE_S)

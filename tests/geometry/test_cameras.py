@@ -41,6 +41,23 @@ CAMERAS: dict[str, Camera] = {
         p2=-0.000222,
         k3=-0.029608,
     ),
+    "rational": cameras.build(
+        "rational",
+        width=2048,
+        height=1536,
+        fx=975.7,
+        fy=975.5,
+        cx=1021.6,
+        cy=778.4,
+        k1=0.5136,
+        k2=-2.6795,
+        p1=0.000838,
+        p2=-0.000085,
+        k3=1.5490,
+        k4=0.3928,
+        k5=-2.5068,
+        k6=1.4778,
+    ),
     "kannala_brandt": cameras.build(
         "kannala_brandt",
         width=1920,
@@ -78,6 +95,12 @@ CAMERAS: dict[str, Camera] = {
 SMALL = {"width": 640, "height": 480, "fx": 300.0, "fy": 310.0, "cx": 320.0, "cy": 235.0}
 VARIANTS: dict[str, Camera] = CAMERAS | {
     "radtan without distortion": cameras.build("radtan", **SMALL, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0),
+    "rational without denominator": cameras.build(
+        "rational", **SMALL, k1=-0.3, k2=0.02, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0
+    ),
+    "rational without numerator": cameras.build(
+        "rational", **SMALL, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.4, k5=0.02, k6=0.0
+    ),
     "kannala_brandt equidistant": cameras.build("kannala_brandt", **SMALL, k1=0.0, k2=0.0, k3=0.0, k4=0.0),
     "mei xi below 1": cameras.build("mei", **SMALL, xi=0.8, k1=-0.1, k2=0.02, p1=0.001, p2=-0.001),
     "mei xi 1": cameras.build("mei", **SMALL, xi=1.0, k1=0.0, k2=0.0, p1=0.0, p2=0.0),
@@ -174,6 +197,17 @@ def test_radtan_equals_opencv() -> None:
     np.testing.assert_allclose(project(camera, rays * 7.0)[0], expected[:, 0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["rational", "rational without denominator", "rational without numerator"])
+def test_rational_equals_opencv(name: str) -> None:
+    camera = VARIANTS[name]
+    c = cameras.intrinsics_of(camera)
+    matrix = np.array([[c["fx"], 0, c["cx"]], [0, c["fy"], c["cy"]], [0, 0, 1.0]])
+    distortion = np.array([c[k] for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")])
+    rays, _ = unproject(camera, pixel_grid(camera))
+    expected, _ = cv2.projectPoints(rays[:, None] * 7.0, np.zeros(3), np.zeros(3), matrix, distortion)
+    np.testing.assert_allclose(project(camera, rays * 7.0)[0], expected[:, 0], rtol=0, atol=1e-9)
+
+
 def test_kannala_brandt_equals_opencv() -> None:
     camera = CAMERAS["kannala_brandt"]
     c = cameras.intrinsics_of(camera)
@@ -229,6 +263,16 @@ LIMITS: list[tuple[Camera, float]] = [
     (
         cameras.build("radtan", **SMALL, k1=-0.3, k2=0.0, p1=0.0, p2=0.0, k3=0.0),
         math.atan(math.sqrt(1 / 0.9)),
+    ),
+    # r/(1 + 0.4 r^2) grows up to 1 - 0.4 r^2 = 0
+    (
+        cameras.build("rational", **SMALL, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.4, k5=0.0, k6=0.0),
+        math.atan(math.sqrt(1 / 0.4)),
+    ),
+    # 1 - 0.5 r^2 = 0 below the line
+    (
+        cameras.build("rational", **SMALL, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=-0.5, k5=0.0, k6=0.0),
+        math.atan(math.sqrt(1 / 0.5)),
     ),
     (VARIANTS["kannala_brandt equidistant"], math.pi),
     # 1 - 3 · 0.2 theta^2 = 0
@@ -454,6 +498,7 @@ def altered(name: str, **changes: Any) -> dict[str, Any]:
         ("pinhole", altered("pinhole", k1=0.1), "unknown intrinsics k1"),
         ("pinhole", {"width": 3, "height": 2, "fx": 1.0, "fy": 1.0}, "missing intrinsics cx, cy"),
         ("radtan", altered("radtan", k3=math.nan), "k3"),
+        ("rational", altered("rational", k6=math.nan), "k6"),
         ("kannala_brandt", altered("kannala_brandt", k4=math.inf), "k4"),
         ("mei", altered("mei", xi=-0.1), "xi must lie in"),
         ("mei", altered("mei", p2=math.nan), "p2"),

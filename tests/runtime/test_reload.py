@@ -10,11 +10,14 @@ from typing import Any
 
 import pytest
 
-from coec.config import Config
+from coec.config import IDENTITY, Config, PairConfig, WindowConfig
 from coec.errors import ConfigError
+from coec.runtime.nominal.kept import completed
 from coec.runtime.reload import RELOADED, Reload, reload_of, settings_hash
 from coec.runtime.worker.jobs import Job, Kind
 from pair_bench import BEGIN_S, Bench, KnowingWorker, configuration
+
+INTRINSICS = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0}
 
 
 @dataclass
@@ -54,6 +57,28 @@ def use(bench: Bench, fresh: Reload) -> None:
 def test_nothing_that_differs_changes_nothing(tmp_path: Path) -> None:
     config = configuration(tmp_path)
     assert reloaded(config) == Reload(config, (), ())
+
+
+def test_a_pair_that_was_found_is_compared_as_it_was_found_and_one_that_is_awaited_waits() -> None:
+    rear = {"name": "rear", "camera": "/rear/image", "points": "/top/points"}
+    read = Config.model_validate(
+        {"middleware": "rmw_zenoh", "pairs": [{**rear, "name": "front", "camera": "/front/image"}, rear]}
+    )
+    camera = {"topic": "/front/image", "frame_id": "camera", "intrinsics": INTRINSICS}
+    lidar = {"topic": "/top/points", "frame_id": "lidar"}
+    front = PairConfig.model_validate({"name": "front", "camera": camera, "lidar": lidar, "T_camera_lidar": IDENTITY})
+    found = {"front": front}
+    running = completed(read, found)
+    assert reload_of(running, completed(read, found)) == Reload(running, (), ())
+
+    window = {"window": WindowConfig(pairs=12)}
+    other = read.model_copy(update={"awaited": tuple(pair.model_copy(update=window) for pair in read.awaited)})
+    found = {"front": front.model_copy(update=window)}
+    fresh = reload_of(running, completed(other, found))
+    assert fresh.taken == ("pairs.front.window.pairs",)
+    assert fresh.waiting == ("awaited.rear.window.pairs",)
+    assert fresh.config.pairs[0].window.pairs == 12
+    assert fresh.config.awaited == running.awaited
 
 
 def test_what_can_be_taken_is_and_the_rest_waits(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.rig import rig_of
+from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.tls.conversation import Listener, credentials_of
 from coec.adapters.zenoh.settings import settings_of
 from coec.config import (
@@ -14,6 +14,7 @@ from coec.config import (
     Config,
     EgoConfig,
     LidarConfig,
+    OpenPairConfig,
     PairConfig,
     StateConfig,
     SweepConfig,
@@ -48,6 +49,7 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
         return 0
     config = load_config(path)
     checks = [check for pair in config.pairs for check in _check(pair, config)]
+    checks += [check for pair in config.awaited for check in _check_awaited(pair, config)]
     if config.zenoh.file is not None:
         checks.append(_check_file(config.zenoh.file, "zenoh.file"))
     settings_of(config.zenoh, config.limits)
@@ -96,14 +98,26 @@ def _check(pair: PairConfig, config: Config) -> list[str]:
     """
     rig = rig_of(pair)
     mask = f", mask {pair.camera.mask}" if rig.mask is not None else ""
+    return [f"pair {pair.name}: rig {pair.camera.intrinsics.model}{mask}", _check_network(pair, config)]
+
+
+def _check_awaited(pair: OpenPairConfig, config: Config) -> list[str]:
+    """The same of a pair whose rig is found when its sensors are heard.
+
+    Raises:
+        ConfigError: what it is given of a rig, or the network, cannot be used.
+    """
+    check_given(pair)
+    found = "its frames, and what else is left out, come from /tf_static and CameraInfo when the service runs"
+    return [f"pair {pair.name}: {found}", _check_network(pair, config)]
+
+
+def _check_network(pair: OpenPairConfig, config: Config) -> str:
     try:
         depth = open_depth(pair.calibration.depth, config.limits)
     except ModelError as error:
         raise ConfigError(f"pair {pair.name}, calibration.depth.model: {error}") from error
-    return [
-        f"pair {pair.name}: rig {pair.camera.intrinsics.model}{mask}",
-        f"pair {pair.name}: depth {pair.calibration.depth.model}, identity {depth.identity}",
-    ]
+    return f"pair {pair.name}: depth {pair.calibration.depth.model}, identity {depth.identity}"
 
 
 def _check_file(path: Path, key: str) -> str:

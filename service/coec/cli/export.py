@@ -19,6 +19,7 @@ from coec.errors import DecodeError, SourceError, UsageError
 from coec.reports import console
 from coec.runtime.api.exports import exported
 from coec.runtime.decisions.state_store import STATE_FILE, read_pairs
+from coec.runtime.nominal.kept import with_kept
 from coec.schemas.base import from_json
 from coec.schemas.replies import CalibrationResult, ExtrinsicReply
 from coec.sources.reading import read_bytes
@@ -88,7 +89,7 @@ def _held(path: Path) -> str | None:
 
 
 def _read(options: Options) -> Extrinsic:
-    config = None if options.config is None else load_config(options.config)
+    config = None if options.config is None else with_kept(load_config(options.config))
     frames = Frames(options.parent, options.child, _pose(options.parent_pose))
     source = options.source
     if source.is_dir() or source.name == STATE_FILE:

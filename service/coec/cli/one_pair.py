@@ -10,11 +10,13 @@ def pair_named(config: Config, name: str | None) -> PairConfig:
     """The one of this name, or (None) the only one.
 
     Raises:
-        UsageError: there is none of this name, or there are several to choose from.
+        UsageError: there is none of this name, there are several to choose from, or it is awaited still.
     """
     pairs = {pair.name: pair for pair in config.pairs}
     if name is None and len(pairs) == 1:
         return config.pairs[0]
+    if name in {pair.name for pair in config.awaited} or (name is None and not pairs):
+        raise UsageError("the pair is awaited: the service has not found what its configuration leaves out")
     if name is None or name not in pairs:
         raise UsageError(f"--pair: the configuration has the pairs {', '.join(pairs)}; choose one")
     return pairs[name]

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coec.adapters.files.rig import rig_of
+from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.zenoh.settings import settings_of
-from coec.config import Config, PairConfig, config_hash
+from coec.config import Config, OpenPairConfig, PairConfig, config_hash
 from coec.errors import ConfigError
 
 RELOADED: Mapping[str, str] = {
@@ -62,7 +62,10 @@ def reload_of(running: Config, read: Config) -> Reload:
     settings_of(read.zenoh, read.limits)
     for pair in read.pairs:
         rig_of(pair)
-        _network_of(pair)
+    for awaited in read.awaited:
+        check_given(awaited)
+    for each in read.every_pair:
+        _network_of(each)
     old, new = _by_name(running.model_dump()), _by_name(read.model_dump())
     taken: list[str] = []
     waiting: list[str] = []
@@ -72,11 +75,11 @@ def reload_of(running: Config, read: Config) -> Reload:
             _put(old, new, names)
         else:
             waiting.append(".".join(names))
-    pairs = list(old["pairs"].values())
-    return Reload(Config.model_validate({**old, "pairs": pairs}), tuple(taken), tuple(waiting))
+    lists = {name: list(old[name].values()) for name in ("pairs", "awaited")}
+    return Reload(Config.model_validate({**old, **lists}), tuple(taken), tuple(waiting))
 
 
-def _network_of(pair: PairConfig) -> None:
+def _network_of(pair: OpenPairConfig) -> None:
     """A file is at least there; what it holds is for the worker to open, which this process does without."""
     model = pair.calibration.depth.model
     if model.endswith(".onnx") and not Path(model).is_file():
@@ -95,7 +98,8 @@ def differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]
 
 def _by_name(document: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration with its pairs by their names."""
-    return {**document, "pairs": {pair["name"]: pair for pair in document["pairs"]}}
+    lists = {name: {pair["name"]: pair for pair in document[name]} for name in ("pairs", "awaited")}
+    return {**document, **lists}
 
 
 def _differences(old: Any, new: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

@@ -404,6 +404,13 @@ class PairStatus(Part):
     checks: Count = Field(default=0, description="checks of the monitor at the served extrinsic")
     transitions: Counts = Field(default_factory=dict, description="changes of health, by the state that was entered")
     commands: Counts = Field(default_factory=dict, description="commands, by name and outcome")
+    awaits: tuple[Reason, ...] = Field(
+        default=(), description="what is missing of the nominal calibration that the configuration leaves out"
+    )
+    found: dict[str, str] = Field(
+        default_factory=dict,
+        description="where the values come from that the configuration leaves out, by their places in it",
+    )
 
 
 class WorkerStatus(Part):

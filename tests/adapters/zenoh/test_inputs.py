@@ -53,7 +53,7 @@ def heard(session: zenoh.Session) -> Iterator[Heard]:
 
     def listen(config: Config) -> queue.SimpleQueue[Sample]:
         got: queue.SimpleQueue[Sample] = queue.SimpleQueue()
-        bus.subscribe(input_of(config.pairs[0].camera, config), got.put)
+        bus.subscribe(input_of(config.every_pair[0].camera, config), got.put)
         return got
 
     yield listen

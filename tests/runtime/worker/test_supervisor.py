@@ -26,7 +26,7 @@ from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Fate, Job, Jo
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas.base import to_msgpack
 from estimates import RIG, estimate
-from fakes import LET_GO, RESULT, fake_worker_command, wait_until
+from fakes import LET_GO, RESULT, SETTINGS, fake_worker_command, wait_until
 
 DEADLINE_S = 30.0
 LIMITS = WorkerConfig(timeout_s=3600.0, max_memory_bytes=2**28, attempts=2)
@@ -116,6 +116,31 @@ def waiting(fault: str, folder: Path, at: str = "solve") -> Iterator[Bench]:
     """Not started yet."""
     with bench(fake_worker_command(fault, folder, at), folder, start=False) as made:
         yield made
+
+
+# --- another configuration --------------------------------------------------------------------------------------------
+
+
+def test_jobs_after_another_configuration_are_done_by_it(tmp_path: Path) -> None:
+    """In the same process: it is warm, and knows the depth of recent images."""
+    with running("none", tmp_path) as it:
+        it.overlay("a")
+        assert it.answer()[0] == "a"
+        pid = it.worker.pid
+        it.worker.use("another")
+        it.overlay("b")
+        assert it.answer()[0] == "b"
+        assert (tmp_path / SETTINGS).read_text().splitlines() == [f"{pid} {{}}", f"{pid} another"]
+        assert it.worker.status().starts == 1
+
+
+def test_a_worker_that_takes_the_place_of_another_has_the_latest_configuration(tmp_path: Path) -> None:
+    with running("crash-once", tmp_path) as it:
+        it.worker.use("another")
+        it.solve("a")
+        assert it.answer() == ("a", "a")
+        assert (tmp_path / SETTINGS).read_text().splitlines()[-1].endswith(" another")
+        assert it.worker.status().starts == 2
 
 
 # --- jobs come back ---------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from coec.config import (
     LidarConfig,
     LimitsConfig,
     Matrix4x4,
+    OpenPairConfig,
     PairConfig,
     SweepConfig,
     describe,
@@ -80,6 +81,27 @@ def rig_of(pair: PairConfig) -> Rig:
         sweep=None if pair.lidar.sweep is None else _sweep(pair.lidar.sweep),
         cloud=_cloud(pair.lidar, f"pair {pair.name}, lidar.T_cloud_lidar"),
     )
+
+
+def check_given(pair: OpenPairConfig) -> None:
+    """What an awaited pair is given of its rig, as far as that can be looked at without the rest.
+
+    Raises:
+        ConfigError: intrinsics that their model refuses, a matrix that is not rigid, a mask that is not there.
+    """
+    where = f"pair {pair.name}"
+    if pair.camera.intrinsics is not None:
+        _camera(pair.camera.intrinsics, f"{where}, camera.intrinsics")
+    if pair.camera.mask is not None and not pair.camera.mask.is_file():
+        raise ConfigError(f"{where}, camera.mask: there is no file {pair.camera.mask}")
+    matrices = {
+        "T_camera_lidar": pair.T_camera_lidar,
+        "lidar.T_cloud_lidar": pair.lidar.T_cloud_lidar,
+        "ego.T_lidar_ego": None if pair.ego is None else pair.ego.T_lidar_ego,
+    }
+    for name, rows in matrices.items():
+        if rows is not None:
+            rigid_matrix(rows, f"{where}, {name}")
 
 
 def camera_of(intrinsics: CameraIntrinsics) -> cameras.Camera:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from coec.adapters.foxglove import topics
 from coec.adapters.foxglove.topics import Pose
 from coec.adapters.frames.incoming import Refusal
-from coec.adapters.images.codec import CHANNELS, decode_bgr, encode_jpeg
+from coec.adapters.images.codec import decode_bgr, encode_jpeg
 from coec.adapters.images.range_colours import FURTHEST_M, NEAREST_M, colours_bgr, share_of
+from coec.adapters.images.raw import BYTES_PER_PIXEL
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import EncodedImage, FramePair, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.config import LimitsConfig
@@ -179,6 +180,6 @@ def compressed(image: EncodedImage, limits: LimitsConfig) -> EncodedImage:
     Raises:
         DecodeError: raw pixels of another size than they say.
     """
-    if image.format not in CHANNELS:
+    if image.format not in BYTES_PER_PIXEL:
         return image
     return EncodedImage(ImageFormat.JPEG, image.width, image.height, encode_jpeg(decode_bgr(image, limits)))

@@ -31,14 +31,15 @@ DEPTH_FORMAT: Final = "16UC1; png"
 DISTORTION: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "pinhole": ("plumb_bob", ()),
     "radtan": ("plumb_bob", ("k1", "k2", "p1", "p2", "k3")),
+    "rational": ("rational_polynomial", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
     "kannala_brandt": ("equidistant", ("k1", "k2", "k3", "k4")),
     "mei": ("mei", ("xi", "k1", "k2", "p1", "p2")),
     "eucm": ("eucm", ("alpha", "beta")),
     "double_sphere": ("double_sphere", ("xi", "alpha")),
 }
-"""`CameraInfo.distortion_model` and the order of `d` by camera model. `plumb_bob` and `equidistant` are those
-of sensor_msgs/distortion_models.hpp; ROS names no others that fit, so the rest go by the names of
-`dataset.yaml`."""
+"""`CameraInfo.distortion_model` and the order of `d` by camera model. `plumb_bob`, `rational_polynomial` and
+`equidistant` are those of sensor_msgs/distortion_models.hpp; ROS names no others that fit, so the rest go by the names
+of `dataset.yaml`."""
 
 _UNKNOWN_POSE_M2 = 1e9
 """Variance written for the pose of a recorded odometry, of which only the twist is known: (30 km)²."""

@@ -15,8 +15,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
+from typing import Protocol
 
 import zenoh
+from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.endpoints import without_secrets
@@ -34,6 +36,9 @@ JSON = "application/json"
 
 MAX_COMMAND_BYTES = 65_536
 """Largest payload of a query; commands are a few numbers."""
+
+LATCHED_SAMPLES = 100
+"""Of what publishers keep for whoever comes later, taken from each; rmw_zenoh's own."""
 
 POLL_S = 0.2
 
@@ -112,13 +117,19 @@ def closed(session: zenoh.Session, deadline_s: float) -> bool:
 _Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route], float]]
 
 
+class _Undeclarable(Protocol):
+    """A subscriber, of whatever kind."""
+
+    def undeclare(self) -> None: ...
+
+
 class Bus:
     """Everything the service declares in a session. Calls come from the daemon's threads; `threads` answer what is not
     answered at once."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
-        self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._subscribers: list[_Undeclarable] = []
         self._queryables: list[zenoh.Queryable[None]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
         self._waiting: dict[Lane, _Waiting] = {lane: queue.Queue(most) for lane, most in WAITING.items()}
@@ -132,9 +143,42 @@ class Bus:
         """Those of `threads` that wait neither for a disk nor for the worker."""
         return tuple(thread for lane, thread in zip(self._waiting, self.threads, strict=True) if lane is Lane.COMMANDS)
 
-    def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> None:
-        """Call `on_sample` for every put on the stream, on Zenoh's thread."""
+    def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
+        """Call `on_sample` for every put on the stream, on Zenoh's thread. Returns what ends it."""
+        receive = self._receiver(stream, on_sample)
+        token = None if stream.token is None else self._session.liveliness().declare_token(stream.token)
+        self._tokens += [] if token is None else [token]
+        declared = [self._session.declare_subscriber(each, _direct(receive)) for each in stream.expressions]
+        self._subscribers += declared
 
+        def end() -> None:
+            for subscriber in declared:
+                self._subscribers.remove(subscriber)
+                subscriber.undeclare()
+            if token is not None:
+                self._tokens.remove(token)
+                token.undeclare()
+
+        return end
+
+    def subscribe_latched(self, stream: Input, on_sample: Callable[[Sample], None]) -> None:
+        """As `subscribe`, and for what was put before, where its publisher keeps it for whoever comes later (ROS calls
+        that transient local). What this session puts itself is not heard."""
+        receive = self._receiver(stream, on_sample)
+        for expression in stream.expressions:
+            subscriber = declare_advanced_subscriber(
+                self._session,
+                expression,
+                _direct(receive),
+                allowed_origin=zenoh.Locality.REMOTE,
+                history=HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_SAMPLES),
+                recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+                subscriber_detection=True,
+            )
+            self._subscribers.append(subscriber)
+
+    @staticmethod
+    def _receiver(stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[zenoh.Sample], None]:
         def receive(sample: zenoh.Sample) -> None:
             try:
                 if sample.kind == zenoh.SampleKind.PUT:
@@ -142,10 +186,7 @@ class Bus:
             except Exception:
                 _log.exception("a subscription failed", extra={"fields": {"key": stream.expressions[0]}})
 
-        if stream.token is not None:
-            self.declare_alive(stream.token)
-        for expression in stream.expressions:
-            self._subscribers.append(self._session.declare_subscriber(expression, _direct(receive)))
+        return receive
 
     def serve(self, key: str, find: Callable[[str], Sequence[Route]], *, complete: bool = True) -> None:
         """Answer queries that match `key`. `find` gets the query's key, which may hold wildcards, and returns who

@@ -11,7 +11,7 @@ from coec.adapters.ros.wire.qos import SENSOR_DATA
 from coec.adapters.zenoh.inputs import Input, input_of
 from coec.adapters.zenoh.ros_publisher import RosNode
 from coec.adapters.zenoh.ros_topics import RosTopics, Topics
-from coec.config import CameraConfig, Config, EgoConfig, LidarConfig
+from coec.config import AnyStreamConfig, Config
 
 
 class RosSide:
@@ -28,7 +28,7 @@ class RosSide:
         self.node = None if dialect is None else RosNode(session, dialect)
         self._topics = None if dialect is None else RosTopics(session, config)
 
-    def input_of(self, stream: CameraConfig | LidarConfig | EgoConfig) -> Input:
+    def input_of(self, stream: AnyStreamConfig) -> Input:
         """How to listen to a stream, with the token by which nodes and tools of ROS see who listens."""
         plain = input_of(stream, self._config)
         if self.node is None or stream.topic is None:

@@ -13,17 +13,19 @@ from pathlib import Path
 from rich.text import Text
 
 from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.rig import rig_of
+from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.zenoh.bus import closed
 from coec.adapters.zenoh.endpoints import Endpoint
 from coec.adapters.zenoh.ros_side import RosSide
+from coec.adapters.zenoh.ros_topics import Topics
 from coec.adapters.zenoh.settings import connected_of, listened_of, settings_of
 from coec.cli.doctor import machine, router, service, streams, topics
-from coec.cli.doctor.found import fail, ok
+from coec.cli.doctor.found import fail, ok, warn
 from coec.cli.doctor.listening import listen
-from coec.config import Config, load_config
+from coec.config import Config, OpenPairConfig, load_config
 from coec.errors import ConfigError, ModelError
 from coec.reports import console
+from coec.runtime.nominal.kept import with_kept
 from coec.schemas.doctor import DoctorReport, Finding, Level
 
 USUAL_FILE = Path("/etc/coec/coec.yaml")
@@ -91,6 +93,7 @@ def examine(path: Path, seconds: float) -> Iterator[Finding]:
             yield from topics.topic_findings(there, config)
         for pair, streams_heard in zip(config.pairs, heard, strict=True):
             yield from streams.stream_findings(pair, streams_heard, config, seconds, there)
+        yield from (_awaited(pair, there) for pair in config.awaited)
         yield from service.service_findings(session, config)
     finally:
         closed(session, router.CLOSE_S)
@@ -101,20 +104,31 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
     advice = "correct it, or name another with --config; `coec check-config FILE` prints what a file comes to"
     try:
         config = load_config(path.resolve())  # as a service has it, whose paths are complete
+        config = with_kept(config)
         for pair in config.pairs:
             rig_of(pair)
+        for awaited in config.awaited:
+            check_given(awaited)
         settings = settings_of(config.zenoh, config.limits)
         for endpoint in (*connected_of(settings), *listened_of(settings)):
             Endpoint.parse(endpoint)
     except ConfigError as error:
         return None, fail("configuration", str(path), str(error), advice)
-    names = ", ".join(pair.name for pair in config.pairs)
+    names = ", ".join(pair.name for pair in config.every_pair)
     return config, ok("configuration", str(path), f"valid; vehicle {config.vehicle}, pairs {names}")
+
+
+def _awaited(pair: OpenPairConfig, there: Topics) -> Finding:
+    """What there is to say of a pair whose calibration no service has found yet."""
+    absent = (there.absent(stream.topic, stream.types) for stream in pair.streams.values() if stream.topic)
+    told = [sentence for sentence in absent if sentence is not None]
+    text = "; ".join(["what its configuration leaves out has not been found yet", *told])
+    return warn("nominal", pair.name, text, "start the service: its health says what is missing, and why")
 
 
 def _networks(config: Config) -> Iterator[Finding]:
     """The depth networks, each once."""
-    for depth in dict.fromkeys(pair.calibration.depth for pair in config.pairs):
+    for depth in dict.fromkeys(pair.calibration.depth for pair in config.every_pair):
         try:
             opened = open_depth(depth, config.limits)
         except ModelError as error:

@@ -20,6 +20,7 @@ from coec.cli.view.candidate import candidate_in
 from coec.config import is_loopback, load_config
 from coec.errors import UsageError
 from coec.reports import console
+from coec.runtime.nominal.kept import with_kept
 from coec.schemas.keys import Keys
 from coec.sources import open_source
 
@@ -95,10 +96,10 @@ def show_vehicle(options: VehicleOptions, place: Place, *, as_json: bool) -> int
     require_extra()
     from coec.cli.view.live import Vehicle, watch
 
-    config = load_config(options.config)
+    config = with_kept(load_config(options.config))
     pair, limits = pair_named(config, options.pair), config.limits
     rig = rig_of(pair)
-    vehicle = Vehicle(Keys(options.service.prefix, options.service.vehicle), pair, rig, limits)
+    vehicle = Vehicle(Keys(options.service.prefix, options.service.vehicle), pair, rig, config)
     connection = connected_by(options.service.way, options.timeout_s, limits.max_message_bytes)
     with until_signal() as stop, connection as session:
         screen = _screen(place, rig)

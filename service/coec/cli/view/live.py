@@ -17,7 +17,7 @@ from coec.calibration.types import FramePair, Rig
 from coec.cli.view.moments import Said, extrinsics_of_service, moment_of_service
 from coec.cli.view.service import ServiceWatch
 from coec.cli.view.streams import Streams
-from coec.config import LimitsConfig, PairConfig
+from coec.config import Config, PairConfig
 from coec.errors import DecodeError
 from coec.runtime.ingest.decoder import CAMERA
 from coec.schemas.keys import Keys
@@ -43,13 +43,13 @@ class Vehicle:
     keys: Keys
     pair: PairConfig
     rig: Rig
-    limits: LimitsConfig
+    config: Config
 
 
 def watch(session: zenoh.Session, vehicle: Vehicle, screen: Screen, stop: threading.Event) -> None:
     """Show the pair until told to stop."""
     name = vehicle.pair.name
-    streams = Streams(session, vehicle.pair, vehicle.limits)
+    streams = Streams(session, vehicle.pair, vehicle.config)
     service = ServiceWatch(session, vehicle.keys, name, lambda cause: streams.refused(SERVICE, cause))
     teller = _Teller(screen, name)
     try:
@@ -95,7 +95,7 @@ class _Teller:
 def _picture(pair: FramePair, vehicle: Vehicle, said: Said, wanted: frozenset[str]) -> Picture:
     compensated = vehicle.pair.calibration.motion_compensation
     extrinsics = extrinsics_of_service(vehicle.rig, said)
-    return picture_of(pair, vehicle.rig, extrinsics, wanted, vehicle.limits, compensated=compensated)
+    return picture_of(pair, vehicle.rig, extrinsics, wanted, vehicle.config.limits, compensated=compensated)
 
 
 def _essence(moment: Moment) -> tuple[object, ...]:

@@ -10,9 +10,10 @@ from collections.abc import Callable
 import zenoh
 
 from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.inputs import Input, input_of
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import FramePair
-from coec.config import LimitsConfig, PairConfig
+from coec.config import Config, PairConfig
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
 from coec.runtime.ingest.inbox import Inbox, Parcel
 
@@ -33,13 +34,12 @@ class Streams:
     """The sensors of one pair. They are subscribed to only while somebody looks, so nobody's looking costs the vehicle
     nothing; and who looks slowly loses frames here, not there."""
 
-    def __init__(self, session: zenoh.Session, pair: PairConfig, limits: LimitsConfig) -> None:
+    def __init__(self, session: zenoh.Session, pair: PairConfig, config: Config) -> None:
         self._session = session
         self._pair = pair
-        self._limits = limits
+        self._limits = config.limits
         self._losses = LossCounter(_SILENT, pair.name)
-        configured = {CAMERA: pair.camera, LIDAR: pair.lidar, EGO: pair.ego}
-        self._keys = {stream: one.key for stream, one in configured.items() if one is not None}
+        self._inputs = {name: input_of(stream, config) for name, stream in pair.streams.items()}
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._begin()
 
@@ -65,20 +65,24 @@ class Streams:
         if not self._subscribers:
             return {}
         arrivals = self._inbox.arrivals(time.monotonic())
-        return {stream: arrivals[stream].age_s for stream in self._keys}
+        return {stream: arrivals[stream].age_s for stream in self._inputs}
 
     @property
     def mute(self) -> tuple[str, ...]:
-        """Keys on which nothing has come although somebody has looked for `PATIENCE_S`."""
+        """Keys and topics on which nothing has come although somebody has looked for `PATIENCE_S`."""
         if time.monotonic() - self._since_s < PATIENCE_S:
             return ()
-        return tuple(self._keys[stream] for stream, age_s in self.ages_s.items() if age_s is None)
+        return tuple(self._pair.streams[stream].place for stream, age_s in self.ages_s.items() if age_s is None)
 
     def listen(self, *, wanted: bool) -> None:
         """Subscribe, or no longer."""
         if wanted and not self._subscribers:
             self._begin()
-            self._subscribers = [self._subscribe(stream, key) for stream, key in self._keys.items()]
+            self._subscribers = [
+                self._subscribe(name, key, source)
+                for name, source in self._inputs.items()
+                for key in source.expressions
+            ]
         elif not wanted:
             self.close()
 
@@ -105,7 +109,7 @@ class Streams:
             subscriber.undeclare()
         self._subscribers = []
 
-    def _subscribe(self, stream: str, key: str) -> zenoh.Subscriber[None]:
+    def _subscribe(self, stream: str, key: str, source: Input) -> zenoh.Subscriber[None]:
         inbox = self._inbox
 
         def receive(sample: zenoh.Sample) -> None:
@@ -114,7 +118,7 @@ class Streams:
             if len(sample.payload) > self._limits.max_message_bytes:
                 self._losses.add(stream, "message_too_large")
                 return
-            inbox.put(stream, sample.payload.to_bytes(), str(sample.encoding))
+            inbox.put(stream, source.read(sample))
 
         handler: Callable[[zenoh.Sample], None] = receive
         return self._session.declare_subscriber(key, zenoh.handlers.Callback(handler, indirect=False))

@@ -11,6 +11,7 @@ from coec.geometry.cameras.kannala_brandt import KannalaBrandt
 from coec.geometry.cameras.mei import Mei
 from coec.geometry.cameras.pinhole import Pinhole
 from coec.geometry.cameras.radtan import RadTan
+from coec.geometry.cameras.rational import Rational
 from coec.geometry.cameras.registry import MODELS, Camera, Model, build, intrinsics_of, name_of, scaled
 from coec.geometry.cameras.view import domain_angle_rad, in_image, pixel_rad
 
@@ -24,6 +25,7 @@ __all__ = [
     "Model",
     "Pinhole",
     "RadTan",
+    "Rational",
     "build",
     "domain_angle_rad",
     "image_point",

@@ -20,6 +20,7 @@ from coec.geometry.cameras.brown_conrady import distort, undistort
 from coec.geometry.cameras.dispatch import image_point, project_point, unproject_point
 from coec.geometry.cameras.formulas import arc_over_tangent, guarded_pixel, guarded_ray, like, polar_angle
 from coec.geometry.cameras.polynomial import odd_polynomial, solve_odd_polynomial
+from coec.geometry.cameras.rational import rational_distort, rational_factor, rational_radius, rational_slope
 from coec.geometry.cameras.registry import model_of
 
 # A division by zero gives an infinity, not a branch to an exception. With options of their own, not those of the loop
@@ -27,7 +28,8 @@ from coec.geometry.cameras.registry import model_of
 _OPTIONS: Any = {"error_model": "numpy"}
 
 for _formula in (
-    distort, guarded_pixel, guarded_ray, odd_polynomial, polar_angle, project_point, solve_odd_polynomial, undistort,
+    distort, guarded_pixel, guarded_ray, odd_polynomial, polar_angle, project_point, rational_distort, rational_factor,
+    rational_radius, rational_slope, solve_odd_polynomial, undistort,
 ):  # fmt: skip
     register_jitable(**_OPTIONS)(_formula)
 

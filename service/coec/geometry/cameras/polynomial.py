@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coec.geometry.cameras.formulas import like
 
@@ -17,8 +18,12 @@ def monotonic_limit_squared(coefficients: tuple[float, ...]) -> float:
     There the derivative 1 + 3 c1 s + 5 c2 s^2 + ..., s = t^2, has its first positive root of odd order. Beyond it two
     radii share a pixel, so the model has no meaning there.
     """
-    derivative = np.array([1.0, *((2 * i + 3) * c for i, c in enumerate(coefficients))])
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(derivative, "b"))
+    return first_positive_root(np.array([1.0, *((2 * i + 3) * c for i, c in enumerate(coefficients))]))
+
+
+def first_positive_root(polynomial: NDArray[np.float64]) -> float:
+    """The smallest s > 0 at which a polynomial, its coefficients (N,) ascending, is zero; infinite if there is none."""
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(polynomial, "b"))
     # A root counts as real if its imaginary part is rounding only (eigenvalues of the companion matrix, relative).
     real = np.sort(roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)])
     return float(real[0]) if real.size else math.inf

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from coec.geometry.cameras import double_sphere, eucm, kannala_brandt, mei, pinhole, radtan
+from coec.geometry.cameras import double_sphere, eucm, kannala_brandt, mei, pinhole, radtan, rational
 from coec.geometry.cameras.double_sphere import DoubleSphere
 from coec.geometry.cameras.eucm import Eucm
 from coec.geometry.cameras.intrinsics import positive
@@ -13,8 +13,9 @@ from coec.geometry.cameras.kannala_brandt import KannalaBrandt
 from coec.geometry.cameras.mei import Mei
 from coec.geometry.cameras.pinhole import Pinhole
 from coec.geometry.cameras.radtan import RadTan
+from coec.geometry.cameras.rational import Rational
 
-Camera = Pinhole | RadTan | KannalaBrandt | Mei | Eucm | DoubleSphere
+Camera = Pinhole | RadTan | Rational | KannalaBrandt | Mei | Eucm | DoubleSphere
 
 
 class Model(NamedTuple):
@@ -38,6 +39,7 @@ MODELS: Mapping[str, Model] = MappingProxyType(
         for name, camera_type, module in (
             ("pinhole", Pinhole, pinhole),
             ("radtan", RadTan, radtan),
+            ("rational", Rational, rational),
             ("kannala_brandt", KannalaBrandt, kannala_brandt),
             ("mei", Mei, mei),
             ("eucm", Eucm, eucm),

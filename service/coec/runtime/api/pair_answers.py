@@ -80,16 +80,18 @@ class PairAnswers:
         extrinsic = extrinsic_of(self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash)
         own = () if self._recorder.trouble is None else (self._recorder.trouble,)
         topics, arrivals = self._outside.topics(), self._stream.inbox.arrivals(time.monotonic())
-        troubles = (*own, *streams.troubles_of(report.streams, self._pair, topics), *self._outside.vehicle_troubles())
+        changed = self._outside.nominal(self.name).changed
+        ailing = (*streams.troubles_of(report.streams, self._pair, topics), *(() if changed is None else (changed,)))
+        troubles = (*own, *ailing, *self._outside.vehicle_troubles())
         missed = streams.missed_of(arrivals, self._pair, topics)
         health = health_of(known, report, self._losses.snapshot(), troubles, missed, self._pair, rig, self._vehicle)
         self._known, self._health = known, Told(health, time.monotonic())
         self._snapshots = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
-        changed = {
+        essences = {
             "extrinsic": extrinsic.model_copy(update={"percent_complete": 0.0}),
             "health": (health.state, tuple(reason.code for reason in health.reasons), health.needs, known.solved),
         }
-        for name, essence in changed.items():
+        for name, essence in essences.items():
             if self._published.get(name) != essence:
                 self._published[name] = essence
                 key = f"{self._outside.keys.root}/{self.name}/{name}"
@@ -216,7 +218,7 @@ class PairAnswers:
 
     def status(self) -> replies.PairStatus:
         """Counters since the start."""
-        return pair_status_of(
+        counted = pair_status_of(
             self.name,
             self._known,
             self._stream.report,
@@ -227,3 +229,6 @@ class PairAnswers:
             self._recorder.waiting,
             has_ego=self._pair.ego is not None,
         )
+        nominal = self._outside.nominal(self.name)
+        losses = {**counted.losses, **nominal.losses}
+        return counted.model_copy(update={"losses": losses, "found": dict(nominal.origins)})

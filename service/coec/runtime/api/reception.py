@@ -12,6 +12,7 @@ from coec.adapters.zenoh.bus import Answer, Request
 from coec.errors import UsageError
 from coec.runtime.api import payloads
 from coec.runtime.api.authority import Authority, NotAllowedError
+from coec.runtime.api.awaited import AwaitedCommands
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.snapshots import answer_of
 from coec.schemas.base import from_json
@@ -39,7 +40,8 @@ class Rules:
 class Reception:
     """Of all pairs of a vehicle."""
 
-    def __init__(self, rules: Rules, commands: Mapping[str, Commands]) -> None:
+    def __init__(self, rules: Rules, commands: Mapping[str, Commands | AwaitedCommands]) -> None:
+        """`commands` of a pair may be replaced while queries come."""
         self._commands = commands
         self.use(rules)
 

@@ -15,6 +15,7 @@ from coec.adapters.exports.told import Frames
 from coec.adapters.zenoh.bus import Answer, Bus, Lane, Request, Route
 from coec.errors import UsageError
 from coec.runtime.api import metrics as metrics_text
+from coec.runtime.api.awaited import AwaitedAnswers
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception
 from coec.runtime.api.snapshots import Snapshot, answer_of
@@ -34,6 +35,10 @@ OCTETS = "application/octet-stream"
 JPEG = "image/jpeg"
 
 
+Answering = PairAnswers | AwaitedAnswers
+"""Who answers about a pair."""
+
+
 class VehicleAnswers:
     """Routes of the vehicle and of each of its pairs.
 
@@ -44,7 +49,7 @@ class VehicleAnswers:
     def __init__(
         self,
         keys: Keys,
-        pairs: Mapping[str, PairAnswers],
+        pairs: Mapping[str, Answering],
         reception: Reception,
         status: Callable[[], Snapshot],
         metrics: Callable[[], bytes],
@@ -53,7 +58,7 @@ class VehicleAnswers:
         """`status()` and `config()` are serialised before; `metrics()` is rendered when asked."""
         self.took = Histogram(QUICK_S)
         self._keys = keys
-        self._pairs = pairs
+        self._pairs = dict(pairs)
         self._reception = reception
         self._vehicle_routes = {
             keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
@@ -61,6 +66,10 @@ class VehicleAnswers:
             keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), Lane.FILES),
         }
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
+
+    def replace(self, pair: PairAnswers) -> None:
+        """From now on this one answers about the pair."""
+        self._pairs[pair.name], self._pair_routes[pair.name] = pair, self._readable(pair)
 
     def declare(self, bus: Bus) -> None:
         """Serve everything on the bus. The last queryable is there for the keys of pairs that are not: it does not
@@ -126,7 +135,7 @@ class VehicleAnswers:
             return []
         raise UsageError(f"no such pair or resource; pairs served here: {', '.join(self._pairs)}")
 
-    def _readable(self, pair: PairAnswers) -> dict[str, Route]:
+    def _readable(self, pair: Answering) -> dict[str, Route]:
         keys, name = self._keys, pair.name
         routes = (
             Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), Lane.AT_ONCE),
@@ -138,14 +147,14 @@ class VehicleAnswers:
         )
         return {route.key: route for route in routes}
 
-    def _window(self, pair: PairAnswers, window_id: str) -> Callable[[Request], Answer]:
+    def _window(self, pair: Answering, window_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
             chosen = parse_range_selector(request.parameters)
             return Answer(pair.read_window(window_id, chosen.offset, chosen.length), OCTETS)
 
         return answer
 
-    def _evidence(self, pair: PairAnswers, event_id: str) -> Callable[[Request], Answer]:
+    def _evidence(self, pair: Answering, event_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
             chosen = parse_evidence_selector(request.parameters)
             if chosen.overlay is not None:
@@ -155,19 +164,19 @@ class VehicleAnswers:
         return answer
 
 
-def _extrinsic(pair: PairAnswers, request: Request) -> Answer:
+def _extrinsic(pair: Answering, request: Request) -> Answer:
     chosen = parse_extrinsic_selector(request.parameters, FORMATS)
     if chosen.export is None:
         return pair.extrinsic(chosen.format)
     return pair.exported(chosen.export, Frames(chosen.parent, chosen.child))
 
 
-def _overlay(pair: PairAnswers, request: Request) -> Answer:
+def _overlay(pair: Answering, request: Request) -> Answer:
     chosen = parse_overlay_selector(request.parameters)
     return Answer(pair.overlay(chosen.window_id, nominal=chosen.at == "nominal"), JPEG)
 
 
-def _history(pair: PairAnswers, request: Request) -> Answer:
+def _history(pair: Answering, request: Request) -> Answer:
     chosen = parse_history_selector(request.parameters)
     return answer_of(pair.history(chosen.since_ns, chosen.until_ns, chosen.limit), chosen.format)
 

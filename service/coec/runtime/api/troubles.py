@@ -126,6 +126,58 @@ TROUBLES: Mapping[str, Trouble] = {
         "Another daemon serves the vehicle; this one ends with exit code 75.",
         "End one of the two, or give them different vehicles.",
     ),
+    "no_look_yet": Trouble(
+        "The service has not looked yet for what the configuration leaves out.",
+        "Nothing; it looks four times a second.",
+    ),
+    "no_image": Trouble(
+        "A pair waits for its first image, which tells the camera's frame and the size of its images.",
+        "See to the camera and its topic (`camera.topic`), or set `camera.frame_id` and `camera.intrinsics`.",
+    ),
+    "no_cloud": Trouble(
+        "A pair waits for its first cloud, which tells the frame of the points.",
+        "See to the LiDAR and its topic, or set `lidar.frame_id` and `lidar.cloud_frame_id`.",
+    ),
+    "no_motion": Trouble(
+        "A pair waits for its first ego-motion, which tells the frame of the velocities.",
+        "See to its topic, set `ego.T_lidar_ego`, or take `ego` out.",
+    ),
+    "no_frame_id": Trouble(
+        "The headers of a stream name no frame.",
+        "Set the frame that the text names, or have the driver say it.",
+    ),
+    "no_camera_info": Trouble(
+        "A pair waits for the `CameraInfo` that tells the intrinsics.",
+        "Have the driver publish it, name its topic in `camera.info_topic`, or set `camera.intrinsics`.",
+    ),
+    "camera_info_refused": Trouble(
+        "The `CameraInfo` is no calibration: not one in CDR, uncalibrated, or of a lens that is not known here.",
+        "Calibrate the camera, or set `camera.intrinsics`.",
+    ),
+    "camera_info_size": Trouble(
+        "The `CameraInfo` is for images of another size.",
+        "Have the driver say its binning and region of interest, or set `camera.intrinsics`.",
+    ),
+    "tf_static": Trouble(
+        "`/tf_static` does not connect two frames of a pair.",
+        "Publish the joint that is missing (robot_state_publisher does, of a URDF), or set what the text names.",
+    ),
+    "tf_static_no_tree": Trouble(
+        "`/tf_static` contradicts itself on the way between two frames: a frame with two parents, or a loop.",
+        "Have one publisher per frame; the text names the frames.",
+    ),
+    "being_built": Trouble(
+        "Everything that the configuration leaves out is found, and the pair is being built.",
+        "Nothing; it takes a second.",
+    ),
+    "cannot_be_built": Trouble(
+        "What was found does not make a rig: a mask of another size, for instance.",
+        "See to what the text says; the service tries again when the bus says something else.",
+    ),
+    "nominal_changed": Trouble(
+        "`/tf_static` or `CameraInfo` say otherwise than when the pair was built; its nominal calibration stays.",
+        "Where the new one is right: stop the service, remove `nominal.json` from `state.directory`, start it.",
+    ),
     "held": Trouble(
         "A person holds the extrinsic as it is; nothing ails the service.",
         "`coec query command/hold --payload '{\"release\": true}'` releases it.",

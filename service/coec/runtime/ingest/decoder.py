@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, defaultdict, deque
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.frames.origin import ApparentOrigin, OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.config import LimitsConfig, PairConfig
+from coec.config import AnyStreamConfig, LimitsConfig, OpenEgoConfig, OpenLidarConfig, PairConfig
 from coec.errors import DecodeError
 from coec.runtime.ingest.inbox import Parcel
 from coec.runtime.ingest.senders import Senders
@@ -73,6 +74,43 @@ class StreamCounts:
     stamped_by_sender: bool = False
 
 
+class SampleReader:
+    """Frames of the samples of a pair's streams, as they come."""
+
+    def __init__(self, streams: Mapping[str, AnyStreamConfig], limits: LimitsConfig) -> None:
+        self._streams = streams
+        self._limits = limits
+        lidar, ego = streams[LIDAR], streams.get(EGO)
+        self._point_time = lidar.time if isinstance(lidar, OpenLidarConfig) else None
+        self._moving = MovingFrame(ego.parent, ego.child) if isinstance(ego, OpenEgoConfig) else None
+
+    def frame(self, stream: str, sample: Sample) -> Frame | None:
+        """The frame in a sample of a stream, `CAMERA`, `LIDAR` or `EGO`; None where it holds transforms of other frames
+        than the vehicle's, or the first ones.
+
+        Raises:
+            DecodeError: there is none, or one of another kind.
+        """
+        configured = self._streams[stream]
+        encoding, _, schema = sample.encoding.partition(";")
+        if encoding not in ("application/msgpack", CDR):
+            encoding = f"application/{configured.encoding}"
+        if encoding == CDR:
+            type_name = schema or configured.assumed_type
+            if type_name not in configured.types:
+                expected = " or ".join(configured.types)
+                told = incoming.REFUSED.get(type_name, "a message of another type")
+                raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
+            if type_name == messages.TF and self._moving is not None:
+                return self._moving.motion(sample.payload)
+            return incoming.decode(type_name, sample.payload, self._limits, point_time=self._point_time)
+        if stream == CAMERA:
+            return msgpack_frames.decode_camera(sample.payload, self._limits)
+        if stream == LIDAR:
+            return msgpack_frames.decode_lidar(sample.payload, self._limits)
+        return msgpack_frames.decode_ego(sample.payload, self._limits)
+
+
 class Decoder:
     """Decodes and checks the samples of one pair's streams.
 
@@ -82,7 +120,7 @@ class Decoder:
 
     def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:
         self._pair = pair
-        self._streams = pair.streams
+        self._samples = SampleReader(pair.streams, limits)
         self._limits = limits
         self._losses = losses
         self._senders: defaultdict[str, Senders] = defaultdict(Senders)
@@ -95,7 +133,6 @@ class Decoder:
         self._looked_in: int | None = None
         self._contradicted = False
         self.timed_by = ""
-        self._moving = MovingFrame(*(("", "") if pair.ego is None else (pair.ego.parent, pair.ego.child)))
 
     def counts(self, stream: str) -> StreamCounts:
         """Counters of a stream since the start."""
@@ -128,9 +165,10 @@ class Decoder:
         try:
             if len(parcel.sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
-            frame = self._decode(stream, parcel.sample)
+            frame = self._samples.frame(stream, parcel.sample)
             if frame is None:
                 return None
+            self._check_times(frame)
             if told is None and frame.sequence is not None:
                 self._number(stream, NOBODY, frame.sequence)
             frame = self._checked(self._stamped(stream, frame, told))
@@ -166,28 +204,6 @@ class Decoder:
         without = frame.stamp_ns == 0 and told is not None and told.source_ns > 0
         self._stamped_by_sender[stream] = without
         return replace(frame, stamp_ns=told.source_ns) if told is not None and without else frame
-
-    def _decode(self, stream: str, sample: Sample) -> Frame | None:
-        configured = self._streams[stream]
-        encoding, _, schema = sample.encoding.partition(";")
-        if encoding not in ("application/msgpack", CDR):
-            encoding = f"application/{configured.encoding}"
-        if encoding == CDR:
-            type_name = schema or configured.assumed_type
-            if type_name not in configured.types:
-                expected = " or ".join(configured.types)
-                told = incoming.REFUSED.get(type_name, "a message of another type")
-                raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
-            if type_name == messages.TF:
-                return self._moving.motion(sample.payload)
-            frame = incoming.decode(type_name, sample.payload, self._limits, point_time=self._pair.lidar.time)
-            self._check_times(frame)
-            return frame
-        if stream == CAMERA:
-            return msgpack_frames.decode_camera(sample.payload, self._limits)
-        if stream == LIDAR:
-            return msgpack_frames.decode_lidar(sample.payload, self._limits)
-        return msgpack_frames.decode_ego(sample.payload, self._limits)
 
     def _checked(self, frame: Frame) -> Frame:
         if isinstance(frame, CameraFrame):

@@ -20,6 +20,9 @@ from coec.runtime.worker.link import Link
 
 PR_SET_PDEATHSIG = 1  # prctl(2)
 
+START = "start"
+"""Kind of the first message, and of any later one that brings another configuration."""
+
 DEPTH_MAPS_KEPT = 64
 """Maps kept per network: two windows of 25 and some; a map at network resolution is about 1 MB."""
 
@@ -47,15 +50,21 @@ def _serve(link: Link, config: Config) -> None:
 
     gc.freeze()
     gc.enable()
-    try:
-        solver = Solver(config, DEPTH_MAPS_KEPT)
-        solver.warm_up()
-    except CoecError as error:
-        link.send({"kind": "unusable", "code": error.reply_code, "text": str(error)})
-        return
-    link.send({"kind": "ready"})
+    solver: Solver | None = None
     while True:
-        link.send(answer(solver, link.receive()))
+        try:
+            if solver is None:
+                solver = Solver(config, DEPTH_MAPS_KEPT)
+            else:
+                solver.use(config)
+            solver.warm_up()
+        except CoecError as error:
+            link.send({"kind": "unusable", "code": error.reply_code, "text": str(error)})
+            return
+        link.send({"kind": "ready"})
+        while (message := link.receive())["kind"] != START:
+            link.send(answer(solver, message))
+        config = Config.model_validate_json(message["settings"])
 
 
 def _tie_to(parent: int) -> None:

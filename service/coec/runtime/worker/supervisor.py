@@ -105,6 +105,7 @@ class Worker:
         arguments: the descriptor of its socket and the id of this process."""
         self._config = config
         self._settings = settings
+        self._told = ""
         self._command = tuple(command)
         self._condition = threading.Condition()
         # Under the condition: the queue is everybody's.
@@ -126,6 +127,11 @@ class Worker:
     def start(self) -> None:
         """Start the supervisor, which starts the process."""
         self.thread.start()
+
+    def use(self, settings: str) -> None:
+        """Go on with another configuration: every job that is asked for from now on is done by it."""
+        with self._condition:
+            self._settings = settings
 
     def request_stop(self) -> None:
         """End the supervisor, which kills the process, whatever it does. All jobs are answered (`stopping`) when this
@@ -238,7 +244,9 @@ class Worker:
         return reached
 
     def _await_ready(self, child: Child) -> None:
-        child.send({"kind": "start", "settings": self._settings})
+        with self._condition:
+            self._told = self._settings
+        child.send({"kind": "start", "settings": self._told})
         message = self._next_message(child, START_TIMEOUT_S)
         match message:
             case None:
@@ -258,6 +266,8 @@ class Worker:
         if child.has_spoken(0.0):
             child.receive()  # its end, perhaps
             raise ChildError(Fault.STRAY_ANSWER, "answered though nothing was asked")
+        if self._told != self._settings:
+            self._await_ready(child)
         ticket = self._take()
         if ticket is None:
             return False

@@ -71,13 +71,22 @@ class Solver:
             ModelError: a network is missing, corrupt or does not match its card.
             ConfigError: a rig cannot be built.
         """
-        self._config = config
         self._depth_maps_kept = depth_maps_kept
         self._images = GreyImages(config.limits)
         self._networks: dict[DepthConfig, CachedDepth] = {}
+        self.use(config)
+
+    def use(self, config: Config) -> None:
+        """Go on with another configuration, whose limits are the same. Networks of pairs that are awaited are opened,
+        too: what they lack is found at the start.
+
+        Raises:
+            ModelError, ConfigError: as at the start.
+        """
+        self._config = config
         self._pairs = {pair.name: pair for pair in config.pairs}
         self._rigs = {pair.name: rig_of(pair) for pair in config.pairs}
-        for pair in config.pairs:
+        for pair in config.every_pair:
             self._network(pair.calibration.depth)
 
     def warm_up(self) -> None:

@@ -6,18 +6,16 @@ The header stamp is the sensor's time; the recorder's is not looked at.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
+from typing import TypeVar
 
 from coec.adapters.ros import messages
+from coec.adapters.ros.camera_info import Info, decode_info
+from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
 from coec.calibration.types import Matrix4
-from coec.errors import SourceError
-from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
+from coec.errors import DecodeError, SourceError
 from coec.sources.bag.storage import Entry, Storage
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
@@ -25,13 +23,10 @@ CLOUD_TYPES = (messages.POINT_CLOUD,)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
 
-_STORE = get_typestore(Stores.ROS2_HUMBLE)
+T = TypeVar("T")
 
 _HEADER = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
 """`std_msgs/Header.stamp` (sec, nanosec), with which every type above begins, by the byte order of the message."""
-
-MAX_JOINT_M = 1e9
-"""Of a static transform, per axis, metres: frames of maps may lie at the centre of the earth, 6.4e6 m away."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -62,14 +57,14 @@ class Index:
     Attributes:
         streams: frames by topic.
         infos: the first camera info of each topic.
-        parents: static transforms: T_neighbour_frame (4, 4) by frame and neighbour.
+        transforms: all static transforms.
         transforms_at: places of the messages of all other transforms, by topic, as they lie in the bag.
     """
 
     path: Path
     streams: dict[str, Stream] = field(default_factory=dict)
-    infos: dict[str, Any] = field(default_factory=dict)
-    parents: dict[str, dict[str, Matrix4]] = field(default_factory=dict)
+    infos: dict[str, Info] = field(default_factory=dict)
+    transforms: StaticTransforms = field(default_factory=StaticTransforms)
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
 
     def topic(self, types: tuple[str, ...], asked: str | None, key: str) -> str:
@@ -95,16 +90,15 @@ class Index:
         return there[0] if there else None
 
     def transform(self, target: str, source: str) -> Matrix4 | None:
-        """T_target_source (4, 4) along the static transforms, or None where they do not connect the two."""
-        reached = {source: np.eye(4)}
-        frontier = [source]
-        while frontier and target not in reached:
-            frame = frontier.pop(0)
-            for neighbour, T_neighbour_frame in self.parents.get(frame, {}).items():
-                if neighbour not in reached:
-                    reached[neighbour] = T_neighbour_frame @ reached[frame]
-                    frontier.append(neighbour)
-        return reached.get(target)
+        """T_target_source (4, 4) along the static transforms, or None where they do not connect the two.
+
+        Raises:
+            SourceError: they connect them in ways that contradict each other.
+        """
+        doubts = self.transforms.doubts(target, source)
+        if doubts:
+            raise SourceError(f"{self.path}: /tf_static is no tree: {'; '.join(doubts)}")
+        return self.transforms.transform(target, source)
 
     def take(self, entry: Entry) -> None:
         """Notes a message.
@@ -120,32 +114,17 @@ class Index:
                 raise SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
             stream.places.append(Place(stamp_ns, entry.place, name))
         elif name == messages.CAMERA_INFO and entry.topic not in self.infos:
-            self.infos[entry.topic] = self._decoded(entry)
+            self.infos[entry.topic] = self._decoded(entry, decode_info)
         elif name == messages.TF and entry.topic == "/tf_static":
-            for joint in self._decoded(entry).transforms:
-                self._join(entry.topic, joint)
+            self._decoded(entry, lambda data: self.transforms.take(decode_joints(data)))
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
 
-    def _join(self, topic: str, joint: Any) -> None:
-        rotation, translation = joint.transform.rotation, joint.transform.translation
-        quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-        offset_m = np.array([translation.x, translation.y, translation.z])
-        if not (np.abs(offset_m) <= MAX_JOINT_M).all():
-            raise SourceError(f"{self.path}: a transform on {topic} is not one: no finite place, or far away")
+    def _decoded(self, entry: Entry, decode: Callable[[bytes], T]) -> T:
         try:
-            T_parent_child = transform_from(rotation_from_quaternion_xyzw(quaternion), offset_m)
-        except ValueError as error:
-            raise SourceError(f"{self.path}: a transform on {topic} is not one: {error}") from error
-        parent, child = joint.header.frame_id.lstrip("/"), joint.child_frame_id.lstrip("/")
-        self.parents.setdefault(child, {})[parent] = T_parent_child
-        self.parents.setdefault(parent, {})[child] = inverse(T_parent_child)
-
-    def _decoded(self, entry: Entry) -> Any:
-        try:
-            return _STORE.deserialize_cdr(entry.data, entry.type_name)
-        except (SerdeError, ValueError, IndexError, struct.error) as error:
-            raise SourceError(f"{self.path}: a message on {entry.topic} is not a {entry.type_name}") from error
+            return decode(entry.data)
+        except DecodeError as error:
+            raise SourceError(f"{self.path}: a {entry.type_name} on {entry.topic} is refused: {error}") from error
 
 
 def index_of(storage: Storage) -> Index:

@@ -70,10 +70,10 @@ def open_bag(spec: SourceSpec) -> Recording:
     if not isinstance(camera, CameraFrame) or not isinstance(motion, EgoMotion | None):
         raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion where it was said to be")
     lidar_frame = query.get("lidar_frame", cloud.frame_id)
-    T_cloud_lidar = index.transform(cloud.frame_id.lstrip("/"), lidar_frame.lstrip("/"))
+    T_cloud_lidar = index.transform(cloud.frame_id, lidar_frame)
     if T_cloud_lidar is None:
         raise SourceError(f"{spec.path}: /tf_static does not connect {cloud.frame_id!r} and {lidar_frame!r}")
-    rig = rig_of_bag(index, query.get("intrinsics"), camera, lidar_frame, motion)
+    rig = rig_of_bag(index, query.get("intrinsics"), camera_topic, camera, lidar_frame, motion)
     name = f"{spec.path.name}{camera_topic}"
     return BagRecording(name, rig, rig.T_camera_lidar_nominal, storage, streams, T_cloud_lidar, point_time)
 

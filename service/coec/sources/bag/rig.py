@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
-from coec.adapters.ros import outgoing
+from coec.adapters.ros.camera_info import Info, Lens, info_topic, is_rectified, lens_of
+from coec.adapters.ros.static_transforms import bare
 from coec.calibration.types import CameraFrame, EgoMotion, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, SourceError
-from coec.geometry import cameras
 from coec.sources.bag.index import Index
 
 
@@ -29,20 +28,26 @@ class RigFile(BaseModel):
 
 
 def rig_of_bag(
-    index: Index, intrinsics: str | None, image: CameraFrame, lidar_frame_id: str, motion: EgoMotion | None
+    index: Index,
+    intrinsics: str | None,
+    image_topic: str,
+    image: CameraFrame,
+    lidar_frame_id: str,
+    motion: EgoMotion | None,
 ) -> Rig:
-    """The rig of a pair: intrinsics from the `CameraInfo` of the camera's frame (or of the topic `intrinsics`), or from
-    the YAML file `intrinsics`; the extrinsic from that file, else along `/tf_static`.
+    """The rig of a pair: intrinsics from the `CameraInfo` beside the images or of the camera's frame (or of the topic
+    `intrinsics`), or from the YAML file `intrinsics`; the extrinsic from that file, else along `/tf_static`.
 
     Raises:
         SourceError: no intrinsics, or more than one, or of another image; no extrinsic.
     """
-    camera_frame, lidar_frame = image.frame_id.lstrip("/"), lidar_frame_id.lstrip("/")
+    camera_frame, lidar_frame = bare(image.frame_id), bare(lidar_frame_id)
     mask = None
     T_camera_lidar = index.transform(camera_frame, lidar_frame)
     try:
         if intrinsics is None or intrinsics in index.infos:
-            camera = _camera_of_info(_info(index, intrinsics, camera_frame))
+            info = _info(index, intrinsics, camera_frame, image_topic)
+            camera = camera_of(_lens(index, info, image_topic).intrinsics)
         else:
             path = Path(intrinsics).expanduser()
             document = RigFile.model_validate(load_yaml(path))
@@ -65,7 +70,7 @@ def rig_of_bag(
             f"{index.path}: images are {image.image.width} x {image.image.height} px, "
             f"the intrinsics are for {camera.width} x {camera.height} px"
         )
-    T_lidar_ego = index.transform(lidar_frame, motion.frame_id.lstrip("/")) if motion else None
+    T_lidar_ego = index.transform(lidar_frame, motion.frame_id) if motion else None
     return Rig(
         pair=re.sub(r"[^A-Za-z0-9_.-]", "_", index.path.stem)[:64],
         camera=camera,
@@ -77,11 +82,21 @@ def rig_of_bag(
     )
 
 
-def _info(index: Index, asked: str | None, camera_frame: str) -> Any:
-    """The camera info that was asked for, the one of the camera's frame, or the only one."""
+def _lens(index: Index, info: Info, image_topic: str) -> Lens:
+    try:
+        return lens_of(info, rectified=is_rectified(image_topic))
+    except SourceError as error:
+        raise SourceError(f"the camera info of {index.path}: {error}; give ?intrinsics=FILE") from error
+
+
+def _info(index: Index, asked: str | None, camera_frame: str, image_topic: str) -> Info:
+    """The camera info that was asked for, the one beside the images, the one of the camera's frame, or the only one."""
     if asked is not None:
         return index.infos[asked]
-    matching = [info for info in index.infos.values() if info.header.frame_id.lstrip("/") == camera_frame]
+    beside = index.infos.get(info_topic(image_topic))
+    if beside is not None:
+        return beside
+    matching = [info for info in index.infos.values() if bare(info.frame_id) == camera_frame]
     candidates = matching or list(index.infos.values())
     if len(candidates) != 1:
         topics = ", ".join(index.infos) or "none"
@@ -90,28 +105,3 @@ def _info(index: Index, asked: str | None, camera_frame: str) -> Any:
             f"name one with ?intrinsics=/TOPIC, or give ?intrinsics=FILE; there: {topics}"
         )
     return candidates[0]
-
-
-def _camera_of_info(info: Any) -> cameras.Camera:
-    """The camera of a `CameraInfo`, by the names in `outgoing.DISTORTION` and ROS 1's `fisheye`.
-
-    Raises:
-        ValueError: another model, or too few parameters.
-    """
-    size = {"width": int(info.width), "height": int(info.height)}
-    matrix = [float(v) for v in info.k]
-    focal = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
-    d = [float(v) for v in info.d]
-    model = {"fisheye": "equidistant"}.get(info.distortion_model, info.distortion_model)
-    if model in ("", "plumb_bob", "rational_polynomial") and not any(d):
-        return cameras.build("pinhole", **size, **focal)
-    if model == "rational_polynomial" and not any(d[5:]):
-        model = "plumb_bob"
-    for name, (distortion, parameters) in outgoing.DISTORTION.items():
-        if distortion == model and parameters:
-            values = [*d, 0.0][: len(parameters)] if model == "plumb_bob" else d[: len(parameters)]
-            if len(values) < len(parameters):
-                raise ValueError(f"{model} has the parameters {' '.join(parameters)}, the camera info only {len(d)}")
-            return cameras.build(name, **size, **focal, **dict(zip(parameters, values, strict=True)))
-    known = ", ".join(sorted({distortion for distortion, _ in outgoing.DISTORTION.values()}))
-    raise ValueError(f"distortion model {model!r} is not known ({known} are); give ?intrinsics=FILE")

@@ -1,0 +1,217 @@
+"""`sensor_msgs/CameraInfo` to intrinsics: which lens an image topic was taken with.
+
+Which of a message's matrices hold depends on the topic: `K` and `d` belong to the image as the sensor gave it, `P` to
+the rectified one (the message's definition). Where a lens is not one of the models here, or what the message says is
+no calibration, it is refused by name: nobody calibrates against a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from pydantic import ValidationError
+from rosbags.typesys.stores import ros2_humble as ros
+
+from coec.adapters.files.rig import intrinsics_config
+from coec.adapters.frames.incoming import MAX_FRAME_ID
+from coec.adapters.ros.messages import deserialized
+from coec.adapters.ros.outgoing import DISTORTION
+from coec.config import CameraIntrinsics, describe
+from coec.errors import DecodeError, SourceError
+from coec.geometry import cameras
+from coec.geometry.se3 import is_rigid, rotation_angle_rad, transform_from
+
+MAX_INFO_BYTES: Final = 16 * 1024
+"""Of a message: a frame id, the name of a model, 14 coefficients and 33 numbers have below 1 kB."""
+
+MAX_COEFFICIENTS: Final = 14
+"""Of `d`: OpenCV's fullest model."""
+
+TURNED_DEG: Final = 0.01
+"""A rectification that turns the camera less than this is none: a tenth of what a calibration is known to."""
+
+TRANSPORTS: Final = ("compressed", "compressedDepth", "theora", "ffmpeg", "zstd")
+"""What image_transport appends to the topic of an image."""
+
+MAX_SKEW_PX: Final = 0.01
+"""Of `K`: less moves no pixel."""
+
+_POLYNOMIAL: Final = ("", "plumb_bob", "rational_polynomial")
+"""OpenCV's polynomials, told apart by their coefficients rather than by what they are called."""
+
+_ALIASES: Final = {"fisheye": "equidistant", "ds": "double_sphere", "cata": "mei", "none": ""}
+"""Other names that are written: ROS 1's, Kalibr's, and those of catadioptric calibrations."""
+
+
+@dataclass(frozen=True, slots=True)
+class Info:
+    """What a `CameraInfo` says: `frame_id` of its header, `size` (width, height) of the full image, px; `d` (N,); `k`
+    (9,), `r` (9,) and `p` (12,) by rows; `binning` (x, y), at least 1; `roi` (x, y, width, height), px."""
+
+    frame_id: str
+    size: tuple[int, int]
+    model: str
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    r: tuple[float, ...]
+    p: tuple[float, ...]
+    binning: tuple[int, int]
+    roi: tuple[int, int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Intrinsics, and in a few words which of the message's numbers they are."""
+
+    intrinsics: CameraIntrinsics
+    told: str
+
+
+def decode_info(payload: bytes) -> Info:
+    """What a message in CDR says.
+
+    Raises:
+        DecodeError: not a `CameraInfo`, or larger than one can be.
+    """
+    if len(payload) > MAX_INFO_BYTES:
+        raise DecodeError("message_too_large", f"a CameraInfo has at most {MAX_INFO_BYTES} bytes")
+    return info_of(deserialized(ros.sensor_msgs__msg__CameraInfo, payload))
+
+
+def info_of(message: Any) -> Info:
+    """What a deserialised `CameraInfo` says.
+
+    Raises:
+        DecodeError: a name or a list in it is longer than any that a driver writes.
+    """
+    if len(message.header.frame_id) > MAX_FRAME_ID or len(message.distortion_model) > MAX_FRAME_ID:
+        raise DecodeError("frame_id_invalid", f"a name in a CameraInfo is longer than {MAX_FRAME_ID} characters")
+    if len(message.d) > MAX_COEFFICIENTS:
+        raise DecodeError("camera_info", f"a CameraInfo has at most {MAX_COEFFICIENTS} distortion coefficients")
+    roi = message.roi
+    d, k, r, p = (tuple(float(value) for value in numbers) for numbers in (message.d, message.k, message.r, message.p))
+    return Info(
+        message.header.frame_id,
+        (int(message.width), int(message.height)),
+        message.distortion_model,
+        d,
+        k,
+        r,
+        p,
+        (max(int(message.binning_x), 1), max(int(message.binning_y), 1)),
+        (int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)),
+    )
+
+
+def info_topic(image_topic: str) -> str:
+    """Where the `CameraInfo` of an image topic lies by image_transport's rule: beside the image, whatever transport
+    carries it."""
+    namespace, _, last = image_topic.rstrip("/").rpartition("/")
+    if last in TRANSPORTS and namespace.strip("/"):
+        namespace = namespace.rpartition("/")[0]
+    return f"{namespace}/camera_info"
+
+
+def is_rectified(image_topic: str) -> bool:
+    """Whether a topic holds rectified images, by the names that image_proc gives them (`image_rect`,
+    `image_rect_color`)."""
+    words = [word for chunk in image_topic.split("/") for word in chunk.split("_")]
+    return any(word in ("rect", "rectified") for word in words)
+
+
+def lens_of(info: Info, *, rectified: bool) -> Lens:
+    """The lens of an image in its raw or in its rectified form, of its size as it comes: `K` and `P` are those of the
+    full image, of which `roi` is cut out, which then is binned. Pixel centres lie at integers, so that binning by b
+    takes u to (u + 0.5)/b - 0.5.
+
+    A message with a rectifying rotation `R` leaves open whether its frame is that of the raw or of the rectified
+    image: it is taken for that of the image in question, and the angle is said.
+
+    Raises:
+        SourceError: uncalibrated, of a model that is not known, numbers that no lens has, or a stereo camera's second
+            image, which is told in the frame of the first.
+    """
+    if not all(np.isfinite(values).all() for values in (info.d, info.k, info.r, info.p)):
+        raise SourceError("a number in it is not finite")
+    if info.k[0] == 0.0:
+        raise SourceError("the camera is uncalibrated: K is zero")
+    model, matrix, distortion, told = _rectified(info) if rectified else _raw(info)
+    (width, height), (x, y, cut_width, cut_height) = info.size, info.roi
+    if cut_width or cut_height:
+        if x + cut_width > width or y + cut_height > height:
+            raise SourceError("its region of interest reaches beyond the image")
+        width, height, told = cut_width, cut_height, f"{told}, cut to {cut_width} x {cut_height} px at ({x}, {y})"
+    fx, fy, cx, cy = matrix
+    try:
+        size = {"width": width, "height": height}
+        camera = cameras.build(model, **size, fx=fx, fy=fy, cx=cx - x, cy=cy - y, **distortion)
+        if info.binning != (1, 1):
+            camera = cameras.scaled(camera, 1.0 / info.binning[0], 1.0 / info.binning[1])
+            told += f", binned {info.binning[0]} x {info.binning[1]}"
+        return Lens(intrinsics_config(camera), told)
+    except ValidationError as error:
+        raise SourceError(describe(error)) from error
+    except ValueError as error:
+        raise SourceError(str(error)) from error
+
+
+_Parts = tuple[str, tuple[float, float, float, float], dict[str, float], str]
+"""Model; fx, fy, cx, cy; distortion; what is told of it."""
+
+
+def _rectified(info: Info) -> _Parts:
+    fx, _, cx, tx, _, fy, cy, ty = info.p[:8]
+    if fx == 0.0:
+        raise SourceError("the camera is uncalibrated for rectified images: P is zero")
+    if tx != 0.0 or ty != 0.0:
+        raise SourceError(
+            f"P is of a stereo camera's second image, {abs(tx / fx):.3f} m beside the first, in whose frame it is; "
+            "give camera.intrinsics and T_camera_lidar"
+        )
+    return "pinhole", (fx, fy, cx, cy), {}, "P, of the rectified image"
+
+
+def _raw(info: Info) -> _Parts:
+    if abs(info.k[1]) > MAX_SKEW_PX:
+        raise SourceError(f"K has a skew of {info.k[1]:g} px, which no camera model here has")
+    name = _ALIASES.get(info.model, info.model)
+    model, distortion = _polynomial(info.d) if name in _POLYNOMIAL else _named(name, info)
+    told = f"K and d, {info.model or 'without a name'}"
+    turned_deg = _turned_deg(info.r)
+    if turned_deg > TURNED_DEG:
+        told += f" (R turns by {turned_deg:.2f} deg, which is not applied)"
+    return model, (info.k[0], info.k[4], info.k[2], info.k[5]), distortion, told
+
+
+def _polynomial(d: Sequence[float]) -> tuple[str, dict[str, float]]:
+    """The least of OpenCV's models that the coefficients need."""
+    if 0 < len(d) < 4:
+        raise SourceError(f"plumb_bob has four or five coefficients, rational_polynomial eight, this camera {len(d)}")
+    names = DISTORTION["rational"][1]
+    if any(d[len(names) :]):
+        raise SourceError("thin prisms and tilted sensors (d beyond its eighth) are no camera model here")
+    values = dict(zip(names, (*d, *(0.0,) * len(names)), strict=False))
+    for model in ("pinhole", "radtan", "rational"):
+        parameters = DISTORTION[model][1]
+        if not any(value for name, value in values.items() if name not in parameters):
+            return model, {name: values[name] for name in parameters}
+    raise AssertionError("the last has every coefficient")
+
+
+def _named(name: str, info: Info) -> tuple[str, dict[str, float]]:
+    for model, (distortion, parameters) in DISTORTION.items():
+        if distortion == name:
+            if len(info.d) < len(parameters) or any(info.d[len(parameters) :]):
+                raise SourceError(f"{info.model} has the parameters {' '.join(parameters)}; here are {len(info.d)}")
+            return model, dict(zip(parameters, info.d, strict=False))
+    known = ", ".join(sorted({distortion for distortion, _ in DISTORTION.values()} | set(_ALIASES) - {"none"}))
+    raise SourceError(f"a distortion model of this name is not known ({known} are)")
+
+
+def _turned_deg(r: Sequence[float]) -> float:
+    """The angle of a rectifying rotation; 0 where none is given, or what is given is no rotation."""
+    turn = transform_from(np.reshape(r, (3, 3)), np.zeros(3))
+    return float(np.degrees(rotation_angle_rad(turn))) if is_rigid(turn) else 0.0

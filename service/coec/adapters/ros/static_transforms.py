@@ -1,0 +1,191 @@
+"""The tree of static transforms (`/tf_static`): how the frames of a vehicle lie to one another.
+
+tf knows one parent per frame, and the last that was said of a joint holds. What senders say is bounded before it is
+kept: names, places, joints. Trees that contradict tf's rule, and joints that change, are told, for whoever reads a
+calibration off them to judge.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from rosbags.typesys.stores import ros2_humble as ros
+
+from coec.adapters.frames.incoming import MAX_FRAME_ID
+from coec.adapters.ros.messages import deserialized
+from coec.calibration.types import Matrix4
+from coec.errors import DecodeError
+from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
+
+MAX_JOINT_M: Final = 1e9
+"""Of a static transform, per axis, metres: frames of maps may lie at the centre of the earth, 6.4e6 m away."""
+
+MAX_JOINTS: Final = 2048
+"""Kept in all; vehicles have some hundred."""
+
+MAX_MESSAGE_BYTES: Final = 2**20
+"""Of a message: as many joints with names of usual length have 300 kB."""
+
+_COUNT: Final = {1: struct.Struct("<I"), 0: struct.Struct(">I")}
+"""The number of transforms, with which a `TFMessage` begins, by the byte order of the message."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """One static transform: `T_parent_child` (4, 4) is the pose of the child in its parent."""
+
+    parent: str
+    child: str
+    T_parent_child: Matrix4
+
+
+class StaticTransforms:
+    """All that was said of static transforms. Not safe for use from several threads.
+
+    Attributes:
+        replaced: how often a joint that was known came with another value.
+    """
+
+    def __init__(self) -> None:
+        self.replaced = 0
+        self._joints: dict[str, dict[str, Joint]] = {}
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """All frames that are named, in the order of their names."""
+        return tuple(sorted({*self._joints, *(parent for parents in self._joints.values() for parent in parents)}))
+
+    def take(self, joints: tuple[Joint, ...]) -> None:
+        """Add these joints; what was said of the same frames before no longer holds.
+
+        Raises:
+            DecodeError: with them there are more than `MAX_JOINTS`; none is taken.
+        """
+        known = {(joint.child, joint.parent) for parents in self._joints.values() for joint in parents.values()}
+        fresh = {(joint.child, joint.parent) for joint in joints} - known
+        if len(known) + len(fresh) > MAX_JOINTS:
+            raise DecodeError("transforms_too_many", f"more than {MAX_JOINTS} static transforms")
+        for joint in joints:
+            parents = self._joints.setdefault(joint.child, {})
+            before = parents.get(joint.parent)
+            if before is not None and not np.array_equal(before.T_parent_child, joint.T_parent_child):
+                self.replaced += 1
+            parents[joint.parent] = joint
+
+    def transform(self, target: str, source: str) -> Matrix4 | None:
+        """T_target_source (4, 4) along the fewest joints, or None where they do not connect the two."""
+        way = self._way(bare(target), bare(source))
+        return None if way is None else way[-1][1]
+
+    def doubts(self, target: str, source: str) -> tuple[str, ...]:
+        """What on the way between two frames no tree can be, one sentence each: a frame with several parents, of which
+        tf takes whichever it heard last, or a loop."""
+        on_the_way = {frame for frame, _ in self._way(bare(target), bare(source)) or ()}
+        several = [
+            f"frame {child!r} has the parents {' and '.join(repr(parent) for parent in sorted(parents))}"
+            for child, parents in sorted(self._joints.items())
+            if len(parents) > 1 and child in on_the_way
+        ]
+        loops = [
+            f"the frames {', '.join(repr(frame) for frame in loop)} form a loop"
+            for loop in self._loops()
+            if on_the_way.intersection(loop)
+        ]
+        return (*several, *loops)
+
+    def _way(self, target: str, source: str) -> list[tuple[str, Matrix4]] | None:
+        """The frames from source to target, each with T_frame_source (4, 4)."""
+        came_from: dict[str, str] = {source: source}
+        reached = {source: np.eye(4)}
+        frontier = deque([source])
+        neighbours = self._neighbours()
+        while frontier and target not in reached:
+            frame = frontier.popleft()
+            for neighbour, T_neighbour_frame in neighbours.get(frame, {}).items():
+                if neighbour not in reached:
+                    came_from[neighbour] = frame
+                    reached[neighbour] = T_neighbour_frame @ reached[frame]
+                    frontier.append(neighbour)
+        if target not in reached:
+            return None
+        way = [target]
+        while way[-1] != source:
+            way.append(came_from[way[-1]])
+        return [(frame, reached[frame]) for frame in reversed(way)]
+
+    def _neighbours(self) -> dict[str, dict[str, Matrix4]]:
+        """T_neighbour_frame by frame and neighbour."""
+        neighbours: dict[str, dict[str, Matrix4]] = {}
+        for parents in self._joints.values():
+            for joint in parents.values():
+                neighbours.setdefault(joint.child, {})[joint.parent] = joint.T_parent_child
+                neighbours.setdefault(joint.parent, {})[joint.child] = inverse(joint.T_parent_child)
+        return neighbours
+
+    def _loops(self) -> Iterator[list[str]]:
+        """Ways up from child to parent that come back to where they were, each once. Of several parents the first is
+        gone up to: that there are several is told anyway."""
+        done: set[str] = set()
+        for start in sorted(self._joints):
+            way: dict[str, None] = {}
+            frame: str | None = start
+            while frame is not None and frame not in done and frame not in way:
+                way[frame] = None
+                frame = next(iter(self._joints.get(frame, {})), None)
+            if frame in way:
+                frames = list(way)
+                yield frames[frames.index(frame) :]
+            done.update(way)
+
+
+def bare(frame_id: str) -> str:
+    """A frame id without the slash that ROS 1 put before it."""
+    return frame_id.lstrip("/")
+
+
+def decode_joints(payload: bytes) -> tuple[Joint, ...]:
+    """The joints of a `TFMessage` in CDR.
+
+    Raises:
+        DecodeError: not such a message, or one of its transforms is none.
+    """
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise DecodeError("message_too_large", f"a message of static transforms has at most {MAX_MESSAGE_BYTES} bytes")
+    layout = _COUNT.get(payload[1]) if len(payload) >= 8 else None
+    if layout is None:
+        raise DecodeError("message_malformed", "not a TFMessage in CDR, or cut off")
+    (count,) = layout.unpack_from(payload, 4)
+    if count > MAX_JOINTS:
+        raise DecodeError("transforms_too_many", f"more than {MAX_JOINTS} static transforms in a message")
+    return joints_of(deserialized(ros.tf2_msgs__msg__TFMessage, payload))
+
+
+def joints_of(message: Any) -> tuple[Joint, ...]:
+    """The joints of a deserialised `TFMessage`.
+
+    Raises:
+        DecodeError: one of its transforms is none.
+    """
+    return tuple(_joint(transform) for transform in message.transforms)
+
+
+def _joint(stamped: Any) -> Joint:
+    parent, child = bare(stamped.header.frame_id), bare(stamped.child_frame_id)
+    if not 0 < len(parent) <= MAX_FRAME_ID or not 0 < len(child) <= MAX_FRAME_ID:
+        raise DecodeError("frame_id_invalid", f"a frame id of a transform is empty or longer than {MAX_FRAME_ID}")
+    if parent == child:
+        raise DecodeError("transform_invalid", "a transform leads from a frame to itself")
+    rotation, translation = stamped.transform.rotation, stamped.transform.translation
+    offset_m = np.array([translation.x, translation.y, translation.z])
+    if not (np.abs(offset_m) <= MAX_JOINT_M).all():
+        raise DecodeError("transform_invalid", "a transform is not one: no finite place, or far away")
+    try:
+        turn = rotation_from_quaternion_xyzw(np.array([rotation.x, rotation.y, rotation.z, rotation.w]))
+    except ValueError as error:
+        raise DecodeError("transform_invalid", f"a transform is not one: {error}") from error
+    return Joint(parent, child, transform_from(turn, offset_m))

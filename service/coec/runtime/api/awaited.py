@@ -1,0 +1,199 @@
+"""What is answered about a pair that is awaited: that it is, and what is missing. Any thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, Never
+
+from coec.adapters.exports.told import Frames
+from coec.adapters.ros.messages import CAMERA_INFO
+from coec.adapters.zenoh.bus import Answer
+from coec.calibration.lifecycle import HealthState, Status
+from coec.calibration.types import Reason
+from coec.config import OpenPairConfig
+from coec.errors import CoecError
+from coec.runtime.api.extrinsic import axes_of
+from coec.runtime.api.health import reasons_of
+from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.decisions.incidents import Side
+from coec.runtime.nominal.findings import info_topic_of
+from coec.runtime.nominal.watch import Nominal
+from coec.runtime.outside import Outside
+from coec.schemas import replies
+from coec.schemas.commands import NAMES
+from coec.schemas.keys import Format
+
+
+class AwaitedError(CoecError):
+    """The pair has no nominal calibration yet, so that there is nothing to serve."""
+
+    reply_code = "awaiting"
+
+
+class AwaitedAnswers:
+    """Of one pair. `renew` is for the main thread, once a second."""
+
+    def __init__(self, pair: OpenPairConfig, vehicle: str, outside: Outside) -> None:
+        self.name = pair.name
+        self._vehicle = vehicle
+        self._outside = outside
+        self._pair = pair
+        self._since_ns = time.time_ns()
+        self._published: object = None
+        self._fault: tuple[Reason, ...] = ()
+        self.commands = AwaitedCommands(pair.name, vehicle, lambda: _sentence(self._nominal))
+        self.renew()
+
+    @property
+    def _nominal(self) -> Nominal:
+        return self._outside.nominal(self.name)
+
+    def renew(self) -> None:
+        """Serialise what is served anew, and publish what changed."""
+        awaits = self._nominal.awaits
+        reasons = (*awaits, *self._outside.vehicle_troubles(), *self._fault)
+        self.health_reply = replies.HealthReply(
+            vehicle=self._vehicle,
+            pair=self.name,
+            state=HealthState.UNKNOWN.value,
+            level=replies.ROS_LEVELS[HealthState.UNKNOWN.value],
+            reasons=reasons_of(reasons),
+            metrics={},
+            axes=axes_of(None, Status.NOT_ACCEPTED),
+            needs=(*(reason.text for reason in awaits), *self._absent()),
+            data_quality=replies.DataQuality(),
+            since_ns=self._since_ns,
+            evaluated_ns=None,
+            age_s=None,
+        )
+        self._snapshot = Snapshot.of(self.health_reply)
+        if self._published != reasons:
+            self._published = reasons
+            self._outside.publish(self._outside.keys.health(self.name), self._snapshot.answer("msgpack"))
+
+    def _absent(self) -> list[str]:
+        """Sentences on the topics that nobody publishes, with those that are there."""
+        topics, pair = self._outside.topics(), self._pair
+        wanted = [(stream.topic, stream.types) for stream in pair.streams.values()]
+        wanted.append((info_topic_of(pair), (CAMERA_INFO,)))
+        told = (None if topic is None else topics.absent(topic, types) for topic, types in wanted)
+        return [sentence for sentence in told if sentence is not None]
+
+    def fail(self, reason: Reason) -> None:
+        """The service is about to end, for this reason: say it."""
+        self._fault = (reason,)
+        self.renew()
+
+    def status(self) -> replies.PairStatus:
+        """What is missing; there is nothing to count."""
+        return replies.PairStatus(
+            name=self.name,
+            ego=replies.StreamStatus() if self._pair.ego is not None else None,
+            commands=self.commands.counts,
+            losses=dict(self._nominal.losses),
+            awaits=reasons_of(self._nominal.awaits),
+            found=dict(self._nominal.origins),
+        )
+
+    def health(self, form: Format) -> Answer:
+        """The health: unknown, and why."""
+        return self._snapshot.answer(form)
+
+    def extrinsic(self, form: Format) -> Answer:
+        """Raises:
+        AwaitedError: always; there is no nominal calibration.
+        """
+        del form
+        self._refuse()
+
+    def exported(self, form: str, frames: Frames) -> Answer:
+        """As `extrinsic`."""
+        del form, frames
+        self._refuse()
+
+    def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
+        """As `extrinsic`: whose history it is depends on the rig."""
+        del since_ns, until_ns, limit
+        self._refuse()
+
+    def windows(self) -> replies.WindowsReply:
+        """As `extrinsic`."""
+        self._refuse()
+
+    def read_window(self, window_id: str, offset: int, length: int) -> bytes:
+        """As `extrinsic`."""
+        del window_id, offset, length
+        self._refuse()
+
+    def events(self) -> replies.EvidenceReply:
+        """As `extrinsic`."""
+        self._refuse()
+
+    def event(self, event_id: str) -> replies.EvidenceEvent:
+        """As `extrinsic`."""
+        del event_id
+        self._refuse()
+
+    def event_overlay(self, event_id: str, side: Side) -> bytes:
+        """As `extrinsic`."""
+        del event_id, side
+        self._refuse()
+
+    def overlay(self, window_id: str | None, *, nominal: bool) -> bytes:
+        """As `extrinsic`."""
+        del window_id, nominal
+        self._refuse()
+
+    def _refuse(self) -> Never:
+        raise AwaitedError(_sentence(self._nominal))
+
+
+class AwaitedCommands:
+    """Of one pair: all are understood, and refused with what is missing."""
+
+    def __init__(self, pair: str, vehicle: str, sentence: Callable[[], str]) -> None:
+        self._pair = pair
+        self._vehicle = vehicle
+        self._sentence = sentence
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Commands since the start, by name and outcome."""
+        with self._lock:
+            return dict(self._counts)
+
+    def carry_out(
+        self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = 0.0
+    ) -> replies.Acknowledgement:
+        """Say why not."""
+        del arguments, sender, deadline_s
+        self._count(f"{name}_refused")
+        return replies.Acknowledgement(
+            vehicle=self._vehicle,
+            pair=self._pair,
+            command=name,
+            accepted=False,
+            code=AwaitedError.reply_code,
+            text=self._sentence(),
+        )
+
+    def reserve_for(self, senders: Sequence[str]) -> None:
+        """Nothing is kept of anybody's commands here."""
+
+    def note_refused(self, name: str, sender: str, why: CoecError) -> None:
+        """Count a command that is not its sender's to give."""
+        del sender, why
+        self._count(f"{name if name in NAMES else 'unknown'}_not_allowed")
+
+    def _count(self, what: str) -> None:
+        with self._lock:
+            self._counts[what] += 1
+
+
+def _sentence(nominal: Nominal) -> str:
+    return " ".join(["This pair waits for its nominal calibration.", *(reason.text for reason in nominal.awaits)])

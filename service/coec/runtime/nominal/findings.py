@@ -1,0 +1,293 @@
+"""What is known of a pair whose configuration leaves out its calibration, what is missing, and what it comes to. Pure.
+
+Whatever the configuration gives, it gives: only what it leaves out is found. Nothing is assumed: frames that
+`/tf_static` does not connect, or an image of another size than its `CameraInfo`, are reasons to wait.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from pydantic import ValidationError
+
+from coec.adapters.files.rig import matrix_rows
+from coec.adapters.ros.camera_info import Info, info_topic, is_rectified, lens_of
+from coec.adapters.ros.static_transforms import StaticTransforms, bare
+from coec.calibration.types import Matrix4, Reason
+from coec.config import IDENTITY, AnyStreamConfig, CameraIntrinsics, Matrix4x4, OpenPairConfig, PairConfig, describe
+from coec.errors import SourceError
+from coec.geometry.se3 import difference
+
+T = TypeVar("T")
+
+TF_STATIC = "/tf_static"
+
+CHANGED_RAD, CHANGED_M = 1e-6, 1e-6
+"""Of a transform: more is another one. What is published anew is rounded to float64; a thousandth of what is found."""
+
+CANNOT_BE_BUILT = "cannot_be_built"
+"""Code of a reason: what was found makes no rig."""
+
+SHOWN_FRAMES = 24
+"""Frames that a sentence lists at most."""
+
+_PLAIN = re.compile(r"[A-Za-z0-9_./:-]{1,64}")
+"""Names of frames as people give them; others are not repeated, for they are the sender's."""
+
+INTRINSICS, EXTRINSIC, CAMERA_FRAME, LIDAR_FRAME, CLOUD, EGO = (
+    "camera.intrinsics",
+    "T_camera_lidar",
+    "camera.frame_id",
+    "lidar.frame_id",
+    "lidar.T_cloud_lidar",
+    "ego.T_lidar_ego",
+)
+"""Places of a pair's configuration that are found."""
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """The first image: the frame of its header and its size, px."""
+
+    frame_id: str
+    width: int
+    height: int
+
+
+@dataclass(slots=True)
+class Heard:
+    """Of one pair, so far. `cloud` and `ego` are the frames of the first cloud and of the first motion; `refused` says
+    of each source (`camera`, `lidar`, `ego`, `info`) why what came last could not be used."""
+
+    image: Image | None = None
+    cloud: str | None = None
+    ego: str | None = None
+    info: Info | None = None
+    refused: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A pair of which everything is known, and where what was found comes from, by its place in the configuration."""
+
+    pair: PairConfig
+    origins: Mapping[str, str]
+
+
+def info_topic_of(pair: OpenPairConfig) -> str | None:
+    """The topic of the `CameraInfo` that tells the intrinsics; None where nothing does: they are given, or the images
+    come on a key, which has no namespace."""
+    camera = pair.camera
+    if camera.intrinsics is not None:
+        return None
+    if camera.info_topic is not None:
+        return camera.info_topic
+    return None if camera.topic is None else info_topic(camera.topic)
+
+
+def needs_transforms(pair: OpenPairConfig) -> bool:
+    """Whether anything that is left out is read off `/tf_static`."""
+    ego = pair.ego
+    return (
+        pair.T_camera_lidar is None
+        or (pair.lidar.frame_id is not None and pair.lidar.T_cloud_lidar is None)
+        or (ego is not None and ego.T_lidar_ego is None)
+    )
+
+
+def found_of(pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> Found | tuple[Reason, ...]:
+    """The pair, complete; or what it waits for, one reason each."""
+    search = _Search(pair, heard, transforms)
+    intrinsics = search.ask(search.intrinsics)
+    camera_frame, cloud_frame = search.ask(search.camera_frame), search.ask(search.cloud_frame)
+    lidar_frame = pair.lidar.frame_id or cloud_frame
+    T_cloud_lidar = search.ask(search.T_cloud_lidar, cloud_frame, lidar_frame)
+    T_camera_lidar = search.ask(search.T_camera_lidar, camera_frame, lidar_frame)
+    T_lidar_ego = search.ask(search.T_lidar_ego, lidar_frame)
+    if search.missing:
+        return tuple(search.missing)
+    document = pair.model_dump()
+    document["T_camera_lidar"] = T_camera_lidar
+    document["camera"] |= {"frame_id": camera_frame, "intrinsics": intrinsics}
+    document["lidar"] |= {"frame_id": lidar_frame, "T_cloud_lidar": T_cloud_lidar}
+    if cloud_frame != lidar_frame:
+        document["lidar"]["cloud_frame_id"] = cloud_frame
+    if pair.ego is not None:
+        document["ego"]["T_lidar_ego"] = T_lidar_ego
+    try:
+        return Found(PairConfig.model_validate(document), search.origins)
+    except ValidationError as error:
+        return (Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {describe(error)}."),)
+
+
+class _MissingError(Exception):
+    """An answer that is missing, and why."""
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__(reason.text)
+        self.reason = reason
+
+
+class _Search:
+    """One look at everything. Each question gives what the configuration says, or else what was found; None where it
+    hangs on another whose answer is missing; and raises where its own is."""
+
+    def __init__(self, pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> None:
+        self._pair = pair
+        self._heard = heard
+        self._transforms = transforms
+        self.origins: dict[str, str] = {}
+        self.missing: list[Reason] = []
+
+    def ask(self, question: Callable[..., T | None], *known: str | None) -> T | None:
+        """What a question gives; None, and a reason in `missing`, where its answer is missing."""
+        try:
+            return question(*known)
+        except _MissingError as error:
+            self.missing.append(error.reason)
+            return None
+
+    def intrinsics(self) -> CameraIntrinsics | None:
+        pair, heard = self._pair, self._heard
+        if pair.camera.intrinsics is not None:
+            return pair.camera.intrinsics
+        topic = info_topic_of(pair)
+        if topic is None:
+            raise _MissingError(Reason("no_camera_info", "Images on a key have no CameraInfo: set camera.info_topic."))
+        if "info" in heard.refused:
+            text = f"The CameraInfo on {topic} is refused: {heard.refused['info']}."
+            raise _MissingError(Reason("camera_info_refused", text))
+        if heard.info is None:
+            raise _MissingError(Reason("no_camera_info", f"No CameraInfo on {topic} yet."))
+        try:
+            lens = lens_of(heard.info, rectified=is_rectified(pair.camera.place))
+        except SourceError as error:
+            raise _MissingError(
+                Reason("camera_info_refused", f"The CameraInfo on {topic} cannot be used: {error}.")
+            ) from error
+        size, image = lens.intrinsics, heard.image
+        if image is not None and (image.width, image.height) != (size.width, size.height):
+            sizes = f"{image.width} x {image.height} px, the CameraInfo on {topic} is for {size.width} x {size.height}"
+            raise _MissingError(Reason("camera_info_size", f"Images on {pair.camera.place} are {sizes} px."))
+        self.origins[INTRINSICS] = f"CameraInfo on {topic}: {lens.told}"
+        return lens.intrinsics
+
+    def camera_frame(self) -> str | None:
+        pair, image = self._pair, self._heard.image
+        if image is None and (pair.camera.frame_id is None or pair.camera.intrinsics is None):
+            raise _MissingError(Reason("no_image", self._silent("camera", "image", pair.camera.place)))
+        if pair.camera.frame_id is not None:
+            return pair.camera.frame_id
+        assert image is not None
+        if not image.frame_id:
+            raise _MissingError(Reason("no_frame_id", _frameless("Images", pair.camera, "camera.frame_id")))
+        self.origins[CAMERA_FRAME] = f"the first image on {pair.camera.place}"
+        return image.frame_id
+
+    def cloud_frame(self) -> str | None:
+        lidar, cloud = self._pair.lidar, self._heard.cloud
+        if lidar.cloud_frame_id is not None:
+            return lidar.cloud_frame_id
+        if cloud is None:
+            raise _MissingError(Reason("no_cloud", self._silent("lidar", "cloud", lidar.place)))
+        if not cloud:
+            raise _MissingError(Reason("no_frame_id", _frameless("Clouds", lidar, "lidar.cloud_frame_id")))
+        if lidar.frame_id is None:
+            self.origins[LIDAR_FRAME] = f"the first cloud on {lidar.place}"
+        return cloud
+
+    def T_cloud_lidar(self, cloud: str | None, lidar: str | None) -> Matrix4x4 | None:
+        given = self._pair.lidar.T_cloud_lidar
+        if given is not None or cloud is None or lidar is None:
+            return given
+        return IDENTITY if bare(cloud) == bare(lidar) else self._rows(CLOUD, cloud, lidar)
+
+    def T_camera_lidar(self, camera: str | None, lidar: str | None) -> Matrix4x4 | None:
+        given = self._pair.T_camera_lidar
+        return given if given is not None or camera is None or lidar is None else self._rows(EXTRINSIC, camera, lidar)
+
+    def T_lidar_ego(self, lidar: str | None) -> Matrix4x4 | None:
+        ego, heard = self._pair.ego, self._heard.ego
+        if ego is None or ego.T_lidar_ego is not None or lidar is None:
+            return None if ego is None else ego.T_lidar_ego
+        if heard is None:
+            raise _MissingError(Reason("no_motion", self._silent("ego", "motion", ego.place)))
+        if not heard:
+            raise _MissingError(Reason("no_frame_id", _frameless("Motions", ego, "ego.T_lidar_ego")))
+        return IDENTITY if bare(heard) == bare(lidar) else self._rows(EGO, lidar, heard)
+
+    def _rows(self, place: str, target: str, source: str) -> Matrix4x4 | None:
+        T_target_source = self._transforms.transform(target, source)
+        names = f"{_named(target)} and {_named(source)}"
+        if T_target_source is None:
+            there = _listed(self._transforms.frames)
+            text = f"{TF_STATIC} does not connect {names} (for {place}): {there}."
+            raise _MissingError(Reason("tf_static", text))
+        doubts = self._transforms.doubts(target, source)
+        if doubts:
+            raise _MissingError(
+                Reason("tf_static_no_tree", f"{TF_STATIC} is no tree between {names}: {'; '.join(doubts)}.")
+            )
+        self.origins[place] = f"{TF_STATIC}, between {names}"
+        return matrix_rows(T_target_source)
+
+    def _silent(self, stream: str, what: str, place: str) -> str:
+        refused = self._heard.refused.get(stream)
+        return f"No {what} on {place} yet." if refused is None else f"No {what} on {place} can be used: {refused}."
+
+
+def changed(found: Found, pair: OpenPairConfig, heard: Heard, transforms: StaticTransforms) -> Reason | None:
+    """What the bus says now otherwise than what the pair was built with; None where it says the same, or nothing."""
+    built = found.pair
+    told = []
+    if INTRINSICS in found.origins and heard.info is not None:
+        try:
+            now: object = lens_of(heard.info, rectified=is_rectified(pair.camera.place)).intrinsics
+        except SourceError as error:
+            now = str(error)
+        if now != built.camera.intrinsics:
+            told.append(f"CameraInfo on {info_topic_of(pair)}")
+    ego = None if built.ego is None else built.ego.T_lidar_ego
+    for place, rows, target, source in (
+        (EXTRINSIC, built.T_camera_lidar, built.camera.frame_id, built.lidar.frame_id),
+        (CLOUD, built.lidar.T_cloud_lidar, built.lidar.cloud_frame_id, built.lidar.frame_id),
+        (EGO, ego, built.lidar.frame_id, heard.ego),
+    ):
+        if place in found.origins and rows is not None and target is not None and source is not None:
+            T_now = transforms.transform(target, source)
+            if T_now is not None and _differ(np.array(rows), T_now):
+                told.append(f"{TF_STATIC}, for {place}")
+    if not told:
+        return None
+    text = (
+        f"The bus says otherwise than when this pair was built: {' and '.join(told)}. What it was built with goes on "
+        "to be the nominal calibration: to take the new one, stop the service, remove nominal.json from its state "
+        "directory, and start it."
+    )
+    return Reason("nominal_changed", text)
+
+
+def _differ(T_a: Matrix4, T_b: Matrix4) -> bool:
+    xi = np.abs(difference(T_a, T_b))
+    return bool(xi[:3].max() > CHANGED_RAD or xi[3:].max() > CHANGED_M)
+
+
+def _frameless(what: str, stream: AnyStreamConfig, place: str) -> str:
+    return f"{what} on {stream.place} name no frame: set {place}."
+
+
+def _named(frame: str) -> str:
+    """A frame for people; what nobody would call one stays unsaid."""
+    return repr(frame) if _PLAIN.fullmatch(frame) else "(a frame of no plain name)"
+
+
+def _listed(frames: Iterable[str]) -> str:
+    known = [frame for frame in frames if _PLAIN.fullmatch(frame)]
+    if not known:
+        return "it names no frames yet"
+    more = f" and {len(known) - SHOWN_FRAMES} more" if len(known) > SHOWN_FRAMES else ""
+    return f"there are {', '.join(known[:SHOWN_FRAMES])}{more}"

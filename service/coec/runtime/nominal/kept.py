@@ -1,0 +1,123 @@
+"""Nominal calibrations that were found, in the state directory: a restart has the same, whoever publishes by then."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, ValidationError
+
+from coec.adapters.files.rig import rig_of
+from coec.adapters.files.state_file import StateFile
+from coec.config import Config, OpenPairConfig, PairConfig, config_hash
+from coec.errors import ConfigError
+from coec.runtime.nominal.findings import Found
+from coec.schemas.base import Part
+
+_log = logging.getLogger(__name__)
+
+NOMINAL_FILE = "nominal.json"
+
+
+class KeptPair(Part):
+    """`Found` on the disk. `asked` is the hash of what was left out and where it was looked for; `found_ns` (wall
+    clock) when it was found."""
+
+    asked: str
+    found_ns: Annotated[int, Field(ge=0, lt=2**63)]
+    pair: PairConfig
+    origins: dict[str, str]
+
+
+class KeptNominals:
+    """Those of a vehicle: a book that the scribe writes. Safe to use from several threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self._lock = threading.Lock()
+        self._file = StateFile(folder / NOMINAL_FILE)
+        loaded = self._file.load()
+        for damage in loaded.damage:
+            _log.warning(f"nominal calibrations that were kept cannot be used: {damage}")
+        self._pairs: dict[str, KeptPair] = {}
+        for name, document in (loaded.body or {}).get("pairs", {}).items():
+            try:
+                self._pairs[name] = KeptPair.model_validate(document)
+            except ValidationError:
+                self._file.distrust()
+                _log.warning("a nominal calibration that was kept has another form", extra={"fields": {"pair": name}})
+
+    def found(self, config: Config) -> dict[str, Found]:
+        """What was found earlier of pairs that this configuration awaits, and asks the same for, by their names."""
+        found = {pair.name: self._found(pair, config) for pair in config.awaited}
+        return {name: one for name, one in found.items() if one is not None}
+
+    def _found(self, pair: OpenPairConfig, config: Config) -> Found | None:
+        with self._lock:
+            kept = self._pairs.get(pair.name)
+        if kept is None or kept.asked != _asked(pair, config):
+            return None
+        document, earlier = pair.model_dump(), kept.pair
+        document["T_camera_lidar"] = earlier.T_camera_lidar
+        document["camera"] |= earlier.camera.model_dump(include={"frame_id", "intrinsics"})
+        document["lidar"] |= earlier.lidar.model_dump(include={"frame_id", "T_cloud_lidar", "cloud_frame_id"})
+        if pair.ego is not None and earlier.ego is not None:
+            document["ego"]["T_lidar_ego"] = earlier.ego.T_lidar_ego
+        complete = PairConfig.model_validate(document)
+        try:
+            rig_of(complete)  # what it was read for may have changed on the disk: the mask
+        except ConfigError as error:
+            _log.warning(f"a nominal calibration that was kept cannot be used: {error}")
+            return None
+        since = datetime.fromtimestamp(kept.found_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return Found(complete, {place: f"{origin}; kept since {since}" for place, origin in kept.origins.items()})
+
+    def keep(self, found: Found, asked: OpenPairConfig, config: Config, now_ns: int) -> None:
+        """Put down what was found; on the disk with the next `flush`."""
+        kept = KeptPair(asked=_asked(asked, config), found_ns=now_ns, pair=found.pair, origins=dict(found.origins))
+        with self._lock:
+            self._pairs = {**self._pairs, asked.name: kept}
+
+    def flush(self) -> None:
+        """Put on the disk what was put down.
+
+        Raises:
+            StateError: it cannot be written; the next call tries again.
+        """
+        with self._lock:
+            pairs = self._pairs
+        self._file.save({"pairs": {name: kept.model_dump(mode="json") for name, kept in pairs.items()}})
+
+
+def _asked(pair: OpenPairConfig, config: Config) -> str:
+    """Hash of what is given and where the rest is looked for; other settings may change."""
+    question = pair.model_dump(
+        mode="json",
+        include={
+            "camera": {"key", "topic", "info_topic", "frame_id", "intrinsics"},
+            "lidar": {"key", "topic", "frame_id", "T_cloud_lidar", "cloud_frame_id"},
+            "ego": {"key", "topic", "T_lidar_ego"},
+            "T_camera_lidar": True,
+        },
+    )
+    where = {"middleware": config.middleware, **config.ros.model_dump(include={"domain", "namespace"})}
+    return config_hash(json.dumps([question, where], sort_keys=True))
+
+
+def completed(config: Config, found: Mapping[str, PairConfig]) -> Config:
+    """The configuration with these pairs, by their names, among those of which everything is known."""
+    joined = tuple(found[pair.name] for pair in config.awaited if pair.name in found)
+    still = tuple(pair for pair in config.awaited if pair.name not in found)
+    return config.model_copy(update={"pairs": (*config.pairs, *joined), "awaited": still})
+
+
+def with_kept(config: Config) -> Config:
+    """A configuration with what a service found of its awaited pairs, and keeps in its state directory."""
+    if not config.awaited:
+        return config
+    kept = KeptNominals(config.state.directory).found(config)
+    return completed(config, {name: found.pair for name, found in kept.items()})

@@ -1,0 +1,276 @@
+"""The thread that listens for what the configuration leaves out: first frames, `CameraInfo`, `/tf_static`.
+
+Samples wait in bounded queues that the network's threads fill; everything else belongs to this thread. What it has
+found lies ready for the main thread, which builds the pairs. It goes on listening to `/tf_static` and `CameraInfo`
+afterwards: what they say otherwise by then is told, and changes nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from coec.adapters.ros import messages
+from coec.adapters.ros.camera_info import decode_info
+from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
+from coec.adapters.system.threads import ServiceThread
+from coec.adapters.zenoh.inputs import CDR, Sample
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Reason
+from coec.config import Config, OpenPairConfig
+from coec.errors import DecodeError
+from coec.runtime.ingest.decoder import SampleReader
+from coec.runtime.nominal.findings import Found, Heard, Image, changed, found_of
+
+_log = logging.getLogger(__name__)
+
+TRANSFORMS_WAITING = 512
+"""Messages of static transforms that may wait; a vehicle has some ten publishers, each of which says one."""
+
+TRANSFORMS_A_TURN = 64
+"""Taken at once: with a turn every `IDLE_S` a flood costs at most some 250 messages a second."""
+
+IDLE_S = 0.25
+"""Between two turns."""
+
+INFO = "info"
+"""Place of a loss: a `CameraInfo`, as `camera` and the others are places."""
+
+TRANSFORMS = "tf_static"
+"""Place of a loss: a message of static transforms."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nominal:
+    """What there is to say of a pair's nominal calibration.
+
+    Attributes:
+        awaits: what is missing, one reason each; empty for a pair that is built.
+        origins: where what was found comes from, by its place in the configuration.
+        changed: what the bus says otherwise by now.
+        losses: samples that could not be used, by place and cause; those of `/tf_static` are the vehicle's.
+    """
+
+    awaits: tuple[Reason, ...] = ()
+    origins: Mapping[str, str] = field(default_factory=dict)
+    changed: Reason | None = None
+    losses: Mapping[str, int] = field(default_factory=dict)
+
+
+NOT_HEARD = Nominal(awaits=(Reason("no_look_yet", "Nobody has looked yet for what the configuration leaves out."),))
+
+
+BEING_BUILT = Reason("being_built", "Everything that the configuration leaves out is found; the pair is being built.")
+
+
+@dataclass(slots=True)
+class _Pair:
+    """One pair, on the thread."""
+
+    pair: OpenPairConfig
+    samples: SampleReader
+    heard: Heard = field(default_factory=Heard)
+    found: Found | None = None
+    built: bool = False
+    refused: Reason | None = None
+    news: bool = True
+    lost: Counter[str] = field(default_factory=Counter)
+
+
+class NominalWatch:
+    """Of a vehicle. `take_*` are for the network's threads, `look` for this one, all else for any."""
+
+    def __init__(self, config: Config, earlier: Mapping[str, Found]) -> None:
+        """`config` is as it was read; `earlier` are those of its awaited pairs that are built with what was found
+        before the start."""
+        self.thread = ServiceThread("nominal", self._run)
+        self._config = config
+        asked = {pair.name: pair for pair in config.awaited}
+        self._pairs = {
+            name: _Pair(pair, SampleReader(pair.streams, config.limits), found=earlier.get(name), built=name in earlier)
+            for name, pair in asked.items()
+        }
+        self._transforms = StaticTransforms()
+        self._condition = threading.Condition()
+        # Under the condition.
+        self._waiting: deque[Sample] = deque()
+        self._latest: dict[tuple[str, str], Sample] = {}
+        self._transforms_lost: Counter[str] = Counter()
+        self._ready: dict[str, Found] = {}
+        self._outcomes: dict[str, Found | Reason] = {}
+        self._nominals: Mapping[str, Nominal] = MappingProxyType(
+            {name: _of_built(earlier[name], None) if each.built else NOT_HEARD for name, each in self._pairs.items()}
+        )
+
+    # --- on the network's threads -----------------------------------------------------------------------------------
+
+    def take_transforms(self, sample: Sample) -> None:
+        """A message on `/tf_static` came."""
+        with self._condition:
+            if len(self._waiting) == TRANSFORMS_WAITING:
+                self._waiting.popleft()
+                self._transforms_lost["overrun"] += 1
+            self._waiting.append(sample)
+
+    def take_info(self, pair: str, sample: Sample) -> None:
+        """A `CameraInfo` of a pair came; the newest counts."""
+        with self._condition:
+            self._latest[pair, INFO] = sample
+
+    def take_frame(self, pair: str, stream: str, sample: Sample) -> None:
+        """A frame of a pair that is awaited came; the newest counts."""
+        with self._condition:
+            self._latest[pair, stream] = sample
+
+    # --- on any -----------------------------------------------------------------------------------------------------
+
+    def nominal(self, pair: str) -> Nominal:
+        """Of a pair; that of one whose configuration gives everything is empty."""
+        return self._nominals.get(pair, Nominal())
+
+    def ready(self) -> dict[str, Found]:
+        """Pairs that were found and nobody has taken yet."""
+        with self._condition:
+            ready, self._ready = self._ready, {}
+        return ready
+
+    def end(self, pair: str, outcome: Found | Reason) -> None:
+        """What became of a pair that was ready: it is built of what was found; or why it cannot be, and is awaited
+        until something else is heard."""
+        with self._condition:
+            self._outcomes[pair] = outcome
+
+    # --- on the thread ----------------------------------------------------------------------------------------------
+
+    def _run(self, thread: ServiceThread) -> None:
+        while not thread.stopping:
+            thread.beat()
+            self.look()
+            time.sleep(IDLE_S)
+
+    def look(self) -> None:
+        """Take what has come, and see what it comes to."""
+        with self._condition:
+            count = min(len(self._waiting), TRANSFORMS_A_TURN)
+            transforms = [self._waiting.popleft() for _ in range(count)]
+            latest, self._latest = self._latest, {}
+            outcomes, self._outcomes = self._outcomes, {}
+        for sample in transforms:
+            self._take_transforms(sample)
+        for (name, stream), sample in latest.items():
+            self._take_latest(self._pairs[name], stream, sample)
+        for name, outcome in outcomes.items():
+            self._take_outcome(self._pairs[name], outcome)
+        fresh = {name: self._nominal(each) for name, each in self._pairs.items() if each.news or transforms}
+        if fresh:
+            self._nominals = MappingProxyType({**self._nominals, **fresh})
+
+    def _take_outcome(self, each: _Pair, outcome: Found | Reason) -> None:
+        each.news = True
+        if isinstance(outcome, Found):
+            each.built, each.found = True, outcome
+            for place, origin in outcome.origins.items():
+                fields = {"pair": each.pair.name, "place": place, "from": origin}
+                _log.info("found what the configuration leaves out", extra={"fields": fields})
+        else:
+            each.refused = outcome
+
+    def _take_transforms(self, sample: Sample) -> None:
+        cause = _attempt(lambda: self._transforms.take(decode_joints(_payload(sample, messages.TF))))
+        if cause is not None:
+            with self._condition:
+                self._transforms_lost[cause] += 1
+                count = self._transforms_lost[cause]
+            _tell_lost(TRANSFORMS, cause, count)
+
+    def _take_latest(self, each: _Pair, stream: str, sample: Sample) -> None:
+        if each.built and stream != INFO:
+            return
+        take = self._take_info if stream == INFO else self._take_frame
+        cause = _attempt(lambda: take(each, stream, sample))
+        refused = each.heard.refused
+        each.news |= cause is not None or stream in refused
+        if cause is None:
+            refused.pop(stream, None)
+            return
+        refused[stream] = cause
+        each.lost[f"{stream}_{cause}"] += 1
+        _tell_lost(stream, cause, each.lost[f"{stream}_{cause}"])
+
+    def _take_info(self, each: _Pair, stream: str, sample: Sample) -> None:
+        del stream
+        info = decode_info(_payload(sample, messages.CAMERA_INFO))
+        each.news |= info != each.heard.info
+        each.heard.info = info
+
+    def _take_frame(self, each: _Pair, stream: str, sample: Sample) -> None:
+        heard = each.heard
+        before = (heard.image, heard.cloud, heard.ego)
+        match each.samples.frame(stream, sample):
+            case CameraFrame() as frame:
+                heard.image = Image(frame.frame_id, frame.image.width, frame.image.height)
+            case LidarFrame() as frame:
+                heard.cloud = frame.frame_id
+            case EgoMotion() as frame:
+                heard.ego = frame.frame_id
+        each.news |= before != (heard.image, heard.cloud, heard.ego)
+
+    def _nominal(self, each: _Pair) -> Nominal:
+        each.news = False
+        return replace(self._judged(each), losses=self._lost(each))
+
+    def _judged(self, each: _Pair) -> Nominal:
+        if each.built and each.found is not None:
+            return _of_built(each.found, changed(each.found, each.pair, each.heard, self._transforms))
+        found = found_of(each.pair, each.heard, self._transforms)
+        if not isinstance(found, Found):
+            each.found = each.refused = None
+            return Nominal(awaits=found)
+        if each.found is None or each.found.pair != found.pair:
+            each.found, each.refused = found, None
+            with self._condition:
+                self._ready[each.pair.name] = found
+        return Nominal(awaits=(each.refused or BEING_BUILT,), origins=found.origins)
+
+    def _lost(self, each: _Pair) -> dict[str, int]:
+        with self._condition:
+            of_transforms = {f"{TRANSFORMS}_{cause}": count for cause, count in self._transforms_lost.items()}
+        return {**of_transforms, **each.lost}
+
+
+def _attempt(take: Callable[[], None]) -> str | None:
+    """Take a sample; the cause for which it could not be. A fault of a decoder costs the sample, not the service."""
+    try:
+        take()
+    except DecodeError as error:
+        return error.reason
+    except Exception:
+        _log.exception("a decoder failed")
+        return "decoder_fault"
+    return None
+
+
+def _tell_lost(place: str, cause: str, count: int) -> None:
+    """The first of each kind, and then every 2^n-th."""
+    if count & (count - 1) == 0:
+        _log.warning(f"lost: {cause}", extra={"fields": {"place": place, "count": count}})
+
+
+def _of_built(found: Found, otherwise: Reason | None) -> Nominal:
+    return Nominal(origins=found.origins, changed=otherwise)
+
+
+def _payload(sample: Sample, expected: str) -> bytes:
+    """The bytes of a sample of this type.
+
+    Raises:
+        DecodeError: it says that it is something else.
+    """
+    encoding, _, type_name = sample.encoding.partition(";")
+    if encoding == CDR and type_name not in ("", expected):
+        raise DecodeError("wrong_type", f"a message of another type: expected {expected}")
+    return sample.payload

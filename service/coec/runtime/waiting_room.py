@@ -1,0 +1,133 @@
+"""The pairs whose configuration leaves out what the bus tells: listened for, answered for, and handed over when found.
+
+For the daemon's main thread; what is heard is looked at by the thread of `NominalWatch`.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+from coec.adapters.files.rig import check_given, rig_of
+from coec.adapters.system.threads import ServiceThread
+from coec.adapters.zenoh.bus import Bus
+from coec.adapters.zenoh.inputs import Input, input_of
+from coec.calibration.types import Reason
+from coec.config import AnyStreamConfig, Config, PairConfig, StreamConfig
+from coec.errors import ConfigError
+from coec.runtime.api.awaited import AwaitedAnswers
+from coec.runtime.nominal.findings import CANNOT_BE_BUILT, TF_STATIC, Found, info_topic_of, needs_transforms
+from coec.runtime.nominal.kept import KeptNominals, completed
+from coec.runtime.nominal.watch import Nominal, NominalWatch
+from coec.runtime.outside import Outside
+
+_log = logging.getLogger(__name__)
+
+
+class WaitingRoom:
+    """Of a vehicle.
+
+    Attributes:
+        answers: of each pair that is awaited still; replaced as a whole, for threads that go through them.
+    """
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        """`config` is as it was read, `folder` the state directory, in which earlier findings lie.
+
+        Raises:
+            ConfigError: what an awaited pair is given cannot be used.
+        """
+        for pair in config.awaited:
+            check_given(pair)
+        self._asked = {pair.name: pair for pair in config.awaited}
+        self._read = config
+        self._kept = KeptNominals(folder)
+        earlier = self._kept.found(config)
+        self._watch = NominalWatch(config, earlier)
+        self._ends: dict[str, list[Callable[[], None]]] = {}
+        self._outside: Outside
+        self.answers: dict[str, AwaitedAnswers] = {}
+
+    @property
+    def threads(self) -> tuple[ServiceThread, ...]:
+        """Those that run: none where nobody is awaited."""
+        return (self._watch.thread,) if self._asked else ()
+
+    def complete(self, config: Config) -> Config:
+        """A configuration as it was read, with what was found so far of the pairs that ask for the same as before."""
+        return completed(config, {name: found.pair for name, found in self._kept.found(config).items()})
+
+    def nominal(self, pair: str) -> Nominal:
+        """Where a pair's nominal calibration comes from. Any thread."""
+        return self._watch.nominal(pair)
+
+    def origins(self) -> dict[str, dict[str, str]]:
+        """By pair and place, where what was found comes from."""
+        told = {name: dict(self.nominal(name).origins) for name in self._asked}
+        return {name: origins for name, origins in told.items() if origins}
+
+    def open(self, config: Config, outside: Outside) -> Mapping[str, AwaitedAnswers]:
+        """Answer for those that are awaited still in this configuration."""
+        self._outside = outside
+        self.answers = {pair.name: AwaitedAnswers(pair, config.vehicle, outside) for pair in config.awaited}
+        return self.answers
+
+    def listen(self, bus: Bus, input_of_stream: Callable[[AnyStreamConfig], Input]) -> None:
+        """Listen for what is left out; to `/tf_static` and `CameraInfo` for as long as the service runs.
+        `input_of_stream` tells how to listen to the streams of a pair."""
+        for thread in self.threads:
+            thread.start()
+        if any(needs_transforms(pair) for pair in self._asked.values()):
+            stream = StreamConfig(topic=TF_STATIC)
+            bus.subscribe_latched(input_of(stream, self._read), self._watch.take_transforms)
+        for name, pair in self._asked.items():
+            topic = info_topic_of(pair)
+            if topic is not None:
+                stream = StreamConfig(topic=topic)
+                bus.subscribe_latched(input_of(stream, self._read), partial(self._watch.take_info, name))
+            if name in self.answers:
+                self._ends[name] = [
+                    bus.subscribe(input_of_stream(stream), partial(self._watch.take_frame, name, place))
+                    for place, stream in pair.streams.items()
+                ]
+
+    def found(self) -> dict[str, PairConfig]:
+        """Pairs of which everything is known by now, and that can be built; each once."""
+        good: dict[str, PairConfig] = {}
+        for name, found in self._watch.ready().items():
+            if name not in self.answers:
+                continue
+            try:
+                rig_of(found.pair)
+            except ConfigError as error:
+                self.refuse(name, str(error))
+                continue
+            self._admit(name, found)
+            good[name] = found.pair
+        return good
+
+    def _admit(self, name: str, found: Found) -> None:
+        for end in self._ends.pop(name, ()):
+            end()
+        self.answers = {other: answers for other, answers in self.answers.items() if other != name}
+        self._kept.keep(found, self._asked[name], self._read, time.time_ns())
+        self._outside.scribe.write(self._kept)
+        self._watch.end(name, found)
+
+    def refuse(self, name: str, why: str) -> None:
+        """What was found of a pair cannot be used; it is awaited again, until something else is heard."""
+        _log.error(f"what was found of a pair cannot be used: {why}", extra={"fields": {"pair": name}})
+        self._watch.end(name, Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {why}."))
+
+    def renew(self) -> None:
+        """Renew what is answered; once a second."""
+        for answers in self.answers.values():
+            answers.renew()
+
+    def fail(self, reason: Reason) -> None:
+        """The service is about to end, for this reason."""
+        for answers in self.answers.values():
+            answers.fail(reason)

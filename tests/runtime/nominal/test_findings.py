@@ -1,0 +1,148 @@
+"""What is known of a pair that leaves out its calibration, what is missing, and what it comes to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.adapters.ros.camera_info import Info
+from coec.adapters.ros.static_transforms import Joint, StaticTransforms
+from coec.config import OpenPairConfig
+from coec.geometry import se3
+from coec.runtime.nominal.findings import Found, Heard, Image, changed, found_of, info_topic_of, needs_transforms
+
+EYE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+K = (50.0, 0.0, 31.5, 0.0, 51.0, 23.5, 0.0, 0.0, 1.0)
+INFO = Info("cam", (64, 48), "plumb_bob", (), K, EYE, (0.0,) * 12, (1, 1), (0, 0, 0, 0))
+
+T_BASE_CAMERA = se3.exp(np.array([1.2, -1.2, 1.2, 1.5, 0.0, 1.4]))
+T_BASE_TOP = se3.exp(np.array([0.0, 0.0, 0.3, 1.0, 0.0, 1.9]))
+T_CAMERA_TOP = se3.inverse(T_BASE_CAMERA) @ T_BASE_TOP
+
+
+def pair(**of: Any) -> OpenPairConfig:
+    return OpenPairConfig.model_validate({"name": "front", "camera": "/front/image_raw", "points": "/top/points", **of})
+
+
+def heard(**of: Any) -> Heard:
+    given: dict[str, Any] = {"image": Image("cam", 64, 48), "cloud": "top", "ego": "base", "info": INFO}
+    return Heard(**given | of)
+
+
+def tree(*joints: tuple[str, str, NDArray[np.float64]]) -> StaticTransforms:
+    transforms = StaticTransforms()
+    transforms.take(tuple(Joint(*joint) for joint in joints))
+    return transforms
+
+
+VEHICLE = (("base", "cam", T_BASE_CAMERA), ("base", "top", T_BASE_TOP))
+
+
+def found(asked: OpenPairConfig, told: Heard | None = None, transforms: StaticTransforms | None = None) -> Found:
+    result = found_of(asked, told or heard(), transforms or tree(*VEHICLE))
+    assert isinstance(result, Found), result
+    return result
+
+
+def missing(asked: OpenPairConfig, told: Heard | None = None, transforms: StaticTransforms | None = None) -> list[str]:
+    result = found_of(asked, told or heard(), tree(*VEHICLE) if transforms is None else transforms)
+    assert not isinstance(result, Found)
+    return [reason.code for reason in result]
+
+
+def test_two_topics_come_to_a_rig() -> None:
+    complete = found(pair(ego="/odometry"))
+    built = complete.pair
+    assert (built.camera.frame_id, built.lidar.frame_id, built.lidar.cloud_frame_id) == ("cam", "top", None)
+    assert built.camera.intrinsics.model == "pinhole"
+    np.testing.assert_allclose(built.T_camera_lidar, T_CAMERA_TOP, rtol=0, atol=1e-12)
+    assert built.ego is not None
+    np.testing.assert_allclose(built.ego.T_lidar_ego, se3.inverse(T_BASE_TOP), rtol=0, atol=1e-12)
+    assert complete.origins["camera.intrinsics"].startswith("CameraInfo on /front/camera_info")
+    assert complete.origins["T_camera_lidar"] == "/tf_static, between 'cam' and 'top'"
+
+
+def test_what_the_configuration_gives_it_gives() -> None:
+    given = np.eye(4).tolist()
+    intrinsics = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0}
+    camera = {"topic": "/front/image_raw", "intrinsics": intrinsics, "frame_id": "mine"}
+    asked = pair(camera=camera, T_camera_lidar=given)
+    built = found(asked, heard(image=None, info=None), StaticTransforms())
+    assert built.pair.camera.frame_id == "mine"
+    assert built.pair.camera.intrinsics.fx == 4.0
+    np.testing.assert_array_equal(built.pair.T_camera_lidar, given)
+    assert set(built.origins) == {"lidar.frame_id"}
+    assert info_topic_of(asked) is None
+    assert not needs_transforms(asked)
+
+
+def test_a_lidar_whose_clouds_come_in_another_frame() -> None:
+    asked = pair()
+    asked = asked.model_copy(update={"lidar": asked.lidar.model_copy(update={"frame_id": "top"})})
+    built = found(asked, heard(cloud="/base")).pair
+    assert (built.lidar.frame_id, built.lidar.cloud_frame_id) == ("top", "/base")
+    np.testing.assert_allclose(built.lidar.T_cloud_lidar, T_BASE_TOP, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(built.T_camera_lidar, T_CAMERA_TOP, rtol=0, atol=1e-12)
+
+
+def test_rectified_images_take_their_own_matrix() -> None:
+    p = (40.0, 0.0, 30.0, 0.0, 0.0, 41.0, 22.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    told = heard(info=replace(INFO, model="equidistant", d=(0.1, 0.2, 0.3, 0.4), p=p))
+    built = found(pair(camera="/front/image_rect"), told).pair
+    assert (built.camera.intrinsics.model, built.camera.intrinsics.fx) == ("pinhole", 40.0)
+
+
+@pytest.mark.parametrize(
+    ("told", "joints", "codes"),
+    [
+        (Heard(), (), ["no_camera_info", "no_image", "no_cloud"]),
+        (heard(info=None), VEHICLE, ["no_camera_info"]),
+        (heard(image=None), VEHICLE, ["no_image"]),
+        (heard(cloud=None), VEHICLE, ["no_cloud"]),
+        (heard(ego=None), VEHICLE, ["no_motion"]),
+        (heard(), (), ["tf_static", "tf_static"]),
+        (heard(), VEHICLE[:1], ["tf_static", "tf_static"]),
+        (heard(), (*VEHICLE, ("roof", "top", T_BASE_TOP)), ["tf_static_no_tree", "tf_static_no_tree"]),
+        (heard(image=Image("cam", 64, 40)), VEHICLE, ["camera_info_size"]),
+        (heard(image=Image("", 64, 48)), VEHICLE, ["no_frame_id"]),
+        (heard(cloud=""), VEHICLE, ["no_frame_id"]),
+        (heard(info=replace(INFO, k=(0.0,) * 9)), VEHICLE, ["camera_info_refused"]),
+        (heard(refused={"info": "message_malformed"}), VEHICLE, ["camera_info_refused"]),
+    ],
+)
+def test_what_is_missing_is_said(told: Heard, joints: Any, codes: list[str]) -> None:
+    assert missing(pair(ego="/odometry"), told, tree(*joints)) == codes
+
+
+def test_the_frames_that_are_there_are_listed_and_no_others_words() -> None:
+    joints = [("base", f"f{index}", np.eye(4)) for index in range(40)]
+    transforms = tree(*joints, ("base", "\x1b[2Jevil", np.eye(4)))
+    result = found_of(pair(), heard(cloud="\x1b[31m"), transforms)
+    assert not isinstance(result, Found)
+    (text,) = (reason.text for reason in result)
+    assert "'cam' and (a frame of no plain name)" in text
+    assert "there are base, f0" in text
+    assert "17 more" in text
+    assert "\x1b" not in text
+    assert "evil" not in text
+
+
+def test_what_the_bus_says_otherwise_is_told() -> None:
+    asked, told = pair(ego="/odometry"), heard()
+    built = found(asked, told)
+    assert changed(built, asked, told, tree(*VEHICLE)) is None
+    assert changed(built, asked, Heard(), StaticTransforms()) is None, "silence says nothing"
+    moved = tree(VEHICLE[0], ("base", "top", se3.perturb(T_BASE_TOP, np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]))))
+    reason = changed(built, asked, told, moved)
+    assert reason is not None
+    assert reason.code == "nominal_changed"
+    assert "/tf_static, for T_camera_lidar" in reason.text
+    assert "CameraInfo" not in reason.text
+    for other in (replace(INFO, k=(50.1, *K[1:])), replace(INFO, k=(0.0,) * 9)):
+        reason = changed(built, asked, heard(info=other), tree(*VEHICLE))
+        assert reason is not None
+        assert "CameraInfo on /front/camera_info" in reason.text

@@ -1,0 +1,78 @@
+"""What was found stays found: over restarts, for the same question, whatever lies on the disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coec.config import Config, PairConfig
+from coec.runtime.nominal.findings import Found
+from coec.runtime.nominal.kept import NOMINAL_FILE, KeptNominals, completed
+
+INTRINSICS = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0}
+TRANSFORM = [[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, 1 / 3], [1.0, 0.0, 0.0, -0.7], [0.0, 0.0, 0.0, 1.0]]
+
+
+def configured(ros: dict[str, Any] | None = None, **of: Any) -> Config:
+    given = {"name": "front", "camera": "/front/image", "points": "/top/points", **of}
+    pair = {name: value for name, value in given.items() if value is not None}
+    return Config.model_validate({"middleware": "rmw_zenoh", "ros": ros or {}, "pairs": [pair]})
+
+
+def found() -> Found:
+    document = {
+        "name": "front",
+        "camera": {"topic": "/front/image", "frame_id": "cam", "intrinsics": INTRINSICS},
+        "lidar": {"topic": "/top/points", "frame_id": "top"},
+        "T_camera_lidar": TRANSFORM,
+    }
+    return Found(PairConfig.model_validate(document), {"T_camera_lidar": "/tf_static, between 'cam' and 'top'"})
+
+
+def keep(folder: Path, config: Config) -> None:
+    kept = KeptNominals(folder)
+    kept.keep(found(), config.awaited[0], config, 1_700_000_000 * 10**9)
+    kept.flush()
+
+
+def test_a_restart_has_the_same_to_the_bit_and_says_since_when(tmp_path: Path) -> None:
+    config = configured()
+    keep(tmp_path, config)
+    again = KeptNominals(tmp_path).found(config)["front"]
+    assert again.pair == found().pair
+    assert again.origins["T_camera_lidar"].endswith("kept since 2023-11-14 22:13:20 UTC")
+    whole = completed(config, {"front": again.pair})
+    assert ([pair.name for pair in whole.pairs], whole.awaited) == (["front"], ())
+    assert Config.model_validate_json(whole.model_dump_json()) == whole
+
+
+def test_other_settings_are_taken_and_other_questions_are_not_answered(tmp_path: Path) -> None:
+    keep(tmp_path, configured())
+    lidar = {"topic": "/top/points", "sweep": {"period_s": 0.05}}
+    other = configured(window={"pairs": 12, "min_pairs": 4}, points=None, lidar=lidar)
+    again = KeptNominals(tmp_path).found(other)["front"].pair
+    assert again.window.pairs == 12
+    assert again.lidar.sweep is not None
+    assert again.T_camera_lidar == found().pair.T_camera_lidar
+    for asked in (
+        configured(camera="/rear/image"),
+        configured(camera={"topic": "/front/image", "info_topic": "/calibration"}),
+        configured(T_camera_lidar=TRANSFORM),
+        configured(ego="/odometry"),
+        configured(ros={"domain": 7}),
+    ):
+        assert KeptNominals(tmp_path).found(asked) == {}
+
+
+@pytest.mark.parametrize("damage", [b"", b"{}", b"\x00" * 100, b'{"body":{"pairs":{"front":{}}}}'])
+def test_what_is_damaged_is_searched_anew(tmp_path: Path, damage: bytes) -> None:
+    config = configured()
+    keep(tmp_path, config)
+    (tmp_path / NOMINAL_FILE).write_bytes(damage)
+    kept = KeptNominals(tmp_path)
+    assert kept.found(config) == {}
+    kept.keep(found(), config.awaited[0], config, 5)
+    kept.flush()
+    assert KeptNominals(tmp_path).found(config)["front"].pair == found().pair
