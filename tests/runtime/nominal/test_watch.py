@@ -157,7 +157,7 @@ def test_a_decoder_that_fails_costs_its_sample(monkeypatch: pytest.MonkeyPatch) 
 
     watch = heard_all()
     with monkeypatch.context() as patched:
-        patched.setattr("coec.runtime.nominal.watch.decoded", broken)
+        patched.setattr("coec.runtime.ingest.decoder.SampleReader.frame", broken)
         patched.setattr("coec.runtime.nominal.watch.decode_joints", broken)
         watch.look()
     assert codes(watch) == ["no_image", "no_cloud"]
