@@ -98,7 +98,7 @@ def test_elsewhere_subscribing_is_enough(session: zenoh.Session, stack: ExitStac
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "namespace"), [("shuttle-7", "/shuttle_7"), ("7.up", "/v7_up"), ("bus_1", "/bus_1")]
+    ("vehicle", "namespace"), [("shuttle-7", "/shuttle_7"), ("7.up", "/_7_up"), ("bus_1", "/bus_1")]
 )
 def test_a_vehicle_has_a_name_that_ros_takes(vehicle: str, namespace: str) -> None:
     assert namespace_of(vehicle) == namespace
@@ -166,6 +166,16 @@ def test_of_too_many_tokens_the_first_are_kept(
         stack.callback(declared.undeclare)
     wait_until(lambda: side.topics().left_out["too_many"] == 200, "all of them are seen")
     assert len(side.topics().publishers) == 100
+
+
+def test_what_a_service_says_itself_is_no_topic_of_the_vehicles(session: zenoh.Session, side: RosSide) -> None:
+    own = session.liveliness().declare_token(DRIVER.replace("%front%image_raw", "%coec%front%overlay"))
+    token = session.liveliness().declare_token(DRIVER)
+    wait_until(lambda: bool(side.topics().publishers), "it is seen")
+    assert list(side.topics().types()) == ["/front/image_raw"]
+    assert not side.topics().left_out
+    for declared in (own, token):
+        declared.undeclare()
 
 
 def test_who_is_missing_is_told_with_those_who_are_there(session: zenoh.Session, side: RosSide) -> None:
