@@ -36,6 +36,10 @@ def drives() -> list[Drive]:
     return chosen
 
 
+@pytest.mark.fault(
+    "tunnels, open roads and nights with a mount that is right",
+    "it is not accused; nothing changes without its reason, nor more than once a minute",
+)
 def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     found: dict[str, list[Transition]] = {}
     entries: dict[str, Any] = {}
