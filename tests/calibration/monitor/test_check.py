@@ -79,6 +79,7 @@ A_CHECK = Check(
     second_derivative=np.ones(6),
     edges=10.0,
     edges_at_best=10.0,
+    edges_in_view=1000,
     edges_kept=1.0,
     contrast=10.0,
     agreement_rad=0.0,
