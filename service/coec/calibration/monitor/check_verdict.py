@@ -85,15 +85,12 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
     of_rotation, of_pose = over_limits(seen, rotation, accuracy, limits)
     metrics = _metrics(seen, of_rotation, of_pose, limits)
     flagged = max(of_rotation, of_pose) > 1.0
-    weak = (
-        edges_per_pair(seen) < limits.min_edges_per_pair
-        or seen.contrast < MIN_CONTRAST
-        or seen.edges_in_view < MIN_EDGES_IN_VIEW * seen.pairs
-    )
+    few = seen.edges_in_view < MIN_EDGES_IN_VIEW * seen.pairs
+    weak = few or edges_per_pair(seen) < limits.min_edges_per_pair or seen.contrast < MIN_CONTRAST
     causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
     dirty, textured = ((), 0) if baseline is None or causes else dirty_blocks(evidence.scenes, baseline.scene)
-    if not causes and not weak:
-        # Faint edges sway as much with a clock as with the mount.
+    if not causes and not few:
+        # What few edges fit, another clock fits as well as another mount.
         explained = explained_by_motion(
             evidence.pairs,
             evidence.rig,
