@@ -38,8 +38,8 @@ FIRST_SEED = 810_001
 COMMISSIONED_ON = (("street", 820_001), ("garage", 820_002))
 """Places and seeds of the drives that a rig is commissioned on."""
 
-COMMISSIONED_CHECKS = 4
-"""Length of each of these, in checks: two of them have as many pairs as commissioning takes."""
+COMMISSIONED_CHECKS = 3
+"""Length of each of these, in checks: together they have 36 pairs, as many as one or two windows of a rig."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class CheckDrive:
         """What it is called."""
         return f"{self.rig}_{self.place}_{self.seed}"
 
-    def source(self, checks: int = CHECKS) -> str:
+    def source(self, checks: int) -> str:
         """The SOURCE that draws so many checks of it."""
         # A moment longer: the last pair is begun.
         seconds = checks * PERIOD_S + 0.5 / HERTZ

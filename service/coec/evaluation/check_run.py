@@ -13,18 +13,19 @@ from numpy.typing import NDArray
 
 from coec.adapters.depth.maps import CachedDepth, open_depth
 from coec.adapters.images.codec import CachedGreys, GreyImages
-from coec.calibration.commissioning.baseline import Baseline
-from coec.calibration.commissioning.learning import commission
+from coec.calibration.commissioning.baseline import Baseline, learned_hash
+from coec.calibration.commissioning.learning import learn_accuracy, learn_limits
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.monitor.change_detector import Observation
-from coec.calibration.monitor.check import NO_BIAS, check_at, gather
-from coec.calibration.monitor.check_verdict import judge_check
+from coec.calibration.monitor.check import NO_BIAS, ROTATION_DOF, check_at, gather
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, judge_check
+from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import FramePair, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, PairingConfig
 from coec.errors import CoecError
-from coec.evaluation.check_drives import CHECK_PAIRS, COMMISSIONED_CHECKS, COMMISSIONED_ON, CheckDrive
+from coec.evaluation.check_drives import CHECK_PAIRS, CHECKS, COMMISSIONED_CHECKS, COMMISSIONED_ON, CheckDrive
 from coec.evaluation.detection import OBSERVABLE_M
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
@@ -61,10 +62,10 @@ class _Stage:
 
 
 def commissioned(rig: str) -> Baseline:
-    """A rig, commissioned on drives of its own.
+    """What checks of a rig learn on drives of its own; limits of full calibrations are not asked for.
 
     Raises:
-        CalibrationError: what they show is not the reference.
+        CalibrationError: these drives show nothing.
     """
     stages = [_draw(CheckDrive(rig, *where).source(COMMISSIONED_CHECKS)) for where in COMMISSIONED_ON]
     pairs = [
@@ -73,18 +74,26 @@ def commissioned(rig: str) -> Baseline:
         for number, stage in enumerate(stages)
         for pair in stage.pairs
     ]
-    first, configuration = stages[0], _configuration()
-    images, depth = GreyImages(LimitsConfig()), open_depth(configuration.depth, LimitsConfig())
-    return commission([first.window(pairs)], depth, images, configuration, sensors={})
+    whole = stages[0].window(pairs)
+    configuration = _configuration()
+    depth = open_depth(configuration.depth, LimitsConfig())
+    evidence = gather(sight_of(whole, depth, GreyImages(LimitsConfig()), configuration, Silence()))
+    rotation, pose = learn_accuracy(evidence, stages[0].truth, configuration)
+    limits = learn_limits(evidence, stages[0].truth, configuration, (rotation, pose), FALSE_ALARM_RATE)
+    return Baseline(
+        pair=whole.rig.pair, T_camera_lidar=stages[0].truth, rotation=rotation, pose=pose, dof=ROTATION_DOF, limits={},
+        monitor=limits, scene=scene_baseline(evidence.scenes), false_alarm_rate=FALSE_ALARM_RATE, windows=len(stages),
+        pairs=len(pairs), detected={}, sensors={}, depth_identity=depth.identity,
+        config_hash=learned_hash(configuration),
+    )  # fmt: skip
 
 
-def run(drive: CheckDrive, baseline: Baseline | None) -> CheckedDrive:
-    """The row of a drive; whatever goes wrong is its `failure`."""
-    row = CheckedDrive(
-        name=drive.name, rig=drive.rig, place=drive.place, seed=drive.seed, source=drive.source(), poses=()
-    )
+def run(drive: CheckDrive, baseline: Baseline | None, checks: int = CHECKS) -> CheckedDrive:
+    """The row of a drive of so many checks; whatever goes wrong is its `failure`."""
+    source = drive.source(checks)
+    row = CheckedDrive(name=drive.name, rig=drive.rig, place=drive.place, seed=drive.seed, source=source, poses=())
     try:
-        return row.model_copy(update={"poses": _checked(_draw(drive.source()), drive, baseline)})
+        return row.model_copy(update={"poses": _checked(_draw(source), drive, baseline)})
     except CoecError as error:
         return row.model_copy(update={"failure": f"{type(error).__name__}: {error}"})
 

@@ -80,6 +80,7 @@ A_CHECK = Check(
     edges=10.0,
     edges_at_best=10.0,
     edges_in_view=100_000,
+    looks=6.0,
     edges_kept=1.0,
     contrast=10.0,
     agreement_rad=0.0,

@@ -14,6 +14,8 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.landscape import Landscape
+from coec.calibration.confidence.noise import measure_noise
 from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
 from coec.calibration.monitor.sensor_faults import SceneFacts, scene_facts
 from coec.calibration.objective.curvature import axis_derivatives
@@ -94,6 +96,7 @@ class Check:
         edges: significance of the edges at the pose.
         edges_at_best: that at the local optimum over rotations.
         edges_in_view: range edges that lie in the images there, of all pairs.
+        looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 where they do not tell.
         edges_kept: that of the finest band where the optimum is expected, over that where it is.
         contrast: how far the edges at the local optimum stand above other poses within reach, standard deviations.
         agreement_rad: angle between the local optima of the two witnesses.
@@ -112,6 +115,7 @@ class Check:
     edges: float
     edges_at_best: float
     edges_in_view: int
+    looks: float
     edges_kept: float
     contrast: float
     agreement_rad: float
@@ -172,9 +176,15 @@ def check_at(
     # By two ways, as blurred edges can lead six degrees of freedom astray.
     ways = (fusion.settling, (fusion.ranking[-1], *fusion.settling[1:]))
     ends = [polished(way, T_rotation, in_all) for way in ways]
-    T_pose = max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score)
+    farther, nearer = (
+        max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score),
+        polished(fusion.settling[-1:], pose, in_all),
+    )
+    T_pose = nearer if _as_significant(evidence.edges.sharp, nearer, farther) else farther
     of_edges = EdgesAlone(evidence.edges.whole, evidence.edges.blur_rad)
     T_edges, T_depth = polished([of_edges], T_rotation), polished([depth], T_rotation)
+    landscape = Landscape.about(fusion.settling[-1].cells(T_rotation), T_rotation, tuple(range(ROTATION_DOF)))
+    noise = measure_noise(landscape)
     at_pose = fusion.settling[0].evaluate(pose)
     first_derivative, second_derivative = axis_derivatives(depth, pose)
     return Check(
@@ -189,6 +199,7 @@ def check_at(
         edges=of_edges.evaluate(pose).score,
         edges_at_best=of_edges.evaluate(T_rotation).score,
         edges_in_view=_in_view(evidence.edges.sharp, T_rotation),
+        looks=1.0 if noise is None else noise.looks,
         edges_kept=_kept(evidence.edges.bands[0], se3.perturb(pose, bias), T_rotation),
         contrast=fusion.edge_contrast(T_rotation),
         agreement_rad=se3.rotation_angle_rad(T_edges @ se3.inverse(T_depth)),
