@@ -826,6 +826,29 @@ def _sim_matrix(
     raise typer.Exit(command.run(options))
 
 
+@sim_app.command("checks")
+def _sim_checks(
+    output: Annotated[
+        Path, typer.Option(help="Folder for report.json and drives/.", metavar="DIR", show_default=False)
+    ],
+    rounds: Annotated[
+        int, typer.Option(help="Drives in every place with every rig, each of another seed.", min=1, max=10_000)
+    ] = 4,
+    hours: Annotated[
+        float, typer.Option(help="Hours of driving to resample from them, whole drives at a time.", min=0, max=10_000)
+    ] = 100.0,
+    as_json: Json = False,
+) -> None:
+    """Tell how often the monitor accuses a right mount on rendered drives, and how soon it notices a wrong one.
+
+    A drive is 25 s of one rig in one place and takes a quarter of a minute of one core, a round 40 of them. What is
+    done is kept in DIR: call again, with more rounds, to go on. A DIR holds results of one state of the code.
+    """
+    from coec.cli import sim_checks as command
+
+    raise typer.Exit(command.run(command.Options(output, rounds, hours, as_json=as_json)))
+
+
 @app.command("sbom")
 def _sbom(
     lock: Annotated[

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import commands, doctor, evaluation, frames, matrix, replies
+from coec.schemas import checks, commands, doctor, evaluation, frames, matrix, replies
 from coec.schemas.base import Message
 
 SENT: tuple[type[Message], ...] = (
@@ -39,6 +39,8 @@ MESSAGES: tuple[type[Message], ...] = (
     evaluation.ClosureReport,
     evaluation.ModelAssessment,
     matrix.MatrixReport,
+    checks.CheckedDrive,
+    checks.ChecksReport,
     doctor.DoctorReport,
 )
 

@@ -172,6 +172,33 @@ class TestEvidence:
         assert form.validate_json(form.dump_json(state)) == state
 
 
+class TestWrongFromTheFirstCheck:
+    """Half a degree on a rig of which nothing is known: what the estimator may be off there, and a little more."""
+
+    RIG = np.full(6, np.radians(0.12))
+    NOISE = np.full(6, np.radians(0.06))
+
+    def checks(self, offset: NDArray[np.float64], count: int) -> list[Observation]:
+        sigma = np.hypot(self.RIG, self.NOISE)
+        near = [fresh(number, flagged=False, offset=offset) for number in range(count)]
+        return [replace(one, sigma=sigma, noise=self.NOISE, place=0.3 * self.RIG) for one in near]
+
+    def test_all_checks_together_doubt_it_though_none_does_alone(self) -> None:
+        checks = self.checks(turned(0.3, 0.3, 0.25), 2)
+        assert not any(check.flagged for check in checks)
+        assert after(checks[0]).outcome is Finding.CLEAR
+        assert after(*checks).outcome is Finding.AT_ODDS
+
+    def test_what_estimators_are_off_on_other_rigs_is_no_doubt(self) -> None:
+        assert after(*self.checks(turned(0.12, -0.12, 0.12), 12)).outcome is Finding.CLEAR
+
+    def test_a_window_that_vouches_for_it_ends_the_doubt(self) -> None:
+        state = MonitorState(vouched=True)
+        for check in self.checks(turned(0.3, 0.3, 0.25), 12):
+            state = after_observation(state, check, LEVELS)
+        assert state.outcome is Finding.CLEAR
+
+
 class TestAlarmLevels:
     def test_are_the_logarithm_of_the_tests_that_begin_in_the_stated_time(self) -> None:
         levels = alarm_levels(MonitorConfig(hours_between_false_alarms=1000.0, period_s=10.0))

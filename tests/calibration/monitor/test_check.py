@@ -11,7 +11,7 @@ from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
-from coec.calibration.monitor.check_verdict import MIN_CONTRAST, judge_check, over_limits
+from coec.calibration.monitor.check_verdict import MIN_CONTRAST, MIN_EDGES_IN_VIEW, MIN_LOOKS, judge_check, over_limits
 from coec.calibration.objective.curvature import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.ports import DepthModel, Silence
@@ -79,6 +79,8 @@ A_CHECK = Check(
     second_derivative=np.ones(6),
     edges=10.0,
     edges_at_best=10.0,
+    edges_in_view=100_000,
+    looks=6.0,
     edges_kept=1.0,
     contrast=10.0,
     agreement_rad=0.0,
@@ -115,3 +117,25 @@ def test_an_optimum_that_stands_out_by_chance_only_is_weak(
     told = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)
     assert told.weak is weak
     assert not told.flagged
+
+
+@pytest.mark.parametrize(
+    ("in_view", "looks", "weak"),
+    [
+        (MIN_EDGES_IN_VIEW + 1, 6.0, False),
+        (MIN_EDGES_IN_VIEW - 1, 6.0, True),
+        (1000.0, MIN_LOOKS + 0.1, False),
+        (1000.0, MIN_LOOKS - 0.1, True),
+    ],
+)
+def test_few_edges_and_frames_that_say_the_same_decide_nothing_however_well_they_fit(
+    evidence: CheckInput, sharp_street: Window, in_view: float, looks: float, weak: bool
+) -> None:
+    pairs = len(evidence.pairs)
+    moved = np.array([0.0, np.radians(1.0), 0, 0, 0, 0])
+    seen = replace(
+        A_CHECK, pairs=pairs, edges_in_view=int(in_view * pairs), looks=looks, edges_at_best=100.0,
+        offset_rotation=moved,
+    )  # fmt: skip
+    told = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)
+    assert (told.flagged, told.weak) == (True, weak)

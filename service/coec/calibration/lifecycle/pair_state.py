@@ -319,7 +319,7 @@ def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
 def _confirmed(state: PairState, stamp_ns: int) -> PairState:
     """A window vouches for what is served: whatever the monitor had against it is settled. What is wrong with the data
     is not."""
-    fresh = MonitorState(blind=state.monitor.blind, dirt=state.monitor.dirt)
+    fresh = MonitorState(blind=state.monitor.blind, dirt=state.monitor.dirt, vouched=True)
     cause = _data_cause(fresh)
     state = replace(state, proven=True, monitor=fresh, flagged_since_ns=None)
     if cause is None:
@@ -342,6 +342,9 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
             since_ns = observation.pair_stamps_ns[0] if was_clear else state.valid_from_ns
     elif monitor.outcome in (Finding.CLEAR, Finding.UNKNOWN):
         since_ns = None
+    elif since_ns is None and monitor.outcome in ACCUSING:
+        # All checks together accuse it, and none by itself: all pairs say the same.
+        since_ns = state.valid_from_ns
     state = replace(state, monitor=monitor, flagged_since_ns=since_ns)
     cause = _data_cause(monitor)
     if cause is not None:
@@ -473,7 +476,7 @@ def after_commissioning(state: PairState, T_commissioned: Matrix4) -> PairState:
     """The rig was commissioned: if that is what is served, it is the baseline of this rig, and confirmed."""
     if not np.array_equal(T_commissioned, state.T_camera_lidar):
         return state
-    state = replace(state, provenance=Provenance.COMMISSIONED, proven=True, monitor=MonitorState())
+    state = replace(state, provenance=Provenance.COMMISSIONED, proven=True, monitor=MonitorState(vouched=True))
     return happened(state, Event.CONFIRMED_BY_WINDOW)
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.baseline import Drift
-from coec.calibration.monitor.hypotheses import MOST_STEP, Axes, Hypotheses, after_check
-from coec.calibration.monitor.likelihood import FARTHER, WEAK_TIMES, Three, Told, three
+from coec.calibration.commissioning.quantiles import chi2_quantile
+from coec.calibration.monitor.hypotheses import MOST_STEP, Axes, Hypotheses, after_check, learnt_distance2
+from coec.calibration.monitor.likelihood import AXES, FARTHER, WEAK_TIMES, Three, Told, three
 from coec.calibration.monitor.sensor_faults import BENT_MOUNT, CAUSES, DIRTY_CHECKS, DIRTY_SHARE, LENS_DIRTY, Cause
 from coec.calibration.types import Metric
 from coec.config import MonitorConfig
@@ -41,6 +42,10 @@ WEAK_SHARE = 0.5
 AT_ODDS_AT, MOST_AT_ODDS = 1.5, 3.0
 """Flagged checks in a row at which, while they do not add up to a move, they are at odds: two; and the most."""
 
+ASTRAY2 = chi2_quantile(0.95, AXES)
+"""Squared distance of where the checks have put the rotations from the pose that is served, above which no move but the
+pose itself is doubted, until a window has vouched for it: of right rigs of which nothing is known one in twenty is."""
+
 BLIND_AT, MOST_BLIND = 1.2, 3.5
 """Evidence in independent checks by which a cause in the data is believed: more than one; and the most, so that a
 cause that went away is forgotten after three."""
@@ -54,7 +59,7 @@ def _unknown() -> NDArray[np.float64]:
 
 class Finding(StrEnum):
     """What the checks so far say. `unknown`: nothing was seen that could tell. `at_odds`: they accuse the mount,
-    but do not add up to a move."""
+    but do not add up to a move: it is elsewhere every time, or was from the first check on."""
 
     UNKNOWN = "unknown"
     CLEAR = "clear"
@@ -157,6 +162,9 @@ class MonitorState:
         at_odds: flagged checks in a row.
         last_stamps_ns: of the pairs of the last check.
         stood: whether the vehicle stood at the end of the last check.
+        astray2: squared distance of where all checks have put the rotations, see `learnt_distance2`.
+        counted: checks that counted, those that did in part by that part; no more than `AT_ODDS_AT`.
+        vouched: whether a window has found what is served to be right.
     """
 
     outcome: Finding = Finding.UNKNOWN
@@ -167,6 +175,9 @@ class MonitorState:
     at_odds: float = 0.0
     last_stamps_ns: tuple[int, ...] = ()
     stood: bool = False
+    astray2: float = 0.0
+    counted: float = 0.0
+    vouched: bool = False
 
     @property
     def evidence(self) -> float:
@@ -204,18 +215,21 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     """The hypotheses after a check that counts by `fresh`. Where its edges are faint it may make the mount suspect,
     but does not confirm: a full solve has to."""
     most = levels.suspect if observation.weak else levels.most
-    after = []
-    for hypotheses, axes, first in ((state.turned, ROTATIONS, 0), (state.shifted, TRANSLATIONS, 3)):
-        told = _told(observation, slice(first, first + 3), hypotheses.before)
-        if told is not None:
-            hypotheses = after_check(hypotheses, told, axes, fresh, most)
-        after.append(hypotheses)
+    turned, shifted, astray2 = state.turned, state.shifted, state.astray2
+    told = _told(observation, slice(0, 3), turned.before)
+    if told is not None:
+        turned = after_check(turned, told, ROTATIONS, fresh, most)
+        astray2 = learnt_distance2(turned, told.rig)
+    told = _told(observation, slice(3, 6), shifted.before)
+    if told is not None:
+        shifted = after_check(shifted, told, TRANSLATIONS, fresh, most)
     step = fresh * (WEAK_SHARE if observation.weak else 1.0)
     if not observation.flagged:
         at_odds = state.at_odds if observation.weak else 0.0
     else:
         at_odds = min(state.at_odds + step, MOST_AT_ODDS)
-    return replace(state, turned=after[0], shifted=after[1], at_odds=at_odds)
+    counted = min(state.counted + step, AT_ODDS_AT)
+    return replace(state, turned=turned, shifted=shifted, at_odds=at_odds, astray2=astray2, counted=counted)
 
 
 def _told(observation: Observation, axes: slice, before: Three | None) -> Told | None:
@@ -261,4 +275,5 @@ def _outcome(before: Finding, after: MonitorState, levels: AlarmLevels) -> Findi
         return before
     if evidence >= levels.suspect or (before is Finding.SUSPECT and evidence >= levels.clear):
         return Finding.SUSPECT
-    return Finding.AT_ODDS if after.at_odds >= AT_ODDS_AT else Finding.CLEAR
+    astray = after.astray2 > ASTRAY2 and after.counted >= AT_ODDS_AT and not after.vouched
+    return Finding.AT_ODDS if astray or after.at_odds >= AT_ODDS_AT else Finding.CLEAR

@@ -14,6 +14,8 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.landscape import Landscape
+from coec.calibration.confidence.noise import measure_noise
 from coec.calibration.estimators import DEPTH_POINTS, Sight, depth_features
 from coec.calibration.monitor.sensor_faults import SceneFacts, scene_facts
 from coec.calibration.objective.curvature import axis_derivatives
@@ -31,8 +33,10 @@ from coec.calibration.search.local_search import near, polish_in_turn
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import se3
+from coec.geometry.cameras import in_image
 from coec.geometry.edges.alignment import EdgeFrames, significances
 from coec.geometry.edges.charts import EdgeCharts
+from coec.geometry.projection import project
 from coec.geometry.thinning import thinned
 
 REACH_RAD = radians(4.0)
@@ -41,6 +45,13 @@ far beyond any limit."""
 
 BASINS = 2
 """Maxima that both witnesses rank: what a few pairs have two of, all blurs together have one of."""
+
+NEAR_SHARE = 0.9
+"""Of the significance of the best maximum within reach on the sharpest edges, from which the one next to the pose is
+believed instead: a mount that is as it was is far likelier than one that moved to a place which fits hardly better.
+Between guard rails, lane markings and a horizon, all of which run to one point, edges fit as well a degree beside: of
+24 checks of right mounts on simulated highways that ended 0.6 to 1.9° off, 13 end within 0.2° so. From 0.8 to 0.95 the
+same do."""
 
 ROTATION_DOF, POSE_DOF = 3, 6
 """Axes of ξ that the two optima of a check are searched over: rotations, and all."""
@@ -84,6 +95,8 @@ class Check:
         second_derivative: (6,) -∂²MI/∂ξ², nats per radian² or metre²; positive at a maximum.
         edges: significance of the edges at the pose.
         edges_at_best: that at the local optimum over rotations.
+        edges_in_view: range edges that lie in the images there, of all pairs.
+        looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 where they do not tell.
         edges_kept: that of the finest band where the optimum is expected, over that where it is.
         contrast: how far the edges at the local optimum stand above other poses within reach, standard deviations.
         agreement_rad: angle between the local optima of the two witnesses.
@@ -101,6 +114,8 @@ class Check:
     second_derivative: NDArray[np.float64]
     edges: float
     edges_at_best: float
+    edges_in_view: int
+    looks: float
     edges_kept: float
     contrast: float
     agreement_rad: float
@@ -155,14 +170,21 @@ def check_at(
     ranked = sorted(basins, key=fusion.rank, reverse=True)[:BASINS]
     to_rank = near(rotation, fusion.ranking[-1])
     best = max((polished(fusion.ranking, basin, to_rank) for basin in ranked), key=fusion.rank)
-    T_rotation = polished(fusion.settling, best)
+    farther, nearer = polished(fusion.settling, best), polished(fusion.settling[-1:], pose)
+    T_rotation = nearer if _as_significant(evidence.edges.sharp, nearer, farther) else farther
     in_all = config.search.model_copy(update={"dof": POSE_DOF})
     # By two ways, as blurred edges can lead six degrees of freedom astray.
     ways = (fusion.settling, (fusion.ranking[-1], *fusion.settling[1:]))
     ends = [polished(way, T_rotation, in_all) for way in ways]
-    T_pose = max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score)
+    farther, nearer = (
+        max(ends, key=lambda end: fusion.settling[-1].evaluate(end).score),
+        polished(fusion.settling[-1:], pose, in_all),
+    )
+    T_pose = nearer if _as_significant(evidence.edges.sharp, nearer, farther) else farther
     of_edges = EdgesAlone(evidence.edges.whole, evidence.edges.blur_rad)
     T_edges, T_depth = polished([of_edges], T_rotation), polished([depth], T_rotation)
+    landscape = Landscape.about(fusion.settling[-1].cells(T_rotation), T_rotation, tuple(range(ROTATION_DOF)))
+    noise = measure_noise(landscape)
     at_pose = fusion.settling[0].evaluate(pose)
     first_derivative, second_derivative = axis_derivatives(depth, pose)
     return Check(
@@ -176,12 +198,27 @@ def check_at(
         second_derivative=second_derivative,
         edges=of_edges.evaluate(pose).score,
         edges_at_best=of_edges.evaluate(T_rotation).score,
+        edges_in_view=_in_view(evidence.edges.sharp, T_rotation),
+        looks=1.0 if noise is None else noise.looks,
         edges_kept=_kept(evidence.edges.bands[0], se3.perturb(pose, bias), T_rotation),
         contrast=fusion.edge_contrast(T_rotation),
         agreement_rad=se3.rotation_angle_rad(T_edges @ se3.inverse(T_depth)),
         overlap=at_pose.overlap,
         deficit=fusion.settling[0].evaluate(T_rotation).score - at_pose.score,
     )
+
+
+def _as_significant(sharp: EdgeFrames, nearer: Matrix4, farther: Matrix4) -> bool:
+    """Whether the edges at a pose are nearly as significant as at another."""
+    near, far = significances(sharp, np.stack([nearer, farther])).tolist()
+    return bool(near >= NEAR_SHARE * far)
+
+
+def _in_view(edges: EdgeFrames, T_camera_lidar: Matrix4) -> int:
+    """How many range edges lie in the images."""
+    p_camera = np.einsum("ij,jn->ni", T_camera_lidar[:3, :3], edges.xyz_m.astype(np.float64)) + T_camera_lidar[:3, 3]
+    uv_px, valid = project(edges.camera, p_camera)
+    return int(np.count_nonzero(valid & in_image(edges.camera, uv_px)))
 
 
 def _kept(band: EdgeFrames, T_expected: Matrix4, T_best: Matrix4) -> float:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import fsum
 
 from coec.calibration.monitor.likelihood import Belief, Three, Told, plus, score, three
 
@@ -86,6 +87,16 @@ def after_check(tests: Hypotheses, told: Told, axes: Axes, share: float, most: f
     least = three([max(v, n / OLDEST) for v, n in zip(learnt.variance, of_rig, strict=True)])
     learnt = replace(learnt, variance=least)
     return Hypotheses(learnt, _thinned(running), told.offset)
+
+
+def learnt_distance2(tests: Hypotheses, rig: Three) -> float:
+    """How far beside the pose that is served the checks have put the mount, in standard deviations, squared: what is
+    learnt of a mean of variance `rig` (per axis) that leaves v of it, itself varies by the rest. χ² of a right mount,
+    as long as nothing else speaks."""
+    if tests.right is None:
+        return 0.0
+    rows = zip(tests.right.mean, tests.right.variance, rig, strict=True)
+    return fsum(m * m / (r - v) for m, v, r in rows if r > v)
 
 
 def _begun(kind: int, right: Belief, told: Told, axes: Axes) -> Hypothesis:

@@ -1,0 +1,78 @@
+"""`coec sim checks`: how often the monitor accuses a right mount on rendered drives, and how soon it notices a wrong
+one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from coec.adapters.files import output
+from coec.calibration.commissioning.baseline import Baseline
+from coec.errors import CalibrationError, DecodeError
+from coec.evaluation import check_drives, check_run, check_statistics
+from coec.evaluation.check_drives import CheckDrive
+from coec.reports import check_tables, console
+from coec.schemas.base import from_json, to_json
+from coec.schemas.checks import CheckedDrive
+from coec.simulation.source import require_extra
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command."""
+
+    output: Path
+    rounds: int
+    hours: float
+    as_json: bool = False
+
+
+def run(options: Options) -> int:
+    """Draws and checks the drives that have no result in the folder yet, and writes report.json there.
+
+    Raises:
+        SourceError: the optional extra is not installed.
+        OutputError: a file cannot be written.
+    """
+    require_extra()
+    drives = list(check_drives.drives(options.rounds))
+    rows = {drive.name: row for drive in drives if (row := _kept(options.output, drive)) is not None}
+    baselines: dict[str, Baseline | None] = {}
+    with console.progress() as bars:
+        task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
+        for drive in drives:
+            if drive.name in rows:
+                continue
+            if drive.rig not in baselines:
+                baselines[drive.rig] = _commissioned(drive.rig)
+            row = check_run.run(drive, baselines[drive.rig])
+            output.write(_path(options.output, row.name), to_json(row))
+            rows[row.name] = row
+            bars.update(task, advance=1, note=row.name)
+    report = check_statistics.report([rows[drive.name] for drive in drives], options.hours)
+    output.write(options.output / "report.json", to_json(report))
+    if options.as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        check_tables.show(report)
+    return 0
+
+
+def _commissioned(rig: str) -> Baseline | None:
+    try:
+        return check_run.commissioned(rig)
+    except CalibrationError as error:
+        console.show(f"{rig} cannot be commissioned: {error}", "red")
+        return None
+
+
+def _path(folder: Path, name: str) -> Path:
+    return folder / "drives" / f"{name}.json"
+
+
+def _kept(folder: Path, drive: CheckDrive) -> CheckedDrive | None:
+    """The row of a drive that was checked before; a damaged one is checked again."""
+    try:
+        return from_json(CheckedDrive, _path(folder, drive.name).read_bytes())
+    except (OSError, DecodeError):
+        return None

@@ -1,0 +1,72 @@
+"""Drives on which checks are tried, as data: rigs and places, each with seeds that nothing was learned on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+CHECK_PAIRS, CHECKS, PERIOD_S = 6, 5, 5.0
+"""Pairs of a check, checks of a drive, and seconds between two: as the monitor is configured unless told otherwise."""
+
+HERTZ = CHECK_PAIRS / PERIOD_S
+
+RIGS = {
+    "fisheye600-32": "camera=fisheye600&lidar=32",
+    "75deg-64": "camera=pinhole560x350@75&lidar=64",
+    "fisheye560-64": "camera=fisheye560&lidar=64",
+    "100deg-32": "camera=pinhole640x320@100&lidar=32",
+}
+"""By name, the words of a `sim:` SOURCE. None of these lenses is in the matrix, or was learned on."""
+
+PLACES = {
+    "highway": "scene=highway",
+    "street": "",
+    "garage": "scene=garage",
+    "street-low-sun": "faults=low_sun:0",
+    "highway-rain": "scene=highway&faults=rain:0:mmph=10",
+    "street-night": "faults=night:0",
+    "room": "scene=room",
+    "street-rain": "faults=rain:0:mmph=10",
+    "open-road": "faults=open_road:0",
+    "tunnel": "faults=tunnel:0",
+}
+"""Likewise."""
+
+FIRST_SEED = 810_001
+"""Beyond all seeds that anything was learned on, or is shown with."""
+
+COMMISSIONED_ON = (("street", 820_001), ("garage", 820_002))
+"""Places and seeds of the drives that a rig is commissioned on."""
+
+COMMISSIONED_CHECKS = 3
+"""Length of each of these, in checks: together they have 36 pairs, as many as one or two windows of a rig."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckDrive:
+    """A drive of `CHECKS` checks. `rig` and `place` are keys of `RIGS` and `PLACES`."""
+
+    rig: str
+    place: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        return f"{self.rig}_{self.place}_{self.seed}"
+
+    def source(self, checks: int) -> str:
+        """The SOURCE that draws so many checks of it."""
+        # A moment longer: the last pair is begun.
+        seconds = checks * PERIOD_S + 0.5 / HERTZ
+        words = [f"seed={self.seed}", f"seconds={seconds:g}", f"camera_hz={HERTZ:g}", f"lidar_hz={HERTZ:g}"]
+        return "sim:" + "&".join([*words, "ego_hz=20", RIGS[self.rig], *filter(None, [PLACES[self.place]])])
+
+
+def drives(rounds: int) -> Iterator[CheckDrive]:
+    """Every place with every rig, `rounds` times, each time with a seed of its own: some of a run have seen all."""
+    for turn in range(rounds):
+        for number, place in enumerate(PLACES):
+            for rig in RIGS:
+                # Rigs share the drive: what differs between them is the rig.
+                yield CheckDrive(rig, place, FIRST_SEED + turn * len(PLACES) + number)

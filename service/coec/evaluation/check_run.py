@@ -1,0 +1,172 @@
+"""One drive of the checks: drawn, and checked at the right pose and beside it, as the monitor does."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.adapters.depth.maps import CachedDepth, open_depth
+from coec.adapters.images.codec import CachedGreys, GreyImages
+from coec.calibration.commissioning.baseline import Baseline, learned_hash
+from coec.calibration.commissioning.learning import learn_accuracy, learn_limits
+from coec.calibration.estimators import sight_of
+from coec.calibration.frames.pairing import Pairer
+from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.monitor.check import NO_BIAS, ROTATION_DOF, check_at, gather
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, judge_check
+from coec.calibration.monitor.sensor_faults import scene_baseline
+from coec.calibration.ports import DepthModel, ImageReader, Silence
+from coec.calibration.types import FramePair, Matrix4, Rig, Window
+from coec.config import CalibrationConfig, LimitsConfig, PairingConfig
+from coec.errors import CoecError
+from coec.evaluation.check_drives import CHECK_PAIRS, CHECKS, COMMISSIONED_CHECKS, COMMISSIONED_ON, CheckDrive
+from coec.evaluation.detection import OBSERVABLE_M
+from coec.geometry import se3
+from coec.geometry.vectors import random_direction
+from coec.schemas.checks import CheckedDrive, CheckedPose, Judged
+from coec.schemas.replies import Vector6
+from coec.simulation.source import open_sim
+from coec.sources.spec import parse_spec
+
+if TYPE_CHECKING:
+    from coec.simulation.drive import SimulatedDrive
+
+RIGHT = "right"
+"""Name of no move."""
+
+MOVES = ((RIGHT, 0.0, 0.0), ("0.3 deg", 0.3, 0.0), ("0.5 deg", 0.5, 0.0), ("1 deg", 1.0, 0.0), ("10 cm", 0.0, 0.10))
+"""By name: by how much the served pose is turned from the truth, about a random axis (degrees), and shifted from it
+along an axis of the camera that checks know (m)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stage:
+    """A drawn drive: its pairs, the truth (4, 4), and what reads them once for all."""
+
+    rig: Rig
+    truth: Matrix4
+    pairs: tuple[FramePair, ...]
+    depth: DepthModel
+    images: ImageReader
+
+    def window(self, pairs: Sequence[FramePair]) -> Window:
+        """Some pairs, from the truth."""
+        rig = replace(self.rig, T_camera_lidar_nominal=self.truth)
+        return Window(f"{rig.pair}-{pairs[0].stamp_ns}", rig, self.truth, tuple(pairs))
+
+
+def commissioned(rig: str) -> Baseline:
+    """What checks of a rig learn on drives of its own; limits of full calibrations are not asked for.
+
+    Raises:
+        CalibrationError: these drives show nothing.
+    """
+    stages = [_draw(CheckDrive(rig, *where).source(COMMISSIONED_CHECKS)) for where in COMMISSIONED_ON]
+    pairs = [
+        # As if one drive had come after the other: they begin at the same time.
+        _later(pair, number * 3_600_000_000_000)
+        for number, stage in enumerate(stages)
+        for pair in stage.pairs
+    ]
+    whole = stages[0].window(pairs)
+    configuration = _configuration()
+    depth = open_depth(configuration.depth, LimitsConfig())
+    evidence = gather(sight_of(whole, depth, GreyImages(LimitsConfig()), configuration, Silence()))
+    rotation, pose = learn_accuracy(evidence, stages[0].truth, configuration)
+    limits = learn_limits(evidence, stages[0].truth, configuration, (rotation, pose), FALSE_ALARM_RATE)
+    return Baseline(
+        pair=whole.rig.pair, T_camera_lidar=stages[0].truth, rotation=rotation, pose=pose, dof=ROTATION_DOF, limits={},
+        monitor=limits, scene=scene_baseline(evidence.scenes), false_alarm_rate=FALSE_ALARM_RATE, windows=len(stages),
+        pairs=len(pairs), detected={}, sensors={}, depth_identity=depth.identity,
+        config_hash=learned_hash(configuration),
+    )  # fmt: skip
+
+
+def run(drive: CheckDrive, baseline: Baseline | None, checks: int = CHECKS) -> CheckedDrive:
+    """The row of a drive of so many checks; whatever goes wrong is its `failure`."""
+    source = drive.source(checks)
+    row = CheckedDrive(name=drive.name, rig=drive.rig, place=drive.place, seed=drive.seed, source=source, poses=())
+    try:
+        return row.model_copy(update={"poses": _checked(_draw(source), drive, baseline)})
+    except CoecError as error:
+        return row.model_copy(update={"failure": f"{type(error).__name__}: {error}"})
+
+
+def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tuple[CheckedPose, ...]:
+    configuration = _configuration()
+    bias = NO_BIAS if baseline is None else baseline.rotation.expected
+    starts = range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS)
+    windows = [stage.window(stage.pairs[first : first + CHECK_PAIRS]) for first in starts]
+    gathered = [gather(sight_of(window, stage.depth, stage.images, configuration, Silence())) for window in windows]
+    rows = []
+    for number, (name, turn_deg, shift_m) in enumerate(MOVES):
+        rng = np.random.default_rng([zlib.crc32(drive.name.encode()), number])
+        xi = _move(rng, turn_deg, shift_m, baseline)
+        if xi is None:
+            continue
+        pose = se3.perturb(stage.truth, xi)
+        seen = [(evidence, check_at(evidence, pose, configuration, bias)) for evidence in gathered]
+        of_any = tuple(_wire(judge_check(evidence, check, pose, None)) for evidence, check in seen)
+        # The reference moves with what is served: a commissioned rig whose mount has moved.
+        of_rig = () if baseline is None else tuple(_wire(judge_check(*one, pose, baseline)) for one in seen)
+        rows.append(CheckedPose(moved=name, uncommissioned=of_any, commissioned=of_rig))
+    return tuple(rows)
+
+
+def _move(
+    rng: np.random.Generator, turn_deg: float, shift_m: float, baseline: Baseline | None
+) -> NDArray[np.float64] | None:
+    """(6,) ξ; None of a shift where checks know no translation to `OBSERVABLE_M`."""
+    xi = np.zeros(6)
+    xi[:3] = radians(turn_deg) * random_direction(rng)
+    if shift_m > 0.0:
+        sigma = np.full(6, OBSERVABLE_M) if baseline is None else baseline.pose.sigma(CHECK_PAIRS)
+        known = [axis for axis in range(3, 6) if sigma[axis] <= OBSERVABLE_M]
+        if not known:
+            return None
+        xi[known[int(rng.integers(len(known)))]] = shift_m * float(rng.choice([-1.0, 1.0]))
+    return xi
+
+
+def _draw(source: str) -> _Stage:
+    made: SimulatedDrive = open_sim(parse_spec(source).query)
+    pairer = Pairer(PairingConfig(), expects_motion=True)
+    pairs = [pair for message in made.messages() for pair in pairer.push(message)] + pairer.flush()
+    depth = CachedDepth(open_depth(_configuration().depth, LimitsConfig()), len(pairs))
+    images = CachedGreys(GreyImages(LimitsConfig()), len(pairs))
+    return _Stage(made.rig, made.truth(pairs[0].stamp_ns), tuple(pairs), depth, images)
+
+
+def _later(pair: FramePair, by_ns: int) -> FramePair:
+    camera, lidar = pair.camera, pair.lidar
+    return replace(
+        pair,
+        camera=replace(camera, stamp_ns=camera.stamp_ns + by_ns),
+        lidar=replace(lidar, stamp_ns=lidar.stamp_ns + by_ns),
+    )
+
+
+def _configuration() -> CalibrationConfig:
+    values = CalibrationConfig().model_dump()
+    # One process draws and checks one drive: its thread is its own.
+    values["depth"] |= {"threads": 1}
+    return CalibrationConfig.model_validate(values)
+
+
+def _wire(seen: Observation) -> Judged:
+    return Judged(
+        offset=_six(seen.offset), sigma=_six(seen.sigma), noise=_six(seen.noise), place=_six(seen.place),
+        distance2=seen.distance2, flagged=seen.flagged, weak=seen.weak,
+        causes=tuple(cause.code for cause in seen.causes),
+    )  # fmt: skip
+
+
+def _six(values: NDArray[np.float64]) -> Vector6:
+    rx, ry, rz, tx, ty, tz = (float(value) for value in values)
+    return rx, ry, rz, tx, ty, tz

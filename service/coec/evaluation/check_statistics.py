@@ -1,0 +1,186 @@
+"""What the change detector makes of checks of rendered drives: shares, delays, and false alarms in hours of driving.
+
+A mount is right or wrong for hours, and so is a place poor for its checks: on a highway what one check is off, the next
+one is off as well. So the hours are resampled by whole drives, and of one place for as long as one is there; checks
+that are shuffled would be independent, and the alarms far too few.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, cycle, islice
+
+import numpy as np
+
+from coec.calibration.commissioning.quantiles import chi2_quantile
+from coec.calibration.monitor.change_detector import (
+    S_PER_H,
+    AlarmLevels,
+    Finding,
+    MonitorState,
+    Observation,
+    after_observation,
+    alarm_levels,
+)
+from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.config import MonitorConfig
+from coec.evaluation.check_drives import CHECK_PAIRS, PERIOD_S
+from coec.evaluation.check_run import MOVES, RIGHT
+from coec.evaluation.detection import CONFIDENCE, interval
+from coec.schemas.checks import (
+    CheckedDrive,
+    ChecksReport,
+    HoursStatistics,
+    Judged,
+    MovedStatistics,
+    RigStatistics,
+)
+
+PLACE_CHECKS = 120
+"""Checks in one place of resampled driving, on average: ten minutes at one every five seconds."""
+
+SETTLED_CHECKS = 24
+"""Of a right mount before a move: two minutes, of other drives in the same place with the same rig."""
+
+SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
+
+CONFIG = MonitorConfig(period_s=PERIOD_S, pairs=CHECK_PAIRS)
+
+Where = tuple[str, Judged]
+"""A check and the name of its place."""
+
+
+def report(rows: Sequence[CheckedDrive], resampled_h: float) -> ChecksReport:
+    """All figures of the rows."""
+    return ChecksReport(
+        drives=len(rows),
+        failed={row.name: row.failure for row in rows if row.failure is not None},
+        rigs=tuple(_of_rigs(rows, of_rig, resampled_h) for of_rig in (False, True)),
+    )
+
+
+def poisson_most(events: int) -> float:
+    """The mean that a Poisson variable would exceed `events` at with a probability of `CONFIDENCE` (Garwood 1936)."""
+    return 0.5 * chi2_quantile(CONFIDENCE, 2 * (events + 1))
+
+
+def _of_rigs(rows: Sequence[CheckedDrive], commissioned: bool, resampled_h: float) -> RigStatistics:
+    right = {row.name: checks for row in rows if (checks := _checks(row, RIGHT, commissioned))}
+    known = [row for row in rows if row.name in right]
+    hours = [_hours("rendered", _in_turn(known, right))]
+    if known and resampled_h > 0.0:
+        most = round(resampled_h * S_PER_H / PERIOD_S)
+        hours.append(_hours("resampled", _at_most(_resampled(known, right), most)))
+    moved = [_moved(name, known, right, commissioned) for name, _, _ in MOVES]
+    return RigStatistics(commissioned=commissioned, moved=tuple(moved), hours=tuple(hours))
+
+
+def _checks(row: CheckedDrive, moved: str, commissioned: bool) -> tuple[Judged, ...]:
+    for pose in row.poses:
+        if pose.moved == moved:
+            return pose.commissioned if commissioned else pose.uncommissioned
+    return ()
+
+
+def _in_turn(rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]]) -> Iterator[list[Where]]:
+    """What each rig met, one drive after the other, as a vehicle of its own."""
+    for rig in dict.fromkeys(row.rig for row in rows):
+        yield [(f"{rig} {row.place}", check) for row in rows if row.rig == rig for check in right[row.name]]
+
+
+def _resampled(rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]]) -> Iterator[list[Where]]:
+    """Vehicles, one of each rig in turn, each in one place after the other."""
+    rng = np.random.default_rng(SEED)
+    rigs = list(dict.fromkeys(row.rig for row in rows))
+    for rig in cycle(rigs):
+        places = list(dict.fromkeys(row.place for row in rows if row.rig == rig))
+        driven: list[Where] = []
+        for place in rng.permutation(places).tolist():
+            there = [row for row in rows if row.rig == rig and row.place == place]
+            most, met = int(rng.geometric(1.0 / PLACE_CHECKS)), 0
+            while met < most:
+                checks = right[there[int(rng.integers(len(there)))].name]
+                driven += [(f"{rig} {place}", check) for check in checks]
+                met += len(checks)
+        yield driven
+
+
+def _at_most(vehicles: Iterable[list[Where]], checks: int) -> Iterator[list[Where]]:
+    """The first so many checks of all vehicles."""
+    for driven in vehicles:
+        yield driven[:checks]
+        checks -= len(driven)
+        if checks <= 0:
+            return
+
+
+def _hours(how: str, vehicles: Iterable[list[Where]]) -> HoursStatistics:
+    levels = alarm_levels(CONFIG)
+    checks = suspicions = 0
+    alarmed: list[str] = []
+    for driven in vehicles:
+        before = MonitorState()
+        for (where, _), state in zip(driven, states([check for _, check in driven], levels), strict=True):
+            checks += 1
+            worse = state.outcome is not before.outcome
+            suspicions += worse and state.outcome is Finding.SUSPECT and before.outcome is not Finding.CONFIRMED
+            if worse and state.outcome is Finding.CONFIRMED:
+                alarmed.append(where)
+            before = state
+    driven_h = checks * PERIOD_S / S_PER_H
+    return HoursStatistics(
+        how=how,
+        hours=driven_h,
+        suspicions=suspicions,
+        alarms=len(alarmed),
+        alarms_per_100_h_at_most=100.0 * poisson_most(len(alarmed)) / driven_h if driven_h > 0.0 else 0.0,
+        alarmed=tuple(dict.fromkeys(alarmed)),
+    )
+
+
+def _moved(
+    name: str, rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]], commissioned: bool
+) -> MovedStatistics:
+    levels = alarm_levels(CONFIG)
+    everything: list[Judged] = []
+    drives = suspected = 0
+    delays: list[int] = []
+    for place, row in enumerate(rows):
+        checks = _checks(row, name, commissioned)
+        if not checks:
+            continue
+        drives += 1
+        everything += checks
+        others = [one for one in (*rows[place + 1 :], *rows[:place]) if (one.rig, one.place) == (row.rig, row.place)]
+        before = list(islice(cycle(chain.from_iterable(right[one.name] for one in others)), SETTLED_CHECKS))
+        after = list(states([*before, *checks], levels))[len(before) :]
+        suspected += any(state.evidence >= levels.suspect for state in after)
+        confirmed = next((number for number, state in enumerate(after, 1) if state.evidence >= levels.confirmed), None)
+        delays += [] if confirmed is None else [confirmed]
+    clear = [check for check in everything if not check.causes and not check.weak]
+    flagged = sum(check.flagged for check in clear)
+    low, high = interval(flagged, len(clear)) if clear else (None, None)
+    return MovedStatistics(
+        moved=name, drives=drives, checks=len(everything), blind=sum(bool(check.causes) for check in everything),
+        weak=sum(check.weak and not check.causes for check in everything), clear=len(clear), flagged=flagged,
+        flagged_low=low, flagged_high=high, suspected=suspected, confirmed=len(delays), delay_checks=tuple(delays),
+    )  # fmt: skip
+
+
+def states(checks: Iterable[Judged], levels: AlarmLevels) -> Iterator[MonitorState]:
+    """The change detector after each of some checks, all of pairs of their own."""
+    state = MonitorState()
+    for number, check in enumerate(checks):
+        state = after_observation(state, _observation(check, number), levels)
+        yield state
+
+
+def _observation(check: Judged, number: int) -> Observation:
+    begin_ns = round(number * PERIOD_S * 1e9)
+    return Observation(
+        stamp_ns=begin_ns + CHECK_PAIRS - 1, pair_stamps_ns=tuple(begin_ns + pair for pair in range(CHECK_PAIRS)),
+        metrics=(), offset=np.array(check.offset), sigma=np.array(check.sigma), noise=np.array(check.noise),
+        place=np.array(check.place), distance2=check.distance2, flagged=check.flagged, weak=check.weak,
+        flagged_by_paper=None, causes=tuple(CAUSES[code] for code in check.causes),
+    )  # fmt: skip

@@ -1,0 +1,48 @@
+"""What `coec sim checks` says in tables."""
+
+from __future__ import annotations
+
+from statistics import median
+
+from coec.reports import console
+from coec.schemas.checks import ChecksReport, RigStatistics
+
+
+def show(report: ChecksReport) -> None:
+    """Shares of checks and drives by move, then false alarms by hours."""
+    for rigs in report.rigs:
+        _show(rigs)
+    for name, failure in report.failed.items():
+        console.show(f"no result: {name}: {failure}", "red")
+
+
+def _show(rigs: RigStatistics) -> None:
+    console.show("commissioned rigs" if rigs.commissioned else "rigs of which nothing is known", "bold")
+    table = console.table(
+        "served pose", "checks", "blind", "faint", "clear", "flagged", "of clear", "95 %", "drives", "suspected",
+        "confirmed", "delay", right=range(1, 12),
+    )  # fmt: skip
+    for row in rigs.moved:
+        share = f"{100.0 * row.flagged / row.clear:.1f} %" if row.clear else "-"
+        between = (
+            "-"
+            if row.flagged_low is None or row.flagged_high is None
+            else f"{100.0 * row.flagged_low:.1f} to {100.0 * row.flagged_high:.1f} %"
+        )
+        delay = f"{median(row.delay_checks):g} checks" if row.delay_checks else "-"
+        counts = (row.checks, row.blind, row.weak, row.clear, row.flagged)
+        drives = (row.drives, row.suspected, row.confirmed)
+        table.add_row(row.moved, *map(str, counts), share, between, *map(str, drives), delay)
+    console.out.print(table)
+    hours = console.table("right mount", "hours", "suspicions", "alarms", "in 100 h at most (95 %)", right=range(1, 5))
+    for driven in rigs.hours:
+        hours.add_row(
+            driven.how,
+            console.figure(driven.hours, 1),
+            *map(str, (driven.suspicions, driven.alarms)),
+            console.figure(driven.alarms_per_100_h_at_most, 1),
+        )
+    console.out.print(hours)
+    for driven in rigs.hours:
+        if driven.alarmed:
+            console.show(f"false alarms, {driven.how}: {', '.join(driven.alarmed)}")

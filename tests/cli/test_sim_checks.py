@@ -1,0 +1,55 @@
+"""`coec sim checks`: what is done stays done, and one drive from its words to its row."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+from cli.conftest import Coec
+from coec.evaluation import check_drives, check_run
+from coec.evaluation.check_drives import CheckDrive
+from coec.schemas.checks import CheckedDrive
+from evaluation.test_check_statistics import driven, judged
+
+
+def test_a_drive_that_has_a_result_is_not_checked_again(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checked: list[str] = []
+
+    def run(drive: CheckDrive, baseline: object) -> CheckedDrive:
+        assert baseline is None
+        checked.append(drive.name)
+        return driven(drive.place, drive.seed, (judged(0.0),), (judged(1.0),)).model_copy(update={"name": drive.name})
+
+    monkeypatch.setattr(check_drives, "PLACES", {"street": "", "highway": "scene=highway"})
+    monkeypatch.setattr(check_run, "run", run)
+    monkeypatch.setattr(check_run, "commissioned", lambda _: None)
+    first = coec("sim", "checks", "--output", tmp_path, "--rounds", 1, "--hours", 0.1, "--json")
+    assert (first.status, first.document["drives"], len(checked)) == (0, len(checked), len(set(checked)))
+    (tmp_path / "drives" / f"{checked[0]}.json").write_text("half of a fi")
+    again = coec("sim", "checks", "--output", tmp_path, "--rounds", 1, "--hours", 0.1)
+    assert checked[-1] == checked[0]  # the damaged one
+    assert len(checked) == first.document["drives"] + 1
+    assert "resampled" in again.out
+
+
+def test_a_right_mount_on_a_highway_is_found_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where guard rails, markings and horizon fit nearly as well most of a degree beside."""
+    monkeypatch.setitem(check_drives.RIGS, "wide", "camera=pinhole640x400&lidar=64")
+    monkeypatch.setattr(check_run, "MOVES", check_run.MOVES[:1])
+    row = check_run.run(CheckDrive("wide", "highway", 700_001), None, checks=1)
+    assert row.failure is None
+    ((check,),) = [pose.uncommissioned for pose in row.poses]
+    assert (check.flagged, check.weak, check.causes) == (False, True, ())  # one frame says what the other says
+    assert max(abs(value) for value in check.offset[:3]) < 0.0035
+
+
+def test_a_drive_that_cannot_be_drawn_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(check_drives.RIGS, "box", "camera=box")
+    row = check_run.run(CheckDrive("box", "street", 1), None)
+    assert row.failure is not None
+    assert "unknown camera 'box'" in row.failure
