@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,9 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What the measurements of processes would bring."""
-    figures = {row.key: 1.0 for row in rows.ROWS if row.key.startswith(("worker", "solve_memory", "io", "query"))}
+    figures = {
+        row.key: 1.0 for row in rows.ROWS if row.key.startswith(("worker", "solve_memory", "io", "ros", "query"))
+    }
     document = {**figures, "io_per_second": {"pairs": 10.0}}
     monkeypatch.setattr(worker, "measure", lambda *_: {})
     monkeypatch.setattr(live, "measure", lambda *_: dict(document))
@@ -80,14 +83,21 @@ def test_a_worker_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     }  # fmt: skip
 
 
-def test_a_daemon_is_measured_under_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("measure", "prefix"), [pytest.param(live.native, "", marks=pytest.mark.slow), (live.ros, "ros_")]
+)
+def test_a_daemon_is_measured_under_load(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, measure: Callable[..., dict[str, Any]], prefix: str
+) -> None:
     monkeypatch.setattr(live, "SETTLE_S", 1.0)
     monkeypatch.setattr(live, "SECONDS", 1.5)
-    document = live.measure(tmp_path, lambda _: None)
-    assert set(document) >= {row.key for row in rows.ROWS if row.key.startswith(("io", "query"))}
-    assert document["io_cpu_percent"] > 0.0
-    assert document["io_resident_mb"] > document["io_proportional_mb"] > 0.0
-    assert {"cameras", "lidars", "pairs", "windows"} <= set(document["io_per_second"])
+    document = measure(tmp_path, lambda _: None)
+    names = ("ros",) if prefix else ("io", "query")
+    assert set(document) >= {row.key for row in rows.ROWS if row.key.startswith(names)}
+    assert document[f"{prefix}io_cpu_percent"] > 0.0
+    assert document[f"{prefix}io_resident_mb"] > document[f"{prefix}io_proportional_mb"] > 0.0
+    per_second = document[f"{prefix}io_per_second"]
+    assert per_second["cameras"] > per_second["lidars"] > 0.0
 
 
 def test_the_table_says_what_is_not_as_required(capsys: pytest.CaptureFixture[str]) -> None:

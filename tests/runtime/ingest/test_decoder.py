@@ -101,6 +101,17 @@ def test_a_cloud_that_contradicts_its_origin_is_refused(desk: Desk, caplog: pyte
     assert "look measured from" in caplog.text
 
 
+def test_where_points_come_from_is_looked_at_once_a_second_and_always_while_it_is_wrong(desk: Desk) -> None:
+    true, moved = replace(a_sweep(), frame_id="lidar"), replace(in_frame(a_sweep(), ROOF), frame_id="lidar")
+
+    def taken(sweep: LidarFrame, stamp_s: float) -> bool:
+        stamped = replace(sweep, stamp_ns=round(stamp_s * 1e9))
+        return desk.take(LIDAR, msgpack_frames.encode_lidar(stamped), MSGPACK) is not None
+
+    looks = [(true, 10.2), (moved, 10.3), (moved, 11.1), (moved, 11.2), (true, 11.3), (moved, 11.4), (moved, 12.0)]
+    assert [taken(*look) for look in looks] == [True, True, False, False, True, True, False]
+
+
 def test_else_the_configurations(desk: Desk) -> None:
     assert desk.take(CAMERA, msgpack_frames.encode_camera(camera())) == camera()
     assert isinstance(desk.take(LIDAR, outgoing.encode_cloud(CLOUD)), LidarFrame)

@@ -33,13 +33,13 @@ def definition(type_name: str) -> str:
 
 
 def deserialized(message_type: type[T], payload: bytes) -> T:
-    """The message in CDR, of either byte order.
+    """The message in CDR, of either byte order. Its arrays are read-only views of `payload`.
 
     Raises:
         DecodeError: it is not one, or is cut off.
     """
     try:
-        message = _STORE.deserialize_cdr(payload, message_type.__msgtype__)  # type: ignore[attr-defined]
+        message = _STORE.deserialize_cdr(memoryview(payload), message_type.__msgtype__)  # type: ignore[attr-defined]
     except (SerdeError, ValueError, IndexError, struct.error) as error:
         raise DecodeError(Refusal.MESSAGE_MALFORMED, "not this message in CDR, or cut off") from error
     if not isinstance(message, message_type):

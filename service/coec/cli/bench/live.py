@@ -40,13 +40,14 @@ from coec.runtime.worker.child import PACKAGE_ROOT
 from coec.schemas.keys import Keys
 
 VEHICLE, PAIR = "bench", "front"
+KEYS = Keys("coec", VEHICLE)
 SETTLE_S, SECONDS = 10.0, 25.0
 """Under load before anything counts; and each of the two times that count."""
 
 SLICE_S = 20.0
 """25 pairs in so much time, nine times the default: the recorder, too, is at work all the while."""
 
-SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(sys.argv[1]))"
+SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(*sys.argv[1:]))"
 
 QUERY_PERIOD_S, COMMAND_PERIOD_S = 0.05, 0.5
 POLL_S, TIMEOUT_S = 0.1, 60.0
@@ -65,48 +66,72 @@ class Seen:
 
 
 def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
-    """Runs the daemon in `folder` under load: as it comes, and then with one solve after another.
+    """Runs the daemon in `folder` under load, by native frames and by topics of ROS.
 
     Raises:
         ConnectionFailedError: the daemon did not become ready.
     """
-    heard("the daemon starts")
+    return native(folder, heard) | ros(folder, heard)
+
+
+def native(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
+    """By native frames as they come, and then with one solve after another."""
+    with _loaded(folder, "native", WindowConfig(slice_s=SLICE_S), heard) as (session, process):
+        document = _resources(session, process, heard)
+        heard("the daemon under load: queries during solves")
+        return document | _round_trips(session, process)
+
+
+def ros(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
+    """By the same sensors as nodes of ROS, with windows as long as they are by default."""
+    with _loaded(folder, "ros", WindowConfig(), heard) as (session, process):
+        return {f"ros_{name}": figure for name, figure in _resources(session, process, heard).items()}
+
+
+@contextmanager
+def _loaded(
+    folder: Path, form: str, window: WindowConfig, heard: Callable[[str], None]
+) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
+    """A daemon that has been under load for a while, as `form` of `load.SENDERS` sends it, and who may ask it."""
+    heard(f"the daemon starts, {form}")
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    configuration = folder / "coec.yaml"
+    configuration = folder / f"{form}.yaml"
     # JSON is YAML.
-    configuration.write_text(_configuration(endpoint, folder / "state").model_dump_json(exclude_none=True))
+    config = _configuration(endpoint, folder / form, form, window)
+    configuration.write_text(config.model_dump_json(exclude_none=True))
     with (
         _running("-m", "coec", "run", "--config", str(configuration)) as daemon,
         connected([endpoint], TIMEOUT_S) as session,
-        _running("-c", SENSORS, endpoint),
+        _running("-c", SENSORS, endpoint, form),
     ):
-        heard("the daemon under load")
-        return _under_load(session, daemon, heard)
+        heard(f"the daemon under load, {form}")
+        _await_running(session, KEYS)
+        process = ProcessReading(daemon.pid)
+        _ask(session, KEYS, process, SETTLE_S, at_work=False)
+        yield session, process
 
 
-def _under_load(
-    session: zenoh.Session, daemon: subprocess.Popen[bytes], heard: Callable[[str], None]
-) -> dict[str, Any]:
-    keys = Keys("coec", VEHICLE)
-    _await_running(session, keys)
-    process = ProcessReading(daemon.pid)
-    _ask(session, keys, process, SETTLE_S, at_work=False)
+def _resources(session: zenoh.Session, process: ProcessReading, heard: Callable[[str], None]) -> dict[str, Any]:
+    """Processor and memory of the I/O process, and what came meanwhile."""
     heard("the daemon under load: processor and memory")
     process.reset_peak()
     cpu_s, begin_s = process.cpu_s, time.monotonic()
-    before = _counters(session, keys)
-    _ask(session, keys, process, SECONDS, at_work=False)
+    before = _counters(session, KEYS)
+    _ask(session, KEYS, process, SECONDS, at_work=False)
     elapsed_s = time.monotonic() - begin_s
-    after = _counters(session, keys)
-    document: dict[str, Any] = {
+    after = _counters(session, KEYS)
+    return {
         "io_cpu_percent": 100.0 * (process.cpu_s - cpu_s) / elapsed_s,
         "io_resident_mb": process.peak_mb,
         "io_proportional_mb": process.proportional_mb,
         "io_per_second": {name: (after[name] - before[name]) / elapsed_s for name in after},
     }
-    heard("the daemon under load: queries during solves")
-    seen = _ask(session, keys, process, SECONDS, at_work=True)
-    document["query_during_solve_count"] = len(seen.solving_ms)
+
+
+def _round_trips(session: zenoh.Session, process: ProcessReading) -> dict[str, Any]:
+    """Of queries, while the worker solves and while it waits."""
+    seen = _ask(session, KEYS, process, SECONDS, at_work=True)
+    document: dict[str, Any] = {"query_during_solve_count": len(seen.solving_ms)}
     for name, times_ms in (("during_solve", seen.solving_ms), ("idle", seen.waiting_ms)):
         for percent in (50, 99):
             document[f"query_{name}_p{percent}_ms"] = float(np.percentile(times_ms, percent)) if times_ms else None
@@ -162,20 +187,23 @@ def _status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
     return document
 
 
-def _configuration(endpoint: str, state: Path) -> Config:
+def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig) -> Config:
     intrinsics = intrinsics_config(scene.CAMERAS[load.CAMERA])
+    is_ros = form == "ros"
+    places = {name: {"topic": load.TOPICS[name]} if is_ros else {"key": key} for name, key in load.KEYS.items()}
     pair = PairConfig(
         name=PAIR,
-        camera=CameraConfig(key=load.KEYS["camera"], intrinsics=intrinsics),
-        lidar=LidarConfig(key=load.KEYS["lidar"]),
-        ego=EgoConfig(key=load.KEYS["ego"]),
+        camera=CameraConfig.model_validate({**places["camera"], "intrinsics": intrinsics}),
+        lidar=LidarConfig.model_validate(places["lidar"]),
+        ego=EgoConfig.model_validate(places["ego"]),
         T_camera_lidar=scene.T_TRUE.tolist(),
-        window=WindowConfig(slice_s=SLICE_S),
+        window=window,
         calibration=CalibrationConfig(search=SearchConfig(dof=6)),
     )
     return Config(
         vehicle=VEHICLE,
         zenoh=ZenohConfig(embedded_router=True, listen=(endpoint,), connect=()),
+        middleware="rmw_zenoh" if is_ros else "native",
         state=StateConfig(directory=state, min_free_bytes=0),
         log=LogConfig(level="error"),
         pairs=(pair,),

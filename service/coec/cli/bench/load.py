@@ -1,5 +1,5 @@
 """The sensors of the benchmark, in a process of their own, until its standard input ends: camera, LiDAR and ego-motion
-of one pair at the rates of a vehicle, native msgpack.
+of one pair at the rates of a vehicle, as native frames or as nodes of ROS 2 send them.
 """
 
 from __future__ import annotations
@@ -8,14 +8,21 @@ import itertools
 import select
 import sys
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import zenoh
 
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.adapters.ros import messages, outgoing
+from coec.adapters.ros.wire.qos import SENSOR_DATA
+from coec.adapters.ros.wire.rmw_zenoh import Node, RmwZenoh
 from coec.adapters.zenoh.client import connected
-from coec.calibration.types import EgoMotion
+from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.cli.bench import scene
+
+Frame = CameraFrame | LidarFrame | EgoMotion
 
 CAMERA_HZ, SWEEP_EVERY = 30.0, 3
 """Images a second, and of how many images each has a sweep: 10 sweeps a second."""
@@ -26,27 +33,65 @@ ROOMS = 7
 CAMERA = "double_sphere"
 CONNECT_S = 60.0
 SPEED_MPS = 10.0
+TOPICS = {"camera": "/bench/camera/compressed", "lidar": "/bench/points", "ego": "/bench/odometry"}
 KEYS = {"camera": "bench/camera", "lidar": "bench/lidar", "ego": "bench/ego"}
 
 
-def main(endpoint: str) -> int:
-    """Publishes until standard input ends; always 0."""
+def main(endpoint: str, form: str) -> int:
+    """Publishes until standard input ends; always 0. `form` is one of `SENDERS`."""
     pairs = [scene.pair(scene.CAMERAS[CAMERA], seed, 0) for seed in range(ROOMS)]
     with connected([endpoint], CONNECT_S) as session:
-        encoding = zenoh.Encoding("application/msgpack")
-        streams = {name: session.declare_publisher(key, encoding=encoding) for name, key in KEYS.items()}
+        send = SENDERS[form](session)
         begin_s = time.monotonic()
         for count in itertools.count():
             if _ended(begin_s + count / CAMERA_HZ - time.monotonic()):
                 return 0
             room, stamp_ns = pairs[count % ROOMS], time.time_ns()
-            ego = EgoMotion(stamp_ns, "ego", (SPEED_MPS, 0.0, 0.0), (0.0, 0.0, 0.0), count)
-            streams["ego"].put(encode_ego(ego))
-            streams["camera"].put(encode_camera(replace(room.camera, stamp_ns=stamp_ns, sequence=count)))
+            send(EgoMotion(stamp_ns, "ego", (SPEED_MPS, 0.0, 0.0), (0.0, 0.0, 0.0), count))
+            send(replace(room.camera, stamp_ns=stamp_ns, sequence=count))
             if count % SWEEP_EVERY == 0:
-                sweep = replace(room.lidar, stamp_ns=stamp_ns, sequence=count // SWEEP_EVERY)
-                streams["lidar"].put(encode_lidar(sweep))
+                send(replace(room.lidar, stamp_ns=stamp_ns, sequence=count // SWEEP_EVERY))
     return 0
+
+
+def _native(session: zenoh.Session) -> Callable[[Frame], None]:
+    """Native frames on `KEYS`."""
+    encoding = zenoh.Encoding("application/msgpack")
+    streams = {name: session.declare_publisher(key, encoding=encoding) for name, key in KEYS.items()}
+
+    def send(frame: Frame) -> None:
+        match frame:
+            case CameraFrame():
+                streams["camera"].put(encode_camera(frame))
+            case LidarFrame():
+                streams["lidar"].put(encode_lidar(frame))
+            case EgoMotion():
+                streams["ego"].put(encode_ego(frame))
+
+    return send
+
+
+def _ros(session: zenoh.Session) -> Callable[[Frame], None]:
+    """CDR on `TOPICS`, as nodes of rmw_zenoh publish it."""
+    node = RosNode(session, RmwZenoh(Node(0, str(session.info.zid()), 0, "/bench", "sensors"), messages.type_hash))
+    publishers = RosPublishers(session, node)
+    types = {"camera": messages.COMPRESSED_IMAGE, "lidar": messages.POINT_CLOUD, "ego": messages.ODOMETRY}
+    streams = {name: publishers.publisher(TOPICS[name], of_type, SENSOR_DATA) for name, of_type in types.items()}
+
+    def send(frame: Frame) -> None:
+        match frame:
+            case CameraFrame():
+                streams["camera"].put(outgoing.encode_image(frame)[1], frame.stamp_ns)
+            case LidarFrame():
+                streams["lidar"].put(outgoing.encode_cloud(frame), frame.stamp_ns)
+            case EgoMotion():
+                streams["ego"].put(outgoing.encode_odometry(frame, frame.frame_id), frame.stamp_ns)
+
+    return send
+
+
+SENDERS: Mapping[str, Callable[[zenoh.Session], Callable[[Frame], None]]] = {"native": _native, "ros": _ros}
+"""By the form in which frames are sent."""
 
 
 def _ended(wait_s: float) -> bool:

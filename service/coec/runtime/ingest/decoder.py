@@ -13,7 +13,7 @@ from coec.adapters.ros import incoming
 from coec.adapters.ros.wire.rmw_zenoh import Attachment
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
-from coec.calibration.frames.origin import OriginCheck, from_origin
+from coec.calibration.frames.origin import ApparentOrigin, OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import AnyStreamConfig, LimitsConfig, PairConfig
 from coec.errors import DecodeError
@@ -26,6 +26,9 @@ CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 
 CLOUD_ORIGIN = "cloud_origin"
 """Cause of a loss: the points were not measured from where the configuration says."""
+
+ORIGIN_PERIOD_NS = 10**9
+"""Of sensor time, between two looks at where points were measured from: 1 ms each."""
 
 WRONG_TYPE = "wrong_type"
 """Cause of a loss: a message that makes no frame of the stream."""
@@ -73,6 +76,8 @@ class Decoder:
         self._accepted: Counter[str] = Counter()
         self._T_cloud_lidar = np.array(pair.lidar.T_cloud_lidar, dtype=np.float64)
         self._origin = OriginCheck()
+        self._looked_in: int | None = None
+        self._contradicted = False
 
     def counts(self, stream: str) -> StreamCounts:
         """Counters of a stream since the start."""
@@ -151,10 +156,21 @@ class Decoder:
         if cloud.frame_id != (self._pair.lidar.cloud_frame_id or self._pair.lidar.frame_id):
             raise DecodeError("frame_id", "not the frame id of the configuration")
         sweep = from_origin(cloud, self._T_cloud_lidar, self._pair.lidar.frame_id)
-        contradiction = self._origin.look(sweep)
+        contradiction = self._contradiction(sweep)
         if contradiction is not None:
             raise DecodeError(CLOUD_ORIGIN, f"{contradiction.sentence} See lidar.T_cloud_lidar.")
         return sweep
+
+    def _contradiction(self, sweep: LidarFrame) -> ApparentOrigin | None:
+        """Of the first sweep of each period of sensor time, and of all while one was found: frames of drivers change
+        with their configuration, not from sweep to sweep."""
+        period = sweep.stamp_ns // ORIGIN_PERIOD_NS
+        if period == self._looked_in and not self._contradicted:
+            return None
+        self._looked_in = period
+        found = self._origin.look(sweep)
+        self._contradicted = found is not None
+        return found
 
     def _check_camera(self, frame: CameraFrame) -> None:
         camera = self._pair.camera

@@ -38,6 +38,9 @@ disk or the worker, 25 pairs of 2.5 MB."""
 GRACE_NS = NS_PER_S
 """Sensor time after the end of a slice before silence ends it: late pairs may still be on their way."""
 
+TOLD_S = 0.1
+"""Between two reports while samples come; whoever reads them looks once a second."""
+
 IDLE_S = 0.25
 """Longest wait for a sample: how soon silence is noticed."""
 
@@ -71,6 +74,7 @@ class Stream:
         self._losses = losses
         self._pairs = 0
         self._sync_error_s: float | None = None
+        self._told_s = 0.0
 
     def request_stop(self) -> None:
         """End the thread."""
@@ -155,7 +159,8 @@ class Stream:
             self.choose_next()
             if item is None:
                 self._end_in_silence()
-            self.tell()
+            if item is None or time.monotonic() - self._told_s >= TOLD_S:
+                self.tell()
 
     def _take_frame(self, parcel: Parcel) -> None:
         begun_s = time.monotonic()
@@ -193,6 +198,7 @@ class Stream:
 
     def tell(self) -> None:
         """Renew the report."""
+        self._told_s = time.monotonic()
         silent = self._clock.is_silent(time.monotonic())
         rate_hz = self._clock.rate_hz
         self.report = StreamStatistics(
