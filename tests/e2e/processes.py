@@ -227,6 +227,14 @@ class Service:
         finally:
             player.close()
 
+    def send_by(self, put: Callable[[Frame], None], frames: Sequence[Frame]) -> None:
+        """The same, in another form than native frames."""
+        for portion in _portions(frames):
+            for frame in portion:
+                put(frame)
+                self.sent[stream_of(frame)] += 1
+            self.until_received()
+
     def _count(self, frame: Frame, _: Played) -> None:
         self.sent[stream_of(frame)] += 1
 

@@ -11,9 +11,32 @@ import psutil
 import pytest
 
 from coec.adapters.mcap.bag_writer import write_bag
-from coec.config import CalibrationConfig, DepthConfig, WindowConfig
-from e2e.drives import SECONDS, STEPPED, Drive, rendered, stepped_configuration, without_depth
+from coec.adapters.zenoh.player import Frame
+from coec.config import (
+    CalibrationConfig,
+    Config,
+    DepthConfig,
+    ObjectiveConfig,
+    SearchConfig,
+    WindowConfig,
+    load_config,
+)
+from coec.reports.commented_yaml import commented_yaml
+from e2e.drives import (
+    NS_PER_S,
+    SECONDS,
+    SHORT,
+    SHORT_PAIRS,
+    STEPPED,
+    Drive,
+    later,
+    rendered,
+    stepped_configuration,
+    without_depth,
+)
 from e2e.processes import Router, Service, coec, service, write_configuration
+from ros_nodes import Sensors
+from tiny_onnx import CARD, first_channel
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -36,6 +59,10 @@ REPLAY_SPEED = 12.0
 """Seconds of driving per second, of the recording that is played."""
 
 MAX_ERROR_DEG = 0.35
+
+SHORT_SLICE_S = 12
+OVER_NS = 15 * NS_PER_S
+"""Of the short drive and what comes after it: two pairs more than its slice."""
 
 
 @pytest.fixture(scope="module")
@@ -150,3 +177,85 @@ def test_live_restarted_and_replayed_the_decisions_are_the_same(
         assert drive.error_deg(running.extrinsic(), SECONDS) < MAX_ERROR_DEG
         assert running.terminate() == 0
     assert [code for code, _ in states(restarted)] == [code for code, _ in states(live)]
+
+
+# --- the way in ---------------------------------------------------------------------------------------------------
+
+TOPICS = {"camera": "/front/image_raw/compressed", "lidar": "/top/points", "ego": "/odometry"}
+
+
+def by_topics(path: Path, middleware: str) -> Path:
+    """The configuration, with topics of ROS in place of keys."""
+    config = load_config(path)
+    (pair,) = config.pairs
+    streams = {
+        name: {**stream.model_dump(exclude={"key", "encoding"}), "topic": TOPICS[name]}
+        for name, stream in pair.streams.items()
+    }
+    document = {**config.model_dump(), "middleware": middleware, "pairs": [{**pair.model_dump(), **streams}]}
+    path.write_text(commented_yaml(Config.model_validate(document)))
+    return path
+
+
+def decided_by(path: Path, router: Router, frames: list[Frame], middleware: str) -> dict[str, Any]:
+    """What the service decides of frames that come this way, and the digests of the windows that it cuts."""
+    if middleware != "native":
+        by_topics(path, middleware)
+    with service(path, router) as running:
+        if middleware == "native":
+            running.send(frames)
+        else:
+            sensors = Sensors(router.session, TOPICS, middleware)
+            running.send_by(sensors.send, frames)
+            sensors.close()
+        running.rest()
+        counters = running.counters()
+        told = {
+            **decisions(running),
+            "files": [window["sha256"] for window in running.windows()],
+            "accepted": {name: counters[name]["accepted"] for name in TOPICS},
+            "lost": {name: counters[name]["losses"] for name in TOPICS},
+        }
+        assert running.terminate() == 0
+    return told
+
+
+def test_native_frames_and_topics_of_rmw_zenoh_come_to_the_same(tmp_path: Path, router: Router) -> None:
+    short = rendered(SHORT)
+    # The first pair of the next slice ends the window, and is none itself.
+    ending = [frame for frame in later(short.frames, SHORT_SLICE_S) if frame.stamp_ns < short.start_ns + OVER_NS]
+    frames = without_depth([*short.frames, *ending])
+    network = tmp_path / "tiny.onnx"
+    network.write_bytes(first_channel())
+    network.with_suffix(".yaml").write_text(CARD)
+
+    def configured(name: str) -> Path:
+        window = WindowConfig(pairs=SHORT_PAIRS, min_pairs=4, slice_s=SHORT_SLICE_S, min_points_in_view=100)
+        calibration = CalibrationConfig(
+            depth=DepthConfig(model=str(network)),
+            objective=ObjectiveConfig(kind="mi"),
+            search=SearchConfig(max_evaluations=60),
+        )
+        return write_configuration(
+            tmp_path / name, short.recording, router.endpoint, window=window, calibration=calibration
+        )
+
+    native, topics = (decided_by(configured(way), router, frames, way) for way in ("native", "rmw_zenoh"))
+    assert len(native["files"]) == len(native["results"]) == 1
+    assert topics == native
+
+
+@pytest.mark.slow
+def test_native_frames_rmw_zenoh_and_a_bridge_come_to_the_same(
+    tmp_path: Path, drive: Drive, router: Router, sample_data: Path
+) -> None:
+    network = DepthConfig(model=str(sample_data / "depth" / "tcsmallnet_dyn.onnx"))
+    frames = without_depth(drive.between(0, SECONDS + 1))
+    ways = {
+        way: decided_by(stepped_configuration(tmp_path / way, router, network), router, frames, way)
+        for way in ("native", "rmw_zenoh", "ros2dds")
+    }
+    assert {code for code, _ in states(ways["native"])} >= {"healthy", "suspect", "miscalibrated"}
+    assert len(ways["native"]["files"]) > 2
+    assert ways["rmw_zenoh"] == ways["native"]
+    assert ways["ros2dds"] == ways["native"]
