@@ -13,7 +13,7 @@ from coec.config import AuthorityConfig, SenderConfig
 from conftest import REPOSITORY
 
 MAKE = REPOSITORY / "deploy" / "make-test-ca"
-NAMES = ("router", "vehicle", "sensors", "operator", "viewer")
+NAMES = ("router", "vehicle", "sensors", "ros", "operator", "viewer")
 USES = "basicConstraints=critical,CA:FALSE\nextendedKeyUsage=clientAuth\nsubjectAltName=DNS:{name}\n"
 
 

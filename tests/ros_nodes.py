@@ -63,6 +63,11 @@ class Driver:
         beside = struct.pack("<qqB16s", self._sequence, time.time_ns(), 16, self.gid)
         self.publisher.put(payload, attachment=beside)
 
+    def sends(self, payload: bytes) -> bool:
+        """Puts it; False, for a loop that waits for what comes of it."""
+        self.put(payload)
+        return False
+
     def close(self) -> None:
         self._token.undeclare()
         self.publisher.undeclare()

@@ -51,7 +51,7 @@ def test_what_it_says_is_a_configuration_that_can_be_used(tmp_path: Path) -> Non
     flight = Listener(credentials).hear("1", speaker.hello())
     assert isinstance(flight, bytes)
     speaker.say(flight, b"hold")
-    for name in ("vehicle", "sensors", "operator", "viewer"):
+    for name in ("vehicle", "sensors", "ros", "operator", "viewer"):
         settings = read_settings(folder / f"{name}.json5")
         assert settings.get_json("connect/endpoints") == '["tls/vehicle-7.example:7448"]'
         assert settings.get_json("listen/endpoints") == "[]"

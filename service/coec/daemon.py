@@ -137,7 +137,7 @@ class Daemon:
         listener = None if credentials is None else Listener(credentials)
         session = open_session(config.zenoh, config.limits)
         self._bus = Bus(session)
-        self._ros = RosSide(session, config)
+        self._ros_side = RosSide(session, config)
         self._presence = Presence(session, config.zenoh, config.limits, self._keys, self._started_ns)
         others = () if mode_of(settings) == "router" else connected_of(settings)
         self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
@@ -152,7 +152,7 @@ class Daemon:
             self._worker,
             self._publish,
             self._troubles,
-            self._ros.topics,
+            self._ros_side.topics,
             self._room.nominal,
         )
         self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
@@ -208,7 +208,7 @@ class Daemon:
         self._door.use(self._config.metrics)
         for pair in self._config.pairs:
             self._run(pair)
-        self._room.listen(self._bus, self._ros.input_of)
+        self._room.listen(self._bus, self._ros_side.input_of)
         for name in (each.name for each in self._config.every_pair):
             self._bus.declare_alive(self._keys.alive(name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
@@ -222,7 +222,7 @@ class Daemon:
         for thread in (pair.decider.thread, pair.recorder.thread, pair.stream.thread):
             thread.start()
         for name, stream in config.streams.items():
-            self._bus.subscribe(self._ros.input_of(stream), partial(pair.take_sample, name))
+            self._bus.subscribe(self._ros_side.input_of(stream), partial(pair.take_sample, name))
 
     def _admit(self) -> None:
         """Build and start the pairs of which everything has been found."""
@@ -287,7 +287,7 @@ class Daemon:
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
             ("look for no more pairs", lambda: _stopped(self._room.threads, LOOK_OUT_STOP_S)),
-            ("be no node of ROS", self._ros.close),
+            ("be no node of ROS", self._ros_side.close),
             ("end the streams", lambda: self._end(pairs, lambda pair: pair.stream, INGEST_STOP_S)),
             ("finish the open windows", self._finish_windows),
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),

@@ -17,6 +17,13 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from zenoh.ext import (
+    CacheConfig,
+    HistoryConfig,
+    MissDetectionConfig,
+    declare_advanced_publisher,
+    declare_advanced_subscriber,
+)
 
 from certificates import TestAuthority, make_authority
 from coec.adapters.tls.conversation import Speaker
@@ -25,10 +32,12 @@ from coec.adapters.zenoh.client import ConnectionFailedError, Way, connected_by,
 from coec.adapters.zenoh.inputs import on_key
 from coec.adapters.zenoh.presence import Presence
 from coec.adapters.zenoh.proven import give
-from coec.config import SenderConfig, ZenohConfig
+from coec.adapters.zenoh.ros_side import RosSide
+from coec.config import IDENTITY, Config, SenderConfig, ZenohConfig
 from coec.errors import UnavailableError
 from doors import Door, opened
 from fakes import wait_until
+from ros_nodes import Driver, described
 from vehicles import KEYS, LIMITS, PAIR, Vehicle, serving
 
 PATIENCE_S = 20.0
@@ -39,6 +48,23 @@ BRIEF_S = 6
 """Of a certificate; openssl counts whole seconds."""
 
 FRAMES = "sensors/front/camera"
+IMAGE_TOPIC = "/front/image_raw/compressed"
+ROS_VEHICLE = Config.model_validate(
+    {
+        "middleware": "rmw_zenoh",
+        "pairs": [
+            {
+                "name": PAIR,
+                "camera": {
+                    "topic": IMAGE_TOPIC,
+                    "intrinsics": {"model": "pinhole", "width": 8, "height": 6, "fx": 4, "fy": 4, "cx": 4, "cy": 3},
+                },
+                "lidar": "/top/points",
+                "T_camera_lidar": IDENTITY,
+            }
+        ],
+    }
+)
 READABLE = {
     "extrinsic": KEYS.extrinsic(PAIR),
     "health": KEYS.health(PAIR),
@@ -53,6 +79,7 @@ READABLE = {
     "config": KEYS.config,
     "health of all": "coec/@v1/*/*/health",
 }
+LOOKED_FOR = MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 COMMAND = KEYS.command(PAIR, "hold")
 NOT_READABLE = (f"{KEYS.root}/**", "coec/@v1/**", "coec/**", "**", "@/**", "@/*/router", "@/**/config/**", FRAMES)
 
@@ -72,7 +99,10 @@ class Town:
     sensors: zenoh.Session
     operator: zenoh.Session
     viewer: zenoh.Session
+    ros: zenoh.Session
+    side: RosSide
     frames: list[bytes]
+    images: list[bytes]
 
     def of(self, name: str) -> zenoh.Session:
         session = getattr(self, name)
@@ -86,15 +116,20 @@ def town(request: pytest.FixtureRequest, door: Door, tmp_path_factory: pytest.Te
     file = door.authority.session("vehicle", door.certified, mode="peer") if away else None
     config = ZenohConfig(connect=(door.loopback,), file=file)
     frames: list[bytes] = []
+    images: list[bytes] = []
     may = door.authority.of_service(SenderConfig(name="operator"))
     with ExitStack() as stack:
         vehicle = stack.enter_context(serving(tmp_path_factory.mktemp("state"), config, may))
         vehicle.bus.subscribe(on_key(FRAMES), lambda sample: frames.append(sample.payload))
+        side = RosSide(vehicle.bus._session, ROS_VEHICLE)
+        stack.callback(side.close)
+        camera = side.input_of(ROS_VEHICLE.pairs[0].camera)
+        vehicle.bus.subscribe(camera, lambda sample: images.append(sample.payload))
         sessions = {
             name: stack.enter_context(connected_by(door.way(name), PATIENCE_S))
-            for name in ("sensors", "operator", "viewer")
+            for name in ("sensors", "operator", "viewer", "ros")
         }
-        made = Town(vehicle, vehicle.bus._session, frames=frames, **sessions)
+        made = Town(vehicle, vehicle.bus._session, side=side, frames=frames, images=images, **sessions)
         wait_until(lambda: bool(answers(made.operator, KEYS.status)), "the operator reaches the vehicle")
         wait_until(lambda: bool(answers(made.viewer, KEYS.status)), "the viewer reaches the vehicle")
         yield made
@@ -122,15 +157,16 @@ def test_operator_and_viewer_read_everything(town: Town, name: str, what: str) -
     assert answers(town.of(name), READABLE[what])
 
 
-@pytest.mark.fault("a sensor's certificate asks, by name or wildcard", "nothing is answered")
+@pytest.mark.fault("a certificate of sensors or of ROS's nodes asks, by name or wildcard", "nothing is answered")
 @pytest.mark.parametrize("key", [*READABLE.values(), COMMAND])
-def test_sensors_read_nothing(town: Town, key: str) -> None:
-    assert answers(town.sensors, key) == []
+@pytest.mark.parametrize("name", ["sensors", "ros"])
+def test_sensors_and_nodes_read_nothing(town: Town, name: str, key: str) -> None:
+    assert answers(town.of(name), key) == []
 
 
 @pytest.mark.fault("wildcards, the admin space, and frames asked for with a certificate", "nothing is answered")
 @pytest.mark.parametrize("key", NOT_READABLE)
-@pytest.mark.parametrize("name", ["operator", "viewer", "sensors"])
+@pytest.mark.parametrize("name", ["operator", "viewer", "sensors", "ros"])
 def test_what_includes_more_than_is_allowed_is_not_answered(town: Town, name: str, key: str) -> None:
     assert answers(town.of(name), key) == []
 
@@ -141,8 +177,8 @@ def test_the_operator_commands(town: Town, door: Door) -> None:
     assert json.loads(told.payload)["code"] == "held"
 
 
-@pytest.mark.fault("a command with the certificate of a viewer or a sensor", "the router lets it not through")
-@pytest.mark.parametrize("name", ["viewer", "sensors"])
+@pytest.mark.fault("a command with the certificate of a viewer, a sensor or a node", "the router lets it not through")
+@pytest.mark.parametrize("name", ["viewer", "sensors", "ros"])
 def test_nobody_else_commands(town: Town, name: str) -> None:
     before = town.vehicle.commands
     assert answers(town.of(name), COMMAND) == []
@@ -183,7 +219,7 @@ def test_frames_go_to_the_vehicle_only(town: Town) -> None:
 
 
 @pytest.mark.fault("spoofed health, and a spoofed answer, with any certificate", "nobody sees either")
-@pytest.mark.parametrize("name", ["operator", "viewer", "sensors"])
+@pytest.mark.parametrize("name", ["operator", "viewer", "sensors", "ros"])
 def test_nobody_speaks_for_the_vehicle(town: Town, name: str) -> None:
     asker = "viewer" if name == "operator" else "operator"
     heard: list[bytes] = []
@@ -213,7 +249,7 @@ def test_nobody_speaks_for_the_vehicle(town: Town, name: str) -> None:
 
 
 @pytest.mark.fault("spoofed liveliness tokens with any certificate", "nobody sees them")
-@pytest.mark.parametrize("name", ["operator", "viewer", "sensors"])
+@pytest.mark.parametrize("name", ["operator", "viewer", "sensors", "ros"])
 def test_nobody_is_alive_for_the_vehicle(town: Town, name: str) -> None:
     tokens = [town.of(name).liveliness().declare_token(key) for key in (KEYS.alive("ghost"), "sensors/ghost")]
     seen(town, name)
@@ -223,6 +259,102 @@ def test_nobody_is_alive_for_the_vehicle(town: Town, name: str) -> None:
     assert is_alive(asker, KEYS, PATIENCE_S)
     for token in tokens:
         token.undeclare()
+
+
+# --- topics of ROS -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def driver(town: Town) -> Iterator[Driver]:
+    """A node that publishes the vehicle's images."""
+    made = Driver(town.ros, IMAGE_TOPIC, "CompressedImage", 10)
+    yield made
+    made.close()
+
+
+def test_nodes_and_the_service_see_each_other(town: Town, driver: Driver) -> None:
+    del driver
+    wait_until(lambda: bool(town.side.topics().of(IMAGE_TOPIC)), "the service sees the driver")
+    assert town.side.topics().of(IMAGE_TOPIC)[0].node == "/driver"
+
+    def nodes_seen() -> set[str]:
+        replies = list(town.ros.liveliness().get("@ros2_lv/0/**", timeout=PATIENCE_S))
+        return {str(reply.ok.key_expr).split("/")[5] for reply in replies if reply.ok is not None}
+
+    wait_until(lambda: nodes_seen() >= {"NN", "MS"}, "a node sees the service and its subscription")
+
+
+@pytest.mark.fault("messages forged on a sensor's topic with any certificate but a node's", "the vehicle gets none")
+def test_topics_come_from_nodes_only(town: Town, driver: Driver) -> None:
+    town.images.clear()
+    for name in ("operator", "viewer", "sensors"):
+        town.of(name).put(str(driver.publisher.key_expr), name.encode())
+        seen(town, name)
+    wait_until(lambda: bool(town.images) or driver.sends(b"true"), "an image of the driver")
+    assert set(town.images) == {b"true"}
+
+
+@pytest.mark.fault("a topic subscribed to, or nodes listed, with another certificate than a node's", "nothing comes")
+@pytest.mark.parametrize("name", ["operator", "viewer", "sensors"])
+def test_topics_go_to_nodes_and_the_vehicle_only(town: Town, driver: Driver, name: str) -> None:
+    got: list[str] = []
+
+    def receive(sample: zenoh.Sample) -> None:
+        got.append(str(sample.key_expr))
+
+    handler = zenoh.handlers.Callback(receive, indirect=False)
+    subscribers = [town.of(name).declare_subscriber(key, handler) for key in ("0/**", str(driver.publisher.key_expr))]
+    list(town.of(name).get(KEYS.status, timeout=PATIENCE_S))
+    town.images.clear()
+    wait_until(lambda: bool(town.images) or driver.sends(b"true"), "an image of the driver")
+    list(town.of(name).get(KEYS.status, timeout=PATIENCE_S))
+    assert got == []
+    assert list(town.of(name).liveliness().get("@ros2_lv/**", timeout=PATIENCE_S)) == []
+    for subscriber in subscribers:
+        subscriber.undeclare()
+
+
+def test_who_comes_late_gets_the_static_transforms(town: Town) -> None:
+    """Either way: of a node to the service, and of the service to a node."""
+    key = "0/tf_static/tf2_msgs::msg::dds_::TFMessage_/TypeHashNotSupported"
+    for speaker, listener in ((town.ros, town.vehicle_session), (town.vehicle_session, town.ros)):
+        publisher = declare_advanced_publisher(
+            speaker, key, publisher_detection=True, cache=CacheConfig(1), sample_miss_detection=LOOKED_FOR
+        )
+        publisher.put(b"transforms")
+        got: list[bytes] = []
+
+        def hear(sample: zenoh.Sample, got: list[bytes] = got) -> None:
+            got.append(sample.payload.to_bytes())
+
+        subscriber = declare_advanced_subscriber(
+            listener,
+            "0/tf_static/*/*",
+            zenoh.handlers.Callback(hear, indirect=False),
+            history=HistoryConfig(detect_late_publishers=True, max_samples=10),
+            subscriber_detection=True,
+        )
+        wait_until(lambda got=got: got == [b"transforms"], "what was put before")  # type: ignore[misc]
+        subscriber.undeclare()
+        publisher.undeclare()
+
+
+def test_the_service_speaks_to_ros_but_is_no_driver(town: Town, door: Door) -> None:
+    by_certificate = door.authority.session("vehicle", door.certified)
+    got: list[str] = []
+
+    def hear(sample: zenoh.Sample) -> None:
+        got.append(str(sample.key_expr))
+
+    subscriber = town.ros.declare_subscriber("0/**", zenoh.handlers.Callback(hear, indirect=False))
+    forged = f"0{IMAGE_TOPIC}/{described('CompressedImage')}"
+    with connected_by(Way((door.certified,), by_certificate), PATIENCE_S) as session:
+        wait_until(lambda: bool(got or session.put("0/diagnostics/a/b", b"x")), "what the service says")
+        session.put(forged, b"forged")
+        session.put("0/coec/front/overlay/a/b", b"x")
+        wait_until(lambda: any(key.startswith("0/coec/") for key in got), "what the service draws")
+    assert forged not in got
+    subscriber.undeclare()
 
 
 @pytest.mark.fault("a session with a certificate that has expired, is foreign, or none", "it is not opened")
