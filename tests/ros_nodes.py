@@ -58,8 +58,9 @@ class Driver:
         self._token = session.liveliness().declare_token(token)
         self._sequence = 0
 
-    def put(self, payload: bytes) -> None:
-        self._sequence += 1
+    def put(self, payload: bytes, number: int | None = None) -> None:
+        """`number` instead of the next one."""
+        self._sequence = self._sequence + 1 if number is None else number
         beside = struct.pack("<qqB16s", self._sequence, time.time_ns(), 16, self.gid)
         self.publisher.put(payload, attachment=beside)
 

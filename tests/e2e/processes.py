@@ -133,6 +133,19 @@ def write_configuration(
     return path
 
 
+def by_topics(path: Path, middleware: str, topics: Mapping[str, str]) -> Path:
+    """The configuration of one pair, with topics of ROS in place of keys."""
+    config = load_config(path)
+    (pair,) = config.pairs
+    streams = {
+        name: {**stream.model_dump(exclude={"key", "encoding"}), "topic": topics[name]}
+        for name, stream in pair.streams.items()
+    }
+    document = {**config.model_dump(), "middleware": middleware, "pairs": [{**pair.model_dump(), **streams}]}
+    path.write_text(commented_yaml(Config.model_validate(document)))
+    return path
+
+
 @dataclass
 class Service:
     """A running `coec run`, and what a client has of it. Questions are about its first pair where none is

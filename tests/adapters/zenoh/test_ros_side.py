@@ -168,6 +168,16 @@ def test_of_too_many_tokens_the_first_are_kept(
     assert len(side.topics().publishers) == 100
 
 
+def test_what_a_service_says_itself_is_no_topic_of_the_vehicles(session: zenoh.Session, side: RosSide) -> None:
+    own = session.liveliness().declare_token(DRIVER.replace("%front%image_raw", "%coec%front%overlay"))
+    token = session.liveliness().declare_token(DRIVER)
+    wait_until(lambda: bool(side.topics().publishers), "it is seen")
+    assert list(side.topics().types()) == ["/front/image_raw"]
+    assert not side.topics().left_out
+    for declared in (own, token):
+        declared.undeclare()
+
+
 def test_who_is_missing_is_told_with_those_who_are_there(session: zenoh.Session, side: RosSide) -> None:
     token = session.liveliness().declare_token(DRIVER)
     wait_until(lambda: bool(side.topics().publishers), "it is seen")

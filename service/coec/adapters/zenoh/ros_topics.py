@@ -23,6 +23,9 @@ _log = logging.getLogger(__name__)
 MAX_PUBLISHERS = 4096
 """Twenty times those of a large vehicle; 2 MB."""
 
+OWN = "/coec/"
+"""Below it services say what they say themselves: no stream of theirs."""
+
 SHOWN = 8
 """Topics that a sentence names; the rest is a number."""
 
@@ -73,7 +76,7 @@ def listed(names: Collection[str]) -> str:
 
 
 class RosTopics:
-    """Follows the tokens of publishers. `now` is for any thread."""
+    """Follows the tokens of publishers but services like this one. `now` is for any thread."""
 
     def __init__(self, session: zenoh.Session, config: Config) -> None:
         """Those who are there come as those who come later do, within milliseconds of a router that answers."""
@@ -116,6 +119,8 @@ class RosTopics:
             self._changed = True
             if publisher is None:
                 self._left_out["malformed"] += 1
+            elif publisher.topic.startswith(OWN):
+                return
             elif len(self._publishers) >= MAX_PUBLISHERS:
                 self._left_out["too_many"] += 1
             else:
