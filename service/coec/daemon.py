@@ -287,7 +287,6 @@ class Daemon:
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
             ("look for no more pairs", lambda: _stopped(self._room.threads, LOOK_OUT_STOP_S)),
-            ("be no node of ROS", self._ros_side.close),
             ("end the streams", lambda: self._end(pairs, lambda pair: pair.stream, INGEST_STOP_S)),
             ("finish the open windows", self._finish_windows),
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
@@ -297,6 +296,7 @@ class Daemon:
             ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
             ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
+            ("be no node of ROS", self._ros_side.close),
         )
         for name, step in steps:
             _attempt(name, step)

@@ -98,7 +98,7 @@ def test_elsewhere_subscribing_is_enough(session: zenoh.Session, stack: ExitStac
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "namespace"), [("shuttle-7", "/shuttle_7"), ("7.up", "/v7_up"), ("bus_1", "/bus_1")]
+    ("vehicle", "namespace"), [("shuttle-7", "/shuttle_7"), ("7.up", "/_7_up"), ("bus_1", "/bus_1")]
 )
 def test_a_vehicle_has_a_name_that_ros_takes(vehicle: str, namespace: str) -> None:
     assert namespace_of(vehicle) == namespace

@@ -25,6 +25,7 @@ def dialect_of(config: Config, session: str) -> Dialect | None:
 
 
 def namespace_of(vehicle: str) -> str:
-    """The namespace of a vehicle: names of ROS have no other characters, and begin with no digit."""
-    name = re.sub(r"[^A-Za-z0-9_]", "_", vehicle)
-    return f"/v{name}" if name[0].isdigit() else f"/{name}"
+    """The namespace of a vehicle: names of ROS have no other characters, and begin with no digit
+    (rmw/validate_full_topic_name.h)."""
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", vehicle)
+    return f"/_{name}" if name[:1].isdecimal() else f"/{name}"

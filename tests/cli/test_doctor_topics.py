@@ -1,0 +1,78 @@
+"""What `coec doctor` says of a vehicle's topics."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import pytest
+
+from coec.adapters.ros.wire.publisher import Publisher
+from coec.adapters.zenoh.ros_topics import Topics
+from coec.cli.doctor.listening import Heard
+from coec.cli.doctor.streams import stream_findings
+from coec.cli.doctor.topics import NAMED, topic_findings
+from coec.config import IDENTITY, Config
+from coec.runtime.ingest.decoder import StreamCounts
+
+IMAGE, POINTS = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2"
+LEFT, RIGHT = b"l" * 16, b"r" * 16
+THERE = Topics(
+    (
+        Publisher("/front/image", IMAGE, "/left", LEFT),
+        Publisher("/front/image", IMAGE, "/right", RIGHT),
+        Publisher("/top/points", POINTS, None, None),
+        Publisher("/chatter", "std_msgs/msg/String", "/talker", None),
+    )
+)
+
+
+def configured(middleware: str = "rmw_zenoh", **ros: Any) -> Config:
+    intrinsics = {"model": "pinhole", "width": 8, "height": 6, "fx": 4, "fy": 4, "cx": 4, "cy": 3}
+    camera = {"topic": "/front/image", "intrinsics": intrinsics}
+    pair = {"name": "front", "camera": camera, "points": "/rear/points", "T_camera_lidar": IDENTITY}
+    return Config.model_validate({"middleware": middleware, "ros": ros, "pairs": [pair]})
+
+
+def test_topics_that_may_be_streams_are_named_with_types_and_nodes() -> None:
+    (found,) = topic_findings(THERE, configured(domain=7))
+    assert (found.level, found.where) == ("ok", "domain 7")
+    assert found.text == (
+        "/front/image (sensor_msgs/msg/Image, by /left, /right); /top/points (sensor_msgs/msg/PointCloud2); "
+        "1 of other types"
+    )
+
+
+def test_a_vehicle_with_very_many_names_some() -> None:
+    many = Topics(tuple(Publisher(f"/image{number:03}", IMAGE, "/node", None) for number in range(NAMED + 5)))
+    (found,) = topic_findings(many, configured())
+    assert found.text.count("/image") == NAMED
+    assert "; 5 more such; 0 of other types" in found.text
+
+
+@pytest.mark.parametrize(("middleware", "where"), [("rmw_zenoh", "domain 0"), ("ros2dds", "bridge")])
+def test_nobody_there_is_told_with_what_may_be_wrong(middleware: str, where: str) -> None:
+    (found,) = topic_findings(Topics(), configured(middleware))
+    assert (found.level, found.where) == ("warn", where)
+    assert found.advice is not None
+    assert "@ros2_lv/**" in found.advice
+
+
+def test_tokens_that_were_not_read_are_told() -> None:
+    *_, found = topic_findings(Topics(THERE.publishers, Counter(too_many=7, malformed=2)), configured())
+    assert (found.level, "2 malformed, 7 too_many" in found.text) == ("warn", True)
+
+
+def test_a_silent_stream_is_told_with_who_is_there_and_two_senders_by_name() -> None:
+    config = configured()
+    (pair,) = config.pairs
+    camera = Heard("/front/image", counts=StreamCounts(9, 9, (LEFT, RIGHT), stamped_by_sender=True))
+    heard = {"camera": camera, "lidar": Heard("/rear/points")}
+    found = list(stream_findings(pair, heard, config, 1.0, THERE))
+    (silent,) = [one for one in found if one.where == "/rear/points"]
+    assert (silent.level, "no publisher of /rear/points; there are: /top/points" in silent.text) == ("fail", True)
+    (unheard,) = [one for one in found if one.where == "/front/image"]
+    assert "no publisher" not in unheard.text
+    senders, clock = [one.text for one in found if one.check == "senders"]
+    assert senders.startswith("2 publishers send on /front/image at a time: /left, /right.")
+    assert "the stamp from the sender's clock" in clock
