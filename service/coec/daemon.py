@@ -232,13 +232,14 @@ class Daemon:
         found = self._room.found()
         if not found:
             return
-        self._config = completed(self._config, found)
-        self._worker.use(self._config.model_dump_json())
+        whole = completed(self._config, found)
+        self._worker.use(whole.model_dump_json())
+        fresh = {name: Pair(config, whole, self._outside) for name, config in found.items()}
+        self._pairs = {**self._pairs, **fresh}  # before the configuration that names them
+        self._config = whole
         for name, config in found.items():
-            pair = Pair(config, self._config, self._outside)
-            self._pairs = {**self._pairs, name: pair}
-            self._commands[name] = pair.commands
-            self._answers.replace(pair.answers)
+            self._commands[name] = fresh[name].commands
+            self._answers.replace(fresh[name].answers)
             self._run(config)
         self._reception.use(self._rules)  # for the commands of new pairs, too
         self._shown = self._shown_now()

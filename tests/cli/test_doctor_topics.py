@@ -29,8 +29,9 @@ THERE = Topics(
 
 def configured(middleware: str = "rmw_zenoh", **ros: Any) -> Config:
     intrinsics = {"model": "pinhole", "width": 8, "height": 6, "fx": 4, "fy": 4, "cx": 4, "cy": 3}
-    camera = {"topic": "/front/image", "intrinsics": intrinsics}
-    pair = {"name": "front", "camera": camera, "points": "/rear/points", "T_camera_lidar": IDENTITY}
+    camera = {"topic": "/front/image", "frame_id": "camera", "intrinsics": intrinsics}
+    lidar = {"topic": "/rear/points", "frame_id": "lidar"}
+    pair = {"name": "front", "camera": camera, "lidar": lidar, "T_camera_lidar": IDENTITY}
     return Config.model_validate({"middleware": middleware, "ros": ros, "pairs": [pair]})
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.client import RemoteError, connected
+from coec.adapters.zenoh.client import RemoteError, ask_one, connected
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.geometry import se3
 from e2e.drives import Drive, rendered
@@ -182,6 +182,7 @@ def test_rubbish_and_a_flood_keep_a_pair_waiting_and_no_other(
         assert (health["state"], health["level"]) == ("unknown", 3)
         assert refused(running, keys.extrinsic("front"))[0] == "awaiting"
         assert running.ask(keys.extrinsic("rear")) == rear
+        assert b'pair="front"' in ask_one(running.session, keys.metrics, PATIENCE_S).payload
 
         for name in ("camera", "lidar", "ego"):
             of_stream = {"camera": CameraFrame, "lidar": LidarFrame, "ego": EgoMotion}[name]

@@ -24,22 +24,26 @@ from cloud_files import npy, npz, pcd
 from coec.adapters.depth.model_cards import CARDS, read_card
 from coec.adapters.files.baseline_file import baseline_to_json, load_baseline
 from coec.adapters.files.conversions import estimate_of, result_of
-from coec.adapters.files.rig import rig_of, rig_to_json
+from coec.adapters.files.rig import camera_of, rig_of, rig_to_json
 from coec.adapters.frames.msgpack_frames import decode_camera, decode_ego, decode_lidar
 from coec.adapters.images.codec import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
 from coec.adapters.mcap.windows import PART_SUFFIX, is_window, read_result, read_window, salvage
 from coec.adapters.ros import incoming, messages, outgoing
 from coec.adapters.ros.images import ENCODINGS
 from coec.adapters.ros.moving_frames import MovingFrame, frames_in
+from coec.adapters.ros.camera_info import decode_info, lens_of
+from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.settings import mode_of, settings_of
 from coec.calibration.lifecycle import Rules, after_estimate, initial_state, restored
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.config import (
     CalibrationConfig,
+    Config,
     LimitsConfig,
     MonitorConfig,
     PointTimeConfig,
+    PairConfig,
     PolicyConfig,
     StateConfig,
     TrackerConfig,
@@ -47,11 +51,13 @@ from coec.config import (
     load_config,
 )
 from coec.errors import SourceError, UsageError
-from coec.geometry.cameras import build
+from coec.geometry.cameras import build, project_point
 from coec.runtime.api import payloads
 from coec.runtime.api.extrinsic import extrinsic_of
 from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.decisions.state_store import Clocks, StateStore
+from coec.runtime.nominal.findings import Found
+from coec.runtime.nominal.kept import NOMINAL_FILE, KeptNominals
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.answers import MalformedAnswerError, number_of, pack_answer, read_answer
 from coec.runtime.worker.jobs import Drawn, Kind, Solved
@@ -308,6 +314,47 @@ def _bag(data: bytes, folder: Path) -> None:
     recording = open_source(str(path))
     assert np.isfinite(recording.rig.T_camera_lidar_nominal).all()
     _played(recording)
+
+
+def _nominal(data: bytes, folder: Path) -> None:
+    """What a vehicle of ROS says of its calibration: by the first byte `CameraInfo`, `/tf_static`, or what is kept."""
+    kind, body = data[:1], data[1:]
+    if kind == b"i":
+        info = decode_info(body)
+        for rectified in (False, True):
+            with suppress(SourceError):
+                camera = camera_of(lens_of(info, rectified=rectified).intrinsics)
+                assert np.isfinite(project_point(camera, 0.1, -0.1, 1.0)[:2]).all()
+    elif kind == b"t":
+        transforms = StaticTransforms()
+        transforms.take(decode_joints(body))
+        found = transforms.transform("camera", "lidar")
+        transforms.doubts("camera", "lidar")
+        assert found is None or np.isfinite(found).all()
+    else:
+        (folder / NOMINAL_FILE).write_bytes(body)
+        for kept in KeptNominals(folder).found(AWAITING).values():
+            rig_of(kept.pair)
+
+
+AWAITING = Config.model_validate(
+    {"middleware": "rmw_zenoh", "pairs": [{"name": "front", "camera": "/c/image", "points": "/points"}]}
+)
+
+
+def _nominal_seeds() -> list[bytes]:
+    intrinsics = {"model": "pinhole", "width": 64, "height": 48, "fx": 50, "fy": 50, "cx": 31.5, "cy": 23.5}
+    lidar = {"topic": "/points", "frame_id": "lidar"}
+    camera = {"topic": "/c/image", "frame_id": "camera", "intrinsics": intrinsics}
+    pair = PairConfig.model_validate(
+        {"name": "front", "camera": camera, "lidar": lidar, "T_camera_lidar": np.eye(4).tolist()}
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        kept = KeptNominals(Path(folder))
+        kept.keep(Found(pair, {"T_camera_lidar": "/tf_static"}), AWAITING.awaited[0], AWAITING, 5)
+        kept.flush()
+        state = (Path(folder) / NOMINAL_FILE).read_bytes()
+    return [b"i" + _camera_info(), b"t" + _tf(), b"k" + state]
 
 
 def _camera_info() -> bytes:
@@ -720,6 +767,9 @@ TARGETS: Final = {
         Target("manifest", _manifest, _manifest_seeds, (in_yaml,), (*YAML_WORDS, b"depth", b"double_sphere", b"mei")),
         Target("kitti", _kitti, lambda: [b"R: 1 0 0\nT: 1 2 3\n", b"2013-05-28 08:46:02.904483072\n"]),
         Target("bag", _bag, _bag_seeds, (in_records,), (b"lz4", b"zstd", b"equidistant")),
+        Target(
+            "nominal", _nominal, _nominal_seeds, (behind(1, checksummed),), (b"equidistant", b"camera", *JSON_WORDS)
+        ),
         Target("window", _window, _window_seeds, (in_records,), (b"lz4", b"zstd")),
         Target("selector", _selector, _selector_seeds, words=(b";", b"=", b"/", b"@v1", b"*", b"?", b"_")),
         Target("command", _command, _command_seeds, (behind(7, in_msgpack), behind(7, in_json)), JSON_WORDS),

@@ -54,6 +54,13 @@ def held(tmp_path: Path, record_property: Callable[[str, object], None]) -> Repl
     return replay
 
 
+@pytest.mark.fault(
+    "CameraInfo, /tf_static and nominal.json, of any bytes", "a value or an error of ours, within 5 s and 500 MB"
+)
+def test_nominal(held: Replay) -> None:
+    held("nominal")
+
+
 @pytest.mark.fault("a camera frame in msgpack, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_camera(held: Replay) -> None:
     held("camera")

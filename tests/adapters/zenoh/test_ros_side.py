@@ -74,7 +74,7 @@ def seen(session: zenoh.Session, expression: str) -> set[str]:
 
 def test_the_service_shows_itself_as_a_node_that_subscribes(session: zenoh.Session, side: RosSide) -> None:
     bus, own = Bus(session), str(session.info.zid())
-    for stream in configured("rmw_zenoh").pairs[0].streams.values():
+    for stream in configured("rmw_zenoh").every_pair[0].streams.values():
         bus.subscribe(side.input_of(stream), lambda _: None)
     points = "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
     node, described = f"@ros2_lv/0/{own}/0", "2::,5:,:,:,,/backends:cpu:"
@@ -93,7 +93,7 @@ def test_elsewhere_subscribing_is_enough(session: zenoh.Session, stack: ExitStac
     config = configured("ros2dds")
     side = RosSide(session, config.model_copy(update={"middleware": middleware}))
     stack.callback(side.close)
-    assert [side.input_of(stream).token for stream in config.pairs[0].streams.values()] == [None] * 3
+    assert [side.input_of(stream).token for stream in config.every_pair[0].streams.values()] == [None] * 3
     assert side.topics() == Topics()
 
 

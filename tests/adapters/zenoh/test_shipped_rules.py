@@ -123,7 +123,7 @@ def town(request: pytest.FixtureRequest, door: Door, tmp_path_factory: pytest.Te
         vehicle.bus.subscribe(on_key(FRAMES), lambda sample: frames.append(sample.payload))
         side = RosSide(vehicle.bus._session, ROS_VEHICLE)
         stack.callback(side.close)
-        camera = side.input_of(ROS_VEHICLE.pairs[0].camera)
+        camera = side.input_of(ROS_VEHICLE.every_pair[0].camera)
         vehicle.bus.subscribe(camera, lambda sample: images.append(sample.payload))
         sessions = {
             name: stack.enter_context(connected_by(door.way(name), PATIENCE_S))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -148,6 +150,25 @@ def test_rubbish_is_counted_by_its_cause_and_what_comes_after_it_is_taken() -> N
     watch.take_frame("front", LIDAR, POINTS)
     watch.look()
     assert codes(watch) == ["being_built"]
+
+
+@pytest.mark.fault("messages of 32 MB on /tf_static and CameraInfo", "none is kept; counted by cause")
+def test_messages_larger_than_any_are_not_kept() -> None:
+    watch = heard_all()
+    watch.look()
+    watch.ready()
+    tracemalloc.start()
+    for _ in range(100):
+        watch.take_transforms(cdr(bytes(2**22), messages.TF))
+        watch.take_transforms(cdr(bytes(2**20), messages.TF))
+        watch.take_info("front", cdr(bytes(2**22), messages.CAMERA_INFO))
+    held_bytes, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held_bytes < 20 * 2**20
+    watch.look()
+    losses = watch.nominal("front").losses
+    assert (losses["tf_static_message_too_large"], losses["tf_static_overrun"]) == (100, 92)
+    assert losses["info_message_too_large"] == 1
 
 
 @pytest.mark.fault("a decoder fails on a sample of a pair that is awaited", "it costs the sample")

@@ -44,7 +44,8 @@ class KeptNominals:
         for damage in loaded.damage:
             _log.warning(f"nominal calibrations that were kept cannot be used: {damage}")
         self._pairs: dict[str, KeptPair] = {}
-        for name, document in (loaded.body or {}).get("pairs", {}).items():
+        pairs = (loaded.body or {}).get("pairs")
+        for name, document in (pairs if isinstance(pairs, dict) else {}).items():
             try:
                 self._pairs[name] = KeptPair.model_validate(document)
             except ValidationError:
@@ -67,10 +68,10 @@ class KeptNominals:
         document["lidar"] |= earlier.lidar.model_dump(include={"frame_id", "T_cloud_lidar", "cloud_frame_id"})
         if pair.ego is not None and earlier.ego is not None:
             document["ego"]["T_lidar_ego"] = earlier.ego.T_lidar_ego
-        complete = PairConfig.model_validate(document)
         try:
+            complete = PairConfig.model_validate(document)
             rig_of(complete)  # what it was read for may have changed on the disk: the mask
-        except ConfigError as error:
+        except (ConfigError, ValidationError) as error:
             _log.warning(f"a nominal calibration that was kept cannot be used: {error}")
             return None
         since = datetime.fromtimestamp(kept.found_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from coec.adapters.ros import messages
-from coec.adapters.ros.camera_info import decode_info
-from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
+from coec.adapters.ros.camera_info import MAX_INFO_BYTES, decode_info
+from coec.adapters.ros.static_transforms import MAX_MESSAGE_BYTES, StaticTransforms, decode_joints
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Reason
@@ -30,6 +30,12 @@ _log = logging.getLogger(__name__)
 
 TRANSFORMS_WAITING = 512
 """Messages of static transforms that may wait; a vehicle has some ten publishers, each of which says one."""
+
+MAX_WAITING_BYTES = 8 * 2**20
+"""Of all of them; several thousand transforms."""
+
+TOO_LARGE = Sample(bytes(MAX_INFO_BYTES + 1), CDR)
+"""Waits in place of a `CameraInfo` that is larger than any."""
 
 TRANSFORMS_A_TURN = 64
 """Taken at once: with a turn every `IDLE_S` a flood costs at most some 250 messages a second."""
@@ -98,6 +104,7 @@ class NominalWatch:
         self._condition = threading.Condition()
         # Under the condition.
         self._waiting: deque[Sample] = deque()
+        self._waiting_bytes = 0
         self._latest: dict[tuple[str, str], Sample] = {}
         self._transforms_lost: Counter[str] = Counter()
         self._ready: dict[str, Found] = {}
@@ -111,15 +118,20 @@ class NominalWatch:
     def take_transforms(self, sample: Sample) -> None:
         """A message on `/tf_static` came."""
         with self._condition:
-            if len(self._waiting) == TRANSFORMS_WAITING:
-                self._waiting.popleft()
-                self._transforms_lost["overrun"] += 1
+            if len(sample.payload) > MAX_MESSAGE_BYTES:
+                self._transforms_lost["message_too_large"] += 1
+                return
             self._waiting.append(sample)
+            self._waiting_bytes += len(sample.payload)
+            while len(self._waiting) > TRANSFORMS_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
+                self._waiting_bytes -= len(self._waiting.popleft().payload)
+                self._transforms_lost["overrun"] += 1
 
     def take_info(self, pair: str, sample: Sample) -> None:
         """A `CameraInfo` of a pair came; the newest counts."""
+        kept = sample if len(sample.payload) <= MAX_INFO_BYTES else TOO_LARGE
         with self._condition:
-            self._latest[pair, INFO] = sample
+            self._latest[pair, INFO] = kept
 
     def take_frame(self, pair: str, stream: str, sample: Sample) -> None:
         """A frame of a pair that is awaited came; the newest counts."""
@@ -157,6 +169,7 @@ class NominalWatch:
         with self._condition:
             count = min(len(self._waiting), TRANSFORMS_A_TURN)
             transforms = [self._waiting.popleft() for _ in range(count)]
+            self._waiting_bytes -= sum(len(sample.payload) for sample in transforms)
             latest, self._latest = self._latest, {}
             outcomes, self._outcomes = self._outcomes, {}
         for sample in transforms:
