@@ -295,6 +295,7 @@ class Bench:
         self.worker = self.kind()
         store = StateStore(self.folder, self.config.vehicle)
         self.published: list[str] = []
+        self.shown: list[str] = []
         outside = Outside(
             Keys("coec", self.config.vehicle),
             store,
@@ -303,6 +304,7 @@ class Bench:
             cast("Worker", self.worker),
             lambda key, _: self.published.append(key),
             lambda: (),
+            lambda pair, _drawn, _pose: self.shown.append(pair.name),
         )
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)

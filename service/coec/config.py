@@ -20,6 +20,7 @@ from ruamel.yaml.error import YAMLError
 
 from coec.errors import ConfigError
 from coec.schemas.commands import NAMES, CommandName
+from coec.schemas.ros_names import ros_name
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 """A name that becomes one chunk of a Zenoh key and part of a file name."""
@@ -110,6 +111,9 @@ class CameraConfig(Stage):
     type: Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"] = "sensor_msgs/msg/CompressedImage"
     intrinsics: CameraIntrinsics
     mask: FilePath | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
+    hardware_id: str | None = Field(
+        default=None, max_length=128, description="its serial number, for ROS diagnostics; null: vehicle/pair"
+    )
 
 
 class LidarConfig(Stage):
@@ -447,6 +451,9 @@ class ZenohConfig(Stage):
         return self.listen if self.embedded_router else self.connect
 
 
+RosOutput = Literal["diagnostics", "tf_static", "camera_info", "overlay"]
+
+
 class RosConfig(Stage):
     """ROS 2 on the bus, where `middleware` is one of its."""
 
@@ -457,6 +464,25 @@ class RosConfig(Stage):
         max_length=128,
         description="of the bridge, where it has one (ros2dds)",
     )
+    publish: tuple[RosOutput, ...] = Field(
+        default=(), description="what ROS nodes are told: diagnostics, tf_static, camera_info, overlay"
+    )
+    calibrated_suffix: str = Field(
+        default="_calibrated",
+        pattern=r"^[A-Za-z0-9_]+$",
+        max_length=64,
+        description="of the camera's frame whose transform is published: the vehicle's tree owns the camera's own",
+    )
+    replace_camera_frames: bool = Field(
+        default=False,
+        description="publish the camera's own frame instead; nobody else may, as a frame has one parent",
+    )
+
+    @model_validator(mode="after")
+    def _each_once(self) -> RosConfig:
+        if len(set(self.publish)) != len(self.publish):
+            raise ValueError("publish names something twice")
+        return self
 
 
 CommonName = Annotated[str, Field(pattern=r"^[A-Za-z0-9 ._:/@+=,-]{1,64}$")]
@@ -572,6 +598,19 @@ class Config(Stage):
         names = [pair.name for pair in self.pairs]
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
+        return self
+
+    @model_validator(mode="after")
+    def _ros_can_be_told(self) -> Config:
+        if not self.ros.publish:
+            return self
+        if self.middleware == "native":
+            raise ValueError(
+                "ros.publish: nobody is told of ROS topics on native keys: set `middleware` to `rmw_zenoh` or `ros2dds`"
+            )
+        tokens = [ros_name(pair.name) for pair in self.pairs]
+        if len(set(tokens)) != len(tokens):
+            raise ValueError("ros.publish: names of pairs must differ in letters, digits or underscores: others are _")
         return self
 
 

@@ -30,6 +30,7 @@ from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.presence import Presence, told
 from coec.adapters.zenoh.reach import Reach
+from coec.adapters.zenoh.ros_publisher import RosPublishers, node_of
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
@@ -55,6 +56,8 @@ from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.reload import reload_of, settings_hash
+from coec.runtime.ros import told as ros
+from coec.runtime.ros.outputs import RosOutputs
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
 from coec.schemas.keys import Keys
@@ -79,7 +82,7 @@ STALLED_S = 20.0
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 1.5
-QUERIES_STOP_S, HTTP_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 1.5, 3.0, 1.0
+QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
 
 
 def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
@@ -135,9 +138,11 @@ class Daemon:
         others = () if mode_of(settings) == "router" else connected_of(settings)
         self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
         self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
+        self._ros = RosOutputs(lambda: RosPublishers(session, node_of(session, config)), config, self._worker)
         store = StateStore(config.state.directory, config.vehicle)
         self._scribe = Scribe(config.state.directory)
-        outside = Outside(self._keys, store, self._scribe, self._folder, self._worker, self._publish, self._troubles)
+        own = (self._worker, self._publish, self._troubles, self._ros.show)
+        outside = Outside(self._keys, store, self._scribe, self._folder, *own)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         commands = {name: pair.commands for name, pair in self._pairs.items()}
         self._reception = Reception(authority, listener, commands)
@@ -183,6 +188,7 @@ class Daemon:
         deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
         for thread in (self._scribe.thread, self._presence.thread, *self._bus.threads, *deciding):
             thread.start()
+        self._ros.start(self._told)
         self._worker.start()
         self._answers.declare(self._bus)
         self._door.use(self._config.metrics)
@@ -246,6 +252,7 @@ class Daemon:
             ("write all books", self._end_scribe),
             ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
             ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
+            ("tell ROS no more", lambda: self._ros.close(ROS_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
         )
         for name, step in steps:
@@ -323,6 +330,7 @@ class Daemon:
 
     def _publish(self, key: str, answer: Answer) -> None:
         self._bus.publish(key, answer)
+        self._ros.wake()
 
     def _troubles(self) -> tuple[Reason, ...]:
         """What ails every pair alike."""
@@ -345,7 +353,7 @@ class Daemon:
         """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
         restart would make it quicker, and none is asked for."""
         own = [thread for pair in self._pairs.values() for thread in pair.threads]
-        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *own]
+        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *self._ros.threads, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()
@@ -377,6 +385,17 @@ class Daemon:
         """The configuration as it is served."""
         return Snapshot.of_document(
             {"schema_version": 1, "config_hash": config_hash(self._config), "config": shown(self._config)}
+        )
+
+    def _told(self) -> ros.View:
+        """What ROS is told of."""
+        pairs = [(pair, self._pairs[pair.name].answers) for pair in self._config.pairs]
+        return ros.View(
+            self._state,
+            tuple(
+                ros.PairTold(answers.health_reply, pair.camera.hardware_id, answers.extrinsic_reply, answers.rig)
+                for pair, answers in pairs
+            ),
         )
 
     def _health(self) -> dict[str, replies.HealthReply]:

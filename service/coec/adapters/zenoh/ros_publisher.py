@@ -6,30 +6,41 @@ Seen on the wire against rmw_zenoh_cpp 0.6.7. Encodings stay unset, as those of 
 
 from __future__ import annotations
 
+import logging
 from itertools import count
 
 import zenoh
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
+from coec.adapters.ros.messages import type_hash
 from coec.adapters.ros.wire.dialect import Dialect
 from coec.adapters.ros.wire.qos import Qos
+from coec.adapters.ros.wire.rmw_zenoh import Node, RmwZenoh
+from coec.adapters.ros.wire.ros2dds import Ros2dds
 from coec.adapters.zenoh.matching import is_heard
+from coec.config import Config
+from coec.schemas.ros_names import NODE, node_namespace
+
+_log = logging.getLogger(__name__)
 
 HEARTBEAT_S = 0.5
 """How soon whoever missed the last message of a latched topic is told so; rmw_zenoh's own."""
 
 
 class RosNode:
-    """The node that a session is. It numbers the session's entities: all of them have to ask the same one."""
+    """The node that a session is, from its first entity on. It numbers the session's entities: all of them have to ask
+    the same one."""
 
     def __init__(self, session: zenoh.Session, dialect: Dialect) -> None:
         self.dialect = dialect
         self._session = session
         self._numbers = count(1)  # 0 is the node
-        self._token = None if dialect.node_token is None else self.hold(dialect.node_token)
+        self._token: zenoh.LivelinessToken | None = None
 
     def number(self) -> int:
         """Of the next entity."""
+        if self._token is None and self.dialect.node_token is not None:
+            self._token = self.hold(self.dialect.node_token)
         return next(self._numbers)
 
     def hold(self, token: str) -> zenoh.LivelinessToken:
@@ -41,6 +52,15 @@ class RosNode:
         if self._token is not None:
             self._token.undeclare()
             self._token = None
+
+
+def node_of(session: zenoh.Session, config: Config) -> RosNode:
+    """The node of a service, as its middleware has it."""
+    zid = str(session.info.zid())
+    if config.middleware == "ros2dds":
+        return RosNode(session, Ros2dds(zid, config.ros.namespace))
+    node = Node(config.ros.domain, zid, 0, node_namespace(config.vehicle), NODE)
+    return RosNode(session, RmwZenoh(node, type_hash))
 
 
 class RosPublisher:
@@ -70,13 +90,13 @@ class RosPublisher:
         return not isinstance(self._publisher, zenoh.Publisher) or is_heard(self._publisher)
 
     def put(self, payload: bytes, source_ns: int) -> None:
-        """Publish a message in CDR; `source_ns` is the wall clock of whoever made it.
-
-        Raises:
-            zenoh.ZError: the session is closed.
-        """
+        """Publish a message in CDR; `source_ns` is the wall clock of whoever made it. Silently lost while no router is
+        there, or as soon as the session is closed."""
         attachment = self._dialect.attachment(self._token, next(self._sequence), source_ns)
-        self._publisher.put(payload, attachment=attachment)
+        try:
+            self._publisher.put(payload, attachment=attachment)
+        except zenoh.ZError as error:
+            _log.debug("a message of ROS could not be published", extra={"fields": {"why": str(error)}})
 
     def undeclare(self) -> None:
         """Withdraw it: the token first, so that nobody waits for what does not come any more."""
@@ -124,6 +144,7 @@ class RosPublishers:
         return declared
 
     def close(self) -> None:
-        """Withdraw all of them."""
+        """Withdraw all of them, and the node."""
         while self._declared:
             self._declared.pop().undeclare()
+        self._node.close()
