@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
 
 import pytest
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
+from coec.adapters.ros.messages import TF
 from coec.adapters.ros.wire.dialect import Dialect
 from coec.adapters.ros.wire.qos import STATIC, Qos
 from coec.adapters.ros.wire.rmw_zenoh import Attachment, Node, RmwZenoh, gid_of
 from coec.adapters.ros.wire.ros2dds import Ros2dds
 from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
-from coec.config import LimitsConfig, ZenohConfig
+from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers, node_of
+from coec.config import LimitsConfig, RosConfig, ZenohConfig
 from fakes import wait_until
+from pair_bench import configuration
 from ports import free_port
 
 TIMEOUT_S = 20.0
 STRING = "std_msgs/msg/String"
 KEY = "0/chatter/std_msgs::msg::dds_::String_/RIHS01_00"
 RELIABLE = Qos(depth=10)
+TF_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 
 
 @pytest.fixture
@@ -158,6 +163,40 @@ def test_beside_a_bridge_messages_go_bare_on_plain_keys(session: zenoh.Session, 
         "the token",
         TIMEOUT_S,
     )
+
+
+@pytest.mark.parametrize(
+    ("middleware", "ros", "key", "token"),
+    [
+        (
+            "rmw_zenoh",
+            RosConfig(domain=7),
+            f"7/tf_static/tf2_msgs::msg::dds_::TFMessage_/{TF_HASH}",
+            f"@ros2_lv/7/ZID/0/1/MP/%/%shuttle_7/coec/%tf_static/tf2_msgs::msg::dds_::TFMessage_/{TF_HASH}/:1:,1:,:,:,,",
+        ),
+        (
+            "ros2dds",
+            RosConfig(namespace="/fleet/seven"),
+            "fleet/seven/tf_static",
+            "@/ZID/@ros2_lv/MP/fleet§seven§tf_static/tf2_msgs§msg§TFMessage/:1:1:0,1",
+        ),
+    ],
+)
+def test_a_service_publishes_as_its_configuration_says(
+    session: zenoh.Session,
+    client: zenoh.Session,
+    middleware: Literal["rmw_zenoh", "ros2dds"],
+    ros: RosConfig,
+    key: str,
+    token: str,
+) -> None:
+    native = configuration(Path("state"), vehicle="shuttle-7")
+    config = native.model_copy(update={"middleware": middleware, "ros": ros})
+    publishers = RosPublishers(session, node_of(session, config))
+
+    assert publishers.publisher("/tf_static", TF, STATIC).key == key
+    wanted = token.replace("ZID", str(session.info.zid()))
+    wait_until(lambda: tokens(client, wanted) == {wanted}, "the token", TIMEOUT_S)
 
 
 def test_a_session_that_starts_anew_is_another_publisher() -> None:

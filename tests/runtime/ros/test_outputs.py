@@ -107,6 +107,14 @@ def test_diagnostics_come_unasked(told: Told) -> None:
     assert times_s == sorted(times_s)
 
 
+@pytest.mark.fault("the thread that decides about a pair stands still", "STALE on ROS's diagnostics, whatever it said")
+def test_what_nobody_renews_is_stale(told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+    told.bench.drive(BEGIN_S, STEP_S)
+    assert told.status_that(lambda status: status.level == OK)
+    monkeypatch.setattr("coec.runtime.api.health.OLD_S", -1.0)
+    assert "service_stuck" in str(told.status_that(lambda status: status.level == STALE).values)
+
+
 def test_the_last_word_is_that_the_service_stops(tmp_path: Path) -> None:
     told = Told(Bench(tmp_path), ALL)
     told.outputs.start(told.view)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +20,8 @@ from coec.runtime.ros.pictures import Asks, Pictures
 from coec.runtime.ros.told import PairTold, View
 from coec.runtime.ros.transforms import CalibratedFrames
 from coec.schemas import ros_names
+
+_log = logging.getLogger(__name__)
 
 PERIOD_S: Final = 0.5
 """Between two diagnostics: twice as often as they are promised, so that a busy processor does not break the promise."""
@@ -170,6 +173,7 @@ def _sayable(rig: Rig) -> _Sayable:
     try:
         camera, residual_px = outgoing.sayable(rig.camera)
     except UnsayableCameraError as error:
+        _log.warning(f"ROS is told no intrinsics: {error}", extra={"fields": {"pair": rig.pair}})
         return _Sayable(rig, None, f"not published: {error}")
     word = "as configured" if camera is rig.camera else f"as equidistant, at most {residual_px:.2g} px off"
     return _Sayable(rig, replace(rig, camera=camera), word)
