@@ -21,6 +21,7 @@ from typing import Literal
 
 from coec import __version__
 from coec.adapters.files.scribe import Scribe
+from coec.adapters.ros.dialects import dialect_of
 from coec.adapters.system import allocator, logs
 from coec.adapters.system.memory import resident_bytes
 from coec.adapters.system.notify import Notifier
@@ -30,7 +31,7 @@ from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.presence import Presence, told
 from coec.adapters.zenoh.reach import Reach
-from coec.adapters.zenoh.ros_publisher import RosPublishers, node_of
+from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import Config, config_hash
@@ -138,10 +139,13 @@ class Daemon:
         others = () if mode_of(settings) == "router" else connected_of(settings)
         self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
         self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
-        self._ros = RosOutputs(lambda: RosPublishers(session, node_of(session, config)), config, self._worker)
+        dialect = dialect_of(config, str(session.info.zid()))
+        self._node = None if dialect is None else RosNode(session, dialect)
+        publishers = None if self._node is None else RosPublishers(session, self._node)
+        self._ros_outputs = RosOutputs(publishers, config, self._worker)
         store = StateStore(config.state.directory, config.vehicle)
         self._scribe = Scribe(config.state.directory)
-        own = (self._worker, self._publish, self._troubles, self._ros.show)
+        own = (self._worker, self._publish, self._troubles, self._ros_outputs.show)
         outside = Outside(self._keys, store, self._scribe, self._folder, *own)
         self._pairs = {pair.name: Pair(pair, config, outside) for pair in config.pairs}
         commands = {name: pair.commands for name, pair in self._pairs.items()}
@@ -188,7 +192,7 @@ class Daemon:
         deciding = (thread for pair in self._pairs.values() for thread in (pair.decider.thread, pair.recorder.thread))
         for thread in (self._scribe.thread, self._presence.thread, *self._bus.threads, *deciding):
             thread.start()
-        self._ros.start(self._told)
+        self._ros_outputs.start(self._told)
         self._worker.start()
         self._answers.declare(self._bus)
         self._door.use(self._config.metrics)
@@ -252,7 +256,8 @@ class Daemon:
             ("write all books", self._end_scribe),
             ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
             ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
-            ("tell ROS no more", lambda: self._ros.close(ROS_STOP_S)),
+            ("tell ROS no more", lambda: self._ros_outputs.close(ROS_STOP_S)),
+            ("be no node of ROS", lambda: None if self._node is None else self._node.close()),
             ("take the answers away", self._bus.undeclare_queryables),
         )
         for name, step in steps:
@@ -330,7 +335,7 @@ class Daemon:
 
     def _publish(self, key: str, answer: Answer) -> None:
         self._bus.publish(key, answer)
-        self._ros.wake()
+        self._ros_outputs.wake()
 
     def _troubles(self) -> tuple[Reason, ...]:
         """What ails every pair alike."""
@@ -353,7 +358,7 @@ class Daemon:
         """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
         restart would make it quicker, and none is asked for."""
         own = [thread for pair in self._pairs.values() for thread in pair.threads]
-        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *self._ros.threads, *own]
+        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *self._ros_outputs.threads, *own]
 
     def _renew(self) -> None:
         self._status_reply = self._status_now()

@@ -18,11 +18,6 @@ def ros_name(name: str) -> str:
     return f"_{token}" if token[:1].isdecimal() else token
 
 
-def node_namespace(vehicle: str) -> str:
-    """Of the node."""
-    return f"/{ros_name(vehicle)}"
-
-
 def camera_info_topic(pair: str) -> str:
     """Of the intrinsics of a pair's camera, beside nobody's images: they are the service's own word of them."""
     return f"/coec/{ros_name(pair)}/camera/camera_info"

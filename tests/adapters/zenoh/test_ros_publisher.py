@@ -11,13 +11,14 @@ import pytest
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
+from coec.adapters.ros.dialects import dialect_of
 from coec.adapters.ros.messages import TF
 from coec.adapters.ros.wire.dialect import Dialect
 from coec.adapters.ros.wire.qos import STATIC, Qos
 from coec.adapters.ros.wire.rmw_zenoh import Attachment, Node, RmwZenoh, gid_of
 from coec.adapters.ros.wire.ros2dds import Ros2dds
 from coec.adapters.zenoh.bus import open_session
-from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers, node_of
+from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
 from coec.config import LimitsConfig, RosConfig, ZenohConfig
 from fakes import wait_until
 from pair_bench import configuration
@@ -95,7 +96,8 @@ def test_messages_are_numbered_from_one_and_name_the_publisher_by_its_token(
 
 
 def test_a_node_and_its_publishers_are_listed_until_they_close(session: zenoh.Session, client: zenoh.Session) -> None:
-    publishers = publishers_of(session, rmw_of(session))
+    node = RosNode(session, rmw_of(session))
+    publishers = RosPublishers(session, node)
     publishers.publisher("/chatter", STRING, RELIABLE)
     publishers.publisher("/tf_static", STRING, STATIC)
     own = f"@ros2_lv/0/{session.info.zid()}/0"
@@ -108,7 +110,9 @@ def test_a_node_and_its_publishers_are_listed_until_they_close(session: zenoh.Se
     }
 
     publishers.close()
-    wait_until(lambda: not tokens(client, "@ros2_lv/0/**"), "all of them gone", TIMEOUT_S)
+    wait_until(lambda: len(tokens(client, "@ros2_lv/0/**")) == 1, "the publishers gone", TIMEOUT_S)
+    node.close()
+    wait_until(lambda: not tokens(client, "@ros2_lv/0/**"), "the node gone", TIMEOUT_S)
 
 
 def test_whoever_comes_later_gets_the_last_message_of_a_latched_topic(
@@ -192,7 +196,9 @@ def test_a_service_publishes_as_its_configuration_says(
 ) -> None:
     native = configuration(Path("state"), vehicle="shuttle-7")
     config = native.model_copy(update={"middleware": middleware, "ros": ros})
-    publishers = RosPublishers(session, node_of(session, config))
+    dialect = dialect_of(config, str(session.info.zid()))
+    assert dialect is not None
+    publishers = publishers_of(session, dialect)
 
     assert publishers.publisher("/tf_static", TF, STATIC).key == key
     wanted = token.replace("ZID", str(session.info.zid()))

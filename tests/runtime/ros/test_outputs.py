@@ -17,6 +17,7 @@ from coec.config import Config, RosConfig
 from coec.geometry.cameras import build
 from coec.runtime.ros.outputs import RosOutputs
 from coec.runtime.ros.told import PairTold, View
+from fakes import wait_until
 from pair_bench import BEGIN_S, END_S, STEP_S, Bench, KnowingWorker
 from runtime.ros.topics import KeptTopic, KeptTopics
 
@@ -34,13 +35,14 @@ class Told:
         self.rig: Rig | None = bench.answers.rig
         self.topics = KeptTopics()
         self.config: Config = bench.config.model_copy(update={"ros": ros, "middleware": "rmw_zenoh"})
-        self.outputs = RosOutputs(lambda: cast("RosPublishers", self.topics), self.config, KnowingWorker())
+        self.outputs = RosOutputs(cast("RosPublishers", self.topics), self.config, KnowingWorker())
 
     def view(self) -> View:
         answers = self.bench.answers
         return View(self.service, (PairTold(answers.health_reply, "SN-1", answers.extrinsic_reply, self.rig),))
 
     def topic(self, name: str) -> KeptTopic:
+        wait_until(lambda: name in self.topics.topics, name)
         return self.topics.topics[name]
 
     def status_that(self, condition: Callable[[Any], bool]) -> Any:
@@ -73,6 +75,7 @@ def told(tmp_path: Path) -> Iterator[Told]:
 
 
 def test_topics_are_declared_as_ros_expects_them(told: Told) -> None:
+    told.status_that(lambda _: True)
     assert {name: (topic.type_name, topic.qos) for name, topic in told.topics.topics.items()} == {
         "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", Qos(depth=1)),
         "/tf_static": ("tf2_msgs/msg/TFMessage", STATIC),
@@ -160,3 +163,8 @@ def test_who_wants_nothing_said_has_no_thread_and_no_topic(tmp_path: Path) -> No
     assert told.outputs.threads == ()
     assert told.outputs.close(1.0)
     assert told.topics.topics == {}
+    deaf = RosOutputs(None, told.config.model_copy(update={"ros": ALL}), KnowingWorker())
+    deaf.start(told.view)
+    deaf.wake()
+    assert deaf.threads == ()
+    assert deaf.close(1.0)

@@ -12,14 +12,9 @@ from itertools import count
 import zenoh
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
-from coec.adapters.ros.messages import type_hash
 from coec.adapters.ros.wire.dialect import Dialect
 from coec.adapters.ros.wire.qos import Qos
-from coec.adapters.ros.wire.rmw_zenoh import Node, RmwZenoh
-from coec.adapters.ros.wire.ros2dds import Ros2dds
 from coec.adapters.zenoh.matching import is_heard
-from coec.config import Config
-from coec.schemas.ros_names import NODE, node_namespace
 
 _log = logging.getLogger(__name__)
 
@@ -28,19 +23,16 @@ HEARTBEAT_S = 0.5
 
 
 class RosNode:
-    """The node that a session is, from its first entity on. It numbers the session's entities: all of them have to ask
-    the same one."""
+    """The node that a session is. It numbers the session's entities: all of them have to ask the same one."""
 
     def __init__(self, session: zenoh.Session, dialect: Dialect) -> None:
         self.dialect = dialect
         self._session = session
         self._numbers = count(1)  # 0 is the node
-        self._token: zenoh.LivelinessToken | None = None
+        self._token = None if dialect.node_token is None else self.hold(dialect.node_token)
 
     def number(self) -> int:
         """Of the next entity."""
-        if self._token is None and self.dialect.node_token is not None:
-            self._token = self.hold(self.dialect.node_token)
         return next(self._numbers)
 
     def hold(self, token: str) -> zenoh.LivelinessToken:
@@ -52,15 +44,6 @@ class RosNode:
         if self._token is not None:
             self._token.undeclare()
             self._token = None
-
-
-def node_of(session: zenoh.Session, config: Config) -> RosNode:
-    """The node of a service, as its middleware has it."""
-    zid = str(session.info.zid())
-    if config.middleware == "ros2dds":
-        return RosNode(session, Ros2dds(zid, config.ros.namespace))
-    node = Node(config.ros.domain, zid, 0, node_namespace(config.vehicle), NODE)
-    return RosNode(session, RmwZenoh(node, type_hash))
 
 
 class RosPublisher:
@@ -144,7 +127,6 @@ class RosPublishers:
         return declared
 
     def close(self) -> None:
-        """Withdraw all of them, and the node."""
+        """Withdraw all of them."""
         while self._declared:
             self._declared.pop().undeclare()
-        self._node.close()

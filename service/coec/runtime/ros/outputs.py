@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 from coec.adapters.ros import diagnostics, messages, outgoing
@@ -52,49 +53,31 @@ class RosOutputs:
     """Everything that `ros.publish` names, which may be nothing. Its thread is the only one that publishes, but for
     pictures."""
 
-    def __init__(self, speak: Callable[[], RosPublishers], config: Config, worker: Asks) -> None:
-        """`speak()` makes the session one of ROS; it is asked once, and only if there is something to say."""
-        self._speak = speak
-        self._publishers: RosPublishers | None = None
+    def __init__(self, publishers: RosPublishers | None, config: Config, worker: Asks) -> None:
+        """`publishers` are those of the session, None where it does not speak to ROS. Nothing is declared yet."""
+        self._publishers = publishers
         self._ros = config.ros
-        self._pairs = [pair.name for pair in config.pairs]
         self._frames = CalibratedFrames(config.ros)
-        self._worker = worker
         self._view: Callable[[], View]
         self._diagnostics: RosPublisher | None = None
         self._tf_static: RosPublisher | None = None
         self._camera_info: dict[str, RosPublisher] = {}
-        self._pictures = Pictures(worker, {})
+        self._overlays: dict[str, RosPublisher] = {}
+        self._pictures = Pictures(worker, self._overlays)
         self._sayable: dict[str, _Sayable] = {}
         self._placed: bytes | None = None
         self._info_s = -CAMERA_INFO_PERIOD_S
         self._woken, self._ending = threading.Event(), threading.Event()
-        self._thread = ServiceThread("ros", self._run)
-
-    @property
-    def threads(self) -> tuple[ServiceThread, ...]:
-        """Its thread, where there is something to say."""
-        return (self._thread,) if self._ros.publish else ()
+        self.threads: tuple[ServiceThread, ...] = ()
+        """Its thread, where there is something to say, and somebody to say it to."""
+        if publishers is not None and config.ros.publish:
+            self.threads = (ServiceThread("ros", partial(self._run, publishers)),)
 
     def start(self, view: Callable[[], View]) -> None:
-        """Declare the topics, and tell of what `view()` gives, on the thread of these outputs."""
-        chosen = self._ros.publish
-        if not chosen:
-            return
-        self._view, self._publishers = view, self._speak()
-        publisher = self._publishers.publisher
-        if "diagnostics" in chosen:
-            self._diagnostics = publisher(ros_names.DIAGNOSTICS, messages.DIAGNOSTICS, DIAGNOSTICS)
-        if "tf_static" in chosen:
-            self._tf_static = publisher(ros_names.TF_STATIC, messages.TF, STATIC)
-        if "camera_info" in chosen:
-            topics = {pair: ros_names.camera_info_topic(pair) for pair in self._pairs}
-            self._camera_info = {pair: publisher(t, messages.CAMERA_INFO, STATIC) for pair, t in topics.items()}
-        if "overlay" in chosen:
-            topics = {pair: ros_names.overlay_topic(pair) for pair in self._pairs}
-            looks = {pair: publisher(t, messages.COMPRESSED_IMAGE, PICTURES) for pair, t in topics.items()}
-            self._pictures = Pictures(self._worker, looks)
-        self._thread.start()
+        """Tell of what `view()` gives, on the thread of these outputs."""
+        self._view = view
+        for thread in self.threads:
+            thread.start()
 
     def wake(self) -> None:
         """Something has changed. Any thread."""
@@ -106,29 +89,49 @@ class RosOutputs:
 
     def close(self, within_s: float) -> bool:
         """Say the last word, and withdraw everything; False when the thread does not end in time."""
-        self._thread.request_stop()
+        for thread in self.threads:
+            thread.request_stop()
         self._ending.set()
         self.wake()
-        ended = self._thread.join(within_s)
+        ended = all(thread.join(within_s) for thread in self.threads)
         if self._publishers is not None:
             self._publishers.close()
         return ended
 
     # --- on its thread ----------------------------------------------------------------------------------------------
 
-    def _run(self, thread: ServiceThread) -> None:
+    def _run(self, publishers: RosPublishers, thread: ServiceThread) -> None:
+        self._declare(publishers)
         while not thread.stopping:
             thread.beat()
             self._woken.clear()
             told_s = time.monotonic()
-            self._tell()
+            self._tell(publishers)
             self._woken.wait(max(told_s + PERIOD_S - time.monotonic(), 0.0))
             self._ending.wait(max(told_s + LEAST_GAP_S - time.monotonic(), 0.0))
-        self._tell()
+        self._tell(publishers)
 
-    def _tell(self) -> None:
+    def _declare(self, publishers: RosPublishers) -> None:
+        """The topics of the whole service."""
+        if "diagnostics" in self._ros.publish:
+            self._diagnostics = publishers.publisher(ros_names.DIAGNOSTICS, messages.DIAGNOSTICS, DIAGNOSTICS)
+        if "tf_static" in self._ros.publish:
+            self._tf_static = publishers.publisher(ros_names.TF_STATIC, messages.TF, STATIC)
+
+    def _declare_of(self, publishers: RosPublishers, pair: str) -> None:
+        """Those of a pair, when it is heard of for the first time."""
+        if "camera_info" in self._ros.publish and pair not in self._camera_info:
+            topic = ros_names.camera_info_topic(pair)
+            self._camera_info[pair] = publishers.publisher(topic, messages.CAMERA_INFO, STATIC)
+        if "overlay" in self._ros.publish and pair not in self._overlays:
+            topic = ros_names.overlay_topic(pair)
+            self._overlays[pair] = publishers.publisher(topic, messages.COMPRESSED_IMAGE, PICTURES)
+
+    def _tell(self, publishers: RosPublishers) -> None:
         view, now_ns = self._view(), time.time_ns()
         words: dict[str, dict[str, str]] = {pair.health.pair: {} for pair in view.pairs}
+        for name in words:
+            self._declare_of(publishers, name)
         if self._tf_static is not None:
             self._tell_frames(self._tf_static, view, now_ns, words)
         if self._camera_info:

@@ -41,7 +41,7 @@ class Pictures:
     """Those of all pairs. Any thread."""
 
     def __init__(self, worker: Asks, topics: Mapping[str, Topic]) -> None:
-        """`topics` by the names of the pairs."""
+        """`topics` by the names of the pairs; more may be put into it meanwhile."""
         self._worker = worker
         self._topics = topics
         self._lock = threading.Lock()
