@@ -296,6 +296,7 @@ class Bench:
         self.worker = self.kind()
         store = StateStore(self.folder, self.config.vehicle)
         self.published: list[str] = []
+        self.shown: list[str] = []
         outside = Outside(
             Keys("coec", self.config.vehicle),
             store,
@@ -304,6 +305,7 @@ class Bench:
             cast("Worker", self.worker),
             lambda key, _: self.published.append(key),
             lambda: (),
+            lambda pair, _drawn, _pose: self.shown.append(pair.name),
             Topics,
         )
         with pytest.MonkeyPatch.context() as patch:

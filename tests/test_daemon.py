@@ -31,6 +31,7 @@ from coec.schemas.base import from_msgpack
 from coec.schemas.replies import HealthReply
 from e2e.drives import SHORT, SHORT_PAIRS, Drive, later, rendered
 from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment, routing, service, write_configuration
+from e2e.ros_listener import listening, speaking_to_ros
 from fakes import wait_until
 from ports import free_port
 
@@ -41,6 +42,7 @@ LATER_S = 60.0
 EXIT_THREAD_DIED = 70
 EXIT_TRY_AGAIN = 75
 FRONT, REAR = "sim", "rear"
+ERROR, STALE = 2, 3
 BROKEN = (
     sys.executable,
     "-c",
@@ -208,7 +210,9 @@ def has_ended(pid: int) -> bool:
         return True
 
 
-@pytest.mark.fault("a thread of the service dies", "the process ends with a code of its own after health has said why")
+@pytest.mark.fault(
+    "a thread of the service dies", "the process ends with a code of its own after health, and ROS, were told why"
+)
 def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     tmp_path: Path, drive: Drive, router: Router
 ) -> None:
@@ -218,7 +222,11 @@ def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
         said.append(sample.payload.to_bytes())
 
     config = configured(tmp_path, drive, router)
-    with service(config, router, warm=False, program=BROKEN) as running:
+    speaking_to_ros(config, "diagnostics")
+    with (
+        listening(router.session, "/diagnostics") as nodes,
+        service(config, router, warm=False, program=BROKEN) as running,
+    ):
         subscriber = router.session.declare_subscriber(
             running.keys.health(FRONT), zenoh.handlers.Callback(hear, indirect=False)
         )
@@ -229,6 +237,10 @@ def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
     health = from_msgpack(HealthReply, said[-1])
     (why,) = (reason for reason in health.reasons if reason.code == "thread_died")
     assert "broken" in why.text
+    assert nodes.levels(FRONT)[-1] in (ERROR, STALE)
+    told = {value.key: value.value for value in nodes.statuses(FRONT)[-1].values}
+    assert told["service"] == "failing"
+    assert "broken" in told["reason thread_died"]
 
 
 @pytest.mark.fault("steps of the end raise", "the others are done all the same")

@@ -21,6 +21,7 @@ from ruamel.yaml.error import YAMLError
 
 from coec.errors import ConfigError
 from coec.schemas.commands import NAMES, CommandName
+from coec.schemas.ros_names import ros_name
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 """A name that becomes one chunk of a Zenoh key and part of a file name."""
@@ -179,6 +180,9 @@ class OpenCameraConfig(StreamConfig):
         description="of the `CameraInfo` that tells intrinsics left out; unless set, `camera_info` beside the images",
     )
     mask: FilePath | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
+    hardware_id: str | None = Field(
+        default=None, max_length=128, description="its serial number, for ROS diagnostics; null: vehicle/pair"
+    )
 
     @property
     def assumed_type(self) -> CameraMessage:
@@ -616,6 +620,9 @@ class ZenohConfig(Stage):
         return self.listen if self.embedded_router else self.connect
 
 
+RosOutput = Literal["diagnostics", "tf_static", "camera_info", "overlay"]
+
+
 class RosConfig(Stage):
     """ROS 2 on the bus, where `middleware` is one of its."""
 
@@ -626,6 +633,25 @@ class RosConfig(Stage):
         max_length=128,
         description="of the bridge, where it has one (ros2dds)",
     )
+    publish: tuple[RosOutput, ...] = Field(
+        default=(), description="what ROS nodes are told: diagnostics, tf_static, camera_info, overlay"
+    )
+    calibrated_suffix: str = Field(
+        default="_calibrated",
+        pattern=r"^[A-Za-z0-9_]+$",
+        max_length=64,
+        description="of the camera's frame whose transform is published: the vehicle's tree owns the camera's own",
+    )
+    replace_camera_frames: bool = Field(
+        default=False,
+        description="publish the camera's own frame instead; nobody else may, as a frame has one parent",
+    )
+
+    @model_validator(mode="after")
+    def _each_once(self) -> RosConfig:
+        if len(set(self.publish)) != len(self.publish):
+            raise ValueError("publish names something twice")
+        return self
 
 
 CommonName = Annotated[str, Field(pattern=r"^[A-Za-z0-9 ._:/@+=,-]{1,64}$")]
@@ -785,6 +811,19 @@ class Config(Stage):
                 f"{', '.join(topics)}: topics of ROS 2 are found where `middleware` is `rmw_zenoh` or `ros2dds`: set "
                 "it, or give the Zenoh `key` of native frames instead"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _ros_can_be_told(self) -> Config:
+        if not self.ros.publish:
+            return self
+        if self.middleware == "native":
+            raise ValueError(
+                "ros.publish: nobody is told of ROS topics on native keys: set `middleware` to `rmw_zenoh` or `ros2dds`"
+            )
+        tokens = [ros_name(pair.name) for pair in self.every_pair]
+        if len(set(tokens)) != len(tokens):
+            raise ValueError("ros.publish: names of pairs must differ in letters, digits or underscores: others are _")
         return self
 
 

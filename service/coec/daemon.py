@@ -30,6 +30,7 @@ from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.presence import Presence, told
 from coec.adapters.zenoh.reach import Reach
+from coec.adapters.zenoh.ros_publisher import RosPublishers
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
@@ -59,6 +60,8 @@ from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.reload import reload_of, settings_hash
+from coec.runtime.ros import told as ros
+from coec.runtime.ros.outputs import RosOutputs
 from coec.runtime.waiting_room import WaitingRoom
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas import replies
@@ -87,7 +90,7 @@ STALLED_S = 20.0
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 1.5
-QUERIES_STOP_S, HTTP_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 1.5, 3.0, 1.0
+QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
 
 
 def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
@@ -145,19 +148,14 @@ class Daemon:
         others = () if mode_of(settings) == "router" else connected_of(settings)
         self._router = RouterWatch([redacted(endpoint) for endpoint in others], self._bus.reaches_somebody)
         self._door = HttpDoor(pages(self._metrics, lambda: self._status_reply, self._health))
+        node = self._ros_side.node
+        publishers = None if node is None else RosPublishers(session, node)
+        self._ros_outputs = RosOutputs(publishers, config, self._worker)
         store = StateStore(config.state.directory, config.vehicle)
         self._scribe = Scribe(config.state.directory)
-        self._outside = Outside(
-            self._keys,
-            store,
-            self._scribe,
-            self._folder,
-            self._worker,
-            self._publish,
-            self._troubles,
-            self._ros_side.topics,
-            self._room.nominal,
-        )
+        own = (self._worker, self._publish, self._troubles, self._ros_outputs.show)
+        of_ros = (self._ros_side.topics, self._room.nominal)
+        self._outside = Outside(self._keys, store, self._scribe, self._folder, *own, *of_ros)
         self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
         awaited = self._room.open(config, self._outside)
         self._commands: dict[str, Commands | AwaitedCommands] = {
@@ -206,6 +204,7 @@ class Daemon:
     def _start(self) -> None:
         for thread in (self._scribe.thread, self._presence.thread, *self._bus.threads):
             thread.start()
+        self._ros_outputs.start(self._told)
         self._worker.start()
         self._answers.declare(self._bus)
         self._door.use(self._config.metrics)
@@ -299,6 +298,7 @@ class Daemon:
             ("write all books", self._end_scribe),
             ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
             ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
+            ("tell ROS no more", lambda: self._ros_outputs.close(ROS_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
             ("be no node of ROS", self._ros_side.close),
         )
@@ -391,6 +391,7 @@ class Daemon:
 
     def _publish(self, key: str, answer: Answer) -> None:
         self._bus.publish(key, answer)
+        self._ros_outputs.wake()
 
     def _troubles(self) -> tuple[Reason, ...]:
         """What ails every pair alike."""
@@ -413,7 +414,8 @@ class Daemon:
         """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
         restart would make it quicker, and none is asked for."""
         own = [thread for pair in self._pairs.values() for thread in pair.threads]
-        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *self._room.threads, *own]
+        of_ros = (*self._room.threads, *self._ros_outputs.threads)
+        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *of_ros, *own]
 
     def _renew(self) -> None:
         self._room.renew()
@@ -451,6 +453,19 @@ class Daemon:
                 "config": shown(self._config),
                 "found": self._room.origins(),
             }
+        )
+
+    def _told(self) -> ros.View:
+        """What ROS is told of."""
+        serials = {pair.name: pair.camera.hardware_id for pair in self._config.every_pair}
+        return ros.View(
+            self._state,
+            tuple(
+                ros.PairTold(answers.health_reply, serials[answers.name], answers.extrinsic_reply, answers.rig)
+                if isinstance(answers, PairAnswers)
+                else ros.PairTold(answers.health_reply, serials[answers.name], None, None)
+                for answers in self._answering()
+            ),
         )
 
     def _health(self) -> dict[str, replies.HealthReply]:

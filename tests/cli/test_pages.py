@@ -20,8 +20,16 @@ PACKAGE = Path(coec.__file__).parent
 OF_A_JOB = {"busy", "deadline_passed", "not_recorded", "stopping", "superseded", "unanswered", "unsendable"}
 """Why one question to the worker came to nothing: counted, and no reason of health by itself."""
 
-COMPOSED = {"overdue_worker", "overdue_depth", "overdue_pairing", "overdue_data", "monitor_blind", "windows_in_vain"}
-"""Codes that are put together, or handed on, in `runtime/decisions`; `service_stuck` is made in its wire form."""
+COMPOSED = {
+    "overdue_worker",
+    "overdue_depth",
+    "overdue_pairing",
+    "overdue_data",
+    "monitor_blind",
+    "windows_in_vain",
+    "service_stuck",
+}
+"""Codes that are put together, or handed on, in `runtime/decisions`; `service_stuck` stands with the wire models."""
 
 
 @pytest.mark.parametrize("name", list(pages.PAGES))

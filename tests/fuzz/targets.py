@@ -29,9 +29,9 @@ from coec.adapters.frames.msgpack_frames import decode_camera, decode_ego, decod
 from coec.adapters.images.codec import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
 from coec.adapters.mcap.windows import PART_SUFFIX, is_window, read_result, read_window, salvage
 from coec.adapters.ros import incoming, messages, outgoing
+from coec.adapters.ros.camera_info import decode_info, lens_of
 from coec.adapters.ros.images import ENCODINGS
 from coec.adapters.ros.moving_frames import MovingFrame, frames_in
-from coec.adapters.ros.camera_info import decode_info, lens_of
 from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.settings import mode_of, settings_of
@@ -42,8 +42,8 @@ from coec.config import (
     Config,
     LimitsConfig,
     MonitorConfig,
-    PointTimeConfig,
     PairConfig,
+    PointTimeConfig,
     PolicyConfig,
     StateConfig,
     TrackerConfig,

@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from coec.adapters.mcap.windows import WindowWriter
 from coec.adapters.ros import incoming, messages, outgoing
+from coec.adapters.ros.diagnostics import Level, Status
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry.cameras import MODELS, build
@@ -34,6 +35,11 @@ SWEEP = LidarFrame(
     time_offset_s=np.linspace(-0.1, 0, 101, dtype=np.float32),
 )
 MOTION = EgoMotion(STAMP, "base_link", (12.5, -1e-9, 0.0), (1 / 3, 0.0, -0.25))
+STATUSES = [
+    Status(Level.OK, "coec: front_calibration", "", "camera-7", {}),
+    Status(Level.STALE, "coec: rear_calibration", "σ ± 0.1°", "", {"mi": "0.5", "drift": "", "ß": "0"}),
+]
+
 FRAMES = {messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY, messages.IMU}
 
 IMAGES = [
@@ -80,10 +86,8 @@ def written() -> list[tuple[str, bytes]]:
         *(outgoing.encode_motion(motion) for motion in (MOTION, replace(MOTION, linear_mps=None))),
         *((messages.CAMERA_INFO, outgoing.encode_camera_info(rig(model), STAMP)) for model in MODELS),
         (messages.TF, outgoing.encode_tf_static(rig("pinhole"), T_CAMERA_LIDAR, STAMP)),
-        *(
-            (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP, "coec/front", level, text, values, "camera-7"))
-            for level, text, values in ((0, "", {}), (3, "σ ± 0.1°", {"mi": "0.5", "drift": "", "ß": "0"}))
-        ),
+        (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP, STATUSES)),
+        (messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP, [])),
     ]
 
 

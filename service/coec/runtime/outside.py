@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from coec.adapters.files.scribe import Scribe
 from coec.adapters.zenoh.bus import Answer
 from coec.adapters.zenoh.ros_topics import Topics
-from coec.calibration.types import Reason
+from coec.calibration.types import FramePair, Matrix4, Reason
+from coec.config import PairConfig
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.nominal.watch import Nominal
 from coec.runtime.recording.window_store import WindowStore
@@ -24,9 +25,13 @@ def given(pair: str) -> Nominal:
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """Everything that a pair shares. `publish(key, answer)`, `vehicle_troubles()`, `topics()`, those that the vehicle's
-    ROS publishes now, and `nominal(pair)`, where a pair's nominal calibration comes from, may be called from any
-    thread."""
+    """Everything that a pair shares. All that can be called may be called from any thread.
+
+    Attributes:
+        show: `show(pair, drawn, pose)` tells of a pair of the stream that is being checked at an extrinsic (4, 4).
+        topics: those that the vehicle's ROS publishes now.
+        nominal: where a pair's nominal calibration comes from.
+    """
 
     keys: Keys
     store: StateStore
@@ -35,5 +40,6 @@ class Outside:
     worker: Worker
     publish: Callable[[str, Answer], None]
     vehicle_troubles: Callable[[], tuple[Reason, ...]]
+    show: Callable[[PairConfig, FramePair, Matrix4], None]
     topics: Callable[[], Topics]
     nominal: Callable[[str], Nominal] = given

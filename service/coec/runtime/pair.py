@@ -45,7 +45,7 @@ class Pair:
         rig, folder = rig_of(pair), outside.folder
         losses = LossCounter(_log, pair.name)
         mailbox, queue = Mailbox(), DecisionQueue()
-        questions = Questions(pair, queue, outside.worker, mailbox, folder)
+        questions = Questions(pair, queue, outside.worker, mailbox, folder, outside.show)
         store = PairStore(rig, config.vehicle, config.state, outside.store, outside.scribe, folder, losses)
         baseline = RigBaseline(pair, rig, config.state.directory)
         self._rig, self._vehicle = rig, config.vehicle

@@ -7,7 +7,7 @@ null.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
@@ -38,6 +38,9 @@ ROS_LEVELS: dict[HealthState, Literal[0, 1, 2, 3]] = {
     "unknown": 3,
 }
 """Level of `diagnostic_msgs/DiagnosticStatus`: 0 OK, 1 WARN, 2 ERROR, 3 STALE. Unknown never reads as OK."""
+
+STUCK: Final = "service_stuck"
+"""Code of the reason that a reply has not been renewed: what it says may not be so any more."""
 
 
 # --- parts --------------------------------------------------------------------------------------------------

@@ -378,7 +378,8 @@ def test_rosbags_reads_a_window_with_its_result(tmp_path: Path) -> None:
     assert seen["/coec/front/camera/image/compressed"][1].data.tobytes() == pair.camera.image.data
     assert seen["/coec/front/odometry"][1].child_frame_id == "base"
     assert seen["/tf_static"][1].transforms[0].child_frame_id == "lidar"
-    assert seen["/diagnostics"][1].status[0].hardware_id == "car"
+    (status,) = seen["/diagnostics"][1].status
+    assert (status.name, status.hardware_id) == ("coec: front_calibration", "car/front")
 
 
 def test_mcap_ros2_decodes_every_message_and_the_json(tmp_path: Path) -> None:

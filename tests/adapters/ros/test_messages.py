@@ -14,6 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import encode_depth_png, probe
 from coec.adapters.ros import incoming, messages, outgoing
+from coec.adapters.ros.diagnostics import Level, Status
 from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.config import LimitsConfig
@@ -483,10 +484,55 @@ def test_tf_maps_the_child_to_the_parent() -> None:
     assert (turned.x, turned.y, turned.z, turned.w) == pytest.approx((0.5, -0.5, 0.5, 0.5))
 
 
-def test_diagnostics() -> None:
-    payload = outgoing.encode_diagnostics(STAMP, "coec/front", 3, "not looked yet", {"mi": "0.5"}, "truck-7")
+def test_several_frames_lie_in_one_message() -> None:
+    lidar, radar = np.eye(4), T_CAMERA_LIDAR
+    frames = [outgoing.Placed("base", "lidar", lidar), outgoing.Placed("lidar", "camera_calibrated", radar)]
 
-    (status,) = read_by_others(messages.DIAGNOSTICS, payload).status
-    assert (status.name, status.message, status.hardware_id) == ("coec/front", "not looked yet", "truck-7")
-    assert ord(status.level) if isinstance(status.level, bytes) else status.level == 3
-    assert [(item.key, item.value) for item in status.values] == [("mi", "0.5")]
+    told = read_by_others(messages.TF, outgoing.encode_transforms(frames, STAMP)).transforms
+
+    assert [(one.header.frame_id, one.child_frame_id) for one in told] == [
+        ("base", "lidar"),
+        ("lidar", "camera_calibrated"),
+    ]
+    assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in told} == {(SEC, NSEC)}
+    assert told[1].transform.translation.z == 0.3
+
+
+def test_diagnostics() -> None:
+    stale = Status(Level.STALE, "coec: front_calibration", "not looked yet", "truck-7", {"mi": "0.5"})
+    fine = Status(Level.OK, "coec: rear_calibration", "healthy", "truck-7/rear", {})
+
+    statuses = read_by_others(messages.DIAGNOSTICS, outgoing.encode_diagnostics(STAMP, [stale, fine])).status
+
+    assert [(one.name, one.message, one.hardware_id) for one in statuses] == [
+        ("coec: front_calibration", "not looked yet", "truck-7"),
+        ("coec: rear_calibration", "healthy", "truck-7/rear"),
+    ]
+    assert [ord(one.level) if isinstance(one.level, bytes) else one.level for one in statuses] == [3, 0]
+    assert [(item.key, item.value) for item in statuses[0].values] == [("mi", "0.5")]
+
+
+@pytest.mark.parametrize("model", ["pinhole", "radtan", "kannala_brandt"])
+def test_what_ros_knows_is_said_as_it_is(model: str) -> None:
+    camera = CAMERAS[model][0]
+    assert outgoing.sayable(camera) == (camera, 0.0)
+
+
+def test_a_double_sphere_is_said_as_equidistant() -> None:
+    camera = build("double_sphere", width=640, height=480, fx=300.0, fy=310.0, cx=320.0, cy=235.0, xi=-0.2, alpha=0.59)
+
+    said, residual_px = outgoing.sayable(camera)
+
+    assert 0.0 < residual_px < 0.01
+    info = read_by_others(messages.CAMERA_INFO, outgoing.encode_camera_info(rig(said), STAMP))
+    assert info.distortion_model == "equidistant"
+    assert len(info.d) == 4
+    assert info.k[0] == said.fx != 300.0
+
+
+def test_a_lens_that_ros_has_no_word_for_is_not_said() -> None:
+    size = {"width": 640, "height": 480, "fx": 700.0, "fy": 700.0, "cx": 320.0, "cy": 235.0}
+    camera = build("mei", **size, xi=2.2, k1=0.0168, k2=1.6549, p1=0.05, p2=0.0004)
+
+    with pytest.raises(outgoing.UnsayableCameraError, match=r"more than 0\.5 px"):
+        outgoing.sayable(camera)

@@ -4,25 +4,31 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
 
 import pytest
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
+from coec.adapters.ros.dialects import dialect_of
+from coec.adapters.ros.messages import TF
 from coec.adapters.ros.wire.dialect import Dialect
 from coec.adapters.ros.wire.qos import STATIC, Qos
 from coec.adapters.ros.wire.rmw_zenoh import Attachment, Node, RmwZenoh, gid_of
 from coec.adapters.ros.wire.ros2dds import Ros2dds
 from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
-from coec.config import LimitsConfig, ZenohConfig
+from coec.config import LimitsConfig, RosConfig, ZenohConfig
 from fakes import wait_until
+from pair_bench import configuration
 from ports import free_port
 
 TIMEOUT_S = 20.0
 STRING = "std_msgs/msg/String"
 KEY = "0/chatter/std_msgs::msg::dds_::String_/RIHS01_00"
 RELIABLE = Qos(depth=10)
+TF_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 
 
 @pytest.fixture
@@ -47,9 +53,8 @@ def rmw_of(session: zenoh.Session) -> RmwZenoh:
     return RmwZenoh(Node(0, str(session.info.zid()), 0, "/shuttle", "coec"), lambda _: "RIHS01_00")
 
 
-def publishers_of(session: zenoh.Session, dialect: Dialect) -> tuple[RosNode, RosPublishers]:
-    node = RosNode(session, dialect)
-    return node, RosPublishers(session, node)
+def publishers_of(session: zenoh.Session, dialect: Dialect) -> RosPublishers:
+    return RosPublishers(session, RosNode(session, dialect))
 
 
 def tokens(client: zenoh.Session, expression: str) -> set[str]:
@@ -69,7 +74,7 @@ def queued() -> tuple[zenoh.handlers.Callback[zenoh.Sample], queue.Queue[zenoh.S
 def test_messages_are_numbered_from_one_and_name_the_publisher_by_its_token(
     session: zenoh.Session, client: zenoh.Session
 ) -> None:
-    _, publishers = publishers_of(session, rmw_of(session))
+    publishers = publishers_of(session, rmw_of(session))
     publisher = publishers.publisher("/chatter", STRING, RELIABLE)
     subscriber = client.declare_subscriber(KEY, queued())
     wait_until(lambda: publisher.is_heard, "somebody who listens", TIMEOUT_S)
@@ -91,7 +96,8 @@ def test_messages_are_numbered_from_one_and_name_the_publisher_by_its_token(
 
 
 def test_a_node_and_its_publishers_are_listed_until_they_close(session: zenoh.Session, client: zenoh.Session) -> None:
-    node, publishers = publishers_of(session, rmw_of(session))
+    node = RosNode(session, rmw_of(session))
+    publishers = RosPublishers(session, node)
     publishers.publisher("/chatter", STRING, RELIABLE)
     publishers.publisher("/tf_static", STRING, STATIC)
     own = f"@ros2_lv/0/{session.info.zid()}/0"
@@ -112,7 +118,7 @@ def test_a_node_and_its_publishers_are_listed_until_they_close(session: zenoh.Se
 def test_whoever_comes_later_gets_the_last_message_of_a_latched_topic(
     session: zenoh.Session, client: zenoh.Session
 ) -> None:
-    _, publishers = publishers_of(session, rmw_of(session))
+    publishers = publishers_of(session, rmw_of(session))
     latched = publishers.publisher("/tf_static", STRING, STATIC)
     latched.put(b"first", 1)
     latched.put(b"second", 2)
@@ -136,14 +142,14 @@ def test_whoever_comes_later_gets_the_last_message_of_a_latched_topic(
 
 
 def test_nobody_listens_to_a_topic_that_nobody_subscribes_to(session: zenoh.Session) -> None:
-    _, publishers = publishers_of(session, rmw_of(session))
+    publishers = publishers_of(session, rmw_of(session))
 
     assert not publishers.publisher("/chatter", STRING, RELIABLE).is_heard
     assert publishers.publisher("/tf_static", STRING, STATIC).is_heard
 
 
 def test_beside_a_bridge_messages_go_bare_on_plain_keys(session: zenoh.Session, client: zenoh.Session) -> None:
-    _, publishers = publishers_of(session, Ros2dds(str(session.info.zid()), ""))
+    publishers = publishers_of(session, Ros2dds(str(session.info.zid()), ""))
     publisher = publishers.publisher("/chatter", STRING, RELIABLE)
     subscriber = client.declare_subscriber("chatter", queued())
     wait_until(lambda: publisher.is_heard, "somebody who listens", TIMEOUT_S)
@@ -161,6 +167,42 @@ def test_beside_a_bridge_messages_go_bare_on_plain_keys(session: zenoh.Session, 
         "the token",
         TIMEOUT_S,
     )
+
+
+@pytest.mark.parametrize(
+    ("middleware", "ros", "key", "token"),
+    [
+        (
+            "rmw_zenoh",
+            RosConfig(domain=7),
+            f"7/tf_static/tf2_msgs::msg::dds_::TFMessage_/{TF_HASH}",
+            f"@ros2_lv/7/ZID/0/1/MP/%/%shuttle_7/coec/%tf_static/tf2_msgs::msg::dds_::TFMessage_/{TF_HASH}/:1:,1:,:,:,,",
+        ),
+        (
+            "ros2dds",
+            RosConfig(namespace="/fleet/seven"),
+            "fleet/seven/tf_static",
+            "@/ZID/@ros2_lv/MP/fleet§seven§tf_static/tf2_msgs§msg§TFMessage/:1:1:0,1",
+        ),
+    ],
+)
+def test_a_service_publishes_as_its_configuration_says(
+    session: zenoh.Session,
+    client: zenoh.Session,
+    middleware: Literal["rmw_zenoh", "ros2dds"],
+    ros: RosConfig,
+    key: str,
+    token: str,
+) -> None:
+    native = configuration(Path("state"), vehicle="shuttle-7")
+    config = native.model_copy(update={"middleware": middleware, "ros": ros})
+    dialect = dialect_of(config, str(session.info.zid()))
+    assert dialect is not None
+    publishers = publishers_of(session, dialect)
+
+    assert publishers.publisher("/tf_static", TF, STATIC).key == key
+    wanted = token.replace("ZID", str(session.info.zid()))
+    wait_until(lambda: tokens(client, wanted) == {wanted}, "the token", TIMEOUT_S)
 
 
 def test_a_session_that_starts_anew_is_another_publisher() -> None:

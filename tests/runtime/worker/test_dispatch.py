@@ -44,6 +44,9 @@ class Painter:
     def overlay(self, _path: object, _pose: object, title: str) -> Drawn:
         return Drawn(title.encode())
 
+    def picture(self, pair: str, _configuration: object, _pose: object, frames: list[object], title: str) -> Drawn:
+        return Drawn(f"{pair} {len(frames)} {title}".encode())
+
     def prefetch(self, _pair: str, _frame: bytes) -> None:
         """Nothing to tell."""
 
@@ -51,6 +54,8 @@ class Painter:
 def test_an_answer_goes_under_the_number_of_its_question() -> None:
     painter = cast("Solver", Painter())
     assert dispatch.answer(painter, {**OVERLAY, "title": "a"}) == {"id": 4, "result": {"jpeg": b"a"}}
+    picture = {**CHECK, "kind": "picture", "frames": [[]], "title": "b"}
+    assert dispatch.answer(painter, picture) == {"id": 3, "result": {"jpeg": b"front 1 b"}}
     prefetch = {"id": 6, "kind": "prefetch", "pair": "front", "frame": b""}
     assert dispatch.answer(painter, prefetch) == {"id": 6, "result": None}
 

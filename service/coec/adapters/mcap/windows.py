@@ -42,7 +42,7 @@ from coec.adapters.mcap.files import (
     read_attachment,
     read_records,
 )
-from coec.adapters.ros import incoming, messages, outgoing
+from coec.adapters.ros import diagnostics, incoming, messages, outgoing
 from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
@@ -610,9 +610,6 @@ _METADATA = "coec"
 _KEPT = "coec_kept"
 _FRAME_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY, messages.IMU)
 
-_OK, _WARN = 0, 1
-"""diagnostic_msgs/DiagnosticStatus.level: an accepted calibration, one that failed."""
-
 
 def _topic(pair: str, name: str) -> str:
     return f"/coec/{pair}/{name}"
@@ -625,16 +622,7 @@ def _ros_schema(type_name: str) -> Schema:
 
 def _diagnostics(result: CalibrationResult) -> bytes:
     """The verdict with its figures, as ROS tools show it."""
-    reasons = result.verdict.reasons
-    values = {name: f"{metric.value} (limit {metric.limit})" for name, metric in result.metrics.items()}
-    return outgoing.encode_diagnostics(
-        result.data_stamp_ns,
-        f"coec/{result.pair}",
-        _WARN if reasons else _OK,
-        "; ".join(reason.text for reason in reasons) or "calibration accepted",
-        values,
-        result.vehicle,
-    )
+    return outgoing.encode_diagnostics(result.data_stamp_ns, [diagnostics.of_result(result)])
 
 
 def _beside(path: Path, suffix: str) -> Path:

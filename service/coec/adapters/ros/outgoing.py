@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -10,6 +11,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.adapters.images.raw import BYTES_PER_PIXEL
 from coec.adapters.ros import point_cloud2
+from coec.adapters.ros.diagnostics import Status
 from coec.adapters.ros.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -21,8 +23,10 @@ from coec.adapters.ros.messages import (
     TF,
     serialized,
 )
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, LidarFrame, Matrix4, Rig
-from coec.geometry.cameras import intrinsics_of, name_of
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
+from coec.errors import CoecError
+from coec.geometry.cameras import Camera, intrinsics_of, name_of
+from coec.geometry.cameras.kannala_brandt_fit import fit_kannala_brandt
 from coec.geometry.se3 import quaternion_xyzw_from_rotation
 
 DEPTH_FORMAT: Final = "16UC1; png"
@@ -48,27 +52,33 @@ _UNKNOWN_POSE_M2 = 1e9
 def encode_image(frame: CameraFrame) -> tuple[str, bytes]:
     """Type name and message: `CompressedImage` for JPEG and PNG, `Image` for raw pixels."""
     image = frame.image
-    header = _header(frame.stamp_ns, frame.frame_id)
-    data = np.frombuffer(image.data, np.uint8)
     if image.format not in BYTES_PER_PIXEL:
-        compressed = ros.sensor_msgs__msg__CompressedImage(header=header, format=image.format.value, data=data)
-        return COMPRESSED_IMAGE, serialized(compressed, COMPRESSED_IMAGE)
+        return COMPRESSED_IMAGE, _encode_compressed(frame.stamp_ns, frame.frame_id, image.format.value, image.data)
     raw = ros.sensor_msgs__msg__Image(
-        header=header,
+        header=_header(frame.stamp_ns, frame.frame_id),
         height=image.height,
         width=image.width,
         encoding=image.format.value,
         is_bigendian=0,
         step=image.width * BYTES_PER_PIXEL[image.format],
-        data=data,
+        data=np.frombuffer(image.data, np.uint8),
     )
     return IMAGE, serialized(raw, IMAGE)
 
 
 def encode_depth(stamp_ns: int, frame_id: str, depth: EncodedImage) -> bytes:
     """`CompressedImage` of a precomputed depth map (PNG); `decode` gives it back as the image of a frame."""
+    return _encode_compressed(stamp_ns, frame_id, DEPTH_FORMAT, depth.data)
+
+
+def encode_jpeg(stamp_ns: int, frame_id: str, jpeg: bytes) -> bytes:
+    """`CompressedImage` of a picture that was drawn."""
+    return _encode_compressed(stamp_ns, frame_id, ImageFormat.JPEG.value, jpeg)
+
+
+def _encode_compressed(stamp_ns: int, frame_id: str, form: str, data: bytes) -> bytes:
     message = ros.sensor_msgs__msg__CompressedImage(
-        header=_header(stamp_ns, frame_id), format=DEPTH_FORMAT, data=np.frombuffer(depth.data, np.uint8)
+        header=_header(stamp_ns, frame_id), format=form, data=np.frombuffer(data, np.uint8)
     )
     return serialized(message, COMPRESSED_IMAGE)
 
@@ -125,6 +135,39 @@ def _encode_odometry(motion: EgoMotion, linear_mps: tuple[float, float, float]) 
     return serialized(message, ODOMETRY)
 
 
+MAX_RESIDUAL_PX: Final = 0.5
+"""What `equidistant` may miss of a lens that ROS has no word for, at most, px: where a point lands on the next pixel,
+an image is wrong."""
+
+ROS_MODELS: Final = frozenset({"plumb_bob", "rational_polynomial", "equidistant"})
+"""Models that ROS's own programs know (sensor_msgs/distortion_models.hpp)."""
+
+
+class UnsayableCameraError(CoecError):
+    """ROS has no model that comes near the camera's."""
+
+    reply_code = "camera_not_sayable"
+
+
+def sayable(camera: Camera) -> tuple[Camera, float]:
+    """The camera in a model that ROS's own programs know, and how many pixels that misses, at most.
+
+    Raises:
+        UnsayableCameraError: none is nearer than `MAX_RESIDUAL_PX`.
+    """
+    if DISTORTION[name_of(camera)][0] in ROS_MODELS:
+        return camera, 0.0
+    try:
+        fit = fit_kannala_brandt(camera)
+    except ValueError as error:
+        raise UnsayableCameraError(f"not as equidistant: {error}") from error
+    if fit.residual_max_px > MAX_RESIDUAL_PX:
+        raise UnsayableCameraError(
+            f"not as equidistant: it would be {fit.residual_max_px:.2g} px off, more than {MAX_RESIDUAL_PX:g} px"
+        )
+    return fit.camera, fit.residual_max_px
+
+
 def encode_camera_info(rig: Rig, stamp_ns: int) -> bytes:
     """`CameraInfo` of the rig's camera; see `DISTORTION` for models that ROS does not know."""
     camera = rig.camera
@@ -148,33 +191,51 @@ def encode_camera_info(rig: Rig, stamp_ns: int) -> bytes:
     return serialized(message, CAMERA_INFO)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A frame in its parent: `T_parent_child` (4, 4) maps coordinates of the child to those of the parent."""
+
+    parent: str
+    child: str
+    T_parent_child: Matrix4
+
+
+def encode_transforms(frames: Sequence[Placed], stamp_ns: int) -> bytes:
+    """`TFMessage`: tf's transforms, too, map coordinates of the child to those of the parent."""
+    transforms = []
+    for frame in frames:
+        x, y, z, w = (float(v) for v in quaternion_xyzw_from_rotation(frame.T_parent_child[:3, :3]))
+        transforms.append(
+            ros.geometry_msgs__msg__TransformStamped(
+                header=_header(stamp_ns, frame.parent),
+                child_frame_id=frame.child,
+                transform=ros.geometry_msgs__msg__Transform(
+                    translation=ros.geometry_msgs__msg__Vector3(*(float(v) for v in frame.T_parent_child[:3, 3])),
+                    rotation=ros.geometry_msgs__msg__Quaternion(x, y, z, w),
+                ),
+            )
+        )
+    return serialized(ros.tf2_msgs__msg__TFMessage(transforms=transforms), TF)
+
+
 def encode_tf_static(rig: Rig, T_camera_lidar: Matrix4, stamp_ns: int) -> bytes:
-    """`TFMessage` with the LiDAR as a child of the camera: tf maps coordinates of the child to those of the
-    parent, so its transform is `T_camera_lidar` (4, 4) as it stands."""
-    x, y, z, w = (float(v) for v in quaternion_xyzw_from_rotation(T_camera_lidar[:3, :3]))
-    transform = ros.geometry_msgs__msg__TransformStamped(
-        header=_header(stamp_ns, rig.camera_frame),
-        child_frame_id=rig.lidar_frame,
-        transform=ros.geometry_msgs__msg__Transform(
-            translation=ros.geometry_msgs__msg__Vector3(*(float(v) for v in T_camera_lidar[:3, 3])),
-            rotation=ros.geometry_msgs__msg__Quaternion(x, y, z, w),
-        ),
-    )
-    return serialized(ros.tf2_msgs__msg__TFMessage(transforms=[transform]), TF)
+    """`TFMessage` of a window: the LiDAR as a child of the camera, `T_camera_lidar` (4, 4) as it stands."""
+    return encode_transforms([Placed(rig.camera_frame, rig.lidar_frame, T_camera_lidar)], stamp_ns)
 
 
-def encode_diagnostics(
-    stamp_ns: int, name: str, level: int, text: str, values: Mapping[str, str], hardware_id: str
-) -> bytes:
-    """`DiagnosticArray` with one status; `level` 0 OK, 1 WARN, 2 ERROR, 3 STALE."""
-    status = ros.diagnostic_msgs__msg__DiagnosticStatus(
-        level=level,
-        name=name,
-        message=text,
-        hardware_id=hardware_id,
-        values=[ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in values.items()],
-    )
-    message = ros.diagnostic_msgs__msg__DiagnosticArray(header=_header(stamp_ns, ""), status=[status])
+def encode_diagnostics(stamp_ns: int, statuses: Sequence[Status]) -> bytes:
+    """`DiagnosticArray`."""
+    array = [
+        ros.diagnostic_msgs__msg__DiagnosticStatus(
+            level=int(status.level),
+            name=status.name,
+            message=status.message,
+            hardware_id=status.hardware_id,
+            values=[ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in status.values.items()],
+        )
+        for status in statuses
+    ]
+    message = ros.diagnostic_msgs__msg__DiagnosticArray(header=_header(stamp_ns, ""), status=array)
     return serialized(message, DIAGNOSTICS)
 
 

@@ -6,6 +6,7 @@ Seen on the wire against rmw_zenoh_cpp 0.6.7. Encodings stay unset, as those of 
 
 from __future__ import annotations
 
+import logging
 from itertools import count
 
 import zenoh
@@ -14,6 +15,8 @@ from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, decla
 from coec.adapters.ros.wire.dialect import Dialect
 from coec.adapters.ros.wire.qos import Qos
 from coec.adapters.zenoh.matching import is_heard
+
+_log = logging.getLogger(__name__)
 
 HEARTBEAT_S = 0.5
 """How soon whoever missed the last message of a latched topic is told so; rmw_zenoh's own."""
@@ -70,13 +73,13 @@ class RosPublisher:
         return not isinstance(self._publisher, zenoh.Publisher) or is_heard(self._publisher)
 
     def put(self, payload: bytes, source_ns: int) -> None:
-        """Publish a message in CDR; `source_ns` is the wall clock of whoever made it.
-
-        Raises:
-            zenoh.ZError: the session is closed.
-        """
+        """Publish a message in CDR; `source_ns` is the wall clock of whoever made it. Silently lost while no router is
+        there, or as soon as the session is closed."""
         attachment = self._dialect.attachment(self._token, next(self._sequence), source_ns)
-        self._publisher.put(payload, attachment=attachment)
+        try:
+            self._publisher.put(payload, attachment=attachment)
+        except zenoh.ZError as error:
+            _log.debug("a message of ROS could not be published", extra={"fields": {"why": str(error)}})
 
     def undeclare(self) -> None:
         """Withdraw it: the token first, so that nobody waits for what does not come any more."""

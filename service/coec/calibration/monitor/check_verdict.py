@@ -144,7 +144,8 @@ def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: Monitor
 
 def _moves(pairs: Sequence[FramePair]) -> bool:
     """Whether the vehicle is known to be on the move in most of the pairs."""
-    moving = [pair for pair in pairs if pair.motion is not None and pair.motion.speed_mps >= MOVING_MPS]
+    speeds_mps = [pair.motion.speed_mps for pair in pairs if pair.motion is not None]
+    moving = [speed_mps for speed_mps in speeds_mps if speed_mps is not None and speed_mps >= MOVING_MPS]
     return 2 * len(moving) > len(pairs)
 
 

@@ -38,7 +38,7 @@ class Told:
         text = (
             f"What the service knows of this pair has not been renewed for {age_s:.0f} s: a disk or a thread is stuck."
         )
-        stuck = replies.Reason(code="service_stuck", text=text)
+        stuck = replies.Reason(code=replies.STUCK, text=text)
         return self.reply.model_copy(
             update={"state": state, "level": replies.ROS_LEVELS[state], "reasons": (*self.reply.reasons, stuck)}
         )

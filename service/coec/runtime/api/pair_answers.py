@@ -53,7 +53,6 @@ class PairAnswers:
         self._pair = pair
         self._vehicle = config.vehicle
         self._config_hash = config_hash(pair.calibration)
-        self._rig = rig
         self._store = store
         self._folder = folder
         self._recorder = recorder
@@ -62,6 +61,9 @@ class PairAnswers:
         self._outside = outside
         self._commands = commands
         self._overlays = Overlays(pair.name, outside.worker)
+        self.rig = rig
+        self.extrinsic_reply: replies.ExtrinsicReply
+        """What `extrinsic` serves."""
         self._known: Known
         self._health: Told
         self._snapshots: dict[str, Snapshot] = {}
@@ -75,7 +77,7 @@ class PairAnswers:
 
     def hear(self, known: Known) -> None:
         """Serialise what is served anew, and publish what changed."""
-        report, rig = self._stream.report, self._rig
+        report, rig = self._stream.report, self.rig
         accepted = None if known.state.accepted is None else result_of(known.state.accepted, rig, self._vehicle)
         extrinsic = extrinsic_of(self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash)
         own = () if self._recorder.trouble is None else (self._recorder.trouble,)
@@ -86,6 +88,7 @@ class PairAnswers:
         missed = streams.missed_of(arrivals, self._pair, topics)
         health = health_of(known, report, self._losses.snapshot(), troubles, missed, self._pair, rig, self._vehicle)
         self._known, self._health = known, Told(health, time.monotonic())
+        self.extrinsic_reply = extrinsic
         self._snapshots = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
         essences = {
             "extrinsic": extrinsic.model_copy(update={"percent_complete": 0.0}),
@@ -213,7 +216,7 @@ class PairAnswers:
         if window_id is None and (latest is None or not latest.exists()):
             raise NotFoundError(f"pair {self.name} has no window yet")
         path = latest if window_id is None and latest else self._folder.existing(self.name, str(window_id))
-        pose = self._rig.T_camera_lidar_nominal if nominal else self._known.served.T_camera_lidar
+        pose = self.rig.T_camera_lidar_nominal if nominal else self._known.served.T_camera_lidar
         return self._overlays.jpeg(path, pose, f"{path.stem}  {'nominal' if nominal else 'current'}")
 
     def status(self) -> replies.PairStatus:

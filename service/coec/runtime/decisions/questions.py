@@ -52,9 +52,17 @@ class Questions:
     """Asks for one pair: for its stream (`ingest.chooser.Asks`) and for its recorder. Any thread."""
 
     def __init__(
-        self, pair: PairConfig, queue: DecisionQueue, worker: Worker, mailbox: Mailbox, windows: WindowStore
+        self,
+        pair: PairConfig,
+        queue: DecisionQueue,
+        worker: Worker,
+        mailbox: Mailbox,
+        windows: WindowStore,
+        show: Callable[[PairConfig, FramePair, Matrix4], None],
     ) -> None:
+        """`show(pair, drawn, pose)` is told of a pair of every check, and of the extrinsic (4, 4) that is checked."""
         self._pair = pair
+        self._show = show
         self._windows = windows
         self._queue = queue
         self._worker = worker
@@ -80,6 +88,7 @@ class Questions:
         ended = partial(self._decides.checked, question, served.epoch, standing)
         pair = self._pair
         self._worker.ask(jobs.check(pair.name, pair.calibration, served.T_camera_lidar, pairs, self._post(ended)))
+        self._show(pair, pairs[-1], served.T_camera_lidar)
 
     def window(self, window_id: str, stamp_ns: int) -> int:
         """What does a window say that ends at a sensor time? It is on its way to the disk. From when on its answer

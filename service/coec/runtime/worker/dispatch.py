@@ -45,6 +45,10 @@ def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
                 return solver.observe(message["pair"], _configuration(message), message["pose"], message["frames"])
             case Kind.OVERLAY:
                 return solver.overlay(Path(message["path"]), message["pose"], message["title"])
+            case Kind.PICTURE:
+                return solver.picture(
+                    message["pair"], _configuration(message), message["pose"], message["frames"], message["title"]
+                )
             case Kind.COMMISSION:
                 paths = [Path(path) for path in message["paths"]]
                 return solver.commission(_configuration(message), message["pose"], paths)

@@ -28,6 +28,7 @@ class Kind(StrEnum):
     SOLVE = "solve"
     CHECK = "check"
     OVERLAY = "overlay"
+    PICTURE = "picture"
     COMMISSION = "commission"
 
 
@@ -44,10 +45,17 @@ class Fate(StrEnum):
     LATE = "deadline_passed"
 
 
-DEADLINE_S = {Kind.SOLVE: 600.0, Kind.CHECK: 180.0, Kind.OVERLAY: 60.0, Kind.COMMISSION: 1800.0}
+DEADLINE_S = {
+    Kind.SOLVE: 600.0,
+    Kind.CHECK: 180.0,
+    Kind.OVERLAY: 60.0,
+    Kind.PICTURE: 15.0,
+    Kind.COMMISSION: 1800.0,
+}
 """From asking to the last moment of an answer, s. A live window: the two attempts of 120 s that `worker` allows by
 default, behind another window that has them, and two minutes for new processes. A check: the first start of a
-worker, which compiles its kernels for a minute and a half on two busy cores, twice over. A picture: six solves of 10 s.
+worker, which compiles its kernels for a minute and a half on two busy cores, twice over. A picture of a window: six
+solves of 10 s; of what is on the road now: a solve and a half, beyond which it is not now any more.
 A commissioning: twice `COMMISSIONING_TIMEOUT_S`."""
 
 BACKLOG_DEADLINE_S = 86_400.0
@@ -109,6 +117,7 @@ ANSWERS: dict[Kind, type[Answer]] = {
     Kind.SOLVE: Solved,
     Kind.CHECK: Checked,
     Kind.OVERLAY: Drawn,
+    Kind.PICTURE: Drawn,
     Kind.COMMISSION: Commissioned,
 }
 """What each kind is answered with."""
@@ -200,6 +209,19 @@ def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadli
     """Draw the last pair of a window's file at an extrinsic (4, 4); answered with `Drawn`."""
     body = {"path": str(path), "pose": pack_pose(pose), "title": title}
     return Job(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
+
+
+def picture(
+    pair: str, configuration: CalibrationConfig, pose: Matrix4, drawn: FramePair, title: str, done: Done
+) -> Job:
+    """Draw a pair of the stream at an extrinsic (4, 4); answered with `Drawn`."""
+    body = {
+        "configuration": _packed(configuration),
+        "pose": pack_pose(pose),
+        "frames": pack_pairs([drawn]),
+        "title": title,
+    }
+    return Job(Kind.PICTURE, pair, "picture", body, done)
 
 
 def commission(pair: str, configuration: CalibrationConfig, pose: Matrix4, paths: Sequence[Path], done: Done) -> Job:

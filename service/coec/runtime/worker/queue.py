@@ -303,5 +303,5 @@ def _lane_of(job: Job) -> Lane:
             return Lane.CHECK
         case Kind.SOLVE:
             return Lane.LIVE if job.live else Lane.BACKLOG
-        case Kind.OVERLAY | Kind.COMMISSION:
+        case Kind.OVERLAY | Kind.PICTURE | Kind.COMMISSION:
             return Lane.ERRAND

@@ -165,12 +165,23 @@ class Solver:
         from coec.adapters.mcap.windows import read_window
 
         window, configuration = read_window(path)
-        pair, rig = window.pairs[-1], window.rig
-        xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
-        image = decode_bgr(pair.camera.image, self._config.limits)
-        T_camera_lidar = np.array(pose, dtype=np.float64)
-        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title)
-        return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
+        return self._drawn(window.rig, configuration, pose, window.pairs[-1], title)
+
+    def picture(
+        self,
+        pair: str,
+        configuration: CalibrationConfig,
+        pose: Sequence[Sequence[float]],
+        frames: Sequence[Sequence[bytes | None]],
+        title: str,
+    ) -> Drawn:
+        """The same of one pair of the stream, packed as `messages` does.
+
+        Raises:
+            DecodeError: a frame cannot be decoded.
+        """
+        (drawn,) = unpack_pairs(frames, self._config.limits)
+        return self._drawn(self._rigs[pair], configuration, pose, drawn, title)
 
     def commission(
         self, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
@@ -194,6 +205,20 @@ class Solver:
         )
         saved = save_baseline(self._config.state.directory / BASELINES, baseline)
         return Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
+
+    def _drawn(
+        self,
+        rig: Rig,
+        configuration: CalibrationConfig,
+        pose: Sequence[Sequence[float]],
+        pair: FramePair,
+        title: str,
+    ) -> Drawn:
+        xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
+        image = decode_bgr(pair.camera.image, self._config.limits)
+        T_camera_lidar = np.array(pose, dtype=np.float64)
+        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title)
+        return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
 
     def _baseline(
         self, pair: str, configuration: CalibrationConfig, depth_identity: str

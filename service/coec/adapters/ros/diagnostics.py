@@ -1,0 +1,121 @@
+"""What `/diagnostics` says of a pair: the one mapping from health, or from a result, to ROS's levels and values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, Literal
+
+from coec.schemas import replies
+from coec.schemas.replies import ROS_LEVELS, CalibrationResult, HealthReply, MetricReply
+from coec.schemas.ros_names import status_name
+
+Service = Literal["starting", "running", "stopping", "failing"]
+"""State of the whole service, as `status` tells it."""
+
+UNITS: Final = ("deg", "deg", "deg", "m", "m", "m")
+AXES: Final = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+MAX_MESSAGE: Final = 500
+"""Characters of the sentence that panels show in one line; the values hold every reason in full."""
+
+
+class Level(IntEnum):
+    """`diagnostic_msgs/DiagnosticStatus.level`."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """`diagnostic_msgs/DiagnosticStatus`."""
+
+    level: Level
+    name: str
+    message: str
+    hardware_id: str
+    values: Mapping[str, str]
+
+
+def hardware_id(vehicle: str, pair: str, serial: str | None) -> str:
+    """The camera's serial number; where nobody said it, the vehicle and the pair."""
+    return serial or f"{vehicle}/{pair}"
+
+
+def level_of(health: HealthReply, service: Service) -> Level:
+    """That of the state (`replies.ROS_LEVELS`). Nothing is known any more of a pair that nobody renews, and nothing
+    will be of one whose service stops; a service that fails is an error whatever it last thought of the pair."""
+    level = Level(ROS_LEVELS[health.state])
+    if service == "stopping" or any(reason.code == replies.STUCK for reason in health.reasons):
+        return Level.STALE
+    return max(level, Level.ERROR) if service == "failing" else level
+
+
+def of_health(health: HealthReply, service: Service, serial: str | None, more: Mapping[str, str]) -> Status:
+    """The status of a pair now. `more` are values that health has none of."""
+    return Status(
+        level_of(health, service),
+        status_name(health.pair),
+        _message(health, service),
+        hardware_id(health.vehicle, health.pair, serial),
+        {**_values(health), "service": service, **more},
+    )
+
+
+def of_result(result: CalibrationResult) -> Status:
+    """The status that a window's file carries: accepted is what a healthy pair is, failed what a degraded one is."""
+    reasons = result.verdict.reasons
+    return Status(
+        Level(ROS_LEVELS["degraded" if reasons else "healthy"]),
+        status_name(result.pair),
+        "; ".join(reason.text for reason in reasons) or "calibration accepted",
+        hardware_id(result.vehicle, result.pair, None),
+        {name: _figure(metric) for name, metric in result.metrics.items()},
+    )
+
+
+def _message(health: HealthReply, service: Service) -> str:
+    """The state and why, in one line."""
+    told = health.state if service in ("starting", "running") else f"{health.state}, service {service}"
+    text = ": ".join([told, *(["; ".join(reason.text for reason in health.reasons)] if health.reasons else [])])
+    return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE - 1]}…"
+
+
+def _values(health: HealthReply) -> dict[str, str]:
+    """Everything that health holds, a line each; what is not known is left out."""
+    values = {"state": health.state, "since_ns": str(health.since_ns)}
+    values |= {f"reason {reason.code}": reason.text for reason in health.reasons}
+    values |= {f"need {number}": need for number, need in enumerate(health.needs, 1)}
+    if health.age_s is not None:
+        values["age_s"] = f"{health.age_s:.1f}"
+    if health.evaluated_ns is not None:
+        values["evaluated_ns"] = str(health.evaluated_ns)
+    values |= {name: _figure(metric) for name, metric in health.metrics.items()}
+    for name in AXES:
+        axis: replies.AxisReply = getattr(health.axes, name)
+        sigma = "unknown" if axis.sigma is None else f"{axis.sigma:.4g} {axis.unit}"
+        values[f"axis {name}"] = f"{axis.status}, correction {axis.correction:.4g} {axis.unit}, sigma {sigma}"
+    drifts = {"drift from commissioned": health.drift, "drift of the latest result": health.result_drift}
+    for name, drift in drifts.items():
+        if drift is not None:
+            told = zip(AXES, drift, UNITS, strict=True)
+            values[name] = ", ".join(f"{axis} {value:.4g} {unit}" for axis, value, unit in told if value is not None)
+    quality = health.data_quality
+    figures = {"pair_rate_hz": quality.pair_rate_hz, "sync_error_s": quality.sync_error_s}
+    values |= {name: f"{value:.4g}" for name, value in figures.items() if value is not None}
+    values["frozen_image"] = str(quality.frozen_image).lower()
+    for place, causes in quality.drops.items():
+        values |= {f"lost {place} {cause}": str(count) for cause, count in causes.items()}
+    return values
+
+
+def _figure(metric: MetricReply) -> str:
+    value = "unknown" if metric.value is None else f"{metric.value:.6g}"
+    if metric.limit is None:
+        return value
+    bound = "at least" if metric.at_least else "at most"
+    return f"{value} ({bound} {metric.limit:.6g}, {'passed' if metric.passed else 'failed'})"

@@ -1,0 +1,27 @@
+"""What the service is asked for whenever ROS is told something."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from coec.adapters.ros.diagnostics import Service
+from coec.calibration.types import Rig
+from coec.schemas.replies import ExtrinsicReply, HealthReply
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairTold:
+    """One pair. `serial` is its camera's; `extrinsic` and `rig` are None while the pair itself is not known yet."""
+
+    health: HealthReply
+    serial: str | None
+    extrinsic: ExtrinsicReply | None
+    rig: Rig | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """The service and its pairs at one moment."""
+
+    service: Service
+    pairs: tuple[PairTold, ...]

@@ -1,0 +1,123 @@
+"""What is said of a pair's health on `/diagnostics`: the levels as ROS's conventions have them, and every figure."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coec.adapters.ros.diagnostics import MAX_MESSAGE, Level, Service, level_of, of_health
+from coec.schemas.replies import (
+    STUCK,
+    Axes,
+    AxisReply,
+    DataQuality,
+    HealthReply,
+    HealthState,
+    MetricReply,
+    Reason,
+)
+
+STATES = st.sampled_from(get_args(HealthState))
+SERVICES: st.SearchStrategy[Service] = st.sampled_from(get_args(Service))
+REASONS = st.lists(
+    st.builds(Reason, code=st.sampled_from([STUCK, "thread_died", "mount_moved"]), text=st.text(max_size=600)),
+    max_size=3,
+).map(tuple)
+AXIS = AxisReply(status="accepted", sigma=0.02, correction=-0.5, unit="deg")
+SHIFT = AxisReply(status="not_solved", sigma=None, correction=0.0, unit="m")
+
+
+def health(state: HealthState, reasons: tuple[Reason, ...] = ()) -> HealthReply:
+    return HealthReply(
+        vehicle="shuttle-7",
+        pair="front",
+        state=state,
+        level=0,  # what it says of its level is not asked
+        reasons=reasons,
+        metrics={
+            "overlap": MetricReply(value=0.97, limit=0.5, at_least=True, passed=True),
+            "drift": MetricReply(value=None, limit=0.3, at_least=False, passed=False),
+            "mi": MetricReply(value=1.5, limit=None, at_least=True, passed=True),
+        },
+        axes=Axes(rx=AXIS, ry=AXIS, rz=AXIS, tx=SHIFT, ty=SHIFT, tz=SHIFT),
+        drift=(0.1, 0.2, None, 0.0, 0.0, None),
+        needs=("3 more pairs",),
+        data_quality=DataQuality(pair_rate_hz=10.0, drops={"camera": {"image_truncated": 2}}),
+        since_ns=7,
+        evaluated_ns=5,
+        age_s=1.25,
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "level"),
+    [
+        ("healthy", Level.OK),
+        ("suspect", Level.WARN),
+        ("degraded", Level.WARN),
+        ("miscalibrated", Level.ERROR),
+        ("unknown", Level.STALE),
+        ("stale", Level.STALE),
+    ],
+)
+def test_a_running_service_says_the_level_of_the_state(state: HealthState, level: Level) -> None:
+    assert level_of(health(state), "running") is level
+
+
+@given(state=STATES, service=SERVICES, reasons=REASONS)
+def test_ok_is_said_of_nothing_but_what_was_looked_at(
+    state: HealthState, service: Service, reasons: tuple[Reason, ...]
+) -> None:
+    told = health(state, reasons)
+    level = level_of(told, service)
+    renewed = all(reason.code != STUCK for reason in reasons)
+
+    assert (level is Level.OK) == (state == "healthy" and renewed and service in ("starting", "running"))
+    if service == "stopping" or not renewed:
+        assert level is Level.STALE
+    elif service == "failing":
+        assert level >= Level.ERROR
+
+
+@given(state=STATES, service=SERVICES, reasons=REASONS)
+def test_the_sentence_is_short_and_begins_with_the_state(
+    state: HealthState, service: Service, reasons: tuple[Reason, ...]
+) -> None:
+    status = of_health(health(state, reasons), service, None, {})
+    assert status.message.startswith(state)
+    assert len(status.message) <= MAX_MESSAGE
+    assert (service in status.message) or service in ("starting", "running")
+
+
+def test_every_figure_is_told_with_its_limit() -> None:
+    moved = Reason(code="mount_moved", text="The mount has moved.")
+    status = of_health(health("miscalibrated", (moved,)), "running", "SN-12", {"tf": "not published: nominal"})
+
+    assert (status.name, status.hardware_id) == ("coec: front_calibration", "SN-12")
+    assert status.message == "miscalibrated: The mount has moved."
+    assert status.values == {
+        "state": "miscalibrated",
+        "since_ns": "7",
+        "reason mount_moved": "The mount has moved.",
+        "need 1": "3 more pairs",
+        "age_s": "1.2",
+        "evaluated_ns": "5",
+        "overlap": "0.97 (at least 0.5, passed)",
+        "drift": "unknown (at most 0.3, failed)",
+        "drift from commissioned": "rx 0.1 deg, ry 0.2 deg, tx 0 m, ty 0 m",
+        "mi": "1.5",
+        **dict.fromkeys(("axis rx", "axis ry", "axis rz"), "accepted, correction -0.5 deg, sigma 0.02 deg"),
+        **dict.fromkeys(("axis tx", "axis ty", "axis tz"), "not_solved, correction 0 m, sigma unknown"),
+        "pair_rate_hz": "10",
+        "frozen_image": "false",
+        "lost camera image_truncated": "2",
+        "service": "running",
+        "tf": "not published: nominal",
+    }
+
+
+def test_without_a_serial_number_the_hardware_is_the_pair_of_the_vehicle() -> None:
+    assert of_health(health("healthy"), "running", None, {}).hardware_id == "shuttle-7/front"
