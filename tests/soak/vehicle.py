@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.player import is_heard
+from coec.adapters.zenoh.matching import is_heard
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import Config
 from coec.reports.commented_yaml import commented_yaml

@@ -7,12 +7,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, cast
+from typing import Literal
 
 import zenoh
 
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import messages, outgoing
+from coec.adapters.zenoh.matching import is_heard
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import PairConfig
 
@@ -152,12 +153,6 @@ def repeated(passes: Callable[[], Iterable[Frame]], shift_ns: int, pause_ns: int
         if not forever or first_ns is None:
             return
         shift_ns += last_ns - first_ns + pause_ns
-
-
-def is_heard(publisher: zenoh.Publisher) -> bool:
-    """Whether somebody subscribes to what it publishes."""
-    # The stubs of eclipse-zenoh 1.10 call it a bool; it is a `MatchingStatus`, which is always true.
-    return cast("zenoh.MatchingStatus", publisher.matching_status).matching
 
 
 def _msgpack(frame: Frame) -> bytes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -135,6 +136,34 @@ class Endpoint:
             return None
         name = f"{unmangled(chunks[7]).rstrip('/')}/{chunks[8]}"
         return cls(chunks[5], name, TopicKey(int(domain), unmangled(topic), ros_type(described), type_hash))
+
+
+@dataclass(frozen=True, slots=True)
+class RmwZenoh:
+    """The dialect of a session that is one node; `type_hash` gives the RIHS01 of a type by its name."""
+
+    node: Node
+    type_hash: Callable[[str], str]
+
+    @property
+    def node_token(self) -> str:
+        """See `Dialect`."""
+        return self.node.token
+
+    def key(self, topic: str, type_name: str) -> str:
+        """See `Dialect`."""
+        return self._topic(topic, type_name).key
+
+    def publisher_token(self, number: int, topic: str, type_name: str, qos: Qos) -> str:
+        """See `Dialect`."""
+        return self.node.publisher(number, self._topic(topic, type_name), qos)
+
+    def attachment(self, token: str, sequence: int, source_ns: int) -> bytes:
+        """See `Dialect`."""
+        return Attachment(sequence, source_ns, gid_of(token)).packed
+
+    def _topic(self, topic: str, type_name: str) -> TopicKey:
+        return TopicKey(self.node.domain, topic, type_name, self.type_hash(type_name))
 
 
 def mangled(name: str) -> str:
