@@ -44,6 +44,7 @@ class Refusal(StrEnum):
     CLOUD_FIELDS = "cloud_fields"
     CLOUD_BIG_ENDIAN = "cloud_big_endian"
     CLOUD_TIME = "cloud_time"
+    CLOUD_CONCATENATED = "cloud_concatenated"
     MOTION_INVALID = "motion_invalid"
 
 

@@ -26,11 +26,14 @@ _MAX_CLOUD_FIELDS = 64
 """Drivers write up to about a dozen. Each would become a Python object."""
 
 
-def decode(type_name: str, payload: bytes, limits: LimitsConfig) -> CameraFrame | LidarFrame | EgoMotion:
+def decode(
+    type_name: str, payload: bytes, limits: LimitsConfig, source: int | None = None
+) -> CameraFrame | LidarFrame | EgoMotion:
     """The frame in a message of type `CompressedImage`, `Image`, `PointCloud2`, `Odometry` or `TwistStamped`.
 
     Stamp and frame id are those of the header; of an odometry the frame id is the child's, in which its twist
-    is expressed. CDR has no sequence number.
+    is expressed. CDR has no sequence number. `source` is the LiDAR that is asked for, of a cloud of several (see
+    `of_source`).
 
     Raises:
         DecodeError: anything else, with a reason of `Refusal`.
@@ -38,6 +41,8 @@ def decode(type_name: str, payload: bytes, limits: LimitsConfig) -> CameraFrame 
     if type_name not in _DECODERS:
         raise DecodeError(Refusal.MESSAGE_TYPE, f"messages of this type are not read; known: {', '.join(_DECODERS)}")
     check_size(payload, limits)
+    if type_name == POINT_CLOUD:
+        return _point_cloud(payload, limits, source)
     return _DECODERS[type_name](payload, limits)
 
 
@@ -70,11 +75,11 @@ def _image(payload: bytes, limits: LimitsConfig) -> CameraFrame:
     return CameraFrame(_stamp_ns(message.header), _frame_id(message.header.frame_id), image)
 
 
-def _point_cloud(payload: bytes, limits: LimitsConfig) -> LidarFrame:
+def _point_cloud(payload: bytes, limits: LimitsConfig, source: int | None = None) -> LidarFrame:
     _check_cloud_fields(payload)
     message = deserialized(ros.sensor_msgs__msg__PointCloud2, payload)
     _frame_id(message.header.frame_id)
-    return point_cloud2.frame_of(message, _stamp_ns(message.header), limits)
+    return point_cloud2.frame_of(message, _stamp_ns(message.header), limits, source)
 
 
 def _odometry(payload: bytes, limits: LimitsConfig) -> EgoMotion:

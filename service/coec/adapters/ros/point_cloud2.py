@@ -13,6 +13,7 @@ from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointField as P
 from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 
 from coec.adapters.frames.incoming import MAX_TIME_OFFSET_S, Refusal, finite_rows, lidar_frame
+from coec.adapters.ros.source_field import of_source
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
@@ -37,19 +38,20 @@ _RELATIVE_S = 1.0
 1970."""
 
 
-def frame_of(message: PointCloud2, stamp_ns: int, limits: LimitsConfig) -> LidarFrame:
+def frame_of(message: PointCloud2, stamp_ns: int, limits: LimitsConfig, source: int | None = None) -> LidarFrame:
     """The sweep of a message whose header is already checked.
 
     `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned
     integer; time one of `_TIME_FIELDS`: integers are nanoseconds after the stamp; floats are seconds after
     the stamp, seconds since 1970 or nanoseconds since 1970, whichever brings them to the stamp. Optional
-    fields of other types are left out.
+    fields of other types are left out. `source`: see `of_source`.
 
     Raises:
         DecodeError: `cloud_big_endian`, `cloud_shape`, `cloud_fields`, `cloud_too_large`, `cloud_empty`,
-        `cloud_time`.
+        `cloud_time`, `cloud_concatenated`.
     """
     _check_layout(message, limits)
+    message = of_source(message, source)
     by_name = {field.name: field for field in reversed(message.fields)}  # the first of a name counts
     columns = [_column(message, by_name.get(axis), "f") for axis in "xyz"]
     xyz_m = np.empty((message.width * message.height, 3), np.float32)

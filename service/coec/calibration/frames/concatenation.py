@@ -47,11 +47,13 @@ class SeveralOrigins:
 
     Attributes:
         cones: of each (see `cones`), in the frame of the points.
+        cause, setting: as of `ApparentOrigin`.
     """
 
     cones: tuple[Doubles, Doubles]
 
     cause: ClassVar[str] = "cloud_concatenated"
+    setting: ClassVar[str] = "source"
 
     @property
     def origins_m(self) -> tuple[tuple[float, ...], ...]:

@@ -45,9 +45,11 @@ class ApparentOrigin:
     Attributes:
         origin_m: (3,) of the LiDAR, in the frame in which the points were taken to be.
         spread_rad, stated_rad: of the elevations within a ring seen from there, and from the stated origin.
+        cause, setting: under which a loss is counted, and what of a LiDAR's configuration would help.
     """
 
     cause: ClassVar[str] = "cloud_origin"
+    setting: ClassVar[str] = "T_cloud_lidar"
 
     origin_m: tuple[float, float, float]
     spread_rad: float

@@ -12,7 +12,8 @@ from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import incoming
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
-from coec.calibration.frames.origin import OriginCheck, from_origin
+from coec.calibration.frames.concatenation import SeveralOrigins
+from coec.calibration.frames.origin import ApparentOrigin, OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import LimitsConfig, PairConfig
 from coec.errors import DecodeError
@@ -23,13 +24,10 @@ _log = logging.getLogger(__name__)
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 
-CLOUD_ORIGIN = "cloud_origin"
-"""Cause of a loss: the points were not measured from where the configuration says."""
-
 WRONG_TYPE = "wrong_type"
 """Cause of a loss: a message that makes no frame of the stream."""
 
-EXPLAINED = frozenset({CLOUD_ORIGIN, WRONG_TYPE})
+EXPLAINED = frozenset({ApparentOrigin.cause, SeveralOrigins.cause, WRONG_TYPE})
 """Causes that the log explains by the sentence of the error, which is ours."""
 
 NUMBERED = b"\xa8sequence"
@@ -106,7 +104,7 @@ class Decoder:
             if type_name not in configured.types:
                 expected = " or ".join(configured.types)
                 raise DecodeError(WRONG_TYPE, f"a message of another type on {configured.place}: expected {expected}")
-            return incoming.decode(type_name, sample.payload, self._limits)
+            return incoming.decode(type_name, sample.payload, self._limits, self._pair.lidar.source)
         if stream == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
         if stream == LIDAR:
@@ -127,7 +125,7 @@ class Decoder:
         sweep = from_origin(cloud, self._T_cloud_lidar, self._pair.lidar.frame_id)
         contradiction = self._origin.look(sweep)
         if contradiction is not None:
-            raise DecodeError(CLOUD_ORIGIN, f"{contradiction.sentence} See lidar.T_cloud_lidar.")
+            raise DecodeError(contradiction.cause, f"{contradiction.sentence} See lidar.{contradiction.setting}.")
         return sweep
 
     def _check_camera(self, frame: CameraFrame) -> None:
