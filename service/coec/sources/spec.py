@@ -61,6 +61,12 @@ def parse_spec(text: str) -> SourceSpec:
     return SourceSpec(text, layout, Path(location).expanduser(), _parse_query(query, text))
 
 
+def is_bag(spec: SourceSpec) -> bool:
+    """Whether it is a bag of ROS 2, a recorded window among them: by the name of the file, or what the folder holds."""
+    by_name = spec.path.suffix in (".mcap", ".db3") or (spec.path / "metadata.yaml").is_file()
+    return spec.layout is None and by_name
+
+
 def _parse_query(query: str, text: str) -> dict[str, str]:
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))

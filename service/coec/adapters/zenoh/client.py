@@ -86,6 +86,8 @@ def connected_by(way: Way, wait_s: float) -> Iterator[zenoh.Session]:
     settings.insert_json5("scouting/multicast/enabled", "false")
     settings.insert_json5("connect/timeout_ms", str(round(wait_s * 1000)))
     settings.insert_json5("connect/exit_on_failure", "true")
+    # Publishers that keep their last message for latecomers need it.
+    settings.insert_json5("timestamping/enabled", "true")
     try:
         settings.insert_json5("connect/endpoints", json.dumps(way.endpoints))
         session = zenoh.open(settings)

@@ -11,7 +11,7 @@ import tempfile
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,7 @@ class FolderStorage:
         """See `Storage`."""
         for number, file in enumerate(self.files):
             for entry in file.entries():
-                yield Entry(entry.topic, entry.type_name, self.plain(entry.data), (number, *entry.place))
+                yield replace(entry, data=self.plain(entry.data), place=(number, *entry.place))
 
     @contextmanager
     def open(self) -> Iterator[Reader]:

@@ -36,7 +36,7 @@ class McapStorage:
                             channel = channels.get(record.channel_id)
                             schema = None if channel is None else schemas.get(channel.schema_id)
                             if channel is not None and schema is not None and channel.message_encoding == "cdr":
-                                yield Entry(channel.topic, schema.name, record.data, _place_of(record))
+                                yield _entry(channel.topic, schema.name, record)
         except OSError as error:
             raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
         except McapDamaged as error:
@@ -63,6 +63,7 @@ class _McapReader:
             raise SourceError(f"{self.path}: {error}") from error
 
 
-def _place_of(message: Message) -> tuple[int, int, int]:
+def _entry(topic: str, type_name: str, message: Message) -> Entry:
     chunk_at = _OUTSIDE_CHUNKS if message.chunk_at is None else message.chunk_at
-    return chunk_at, message.at, len(message.data)
+    place = (chunk_at, message.at, len(message.data))
+    return Entry(topic, type_name, message.data, message.log_time_ns, place)

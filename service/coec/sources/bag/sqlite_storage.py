@@ -32,14 +32,14 @@ class SqliteStorage:
         """See `Storage`."""
         with self._connected() as connection:
             rows = connection.execute(
-                "SELECT messages.id, topics.name, topics.type, messages.data FROM messages "
+                "SELECT messages.id, topics.name, topics.type, messages.data, messages.timestamp FROM messages "
                 "JOIN topics ON topics.id = messages.topic_id WHERE topics.serialization_format = 'cdr' "
                 "ORDER BY messages.id"
             )
-            for row, topic, type_name, data in rows:
-                if not (isinstance(topic, str) and isinstance(type_name, str)):
-                    raise SourceError(f"{self.path} is damaged: message {row} has no topic")
-                yield Entry(topic, type_name, self._bytes(row, data), (int(row),))
+            for row, topic, type_name, data, logged_ns in rows:
+                if not (isinstance(topic, str) and isinstance(type_name, str) and isinstance(logged_ns, int)):
+                    raise SourceError(f"{self.path} is damaged: message {row} has no topic, or no time")
+                yield Entry(topic, type_name, self._bytes(row, data), logged_ns, (int(row),))
 
     @contextmanager
     def open(self) -> Iterator[Reader]:
