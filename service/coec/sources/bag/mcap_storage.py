@@ -7,7 +7,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from coec.adapters.mcap.files import Channel, McapDamaged, Message, MessageReader, Schema, read_records
+from coec.adapters.mcap.files import (
+    MAX_CHUNK_BYTES,
+    MAX_RATIO,
+    Channel,
+    McapDamaged,
+    Message,
+    MessageReader,
+    Schema,
+    read_records,
+)
 from coec.errors import SourceError
 from coec.sources.bag.storage import Entry, Reader
 
@@ -26,7 +35,8 @@ class McapStorage:
         channels: dict[int, Channel] = {}
         try:
             with self.path.open("rb") as stream:
-                for record in read_records(stream):
+                limit = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
+                for record in read_records(stream, max_unpacked_bytes=limit):
                     match record:
                         case Schema():
                             schemas[record.schema_id] = record
