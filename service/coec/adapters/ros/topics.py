@@ -44,10 +44,11 @@ class TopicMessage:
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A topic of a recording."""
+    """A topic of a recording: messages of a type, so many, and so many a second; 0 of fewer than two."""
 
     type_name: str
     count: int
+    rate_hz: float = 0.0
 
 
 def qos_of(topic: str) -> Qos:

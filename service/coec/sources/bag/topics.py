@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from coec.adapters.ros.topics import TopicInfo, TopicMessage
@@ -61,8 +62,15 @@ def open_topics(spec: SourceSpec) -> BagTopics:
         if types.setdefault(entry.topic, entry.type_name) != entry.type_name:
             raise SourceError(f"{spec.path}: {entry.topic} has messages of several types")
         places.append(_Place(entry.logged_ns, entry.place, entry.topic))
-    counts = dict.fromkeys(sorted(types), 0)
+    places.sort()
+    times_ns: defaultdict[str, list[int]] = defaultdict(list)
     for place in places:
-        counts[place.topic] += 1
-    infos = {topic: TopicInfo(types[topic], count) for topic, count in counts.items()}
-    return BagTopics(spec.path.name, infos, storage, tuple(sorted(places)))
+        times_ns[place.topic].append(place.logged_ns)
+    infos = {topic: _info(types[topic], times_ns[topic]) for topic in sorted(types)}
+    return BagTopics(spec.path.name, infos, storage, tuple(places))
+
+
+def _info(type_name: str, logged_ns: Sequence[int]) -> TopicInfo:
+    """Of ascending times."""
+    span_s = (logged_ns[-1] - logged_ns[0]) * 1e-9
+    return TopicInfo(type_name, len(logged_ns), (len(logged_ns) - 1) / span_s if span_s > 0 else 0.0)
