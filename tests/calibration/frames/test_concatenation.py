@@ -75,7 +75,7 @@ def test_a_crowd_is_no_second_lidar(walkers: float) -> None:
     assert apparent_origin(a_sweep(noise_rad=np.radians(0.1), walkers=walkers)) is None
 
 
-@pytest.mark.parametrize("speed_mps", [15.0, 40.0])
+@pytest.mark.parametrize("speed_mps", [15.0, 25.0, 40.0])
 def test_a_lidar_that_drove_on_while_it_turned_is_one(speed_mps: float) -> None:
     """Points that a driver has brought to where the LiDAR was at the end."""
     sweep = a_sweep(noise_rad=np.radians(0.05))

@@ -36,7 +36,7 @@ WITHIN, BEYOND = 0.6, 0.6
 """Share of the points that fit the first LiDAR's beams in its block at least, and behind it at most: a passer-by stands
 beside the beams, and some of another's points lie on them by chance."""
 
-SECTORS, COMMON = 36, 0.25
+SECTORS, COMMON = 36, 0.5
 """Of 10° around a LiDAR; and the share of those into which one LiDAR looks that the other sees too, at least. One that
 drives on while it turns looks into each direction once."""
 
