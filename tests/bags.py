@@ -6,8 +6,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_humble as ros
 
@@ -132,6 +135,21 @@ class Bag:
                 writer.add_message(channels[topic, name], time, data, time)
             writer.finish()  # type: ignore[no-untyped-call]
         return path
+
+
+def converted(bag: Path, folder: Path, plugin: StoragePlugin, mode: CompressionMode = CompressionMode.NONE) -> Path:
+    """The messages of an MCAP file, byte for byte, as a folder that `rosbags` writes."""
+    writer = Rosbag2(folder, version=9, storage_plugin=plugin)
+    if mode is not CompressionMode.NONE:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    connections: dict[str, Any] = {}
+    with bag.open("rb") as stream, writer:
+        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            assert schema is not None
+            if channel.topic not in connections:
+                connections[channel.topic] = writer.add_connection(channel.topic, schema.name, typestore=STORE)
+            writer.write(connections[channel.topic], message.log_time, message.data)
+    return folder
 
 
 def a_drive(*, info: Any = None, tree: list[Any] | None = None, image: Any = an_image) -> list[tuple[str, Any]]:

@@ -1,4 +1,5 @@
-"""The README as somebody meets it who types it: every command is run, and what it says is compared with what is shown.
+"""The README and docs/recordings.md as somebody meets them who types them: every command is run, and what it says is
+compared with what is shown.
 
 A fenced block is `console` (typed here) or `text` (not). In a console block a line `$ COMMAND  # remark` is typed, the
 lines below it are what it says, and a line `…` stands for any number of lines. Every command runs as it is written,
@@ -22,7 +23,7 @@ from conftest import REPOSITORY
 from e2e.processes import environment
 from ports import free_port
 
-README = REPOSITORY / "README.md"
+PAGES = (REPOSITORY / "README.md", REPOSITORY / "docs" / "recordings.md")
 SAMPLES = "../shared/data"
 ELLIPSIS = "…"
 
@@ -47,8 +48,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of the README."""
+    """A fenced block of a page."""
 
+    page: Path
     line: int
     language: str
     steps: tuple[Step, ...]
@@ -88,6 +90,7 @@ SIM_CALIBRATE = 'coec calibrate "sim:seed=3&seconds=60&camera_hz=0.4&lidar_hz=0.
 COMMISSION = "coec commission SOURCE... --output rig.json"
 DIAGNOSE = "coec diagnose SOURCE --rig rig.json"
 ASSESS = "coec models assess network.onnx SOURCE --output DIR"
+CHECK = f'coec check "kitti360:{SAMPLES}/kitti360?camera=image_00" --depth stereo'
 NETWORK = f"{SAMPLES}/depth/tcsmallnet_dyn.onnx"
 
 FORMS = {
@@ -98,6 +101,8 @@ FORMS = {
     SIM_DRIVE: Form(f"{SIM_DRIVE} --camera fisheye200".replace("60", "0.5").replace("step:30", "step:0.2")),
     # Two frames are too few for an uncertainty: the verdict is negative.
     SIM_CALIBRATE: Form(f"{SIM_CALIBRATE} --frames 2", status=1),
+    # What it looks at is tested in tests/cli/test_check.py; the slow form compares the figures.
+    CHECK: Form("coec check --help > help.txt && grep -q -e --depth help.txt"),
     COMMISSION: options_known(COMMISSION),
     DIAGNOSE: options_known(DIAGNOSE),
     # A service that has no router to connect to runs on; it is stopped as soon as it says that it is ready.
@@ -112,19 +117,19 @@ FORMS = {
 }
 
 
-def blocks() -> list[Block]:
-    """Of the README, in order."""
+def blocks(page: Path) -> list[Block]:
+    """Of a page, in order."""
     found: list[Block] = []
     inside: list[str] | None = None
     begin, language = 0, ""
-    for number, line in enumerate(README.read_text().splitlines(), start=1):
+    for number, line in enumerate(page.read_text().splitlines(), start=1):
         if not line.startswith("```"):
             if inside is not None:
                 inside.append(line)
         elif inside is None:
             inside, begin, language = [], number, line.removeprefix("```")
         else:
-            found.append(Block(begin, language, steps(inside) if language == "console" else ()))
+            found.append(Block(page, begin, language, steps(inside) if language == "console" else ()))
             inside = None
     assert inside is None, f"the block of line {begin} has no end"
     return found
@@ -151,11 +156,17 @@ def without_remark(command: str) -> str:
     return re.split(r"\s+#\s", command)[0].strip()
 
 
-CONSOLE = [block for block in blocks() if block.language == "console"]
+BLOCKS = [block for page in PAGES for block in blocks(page)]
+CONSOLE = [block for block in BLOCKS if block.language == "console"]
+
+
+def name_of(block: Block) -> str:
+    """For pytest."""
+    return f"{block.page.stem}-line-{block.line}"
 
 
 def test_every_block_says_whether_it_is_typed() -> None:
-    assert [block.line for block in blocks() if block.language not in ("console", "text")] == []
+    assert [name_of(block) for block in BLOCKS if block.language not in ("console", "text")] == []
     assert all(block.steps for block in CONSOLE)
 
 
@@ -164,7 +175,7 @@ def test_no_form_is_left_of_a_command_that_is_gone() -> None:
     assert set(FORMS) - typed == set()
 
 
-@pytest.mark.parametrize("block", CONSOLE, ids=lambda block: f"line-{block.line}")
+@pytest.mark.parametrize("block", CONSOLE, ids=name_of)
 def test_a_block_does_what_it_says(block: Block, tmp_path: Path) -> None:
     play_through(block, tmp_path, PATIENCE_S, short=True)
 
@@ -173,7 +184,7 @@ def test_a_block_does_what_it_says(block: Block, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "block",
     [b for b in CONSOLE if any((f := FORMS.get(step.command)) and f.instead and not f.always for step in b.steps)],
-    ids=lambda block: f"line-{block.line}",
+    ids=name_of,
 )
 def test_a_long_block_does_what_it_says(block: Block, tmp_path: Path) -> None:
     play_through(block, tmp_path, LONG_S, short=False)
@@ -236,7 +247,7 @@ def play_through(block: Block, folder: Path, patience_s: float, *, short: bool) 
 
 
 def typed(step: Step, *, short: bool) -> Step:
-    """What is typed for a step of the README."""
+    """What is typed for a step of a page."""
     form = FORMS.get(step.command, Form())
     return Step(form.instead, ()) if form.instead is not None and (short or form.always) else step
 
@@ -304,10 +315,10 @@ def missing(shown: tuple[str, ...], said: str) -> str | None:
             continue
         place = next((index for index, real in enumerate(rest) if fits(line, real)), None)
         if place is None or (place > 0 and not any_lines):
-            return f"the README shows {line!r}, it says {rest[0] if rest else 'nothing more'!r}"
+            return f"the page shows {line!r}, it says {rest[0] if rest else 'nothing more'!r}"
         del rest[: place + 1]
         any_lines = False
-    return f"the README does not show {rest[0]!r}" if rest and not any_lines else None
+    return f"the page does not show {rest[0]!r}" if rest and not any_lines else None
 
 
 def fits(shown: str, said: str) -> bool:

@@ -217,6 +217,13 @@ class OpenLidarConfig(StreamConfig):
     cloud_frame_id: str | None = Field(
         default=None, max_length=128, description="of the clouds as they come, where it is not that of the LiDAR"
     )
+    source: int | None = Field(
+        default=None,
+        ge=-(2**31),
+        lt=2**32,
+        description="of a cloud of several LiDARs: this one's number in the field that tells them apart (lidar_id, "
+        "sensor_id, source_id, device_id or source)",
+    )
     sweep: SweepConfig | None = Field(default=None, description="needed for clouds without per-point time")
     time: PointTimeConfig | None = Field(
         default=None, description="of clouds of ROS; unless set it is recognised from the values"

@@ -71,7 +71,7 @@ class Truth:
         recording = open_source(str(path))
         stamps_ns = [frame.stamp_ns for frame in recording.messages()]
         self.first_ns = min(stamps_ns)
-        # As `player.repeated` has it: a pass begins a camera period after the last frame of the one before.
+        # As `cadence.repeated` has it: a pass begins a camera period after the last frame of the one before.
         pause_ns = int(np.median(np.diff(recording.camera_stamps_ns)))
         self.pass_ns = max(stamps_ns) - self.first_ns + pause_ns
 

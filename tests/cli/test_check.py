@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from bags import Bag, a_drive
@@ -36,3 +37,6 @@ def test_several_topics_are_listed_with_types_and_counts(coec: Coec, tmp_path: P
     outcome = coec("check", Bag([*a_drive(), *other]).write(tmp_path / "bag.mcap"))
     assert outcome.status == 1
     assert "/rear/points (sensor_msgs/msg/PointCloud2, 8 messages)" in outcome.err
+    assert re.search(r"/odom +nav_msgs/msg/Odometry +20 +\d", outcome.out)
+    told = coec("check", tmp_path / "bag.mcap", "--json")
+    assert (told.status, told.document["error"]["code"]) == (1, "bad_source")

@@ -23,8 +23,9 @@ import zenoh
 
 from coec.adapters.files.rig import mask_to_png
 from coec.adapters.zenoh.bus import open_session
+from coec.adapters.zenoh.cadence import Played
 from coec.adapters.zenoh.client import ask_one, connected
-from coec.adapters.zenoh.player import CAMERA, Frame, Played, Player, Streams, stream_of
+from coec.adapters.zenoh.player import CAMERA, Frame, Player, Streams, stream_of
 from coec.cli.convert import configuration_for
 from coec.config import Config, LimitsConfig, StateConfig, ZenohConfig, load_config
 from coec.errors import NotFoundError

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from coec.adapters.mcap.windows import read_window
-from coec.adapters.zenoh.player import Player, Streams, repeated
+from coec.adapters.zenoh.cadence import repeated
+from coec.adapters.zenoh.player import Player, Streams, shifted
 from coec.config import CalibrationConfig, DepthConfig, MonitorConfig, WindowConfig
 from e2e.drives import NS_PER_S, STEPPED, Drive, rendered
 from e2e.processes import Router, Service, service, write_configuration
@@ -68,7 +69,7 @@ def driving(drive: Drive, router: Router) -> Iterator[None]:
     """The drive on the bus, over and over, whether somebody listens or not; sensor time never steps back."""
     player = Player(router.session, Streams.default(drive.recording.rig.pair), "msgpack")
     stop = threading.Event()
-    frames = repeated(lambda: drive.frames, 0, NS_PER_S, forever=True)
+    frames = repeated(lambda: drive.frames, shifted, 0, NS_PER_S, forever=True)
     thread = threading.Thread(target=player.play, args=(frames, SPEED, stop, lambda *_: None))
     thread.start()
     try:

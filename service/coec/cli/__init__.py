@@ -43,6 +43,14 @@ Connect = Annotated[
 ]
 
 
+class Middleware(StrEnum):
+    """How a recording speaks on the bus."""
+
+    NATIVE = "native"
+    RMW_ZENOH = "rmw_zenoh"
+    ROS2DDS = "ros2dds"
+
+
 class Encoding(StrEnum):
     """Encodings of frames."""
 
@@ -428,6 +436,22 @@ def _play(
         str | None,
         typer.Option(help="Pair of the configuration; without one, name in `sensors/<pair>/camera|lidar|ego`."),
     ] = None,
+    middleware: Annotated[
+        Middleware | None,
+        typer.Option(
+            help="native: frames on the keys of a pair. rmw_zenoh, ros2dds: a bag on its own topics, byte for byte; "
+            "any other recording on those of the configuration's pair, or below `/<pair>/`.",
+            show_default="that of --config, else native",
+        ),
+    ] = None,
+    topics: Annotated[
+        list[str] | None,
+        typer.Option("--topics", help="Of ROS 2, only these; comma between, or several times.", show_default="all"),
+    ] = None,
+    domain: Annotated[
+        int | None,
+        typer.Option(help="ROS_DOMAIN_ID (rmw_zenoh).", min=0, max=232, show_default="that of --config, else 0"),
+    ] = None,
     rate: Annotated[float, typer.Option(help="Times recorded speed; 0 = without waiting.", min=0)] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="Again and again; sensor time goes on.")] = False,
     connect: Connect = None,
@@ -442,6 +466,9 @@ def _play(
         source=source,
         config=config,
         pair=pair,
+        middleware=None if middleware is None else middleware.value,
+        topics=tuple(topic for given in topics or () for topic in given.split(",")),
+        domain=domain,
         rate=rate,
         loop=loop,
         connect=connect,

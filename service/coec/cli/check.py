@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -13,10 +14,11 @@ from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import Estimate
 from coec.cli import calibrate as calibrate_command
 from coec.config import LimitsConfig
-from coec.errors import CalibrationError
+from coec.errors import CalibrationError, SourceError
 from coec.evaluation.fitness import Cadence, Fitness, Remark, fitness_of
 from coec.reports import console
 from coec.sources import Recording, open_source, windows
+from coec.sources.spec import is_bag, parse_spec
 
 PAIRS = 6
 """Of the trial, evenly chosen: as many as a check of the monitor has."""
@@ -25,12 +27,18 @@ LEVEL_STYLES = {"fail": "bold red", "warn": "bold yellow", "ok": ""}
 
 
 def run(source: str, *, depth: str | None, as_json: bool) -> int:
-    """Says what is there; 1 where a calibration cannot come of it.
+    """Says what is there; 1 where a calibration cannot come of it. Of a bag that cannot be opened as a recording of a
+    pair, its topics.
 
     Raises:
         UsageError, SourceError: the recording cannot be opened, or a file of it cannot be read.
     """
-    recording = open_source(source)
+    try:
+        recording = open_source(source)
+    except SourceError:
+        if not as_json:
+            _show_topics(source)
+        raise
     with console.progress() as bars:
         times = calibrate_command.StageTimes(bars)
         seen = fitness_of(recording)
@@ -110,6 +118,21 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
         console.show(f"{remark.level:4}  {remark.text}", LEVEL_STYLES[remark.level])
     if not seen.remarks:
         console.show("nothing is missing", "green")
+
+
+def _show_topics(source: str) -> None:
+    spec = parse_spec(source)
+    if not is_bag(spec):
+        return
+    from coec.sources.bag.topics import open_topics
+
+    # A file that is damaged has been said to be.
+    with suppress(SourceError):
+        bag = open_topics(replace(spec, query={}))
+        table = console.table("topic", "type", "messages", "Hz", right=(2, 3))
+        for topic, info in bag.infos.items():
+            table.add_row(topic, info.type_name, str(info.count), f"{info.rate_hz:.2f}")
+        console.out.print(table)
 
 
 def _add(table: Any, name: str, cadence: Cadence | None, what: str) -> None:

@@ -1,4 +1,4 @@
-"""`coec play`: a recording published on Zenoh."""
+"""`coec play`: a recording published on Zenoh, as frames of a pair or on topics of ROS 2."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import Literal
 
 import numpy as np
 
+from coec.adapters.zenoh.cadence import Played, Stamped, repeated
 from coec.adapters.zenoh.client import connected, single_key
-from coec.adapters.zenoh.player import Frame, Played, Player, Streams, repeated
+from coec.adapters.zenoh.player import Player, Streams, shifted
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.cli.stopping import until_signal
-from coec.config import Config, PairConfig, ZenohConfig, load_config
+from coec.config import Config, PairConfig, RosConfig, ZenohConfig, load_config
 from coec.errors import SourceError, UsageError
 from coec.reports import console
 from coec.sources import Recording, open_source
@@ -27,6 +28,8 @@ LISTENER_S = 5.0
 DEFAULT_PERIOD_NS = 100_000_000
 """Between two passes of a recording with a single frame: 10 Hz."""
 
+Middleware = Literal["native", "rmw_zenoh", "ros2dds"]
+
 
 @dataclass(frozen=True, slots=True)
 class Options:
@@ -35,6 +38,9 @@ class Options:
     source: str
     config: Path | None = None
     pair: str | None = None
+    middleware: Middleware | None = None
+    topics: tuple[str, ...] = ()
+    domain: int | None = None
     rate: float = 1.0
     loop: bool = False
     connect: str | None = None
@@ -43,41 +49,68 @@ class Options:
     as_json: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Where to publish: the pair of the configuration, if there is one, the routers, and how ROS is spoken there."""
+
+    pair: PairConfig | None
+    endpoints: tuple[str, ...]
+    middleware: Middleware
+    ros: RosConfig
+
+
 def run(options: Options) -> int:
-    """Publishes every frame.
+    """Publishes every frame, or every message.
 
     Raises:
-        UsageError, ConfigError, SourceError: no such pair, configuration or recording.
+        UsageError, ConfigError, SourceError: no such pair, configuration, recording or topic.
         ConnectionFailedError: no router.
     """
+    target = _target(options)
+    if target.middleware == "native":
+        return _frames(options, target)
+    from coec.cli.play_topics import topics
+
+    return topics(options, target, target.middleware)
+
+
+def _frames(options: Options, target: Target) -> int:
+    if options.topics or options.domain is not None:
+        raise UsageError("--topics and --domain are of ROS 2: add --middleware rmw_zenoh or ros2dds")
     recording = open_source(options.source)
-    pair, endpoints = _target(options)
+    pair = target.pair
     streams = Streams.default(options.pair or recording.rig.pair) if pair is None else Streams.of_pair(pair)
     single_key(streams.camera)
     _warn(recording, pair, options.encoding)
-    shift_ns = time.time_ns() - _first_stamp_ns(recording) if options.start_now else 0
-    with until_signal() as stop, connected(endpoints, CONNECT_S) as session:
+    shift_ns = time.time_ns() - first_stamp_ns(recording) if options.start_now else 0
+    with until_signal() as stop, connected(target.endpoints, CONNECT_S) as session:
         player = Player(session, streams, options.encoding)
         deaf = player.wait_for_listener(LISTENER_S)
-        if deaf:
-            console.say(f"coec: nobody listens to {', '.join(deaf)}; publishing all the same")
-        frames = repeated(recording.messages, shift_ns, _pause_ns(recording), options.loop)
+        say_deaf(deaf)
+        frames = repeated(recording.messages, shifted, shift_ns, pause_ns(recording), options.loop)
         started_s = time.monotonic()
-        with _display(recording, options) as heard:
+        with display(recording.name, len(recording.camera_stamps_ns), options, counted=("camera",)) as heard:
             played = player.play(frames, options.rate, stop, heard)
         elapsed_s = time.monotonic() - started_s
         player.close()
-    _report(options, played, elapsed_s, deaf)
+    report(options, played, elapsed_s, deaf, "frames")
     return 0
 
 
-def _target(options: Options) -> tuple[PairConfig | None, tuple[str, ...]]:
-    """The pair of the configuration, if there is one, and where to connect."""
+def _target(options: Options) -> Target:
     given = (options.connect,) if options.connect else None
     if options.config is None:
-        return None, given or ZenohConfig().router
+        endpoints = given or ZenohConfig().router
+        return Target(None, endpoints, options.middleware or "native", _ros(RosConfig(), options))
     config = load_config(options.config)
-    return _pair(config, options.pair), given or config.zenoh.router
+    endpoints = given or config.zenoh.router
+    return Target(
+        _pair(config, options.pair), endpoints, options.middleware or config.middleware, _ros(config.ros, options)
+    )
+
+
+def _ros(configured: RosConfig, options: Options) -> RosConfig:
+    return configured if options.domain is None else configured.model_copy(update={"domain": options.domain})
 
 
 def _pair(config: Config, name: str | None) -> PairConfig:
@@ -94,7 +127,7 @@ def _warn(recording: Recording, pair: PairConfig | None, encoding: str) -> None:
     """What the receiver is going to refuse, or to miss."""
     for frame in recording.messages([0]):
         if isinstance(frame, CameraFrame) and frame.depth is not None and encoding == "cdr":
-            console.say("coec: ROS 2 messages carry no depth maps: the service needs a depth network for these frames")
+            say_without_depth()
         expected = None
         if pair is not None and isinstance(frame, CameraFrame):
             expected = pair.camera.frame_id
@@ -107,35 +140,54 @@ def _warn(recording: Recording, pair: PairConfig | None, encoding: str) -> None:
             )
 
 
-def _first_stamp_ns(recording: Recording) -> int:
+def say_without_depth() -> None:
+    """That the depth maps of a recording do not go with its frames."""
+    console.say("coec: ROS 2 messages carry no depth maps: the service needs a depth network for these frames")
+
+
+def say_deaf(deaf: list[str]) -> None:
+    """Who is not there, if somebody is not."""
+    if deaf:
+        console.say(f"coec: nobody listens to {', '.join(deaf)}; publishing all the same")
+
+
+def first_stamp_ns(recording: Recording) -> int:
+    """Of its first frame.
+
+    Raises:
+        SourceError: it has none.
+    """
     for frame in recording.messages():
         return frame.stamp_ns
     raise SourceError(f"{recording.name} holds no frame")
 
 
-def _pause_ns(recording: Recording) -> int:
+def pause_ns(recording: Recording) -> int:
     """Between two passes: the usual period of the camera."""
     stamps = np.diff(np.array(recording.camera_stamps_ns))
     return int(np.median(stamps)) if len(stamps) else DEFAULT_PERIOD_NS
 
 
 @contextmanager
-def _display(recording: Recording, options: Options) -> Iterator[Callable[[Frame, Played], None]]:
-    total = None if options.loop else len(recording.camera_stamps_ns)
+def display(
+    name: str, total: int, options: Options, *, counted: tuple[str, ...]
+) -> Iterator[Callable[[Stamped, Played], None]]:
+    """A bar that is told after each frame; it counts the frames of the streams `counted`, `total` in all."""
     rate = "as fast as it goes" if options.rate == 0 else f"× {options.rate:g}"
     with console.progress() as bars:
-        task = bars.add_task(f"{recording.name} {rate}", total=total, note="")
+        task = bars.add_task(f"{name} {rate}", total=None if options.loop else total, note="")
 
-        def heard(_frame: Frame, played: Played) -> None:
+        def heard(_item: Stamped, played: Played) -> None:
             counts = "  ".join(f"{stream} {count}" for stream, count in sorted(played.frames.items()))
             late = f"  {played.latest_late_s:.2f} s late" if played.latest_late_s > 0.1 else ""
             note = f"{counts}  {played.bytes / 1e6:.1f} MB{late}"
-            bars.update(task, completed=played.frames["camera"], note=note)
+            bars.update(task, completed=sum(played.frames[stream] for stream in counted), note=note)
 
         yield heard
 
 
-def _report(options: Options, played: Played, elapsed_s: float, deaf: list[str]) -> None:
+def report(options: Options, played: Played, elapsed_s: float, deaf: list[str], what: str) -> None:
+    """What was published: `what` by stream."""
     if options.as_json:
         console.print_json(
             {
@@ -149,4 +201,4 @@ def _report(options: Options, played: Played, elapsed_s: float, deaf: list[str])
         return
     counts = ", ".join(f"{count} {stream}" for stream, count in sorted(played.frames.items()))
     late = f", at most {played.late_s:.2f} s late" if options.rate > 0 else ""
-    console.show(f"published {counts} frames, {played.bytes / 1e6:.1f} MB in {elapsed_s:.1f} s{late}")
+    console.show(f"published {counts} {what}, {played.bytes / 1e6:.1f} MB in {elapsed_s:.1f} s{late}")

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coec.adapters.files.output import OutputError, write
-from coec.adapters.mcap.bag_writer import Frame, write_bag
+from coec.adapters.mcap.bag_writer import write_bag
 from coec.adapters.ros import messages, outgoing
+from coec.adapters.ros.topics import Frame
 from coec.calibration.types import CameraFrame
 from coec.errors import UsageError
 from coec.reports import console

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from coec.errors import SourceError, UsageError
 from coec.sources.recording import Recording
-from coec.sources.spec import FORMS, SourceSpec, parse_spec
+from coec.sources.spec import FORMS, SourceSpec, is_bag, parse_spec
 
 __all__ = ["Recording", "open_source"]
 
@@ -38,7 +38,7 @@ def open_source(spec: str) -> Recording:
 def _open_path(spec: SourceSpec) -> Recording:
     if not spec.path.exists():
         raise SourceError(f"{spec.path} does not exist\n{FORMS}")
-    if spec.path.suffix in (".mcap", ".db3") or (spec.path / "metadata.yaml").is_file():
+    if is_bag(spec):
         from coec.sources.bag.recording import open_bag
 
         return open_bag(spec)

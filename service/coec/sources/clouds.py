@@ -5,6 +5,7 @@ Rows with a non-finite coordinate are dropped together with their intensity, rin
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -39,16 +40,18 @@ def load_cloud(stamp_ns: int, frame_id: str, path: Path) -> LidarFrame:
         return _frame(stamp_ns, frame_id, path, columns)
 
 
-def measured_from(cloud: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str, where: Path, advice: str) -> LidarFrame:
+def measured_from(
+    cloud: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str, where: Path, advice: Mapping[str, str]
+) -> LidarFrame:
     """A sweep in the LiDAR's own frame, see `from_origin`.
 
     Raises:
-        SourceError: its points contradict that they were measured from there; `advice` says how to state it.
+        SourceError: its points contradict that they were measured from there; `advice` says by its cause what to do.
     """
     sweep = from_origin(cloud, T_cloud_lidar, frame_id)
     contradiction = apparent_origin(sweep)
     if contradiction is not None:
-        raise SourceError(f"{where}: {contradiction.sentence} {advice}")
+        raise SourceError(f"{where}: {contradiction.sentence} {advice[contradiction.cause]}")
     return sweep
 
 

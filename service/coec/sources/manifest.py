@@ -17,6 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.images.codec import encode_depth_png, probe, raw_image
+from coec.calibration.frames.concatenation import SeveralOrigins
+from coec.calibration.frames.origin import ApparentOrigin
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
 from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Name, describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
@@ -146,9 +148,14 @@ def _recorded(folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_li
     )
 
 
+_ADVICE = {
+    ApparentOrigin.cause: "State the LiDAR's pose there as `T_cloud_lidar`.",
+    SeveralOrigins.cause: "Give the cloud of one LiDAR only.",
+}
+
+
 def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: Matrix4) -> LidarFrame:
-    advice = "State the LiDAR's pose there as `T_cloud_lidar`."
-    return measured_from(load_cloud(stamp_ns, LIDAR_FRAME, path), T_cloud_lidar, LIDAR_FRAME, path, advice)
+    return measured_from(load_cloud(stamp_ns, LIDAR_FRAME, path), T_cloud_lidar, LIDAR_FRAME, path, _ADVICE)
 
 
 def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> CameraFrame:

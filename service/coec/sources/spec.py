@@ -12,7 +12,8 @@ FORMS = """accepted forms of a source:
   FILE.mcap                                     a recorded window
   BAG?camera=/TOPIC&points=/TOPIC&...           any ROS 2 bag: FILE.mcap, FILE.db3 or rosbag2's folder (topics are found
                                                 by type where they are unique; lidar_frame=NAME for clouds in another,
-                                                moving=PARENT,CHILD for motion on /tf, time=FIELD,UNIT[,BASE])
+                                                moving=PARENT,CHILD for motion on /tf, time=FIELD,UNIT[,BASE],
+                                                lidar_source=N for one LiDAR of a cloud of several)
   kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
   kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
   FOLDER or dataset.yaml                        images and clouds listed in a manifest
@@ -59,6 +60,12 @@ def parse_spec(text: str) -> SourceSpec:
     if not location and layout != "sim":
         raise UsageError(f"no path in source {text!r}\n{FORMS}")
     return SourceSpec(text, layout, Path(location).expanduser(), _parse_query(query, text))
+
+
+def is_bag(spec: SourceSpec) -> bool:
+    """Whether it is a bag of ROS 2, a recorded window among them: by the name of the file, or what the folder holds."""
+    by_name = spec.path.suffix in (".mcap", ".db3") or (spec.path / "metadata.yaml").is_file()
+    return spec.layout is None and by_name
 
 
 def _parse_query(query: str, text: str) -> dict[str, str]:

@@ -114,6 +114,21 @@ def test_where_points_come_from_is_looked_at_once_a_second_and_always_while_it_i
     assert [taken(*look) for look in looks] == [True, True, False, False, True, True, False]
 
 
+@pytest.mark.fault(
+    "two LiDARs in one cloud, and no field tells them apart",
+    "refused as `cloud_concatenated`, and the log says from where they look measured",
+)
+def test_a_cloud_of_two_lidars_is_refused(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+    here, there = a_sweep(1), in_frame(a_sweep(2), ROOF)
+    assert here.ring is not None
+    assert there.ring is not None
+    xyz_m, ring = np.concatenate([here.xyz_m, there.xyz_m]), np.concatenate([here.ring, there.ring])
+    cloud = LidarFrame(5, "lidar", xyz_m, ring=ring)
+    assert desk.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is None
+    assert desk.losses.snapshot() == {(LIDAR, "cloud_concatenated"): 1}
+    assert "See lidar.source." in caplog.text
+
+
 def test_else_the_configurations(desk: Desk) -> None:
     assert desk.take(CAMERA, msgpack_frames.encode_camera(camera())) == camera()
     assert isinstance(desk.take(LIDAR, outgoing.encode_cloud(CLOUD)), LidarFrame)

@@ -1,5 +1,6 @@
 """The recording of a pair in a ROS 2 bag, and recorded windows."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from bags import (
     TREE,
     WIDTH,
     Bag,
+    a_cloud,
     a_drive,
     a_joint,
     a_raw_image,
@@ -64,6 +66,27 @@ def test_a_cloud_in_the_vehicles_frame_is_taken_back_to_the_lidars(tmp_path: Pat
     np.testing.assert_allclose(sweep.xyz_m[0], measured_m[:3], atol=1e-6)
     with pytest.raises(SourceError, match="/tf_static does not connect 'lidar' and 'cellar'"):
         open_source(f"{tmp_path / 'b.mcap'}?lidar_frame=cellar")
+
+
+def numbered_cloud(stamp_ns: int) -> Any:
+    """Three points of LiDAR 0 at 1 m, one of LiDAR 1 at 4 m."""
+    message = a_cloud(stamp_ns)
+    points = np.zeros(4, [("xyz", "<f4", 3), ("lidar_id", "u1")])
+    points["xyz"], points["lidar_id"] = np.array([[1], [1], [1], [4]]), [0, 0, 0, 1]
+    number = ros.sensor_msgs__msg__PointField("lidar_id", 12, 2, 1)
+    data = np.frombuffer(points.tobytes(), np.uint8)
+    return replace(message, fields=[*message.fields, number], point_step=13, row_step=52, data=data)
+
+
+def test_one_lidar_of_a_cloud_of_several_is_chosen(tmp_path: Path) -> None:
+    drive = [(topic, numbered_cloud(5) if topic == "/points" else message) for topic, message in a_drive()]
+    path = Bag(drive).write(tmp_path / "b.mcap")
+    with pytest.raises(SourceError, match=r"concatenated: its lidar_id has 0, 1; choose one"):
+        open_source(str(path))
+    sweeps = [m for m in open_source(f"{path}?lidar_source=1").messages() if isinstance(m, LidarFrame)]
+    assert {tuple(sweep.xyz_m[:, 0]) for sweep in sweeps} == {(4.0,)}
+    with pytest.raises(UsageError, match="lidar_source=top"):
+        open_source(f"{path}?lidar_source=top")
 
 
 def test_a_bag_without_chunks(tmp_path: Path) -> None:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from ruamel.yaml import YAML
 
-from bags import STORE, Bag, a_drive
+from bags import STORE, Bag, a_drive, an_image
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.errors import SourceError
+from coec.errors import SourceError, WindowError
 from coec.sources import open_source
 from coec.sources.recording import Message
 
@@ -21,14 +24,19 @@ SQLITE, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
 NONE, FILE, MESSAGE = CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE
 
 
-def a_folder(path: Path, plugin: StoragePlugin, mode: CompressionMode = CompressionMode.NONE) -> Path:
-    """The drive as a folder of rosbag2."""
+def a_folder(
+    path: Path,
+    plugin: StoragePlugin,
+    mode: CompressionMode = CompressionMode.NONE,
+    drive: list[tuple[str, Any]] | None = None,
+) -> Path:
+    """A drive as a folder of rosbag2."""
     writer = Writer(path, version=9, storage_plugin=plugin)
     if mode is not NONE:
         writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         connections = {}
-        for time, (topic, message) in enumerate(a_drive()):
+        for time, (topic, message) in enumerate(a_drive() if drive is None else drive):
             name = message.__msgtype__
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, name, typestore=STORE)
@@ -153,3 +161,83 @@ def test_rows_that_are_no_messages_are_refused(tmp_path: Path) -> None:
         connection.commit()
     with pytest.raises(SourceError, match="message 1 holds no bytes"):
         open_source(str(file))
+
+
+@pytest.mark.fault("a bag that is cut off after any kilobyte", "an error that names the file; nothing else is raised")
+@pytest.mark.parametrize("suffix", ["mcap", "db3"])
+def test_a_bag_that_is_cut_anywhere_is_refused(tmp_path: Path, suffix: str) -> None:
+    if suffix == "mcap":
+        file = Bag(a_drive(), chunking=False).write(tmp_path / "drive.mcap")
+    else:
+        (file,) = a_folder(tmp_path / "drive", SQLITE).glob("*.db3")
+    whole = file.read_bytes()
+    cuts = list(range(0, len(whole), 1024))
+    assert len(cuts) > 15
+    for size in cuts:
+        file.write_bytes(whole[:size])
+        with pytest.raises((SourceError, WindowError), match=file.name):
+            list(open_source(str(file)).messages())
+
+
+def a_database(path: Path, messages: str, row: str, topic: str = "'/a'") -> Path:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("CREATE TABLE topics(id, name, type, serialization_format)")
+        connection.execute(f"INSERT INTO topics VALUES(1, {topic}, 'acme_msgs/msg/Any', 'cdr')")
+        connection.execute(f"CREATE TABLE messages{messages}")
+        connection.execute(f"INSERT INTO messages VALUES{row}")
+        connection.commit()
+    return path
+
+
+COLUMNS = "(id, topic_id, timestamp, data)"
+
+
+@pytest.mark.fault("a database whose schema makes messages up", "refused before it gives more than the file holds")
+@pytest.mark.parametrize(
+    ("messages", "row", "topic", "said"),
+    [
+        ("(id, topic_id, timestamp, data BLOB AS (zeroblob(9000000)))", "(1, 1, 0)", "'/a'", "longer than the file"),
+        ("(id PRIMARY KEY, topic_id, timestamp, data) WITHOUT ROWID", "(1, 1, 0, x'00')", "'/a'", "is damaged"),
+        ("(rowid TEXT, topic_id, timestamp, data)", "('one', 1, 0, x'00')", "'/a'", "no number"),
+        (COLUMNS, "(1, 7, 0, x'00')", "'/a'", "no topic"),
+        (COLUMNS, "(1, 1, 'noon', x'00')", "'/a'", "no time"),
+        (COLUMNS, "(1, 1, 0, x'00')", "zeroblob(9)", "a topic has no name"),
+        (COLUMNS, "(1, 1, 0, x'00')", "hex(zeroblob(5000))", "a topic has no name"),
+    ],
+    ids=range(7),
+)
+def test_a_schema_that_makes_messages_up_is_refused(
+    tmp_path: Path, messages: str, row: str, topic: str, said: str
+) -> None:
+    with pytest.raises(SourceError, match=said):
+        open_source(str(a_database(tmp_path / "evil.db3", messages, row, topic)))
+
+
+@pytest.mark.fault("a bag that unpacks to a thousand times its size", "refused, and nothing of it is left behind")
+@pytest.mark.parametrize("mode", [NONE, FILE, MESSAGE])
+def test_a_bag_that_grows_without_end_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
+) -> None:
+    for module in ("folder", "mcap_storage"):
+        monkeypatch.setattr(f"coec.sources.bag.{module}.MAX_RATIO", 2)
+    monkeypatch.setattr("coec.sources.bag.folder.MAX_MESSAGE_BYTES", 30_000)
+    monkeypatch.setattr("coec.sources.bag.mcap_storage.MAX_CHUNK_BYTES", 30_000)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    zeros = replace(an_image(5), data=np.zeros(20_000, np.uint8))
+    drive = [*a_drive(), *[("/front/image", zeros)] * 9]
+    if mode is NONE:
+        path = Bag(drive, compression=CompressionType.ZSTD).write(tmp_path / "drive.mcap")
+    else:
+        path = a_folder(tmp_path / "drive", MCAP, mode, drive)
+    with pytest.raises(SourceError, match=r"unpacks to more than .* (times its size|bytes)"):
+        open_source(str(path))
+    assert not list(tmp_path.glob("coec-bag-*"))
+
+
+@pytest.mark.fault("a bag's metadata that names a million files, or one twice", "refused before they are opened")
+def test_metadata_with_too_many_files_is_refused(tmp_path: Path) -> None:
+    head = "rosbag2_bagfile_information: {storage_identifier: mcap, relative_file_paths: "
+    for names, said in (("[a, b, x/a]", "names a file twice"), (f"[{'a,' * 10_001}]", "relative_file_paths")):
+        (tmp_path / "metadata.yaml").write_text(f"{head}{names}}}")
+        with pytest.raises(SourceError, match=said):
+            open_source(str(tmp_path))

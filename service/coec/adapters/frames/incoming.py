@@ -44,6 +44,7 @@ class Refusal(StrEnum):
     CLOUD_FIELDS = "cloud_fields"
     CLOUD_TIME = "cloud_time"
     CLOUD_TIME_AMBIGUOUS = "cloud_time_ambiguous"
+    CLOUD_CONCATENATED = "cloud_concatenated"
     MOTION_INVALID = "motion_invalid"
 
 

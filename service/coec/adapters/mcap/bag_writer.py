@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from coec import __version__
-from coec.adapters.ros import messages, outgoing
-from coec.calibration.frames.motion_compensation import azimuth_offsets_s
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
-
-Frame = CameraFrame | LidarFrame | EgoMotion
+from coec.adapters.ros import messages
+from coec.adapters.ros.topics import Frame, FrameTopics, PairTopics
+from coec.calibration.types import Matrix4, Rig
 
 
 def _nothing(_: Frame) -> list[tuple[str, str, bytes]]:
@@ -44,14 +40,10 @@ def write_bag(
         writer = Writer(stream, compression=CompressionType.NONE, enable_data_crcs=True)
         writer.start(profile="ros2", library=f"coec/{__version__}")
         topics = _Topics(writer)
-        joined: set[str] = set()
+        told = FrameTopics(rig, T_camera_lidar, PairTopics.default(rig.pair))
         for frame in frames:
-            for child, joint in _joints(rig, T_camera_lidar, frame):
-                if child not in joined:
-                    topics.write("/tf_static", messages.TF, frame.stamp_ns, joint)
-                    joined.add(child)
-            for topic, type_name, data in _messages(rig, frame):
-                topics.write(topic, type_name, frame.stamp_ns, data)
+            for message in told.of(frame):
+                topics.write(message.topic, message.type_name, message.stamp_ns, message.data)
             for topic, type_name, data in beside(frame):
                 topics.write(topic, type_name, frame.stamp_ns, data)
             heard(frame)
@@ -76,34 +68,3 @@ class _Topics:
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[type_name])
         self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, self._sequence)
         self._sequence += 1
-
-
-def _joints(rig: Rig, T_camera_lidar: Matrix4, frame: Frame) -> list[tuple[str, bytes]]:
-    """The static transforms that a frame needs, by the name of their child."""
-    joints = [(rig.lidar_frame, outgoing.encode_tf_static(rig, T_camera_lidar, frame.stamp_ns))]
-    if isinstance(frame, EgoMotion) and frame.frame_id != rig.lidar_frame:
-        # The ego frame as a child of the LiDAR's, written by the same rule: child to parent.
-        below = replace(rig, camera_frame=rig.lidar_frame, lidar_frame=frame.frame_id)
-        joints.append((frame.frame_id, outgoing.encode_tf_static(below, rig.T_lidar_ego, frame.stamp_ns)))
-    return joints
-
-
-def _messages(rig: Rig, frame: Frame) -> list[tuple[str, str, bytes]]:
-    match frame:
-        case CameraFrame():
-            type_name, data = outgoing.encode_image(frame)
-            topic = f"/{rig.pair}/camera/image" + ("/compressed" if type_name == messages.COMPRESSED_IMAGE else "")
-            info = outgoing.encode_camera_info(rig, frame.stamp_ns)
-            return [(f"/{rig.pair}/camera/camera_info", messages.CAMERA_INFO, info), (topic, type_name, data)]
-        case LidarFrame():
-            return [(f"/{rig.pair}/lidar/points", messages.POINT_CLOUD, outgoing.encode_cloud(_timed(rig, frame)))]
-        case EgoMotion():
-            type_name, data = outgoing.encode_motion(frame)
-            return [(f"/{rig.pair}/{'imu' if type_name == messages.IMU else 'odometry'}", type_name, data)]
-
-
-def _timed(rig: Rig, sweep: LidarFrame) -> LidarFrame:
-    """The sweep with the time of each point: a bag has no other place for the timing of the rig."""
-    if sweep.time_offset_s is not None or rig.sweep is None:
-        return sweep
-    return replace(sweep, time_offset_s=azimuth_offsets_s(sweep.xyz_m, rig.sweep).astype(np.float32))

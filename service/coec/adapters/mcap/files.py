@@ -25,6 +25,9 @@ MAX_CHUNK_BYTES = 256 * 2**20
 """Unpacked size of one chunk. Writers use 0.75 to 4 MiB, or one message more, and messages have up to
 some 32 MiB."""
 
+MAX_RATIO = 1000
+"""Of unpacked to packed bytes of a whole recording, beyond one chunk's; JPEG images and clouds get 1 to 20."""
+
 MAX_ZSTD_WINDOW = 2**27
 """128 MiB, the default limit of the zstd tool: bounds the memory of a decompression."""
 

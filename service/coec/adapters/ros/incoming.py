@@ -43,12 +43,18 @@ REFUSED: Final = {
 
 
 def decode(
-    type_name: str, payload: bytes, limits: LimitsConfig, *, point_time: PointTimeConfig | None = None
+    type_name: str,
+    payload: bytes,
+    limits: LimitsConfig,
+    *,
+    point_time: PointTimeConfig | None = None,
+    source: int | None = None,
 ) -> CameraFrame | LidarFrame | EgoMotion:
     """The frame in a message of one of the types in `KNOWN`.
 
     Stamp and frame id are those of the header; of an odometry the frame id is the child's, in which its twist
-    is expressed. CDR has no sequence number. `point_time` says how points are timed, where their values do not.
+    is expressed. CDR has no sequence number. `point_time` says how points are timed, where their values do not;
+    `source` is the LiDAR that is asked for, of a cloud of several (see `of_source`).
 
     Raises:
         DecodeError: anything else, with a reason of `Refusal`.
@@ -62,7 +68,7 @@ def decode(
         case messages.IMAGE:
             return _image(payload, limits)
         case messages.POINT_CLOUD:
-            return _point_cloud(payload, limits, point_time)
+            return _point_cloud(payload, limits, point_time, source)
         case _:
             instead = REFUSED.get(type_name, f"messages of this type are not read; known: {', '.join(KNOWN)}")
             raise DecodeError(Refusal.MESSAGE_TYPE, instead)
@@ -93,8 +99,10 @@ def _image(payload: bytes, limits: LimitsConfig) -> CameraFrame:
     return CameraFrame(stamp_ns(message.header), frame_id(message.header.frame_id), image)
 
 
-def _point_cloud(payload: bytes, limits: LimitsConfig, point_time: PointTimeConfig | None) -> LidarFrame:
+def _point_cloud(
+    payload: bytes, limits: LimitsConfig, point_time: PointTimeConfig | None, source: int | None
+) -> LidarFrame:
     check_cloud_fields(payload)
     message = deserialized(ros.sensor_msgs__msg__PointCloud2, payload)
     frame_id(message.header.frame_id)
-    return point_cloud2.frame_of(message, stamp_ns(message.header), limits, point_time=point_time)
+    return point_cloud2.frame_of(message, stamp_ns(message.header), limits, point_time=point_time, source=source)

@@ -54,6 +54,17 @@ def serialized(message: Any, type_name: str) -> bytes:
     return bytes(_STORE.serialize_cdr(message, type_name, little_endian=True))
 
 
+def is_known(type_name: str) -> bool:
+    """Whether it is a type of ROS's own: only of those is the hash known."""
+    return type_name in _STORE.fielddefs
+
+
+def has_header(type_name: str) -> bool:
+    """Whether its messages are known to begin with a `std_msgs/Header`."""
+    fields = _STORE.fielddefs[type_name][1] if is_known(type_name) else []
+    return bool(fields) and fields[0][0] == "header"
+
+
 def type_hash(type_name: str) -> str:
     """`RIHS01_` and 64 hexadecimal digits: how ROS 2 tells definitions of one name apart (REP 2016)."""
     return str(_STORE.hash_rihs01(type_name))

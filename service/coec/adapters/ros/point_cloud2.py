@@ -16,6 +16,7 @@ from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 from coec.adapters.frames.incoming import Refusal, finite_rows, lidar_frame
 from coec.adapters.ros.point_time import FIELDS as TIME_FIELDS
 from coec.adapters.ros.point_time import offsets_s
+from coec.adapters.ros.source_field import of_source
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig
 from coec.errors import DecodeError
@@ -36,19 +37,25 @@ _PLACE = np.dtype("V12")
 
 
 def frame_of(
-    message: PointCloud2, stamp_ns: int, limits: LimitsConfig, *, point_time: PointTimeConfig | None = None
+    message: PointCloud2,
+    stamp_ns: int,
+    limits: LimitsConfig,
+    *,
+    point_time: PointTimeConfig | None = None,
+    source: int | None = None,
 ) -> LidarFrame:
     """The sweep of a message whose header is already checked.
 
     `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned
     integer; time one of `TIME_FIELDS`, any number, as recognised there or as `point_time` says. Optional
-    fields of other types are left out, as are fields with several values a point.
+    fields of other types are left out, as are fields with several values a point. `source`: see `of_source`.
 
     Raises:
         DecodeError: `cloud_shape`, `cloud_fields`, `cloud_too_large`, `cloud_empty`, `cloud_time`,
-        `cloud_time_ambiguous`.
+        `cloud_time_ambiguous`, `cloud_concatenated`.
     """
     _check_layout(message, limits)
+    message = of_source(message, source)
     by_name = {field.name: field for field in reversed(message.fields)}  # the first of a name counts
     with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes infinite, and is dropped
         xyz_m = _places(message, by_name)

@@ -89,6 +89,8 @@ def connected_by(way: Way, wait_s: float, max_message_bytes: int | None = None) 
     settings.insert_json5("connect/exit_on_failure", "true")
     if max_message_bytes is not None:
         settings.insert_json5("transport/link/rx/max_message_size", str(max_message_bytes))
+    # Publishers that keep their last message for latecomers need it.
+    settings.insert_json5("timestamping/enabled", "true")
     try:
         settings.insert_json5("connect/endpoints", json.dumps(way.endpoints))
         session = zenoh.open(settings)

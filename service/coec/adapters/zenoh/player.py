@@ -1,11 +1,11 @@
-"""A recording on the air: its frames on Zenoh keys at the cadence at which they were recorded."""
+"""The frames of a recording on the keys of a pair, at the cadence at which they were recorded."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,12 +13,12 @@ import zenoh
 
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import messages, outgoing
+from coec.adapters.zenoh.cadence import Played, paced
 from coec.adapters.zenoh.matching import is_heard
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import PairConfig
 from coec.errors import UsageError
 
-NS_PER_S = 1_000_000_000
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 
 Frame = CameraFrame | LidarFrame | EgoMotion
@@ -50,18 +50,9 @@ class Streams:
         return cls(f"sensors/{pair}/camera", f"sensors/{pair}/lidar", f"sensors/{pair}/ego")
 
 
-@dataclass(slots=True)
-class Played:
-    """What has been published: frames by stream, bytes, and how far the latest was behind its time, seconds."""
-
-    frames: Counter[str]
-    bytes: int = 0
-    late_s: float = 0.0
-    latest_late_s: float = 0.0
-
-
 class Player:
-    """Publishes frames. Senders wait rather than drop: what is lost is then lost by the receiver, which counts it."""
+    """Publishes the frames of a pair. Senders wait rather than drop: what is lost is then lost by the receiver, which
+    counts it."""
 
     def __init__(self, session: zenoh.Session, streams: Streams, encoding: Literal["msgpack", "cdr"]) -> None:
         self._encoding = encoding
@@ -96,38 +87,20 @@ class Player:
         stop: threading.Event,
         heard: Callable[[Frame, Played], None],
     ) -> Played:
-        """Publishes every frame when it is due, `rate` times as fast as it was recorded; 0 = without waiting.
-
-        Times are counted from the first frame, so that delays do not add up. `heard` is told after each frame; `stop`
-        ends it before the next one.
-        """
-        start_s = time.monotonic()
-        first_ns: int | None = None
-        for frame in frames:
-            stream = stream_of(frame)
-            if stop.is_set():
-                break
-            if stream not in self._publishers:
-                continue
-            payload, encoding = self._encoded(stream, frame)
-            if first_ns is None:
-                first_ns, start_s = frame.stamp_ns, time.monotonic()
-            due_s = start_s + (frame.stamp_ns - first_ns) / NS_PER_S / rate if rate > 0 else 0.0
-            if rate > 0 and stop.wait(max(due_s - time.monotonic(), 0.0)):
-                break
-            self._publishers[stream].put(payload, encoding=encoding)
-            self.played.frames[stream] += 1
-            self.played.bytes += len(payload)
-            if rate > 0:
-                self.played.latest_late_s = max(time.monotonic() - due_s, 0.0)
-                self.played.late_s = max(self.played.late_s, self.played.latest_late_s)
-            heard(frame, self.played)
-        return self.played
+        """Publishes every frame when it is due, see `paced`; the frames of a stream that has no key are left out."""
+        ours = (frame for frame in frames if stream_of(frame) in self._publishers)
+        return paced(ours, rate, stop, self._send, heard, self.played)
 
     def close(self) -> None:
         """Withdraws the publishers."""
         for publisher in self._publishers.values():
             publisher.undeclare()
+
+    def _send(self, frame: Frame) -> tuple[str, int]:
+        stream = stream_of(frame)
+        payload, encoding = self._encoded(stream, frame)
+        self._publishers[stream].put(payload, encoding=encoding)
+        return stream, len(payload)
 
     def _encoded(self, stream: str, frame: Frame) -> tuple[bytes, zenoh.Encoding]:
         numbered = replace(frame, sequence=self._sequence[stream])
@@ -149,18 +122,9 @@ def stream_of(frame: Frame) -> str:
             return EGO
 
 
-def repeated(passes: Callable[[], Iterable[Frame]], shift_ns: int, pause_ns: int, forever: bool) -> Iterator[Frame]:
-    """The frames of `passes()` with `shift_ns` added to their stamps; if `forever`, again and again, each time
-    `pause_ns` after the last frame of the pass before: sensor time never steps back."""
-    while True:
-        first_ns, last_ns = None, 0
-        for frame in passes():
-            first_ns = frame.stamp_ns if first_ns is None else first_ns
-            last_ns = frame.stamp_ns
-            yield replace(frame, stamp_ns=frame.stamp_ns + shift_ns)
-        if not forever or first_ns is None:
-            return
-        shift_ns += last_ns - first_ns + pause_ns
+def shifted(frame: Frame, shift_ns: int) -> Frame:
+    """The frame with so much added to its stamp."""
+    return replace(frame, stamp_ns=frame.stamp_ns + shift_ns)
 
 
 def _msgpack(frame: Frame) -> bytes:

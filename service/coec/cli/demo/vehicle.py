@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from coec.adapters.zenoh.player import CAMERA, Frame, Played, Player, Streams
+from coec.adapters.zenoh.cadence import Played
+from coec.adapters.zenoh.player import CAMERA, Frame, Player, Streams
 
 if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive

@@ -14,7 +14,8 @@ import numpy as np
 from coec.adapters.foxglove.server import Screen
 from coec.adapters.foxglove.shown import picture_of
 from coec.adapters.foxglove.topics import PICTURES
-from coec.adapters.zenoh.player import repeated
+from coec.adapters.zenoh.cadence import repeated
+from coec.adapters.zenoh.player import shifted
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import FramePair
 from coec.cli.view.candidate import Candidate
@@ -131,7 +132,7 @@ def _pairs(show: Show) -> Iterator[FramePair]:
     period_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else DEFAULT_PERIOD_NS
     end_ns = math.inf if not stamps_ns else 2 * stamps_ns[-1] - stamps_ns[0] + period_ns
     found = False
-    for message in repeated(recording.messages, 0, period_ns, show.repeat):
+    for message in repeated(recording.messages, shifted, 0, period_ns, show.repeat):
         for pair in pairer.push(message):
             found = True
             yield pair

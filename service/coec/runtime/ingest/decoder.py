@@ -16,6 +16,7 @@ from coec.adapters.ros.moving_frames import MovingFrame
 from coec.adapters.ros.wire.rmw_zenoh import Attachment
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
+from coec.calibration.frames.concatenation import SeveralOrigins
 from coec.calibration.frames.origin import ApparentOrigin, OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import AnyStreamConfig, LimitsConfig, OpenEgoConfig, OpenLidarConfig, PairConfig
@@ -27,18 +28,16 @@ _log = logging.getLogger(__name__)
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 
-CLOUD_ORIGIN = "cloud_origin"
-"""Cause of a loss: the points were not measured from where the configuration says."""
+WRONG_TYPE = "wrong_type"
+"""Cause of a loss: a message that makes no frame of the stream."""
 
 ORIGIN_PERIOD_NS = 10**9
 """Of sensor time, between two looks at where points were measured from: 1 ms each."""
 
-WRONG_TYPE = "wrong_type"
-"""Cause of a loss: a message that makes no frame of the stream."""
-
 EXPLAINED = frozenset(
     {
-        CLOUD_ORIGIN,
+        ApparentOrigin.cause,
+        SeveralOrigins.cause,
         WRONG_TYPE,
         Refusal.MESSAGE_TYPE,
         Refusal.CLOUD_FIELDS,
@@ -81,7 +80,7 @@ class SampleReader:
         self._streams = streams
         self._limits = limits
         lidar, ego = streams[LIDAR], streams.get(EGO)
-        self._point_time = lidar.time if isinstance(lidar, OpenLidarConfig) else None
+        self._lidar = lidar if isinstance(lidar, OpenLidarConfig) else None
         self._moving = MovingFrame(ego.parent, ego.child) if isinstance(ego, OpenEgoConfig) else None
 
     def frame(self, stream: str, sample: Sample) -> Frame | None:
@@ -103,7 +102,8 @@ class SampleReader:
                 raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
             if type_name == messages.TF and self._moving is not None:
                 return self._moving.motion(sample.payload)
-            return incoming.decode(type_name, sample.payload, self._limits, point_time=self._point_time)
+            point_time, source = (None, None) if self._lidar is None else (self._lidar.time, self._lidar.source)
+            return incoming.decode(type_name, sample.payload, self._limits, point_time=point_time, source=source)
         if stream == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
         if stream == LIDAR:
@@ -219,10 +219,10 @@ class Decoder:
         sweep = from_origin(cloud, self._T_cloud_lidar, self._pair.lidar.frame_id)
         contradiction = self._contradiction(sweep)
         if contradiction is not None:
-            raise DecodeError(CLOUD_ORIGIN, f"{contradiction.sentence} See lidar.T_cloud_lidar.")
+            raise DecodeError(contradiction.cause, f"{contradiction.sentence} See lidar.{contradiction.setting}.")
         return sweep
 
-    def _contradiction(self, sweep: LidarFrame) -> ApparentOrigin | None:
+    def _contradiction(self, sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
         """Of the first sweep of each period of sensor time, and of all while one was found: frames of drivers change
         with their configuration, not from sweep to sweep."""
         period = sweep.stamp_ns // ORIGIN_PERIOD_NS

@@ -11,14 +11,14 @@ import tempfile
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import zstandard
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coec.adapters.mcap.files import MAX_ZSTD_WINDOW
+from coec.adapters.mcap.files import MAX_RATIO, MAX_ZSTD_WINDOW
 from coec.config import describe, load_yaml
 from coec.errors import ConfigError, SourceError
 from coec.sources.bag.mcap_storage import McapStorage
@@ -65,8 +65,13 @@ class FolderStorage:
     def entries(self) -> Iterator[Entry]:
         """See `Storage`."""
         for number, file in enumerate(self.files):
+            left = MAX_MESSAGE_BYTES
             for entry in file.entries():
-                yield Entry(entry.topic, entry.type_name, self.plain(entry.data), (number, *entry.place))
+                data = self.plain(entry.data)
+                left += MAX_RATIO * len(entry.data) - len(data)
+                if left < 0:
+                    raise SourceError(f"{file.path} unpacks to more than {MAX_RATIO} times its size")
+                yield replace(entry, data=data, place=(number, *entry.place))
 
     @contextmanager
     def open(self) -> Iterator[Reader]:
@@ -122,6 +127,8 @@ def open_folder(path: Path) -> FolderStorage:
         raise SourceError(f"{path / METADATA}: compression {information.compression_format!a} is not zstd")
     # Folders above are no business of a bag's; old versions wrote the folder's own name in front.
     names = [path / Path(name).name for name in information.relative_file_paths]
+    if len(set(names)) < len(names):
+        raise SourceError(f"{path / METADATA} names a file twice")
     if mode != "FILE":
         return FolderStorage(path, _files(path, information, names), mode == "MESSAGE")
     unpacked = Path(tempfile.mkdtemp(prefix="coec-bag-"))
@@ -164,7 +171,11 @@ def _unpacked(file: Path, folder: Path) -> Path:
     unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
     try:
         with file.open("rb") as packed, target.open("wb") as plain:
+            left = MAX_MESSAGE_BYTES + MAX_RATIO * file.stat().st_size
             for block in unpacker.read_to_iter(packed, write_size=_COPY_BYTES):
+                left -= len(block)
+                if left < 0:
+                    raise SourceError(f"{file} unpacks to more than {MAX_RATIO} times its size")
                 if shutil.disk_usage(folder).free < KEPT_FREE_BYTES:
                     raise SourceError(f"{file} unpacks to more than {folder.parent} has room for")
                 plain.write(block)

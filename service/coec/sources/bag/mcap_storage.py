@@ -7,7 +7,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from coec.adapters.mcap.files import Channel, McapDamaged, Message, MessageReader, Schema, read_records
+from coec.adapters.mcap.files import (
+    MAX_CHUNK_BYTES,
+    MAX_RATIO,
+    Channel,
+    McapDamaged,
+    Message,
+    MessageReader,
+    Schema,
+    read_records,
+)
 from coec.errors import SourceError
 from coec.sources.bag.storage import Entry, Reader
 
@@ -26,7 +35,8 @@ class McapStorage:
         channels: dict[int, Channel] = {}
         try:
             with self.path.open("rb") as stream:
-                for record in read_records(stream):
+                limit = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
+                for record in read_records(stream, max_unpacked_bytes=limit):
                     match record:
                         case Schema():
                             schemas[record.schema_id] = record
@@ -36,7 +46,7 @@ class McapStorage:
                             channel = channels.get(record.channel_id)
                             schema = None if channel is None else schemas.get(channel.schema_id)
                             if channel is not None and schema is not None and channel.message_encoding == "cdr":
-                                yield Entry(channel.topic, schema.name, record.data, _place_of(record))
+                                yield _entry(channel.topic, schema.name, record)
         except OSError as error:
             raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
         except McapDamaged as error:
@@ -63,6 +73,7 @@ class _McapReader:
             raise SourceError(f"{self.path}: {error}") from error
 
 
-def _place_of(message: Message) -> tuple[int, int, int]:
+def _entry(topic: str, type_name: str, message: Message) -> Entry:
     chunk_at = _OUTSIDE_CHUNKS if message.chunk_at is None else message.chunk_at
-    return chunk_at, message.at, len(message.data)
+    place = (chunk_at, message.at, len(message.data))
+    return Entry(topic, type_name, message.data, message.log_time_ns, place)

@@ -13,6 +13,8 @@ from pydantic import ValidationError
 
 from coec.adapters.mcap.windows import is_window, read_window
 from coec.adapters.ros import incoming
+from coec.calibration.frames.concatenation import SeveralOrigins
+from coec.calibration.frames.origin import ApparentOrigin
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
 from coec.config import CalibrationConfig, LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
@@ -35,9 +37,16 @@ _EGO, _LIDAR, _CAMERA = 0, 1, 2
 """Order of messages with equal stamps, as in `sources.recording`."""
 
 
+_ADVICE = {
+    ApparentOrigin.cause: "Name the LiDAR's frame with ?lidar_frame=..., if /tf_static has it.",
+    SeveralOrigins.cause: "Choose the topic of one LiDAR with ?points=..., or one by its number with ?lidar_source=N, "
+    "if a field of the points tells it.",
+}
+
+
 def open_bag(spec: SourceSpec) -> Recording:
     """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]
-    [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]]`.
+    [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N]`.
 
     Without a query, a recorded window is opened as such. In any other bag topics are found by their type where there is
     only one of it. Intrinsics come from the `CameraInfo` of the camera's frame (or of the topic named), or from a YAML
@@ -46,26 +55,27 @@ def open_bag(spec: SourceSpec) -> Recording:
     frame than the LiDAR's (`base_link`) are taken back to it where `lidar_frame` names it and `/tf_static` leads there.
     Where no topic tells a velocity, the transforms of `/tf` do, from frame to frame as `moving` names them (`odom` and
     `base_link` unless it does), else an IMU tells the rotation. `time` says how points are timed, where their values
-    leave it open (see `config.PointTimeConfig`).
+    leave it open (see `config.PointTimeConfig`). Of a cloud of several LiDARs `lidar_source` chooses one (see
+    `adapters.ros.source_field`).
 
     Raises:
         UsageError: unknown query key, or a value that is none.
         SourceError: no bag, cut off or damaged; no topic, or several, of a type; no intrinsics, no extrinsic.
         WindowError: a recorded window that is damaged.
     """
-    query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame", "moving", "time")
+    query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame", "moving", "time", "lidar_source")
     if not query and spec.path.suffix == ".mcap" and is_window(spec.path):
         return _window_recording(spec.path)
-    point_time, frames = _point_time(query.get("time")), _frames(query.get("moving"))
+    clouds, frames = Clouds.asked(query.get("time"), query.get("lidar_source")), _frames(query.get("moving"))
     storage = open_storage(spec.path)
     index = index_of(storage)
     camera_topic = index.topic(IMAGE_TYPES, query.get("camera"), "camera")
     lidar_topic = index.topic(CLOUD_TYPES, query.get("points"), "points")
     with storage.open() as reader:
         streams = _streams(index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")))
-        camera = _load(storage, reader, streams.camera[0])
-        cloud = _load(storage, reader, streams.lidar[0], point_time=point_time)
-        motions = [*streams.moved[:1], *(_load(storage, reader, place) for place in streams.motion[:1])]
+        camera = _load(storage, reader, streams.camera[0], clouds)
+        cloud = _load(storage, reader, streams.lidar[0], clouds)
+        motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
         motion = motions[0] if motions else None
     if not isinstance(camera, CameraFrame) or not isinstance(motion, EgoMotion | None):
         raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion where it was said to be")
@@ -75,7 +85,7 @@ def open_bag(spec: SourceSpec) -> Recording:
         raise SourceError(f"{spec.path}: /tf_static does not connect {cloud.frame_id!r} and {lidar_frame!r}")
     rig = rig_of_bag(index, query.get("intrinsics"), camera_topic, camera, lidar_frame, motion)
     name = f"{spec.path.name}{camera_topic}"
-    return BagRecording(name, rig, rig.T_camera_lidar_nominal, storage, streams, T_cloud_lidar, point_time)
+    return BagRecording(name, rig, rig.T_camera_lidar_nominal, storage, streams, T_cloud_lidar, clouds)
 
 
 def _window_recording(path: Path) -> FramewiseRecording:
@@ -92,6 +102,37 @@ def _window_recording(path: Path) -> FramewiseRecording:
         tuple(pair.motion for pair in window.pairs if pair.motion is not None),
         configuration,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Clouds:
+    """How the clouds of a bag are read.
+
+    Attributes:
+        point_time: how points are timed, where that was said.
+        source: number of the LiDAR, of clouds of several.
+    """
+
+    point_time: PointTimeConfig | None = None
+    source: int | None = None
+
+    @classmethod
+    def asked(cls, time: str | None, source: str | None) -> Clouds:
+        """As a query asks for it: `FIELD,UNIT[,BASE]`, and a number.
+
+        Raises:
+            UsageError: it does not.
+        """
+        names = ("field", "unit", "base")
+        try:
+            timed = None if time is None else dict(zip(names, time.split(",", 2), strict=False))
+            point_time = None if timed is None else PointTimeConfig.model_validate(timed)
+        except ValidationError as error:
+            raise UsageError(f"time={time}: {describe(error)}; for example time=timestamp,s,clock") from error
+        try:
+            return cls(point_time, None if source is None else int(source))
+        except ValueError:
+            raise UsageError(f"lidar_source={source}: it is a whole number, as in the points' field") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +162,7 @@ class BagRecording:
         storage: of the bag.
         streams: places of the messages.
         T_cloud_lidar: (4, 4) pose of the LiDAR in the frame in which the points are given.
-        point_time: how points are timed, where that was said.
+        clouds: how the clouds are read.
     """
 
     name: str
@@ -130,7 +171,7 @@ class BagRecording:
     storage: Storage
     streams: Streams
     T_cloud_lidar: Matrix4
-    point_time: PointTimeConfig | None = None
+    clouds: Clouds
     configuration: CalibrationConfig | None = None
 
     @property
@@ -166,12 +207,11 @@ class BagRecording:
                 if isinstance(item, EgoMotion):
                     yield item
                     continue
-                message = _load(self.storage, reader, item, point_time=self.point_time)
+                message = _load(self.storage, reader, item, self.clouds)
                 yield self._from_origin(message) if isinstance(message, LidarFrame) else message
 
     def _from_origin(self, cloud: LidarFrame) -> LidarFrame:
-        advice = "Name the LiDAR's frame with ?lidar_frame=..., if /tf_static has it."
-        return measured_from(cloud, self.T_cloud_lidar, self.rig.lidar_frame, self.storage.path, advice)
+        return measured_from(cloud, self.T_cloud_lidar, self.rig.lidar_frame, self.storage.path, _ADVICE)
 
 
 def _streams(
@@ -196,18 +236,11 @@ def _frames(text: str | None) -> tuple[str, str]:
     return parent, child
 
 
-def _point_time(text: str | None) -> PointTimeConfig | None:
-    if text is None:
-        return None
-    try:
-        return PointTimeConfig.model_validate(dict(zip(("field", "unit", "base"), text.split(",", 2), strict=False)))
-    except ValidationError as error:
-        raise UsageError(f"time={text}: {describe(error)}; for example time=timestamp,s,clock") from error
-
-
-def _load(storage: Storage, reader: Reader, place: Place, *, point_time: PointTimeConfig | None = None) -> Message:
+def _load(storage: Storage, reader: Reader, place: Place, clouds: Clouds) -> Message:
     data = reader.read(place.at)
     try:
-        return incoming.decode(place.type_name, data, LimitsConfig(), point_time=point_time)
+        return incoming.decode(
+            place.type_name, data, LimitsConfig(), point_time=clouds.point_time, source=clouds.source
+        )
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error

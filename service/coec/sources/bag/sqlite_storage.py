@@ -19,6 +19,15 @@ from coec.sources.bag.storage import Entry, Reader
 MAX_MESSAGE_BYTES = 256 * 2**20
 """Of one message, as in MCAP's chunks."""
 
+MAX_TOPICS = 10_000
+"""Of a bag; a large vehicle has some 2,000."""
+
+MAX_NAME = 1024
+"""Characters of a topic's name, or a type's."""
+
+MIN_ROW_BYTES = 4
+"""Of a message in the file beside its data: size of the cell, row, header and time take more."""
+
 _TABLES = {"topics", "messages"}
 
 
@@ -31,15 +40,22 @@ class SqliteStorage:
     def entries(self) -> Iterator[Entry]:
         """See `Storage`."""
         with self._connected() as connection:
-            rows = connection.execute(
-                "SELECT messages.id, topics.name, topics.type, messages.data FROM messages "
-                "JOIN topics ON topics.id = messages.topic_id WHERE topics.serialization_format = 'cdr' "
-                "ORDER BY messages.id"
-            )
-            for row, topic, type_name, data in rows:
-                if not (isinstance(topic, str) and isinstance(type_name, str)):
-                    raise SourceError(f"{self.path} is damaged: message {row} has no topic")
-                yield Entry(topic, type_name, self._bytes(row, data), (int(row),))
+            topics = self._topics(connection)
+            left = self.path.stat().st_size
+            # As they lie, without a join or an order of their own: nothing is sorted, whatever the schema says.
+            for row, topic_id, logged_ns, data in connection.execute(
+                "SELECT rowid, topic_id, timestamp, data FROM messages"
+            ):
+                if not (isinstance(row, int) and isinstance(logged_ns, int)) or topic_id not in topics:
+                    raise SourceError(f"{self.path} is damaged: a message has no number, no time or no topic")
+                message = self._bytes(row, data)
+                # Pages that are used twice, and columns that are made up, would give more than there is.
+                left -= len(message) + MIN_ROW_BYTES
+                if left < 0:
+                    raise SourceError(f"{self.path} is damaged: its messages are longer than the file")
+                topic, type_name, serialization = topics[topic_id]
+                if serialization == "cdr":
+                    yield Entry(topic, type_name, message, logged_ns, (row,))
 
     @contextmanager
     def open(self) -> Iterator[Reader]:
@@ -47,9 +63,21 @@ class SqliteStorage:
         with self._connected() as connection:
             yield _SqliteReader(self, connection)
 
+    def _topics(self, connection: sqlite3.Connection) -> dict[int, tuple[str, str, str]]:
+        """Name, type and serialization by id."""
+        topics = {}
+        rows = connection.execute("SELECT id, name, type, serialization_format FROM topics LIMIT ?", (MAX_TOPICS + 1,))
+        for number, *texts in rows:
+            if not isinstance(number, int) or not all(isinstance(t, str) and len(t) <= MAX_NAME for t in texts):
+                raise SourceError(f"{self.path} is damaged: a topic has no name, type or serialization")
+            topics[number] = (texts[0], texts[1], texts[2])
+        if len(topics) > MAX_TOPICS:
+            raise SourceError(f"{self.path} has more than {MAX_TOPICS} topics")
+        return topics
+
     def read_from(self, connection: sqlite3.Connection, row: int) -> bytes:
         """The data of a message by its row."""
-        found = connection.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()
+        found = connection.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
         if found is None:
             raise SourceError(f"{self.path}: there is no message {row} any more: the file has changed")
         return self._bytes(row, found[0])

@@ -18,12 +18,14 @@ class Entry:
     Attributes:
         type_name: of ROS, for example `sensor_msgs/msg/Image`.
         data: CDR.
+        logged_ns: when the recorder got it, by its own clock.
         place: means something to the storage that gave it.
     """
 
     topic: str
     type_name: str
     data: bytes
+    logged_ns: int
     place: tuple[int, ...]
 
 

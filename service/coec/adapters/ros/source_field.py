@@ -1,0 +1,100 @@
+"""Clouds of several LiDARs in one `PointCloud2`: split by the field that tells the source of each point.
+
+Most who join clouds give none. Autoware's `concatenate_data` writes which point is whose into another message
+(`ConcatenatedPointCloudInfo`), and none of the fields of its points (x, y, z, intensity, return_type, channel, azimuth,
+elevation, distance, time_stamp) says it; a `laser_id` or `channel` is a beam's number, not a LiDAR's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointCloud2 as PointCloud2
+from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointField as PointField
+
+from coec.adapters.frames.incoming import Refusal
+from coec.errors import DecodeError
+
+SOURCE_FIELDS: Final = ("lidar_id", "sensor_id", "source_id", "device_id", "source")
+"""Integers under which mergers of clouds tell LiDARs apart: `lidar_id`, `sensor_id` and `source` in those that others
+publish, `device_id` in Kitware's SLAM (beside its `laser_id`, the beam)."""
+
+_WIDTHS: Final = {
+    PointField.INT8: "i1",
+    PointField.UINT8: "u1",
+    PointField.INT16: "i2",
+    PointField.UINT16: "u2",
+    PointField.INT32: "i4",
+    PointField.UINT32: "u4",
+}
+
+MAX_LISTED: Final = 16
+"""Sources that a refusal lists: a vehicle has fewer LiDARs, and numbers of something else may be any."""
+
+
+def of_source(message: PointCloud2, source: int | None) -> PointCloud2:
+    """The points of one LiDAR, in their order, as a cloud of one row; the message as it is where it holds no other.
+
+    Args:
+        message: whose data are as long as its layout says.
+        source: the number of the LiDAR that is asked for; None: there must be one only.
+
+    Raises:
+        DecodeError: `cloud_concatenated`: several sources and none asked for, or no point of the one asked for; says
+            which there are.
+    """
+    field = next((field for name in SOURCE_FIELDS for field in message.fields if field.name == name), None)
+    values = None if field is None else _values(message, field)
+    if field is None or values is None:
+        if source is None:
+            return message
+        raise DecodeError(
+            Refusal.CLOUD_CONCATENATED,
+            f"source {source} is asked for, and no field tells sources: {', '.join(SOURCE_FIELDS)} would",
+        )
+    wanted = int(values[0, 0]) if source is None else source
+    mine = values == wanted
+    if mine.all():
+        return message
+    if source is None or not mine.any():
+        known = np.unique(values)
+        listed = ", ".join(map(str, known[:MAX_LISTED].tolist())) + (", ..." if len(known) > MAX_LISTED else "")
+        asked = "choose one" if source is None else f"none has {source}"
+        raise DecodeError(
+            Refusal.CLOUD_CONCATENATED, f"the cloud is concatenated: its {field.name} has {listed}; {asked}"
+        )
+    rows = _rows(message)[mine]
+    return replace(
+        message,
+        height=1,
+        width=len(rows),
+        row_step=len(rows) * message.point_step,
+        data=np.ascontiguousarray(rows).reshape(-1),
+    )
+
+
+def _values(message: PointCloud2, field: PointField) -> NDArray[np.integer] | None:
+    """(height, width) numbers of a field; None where it holds none, or lies outside its point."""
+    width = _WIDTHS.get(field.datatype)
+    if width is None or field.offset + int(width[1]) > message.point_step:
+        return None
+    return np.ndarray(
+        shape=(message.height, message.width),
+        dtype=np.dtype(width).newbyteorder(">" if message.is_bigendian else "<"),
+        buffer=message.data,
+        offset=field.offset,
+        strides=(message.row_step, message.point_step),
+    )
+
+
+def _rows(message: PointCloud2) -> NDArray[np.uint8]:
+    """(height, width, point_step) bytes of the points."""
+    return np.ndarray(
+        shape=(message.height, message.width, message.point_step),
+        dtype=np.uint8,
+        buffer=message.data,
+        strides=(message.row_step, message.point_step, 1),
+    )

@@ -1,0 +1,136 @@
+"""Messages on topics of ROS 2: what a recording holds, or is given as, with the topics on which they lie.
+
+The topics of a pair that no driver named are below `/<pair>/`: those of the bags that are written here, and of what is
+played.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from coec.adapters.ros import messages, outgoing
+from coec.adapters.ros.wire.qos import Qos
+from coec.calibration.frames.motion_compensation import azimuth_offsets_s
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+from coec.config import PairConfig
+
+Frame = CameraFrame | LidarFrame | EgoMotion
+
+TF_STATIC: Final = "/tf_static"
+
+LATCHED: Final = 100
+"""Messages of `/tf_static` that are kept for whoever comes later: as many as tf2's listeners ask for
+(tf2_ros/qos.hpp, StaticListenerQoS). A recording has one of each node that published some."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessage:
+    """A message on its way.
+
+    Attributes:
+        stamp_ns: when it was published; what its header says may be earlier.
+        data: CDR.
+    """
+
+    stamp_ns: int
+    topic: str
+    type_name: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """A topic of a recording: messages of a type, so many, and so many a second; 0 of fewer than two."""
+
+    type_name: str
+    count: int
+    rate_hz: float = 0.0
+
+
+def qos_of(topic: str) -> Qos:
+    """What a recording is played with: reliable, which all subscribers take; `/tf_static` waits for latecomers."""
+    return Qos(transient_local=True, depth=LATCHED) if topic == TF_STATIC else Qos()
+
+
+@dataclass(frozen=True, slots=True)
+class PairTopics:
+    """Where the frames of a pair lie; None: nowhere. `image_raw` is for images that are not compressed, `turns` for
+    motion of which only the rotation is known."""
+
+    image: str
+    image_raw: str
+    info: str
+    points: str
+    motion: str | None
+    turns: str | None
+
+    @classmethod
+    def default(cls, pair: str) -> PairTopics:
+        """Those below `/<pair>/`."""
+        image = f"/{pair}/camera/image"
+        points, motion, turns = f"/{pair}/lidar/points", f"/{pair}/odometry", f"/{pair}/imu"
+        return cls(f"{image}/compressed", image, f"/{pair}/camera/camera_info", points, motion, turns)
+
+    @classmethod
+    def of_pair(cls, pair: PairConfig) -> PairTopics:
+        """Those of a configuration; the camera info lies beside the image, as image_transport has it."""
+        image = pair.camera.place
+        info = f"{image.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        motion = pair.ego.place if pair.ego else None
+        return cls(image, image, info, pair.lidar.place, motion, motion)
+
+
+class FrameTopics:
+    """The frames of a recording as messages, with the camera info of each image, and `/tf_static` before the first."""
+
+    def __init__(self, rig: Rig, T_camera_lidar: Matrix4, topics: PairTopics) -> None:
+        """`T_camera_lidar` (4, 4) is what `/tf_static` says."""
+        self._rig = rig
+        self._T_camera_lidar = T_camera_lidar
+        self._topics = topics
+        self._joined: set[str] = set()
+
+    def of(self, frame: Frame) -> Iterator[TopicMessage]:
+        """Those of the next frame; depth maps are left out."""
+        for child, joint in self._joints(frame):
+            if child not in self._joined:
+                self._joined.add(child)
+                yield TopicMessage(frame.stamp_ns, TF_STATIC, messages.TF, joint)
+        for topic, type_name, data in self._messages(frame):
+            yield TopicMessage(frame.stamp_ns, topic, type_name, data)
+
+    def _joints(self, frame: Frame) -> list[tuple[str, bytes]]:
+        """The static transforms that a frame needs, by the name of their child."""
+        rig = self._rig
+        joints = [(rig.lidar_frame, outgoing.encode_tf_static(rig, self._T_camera_lidar, frame.stamp_ns))]
+        if isinstance(frame, EgoMotion) and frame.frame_id != rig.lidar_frame:
+            # The ego frame as a child of the LiDAR's, written by the same rule: child to parent.
+            below = replace(rig, camera_frame=rig.lidar_frame, lidar_frame=frame.frame_id)
+            joints.append((frame.frame_id, outgoing.encode_tf_static(below, rig.T_lidar_ego, frame.stamp_ns)))
+        return joints
+
+    def _messages(self, frame: Frame) -> list[tuple[str, str, bytes]]:
+        topics = self._topics
+        match frame:
+            case CameraFrame():
+                type_name, data = outgoing.encode_image(frame)
+                image = topics.image if type_name == messages.COMPRESSED_IMAGE else topics.image_raw
+                info = outgoing.encode_camera_info(self._rig, frame.stamp_ns)
+                return [(topics.info, messages.CAMERA_INFO, info), (image, type_name, data)]
+            case LidarFrame():
+                return [(topics.points, messages.POINT_CLOUD, outgoing.encode_cloud(_timed(self._rig, frame)))]
+            case EgoMotion():
+                type_name, data = outgoing.encode_motion(frame)
+                topic = topics.turns if type_name == messages.IMU else topics.motion
+                return [] if topic is None else [(topic, type_name, data)]
+
+
+def _timed(rig: Rig, sweep: LidarFrame) -> LidarFrame:
+    """The sweep with the time of each point: topics have no other place for the timing of the rig."""
+    if sweep.time_offset_s is not None or rig.sweep is None:
+        return sweep
+    return replace(sweep, time_offset_s=azimuth_offsets_s(sweep.xyz_m, rig.sweep).astype(np.float32))

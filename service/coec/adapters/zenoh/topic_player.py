@@ -1,0 +1,81 @@
+"""Messages of a recording on topics of ROS 2: keys, tokens and attachments as those of its own nodes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import Final, Literal
+
+import zenoh
+
+from coec.adapters.ros import messages
+from coec.adapters.ros.topics import TopicMessage, qos_of
+from coec.adapters.ros.wire.dialect import Dialect
+from coec.adapters.ros.wire.rmw_zenoh import Node, RmwZenoh
+from coec.adapters.ros.wire.ros2dds import Ros2dds
+from coec.adapters.zenoh.cadence import Played, paced
+from coec.adapters.zenoh.ros_publisher import RosNode, RosPublisher, RosPublishers
+
+Middleware = Literal["rmw_zenoh", "ros2dds"]
+
+NODE: Final = "coec_play"
+
+LOOK_AGAIN_S: Final = 0.05
+"""Between two looks at who listens."""
+
+
+def dialect_of(middleware: Middleware, session: zenoh.Session, domain: int, namespace: str) -> Dialect:
+    """How a player speaks in a session: as a node of rmw_zenoh in a domain, or beside a bridge of a namespace."""
+    name = str(session.info.zid())
+    if middleware == "ros2dds":
+        return Ros2dds(name, namespace)
+    return RmwZenoh(Node(domain, name, 0, "/", NODE), messages.type_hash)
+
+
+def is_playable(middleware: Middleware, type_name: str) -> bool:
+    """Whether messages of a type have a key: that of rmw_zenoh holds the type's hash, known of ROS's own types."""
+    return middleware == "ros2dds" or messages.is_known(type_name)
+
+
+class TopicPlayer:
+    """Publishes on topics. Senders wait rather than drop: what is lost is then lost by the receiver."""
+
+    def __init__(self, session: zenoh.Session, dialect: Dialect, topics: Mapping[str, str]) -> None:
+        """`topics`: types by name."""
+        self._node = RosNode(session, dialect)
+        self._all = RosPublishers(session, self._node)
+        self._publishers: dict[str, RosPublisher] = {
+            topic: self._all.publisher(topic, type_name, qos_of(topic), zenoh.CongestionControl.BLOCK)
+            for topic, type_name in topics.items()
+        }
+
+    def wait_for_listener(self, topics: Iterable[str], timeout_s: float, stop: threading.Event) -> list[str]:
+        """Until somebody subscribes to each of these topics, at most so long; those that nobody listens to."""
+        awaited = list(topics)
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            deaf = [topic for topic in awaited if not self._publishers[topic].is_heard]
+            if not deaf or time.monotonic() > deadline_s or stop.wait(LOOK_AGAIN_S):
+                return deaf
+
+    def play(
+        self,
+        items: Iterable[TopicMessage],
+        rate: float,
+        stop: threading.Event,
+        heard: Callable[[TopicMessage, Played], None],
+    ) -> Played:
+        """Publishes every message on one of the topics when it is due, see `paced`; the others are left out."""
+        ours = (message for message in items if message.topic in self._publishers)
+        return paced(ours, rate, stop, self._send, heard, Played(Counter()))
+
+    def close(self) -> None:
+        """Withdraws tokens and publishers."""
+        self._all.close()
+        self._node.close()
+
+    def _send(self, message: TopicMessage) -> tuple[str, int]:
+        self._publishers[message.topic].put(message.data, time.time_ns())
+        return message.topic, len(message.data)

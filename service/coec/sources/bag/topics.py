@@ -1,0 +1,76 @@
+"""All topics of a bag, with the messages as they were recorded."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+
+from coec.adapters.ros.topics import TopicInfo, TopicMessage
+from coec.errors import SourceError, UsageError
+from coec.sources.bag.storage import Storage, open_storage
+from coec.sources.spec import SourceSpec, is_bag
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class _Place:
+    logged_ns: int
+    at: tuple[int, ...]
+    topic: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BagTopics:
+    """A bag that was gone through once.
+
+    Attributes:
+        infos: its topics of CDR messages, in the order of their names.
+    """
+
+    name: str
+    infos: dict[str, TopicInfo]
+    _storage: Storage
+    _places: tuple[_Place, ...]
+
+    def messages(self, topics: Collection[str]) -> Iterator[TopicMessage]:
+        """Those of these topics, in the order in which they were recorded, each loaded when it is its turn.
+
+        Raises:
+            SourceError: the file is no longer what it was.
+        """
+        with self._storage.open() as reader:
+            for place in self._places:
+                if place.topic in topics:
+                    type_name = self.infos[place.topic].type_name
+                    yield TopicMessage(place.logged_ns, place.topic, type_name, reader.read(place.at))
+
+
+def open_topics(spec: SourceSpec) -> BagTopics:
+    """The topics of a bag, or of a recorded window.
+
+    Raises:
+        UsageError: it is none, or has a query: topics are not chosen by it.
+        SourceError: cut off or damaged; a topic with messages of two types.
+    """
+    if not is_bag(spec):
+        raise UsageError(f"{spec.text} is no bag")
+    spec.only()
+    storage = open_storage(spec.path)
+    types: dict[str, str] = {}
+    places: list[_Place] = []
+    for entry in storage.entries():
+        if types.setdefault(entry.topic, entry.type_name) != entry.type_name:
+            raise SourceError(f"{spec.path}: {entry.topic} has messages of several types")
+        places.append(_Place(entry.logged_ns, entry.place, entry.topic))
+    places.sort()
+    times_ns: defaultdict[str, list[int]] = defaultdict(list)
+    for place in places:
+        times_ns[place.topic].append(place.logged_ns)
+    infos = {topic: _info(types[topic], times_ns[topic]) for topic in sorted(types)}
+    return BagTopics(spec.path.name, infos, storage, tuple(places))
+
+
+def _info(type_name: str, logged_ns: Sequence[int]) -> TopicInfo:
+    """Of ascending times."""
+    span_s = (logged_ns[-1] - logged_ns[0]) * 1e-9
+    return TopicInfo(type_name, len(logged_ns), (len(logged_ns) - 1) / span_s if span_s > 0 else 0.0)

@@ -1,0 +1,184 @@
+"""`coec play` on topics of ROS 2: a bag's own bytes under the keys of rmw_zenoh or of a bridge."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xxhash
+import zenoh
+from mcap.writer import Writer
+
+from bags import STORE, Bag, a_drive
+from cli.conftest import SMALL, Coec
+from coec.adapters.ros.incoming import decode
+from coec.adapters.ros.wire.rmw_zenoh import Attachment
+from coec.adapters.zenoh.bus import open_session
+from coec.config import LimitsConfig, ZenohConfig
+from fakes import wait_until
+from ports import free_port
+
+SECONDS = 20.0
+TF_KEY = (
+    "0/tf_static/tf2_msgs::msg::dds_::TFMessage_/"
+    "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+)
+IMAGE_KEY = (
+    "0/front/image/sensor_msgs::msg::dds_::CompressedImage_/"
+    "RIHS01_15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a"
+)
+
+
+class Listener:
+    """A router, and what comes through it."""
+
+    def __init__(self, endpoint: str, session: zenoh.Session) -> None:
+        self.endpoint = endpoint
+        self.session = session
+        self.samples: defaultdict[str, list[zenoh.Sample]] = defaultdict(list)
+        self.tokens: set[str] = set()
+        self._open = [
+            session.declare_subscriber("**", zenoh.handlers.Callback(self._take, indirect=False)),
+            session.liveliness().declare_subscriber("@ros2_lv/**", zenoh.handlers.Callback(self._note, indirect=False)),
+        ]
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self.samples[str(sample.key_expr)].append(sample)
+
+    def _note(self, sample: zenoh.Sample) -> None:
+        self.tokens.add(str(sample.key_expr))
+
+    def attachments(self, key: str) -> list[Attachment]:
+        told = [Attachment.parse(s.attachment.to_bytes()) for s in self.samples[key] if s.attachment]
+        return [attachment for attachment in told if attachment is not None]
+
+    def count(self) -> int:
+        return sum(map(len, self.samples.values()))
+
+    def payloads(self, key: str) -> list[bytes]:
+        return [sample.payload.to_bytes() for sample in self.samples[key]]
+
+
+@pytest.fixture
+def listener() -> Iterator[Listener]:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig()) as session:
+        yield Listener(endpoint, session)
+
+
+def recorded(drive: list[tuple[str, Any]], topic: str) -> list[bytes]:
+    return [bytes(STORE.serialize_cdr(m, m.__msgtype__)) for name, m in drive if name == topic]
+
+
+def played(coec: Coec, listener: Listener, source: object, *options: object) -> Any:
+    told = coec("play", source, *options, "--rate", 0, "--connect", listener.endpoint, "--json")
+    assert told.status == 0, told.err
+    wait_until(lambda: listener.count() == sum(told.document["frames"].values()), "every message", SECONDS)
+    return told.document
+
+
+def test_a_bag_keeps_its_topics_types_and_bytes_on_the_keys_of_rmw_zenoh(
+    coec: Coec, listener: Listener, tmp_path: Path
+) -> None:
+    drive = a_drive()
+    document = played(coec, listener, Bag(drive).write(tmp_path / "b.mcap"), "--middleware", "rmw_zenoh")
+    assert document["frames"] == {
+        "/front/image": 4, "/front/camera_info": 1, "/points": 8, "/odom": 20, "/tf_static": 1
+    }  # fmt: skip
+    assert document["nobody_listened_to"] == []
+    assert listener.payloads(TF_KEY) == recorded(drive, "/tf_static")
+    assert listener.payloads(IMAGE_KEY) == recorded(drive, "/front/image")
+    (token,) = (token for token in listener.tokens if "%front%image/" in token)
+    assert token.split("/")[5:10] == ["MP", "%", "%", "coec_play", "%front%image"]
+    told = listener.attachments(IMAGE_KEY)
+    assert [attachment.sequence for attachment in told] == [1, 2, 3, 4]
+    assert {attachment.gid for attachment in told} == {xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")}
+    wait_until(lambda: not list(listener.session.liveliness().get("@ros2_lv/**")), "tokens are withdrawn", SECONDS)
+
+
+def test_a_bag_on_the_keys_of_a_bridge(coec: Coec, listener: Listener, tmp_path: Path) -> None:
+    drive = a_drive()
+    config = tmp_path / "coec.yaml"
+    config.write_text(
+        "middleware: ros2dds\nros: {namespace: /shuttle}\npairs:\n- name: front\n  points: /points\n"
+        "  camera:\n    topic: /front/image\n"
+        "    intrinsics: {model: pinhole, width: 64, height: 48, fx: 5, fy: 5, cx: 3, cy: 2}\n"
+        "  T_camera_lidar: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    )
+    document = played(coec, listener, Bag(drive).write(tmp_path / "b.mcap"), "--config", config)
+    assert document["nobody_listened_to"] == []
+    assert set(listener.samples) == {f"shuttle{topic}" for topic in document["frames"]}
+    assert listener.payloads("shuttle/points") == recorded(drive, "/points")
+    assert all(sample.attachment is None for sample in listener.samples["shuttle/points"])
+
+
+def test_topics_are_chosen_by_name(coec: Coec, listener: Listener, tmp_path: Path) -> None:
+    bag = Bag(a_drive()).write(tmp_path / "b.mcap")
+    document = played(coec, listener, bag, "--middleware", "ros2dds", "--topics", "/points,/odom")
+    assert set(document["frames"]) == {"/points", "/odom"}
+    said = coec("play", bag, "--middleware", "ros2dds", "--topics", "/lidar", "--connect", listener.endpoint)
+    assert said.status == 2
+    assert "no topic /lidar; there: /front/camera_info (sensor_msgs/msg/CameraInfo, 1 messages)" in said.err
+
+
+def test_stamps_begin_now_where_asked_and_all_else_is_as_recorded(
+    coec: Coec, listener: Listener, tmp_path: Path
+) -> None:
+    drive = a_drive()
+    bag = Bag(drive).write(tmp_path / "b.mcap")
+    played(coec, listener, bag, "--middleware", "rmw_zenoh", "--start-now")
+    now, then = listener.payloads(IMAGE_KEY), recorded(drive, "/front/image")
+    assert [payload[12:] for payload in now] == [payload[12:] for payload in then]
+    stamps = [decode("sensor_msgs/msg/CompressedImage", payload, LimitsConfig()).stamp_ns for payload in now]
+    np.testing.assert_array_equal(np.diff(stamps), 100_000_000)
+    # The recorder's clock began at 0, the sensors' at 1 s.
+    began_ns = stamps[0] - 10**9
+    assert 0 < listener.attachments(IMAGE_KEY)[0].source_ns - began_ns < SECONDS * 10**9
+
+
+def test_types_that_are_not_ros_own_have_no_key_of_rmw_zenoh(coec: Coec, listener: Listener, tmp_path: Path) -> None:
+    bag = tmp_path / "b.mcap"
+    with bag.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        for topic, type_name in (("/wheels", "acme_msgs/msg/Wheels"), ("/word", "std_msgs/msg/String")):
+            schema = writer.register_schema(type_name, "ros2msg", b"int32 data")
+            writer.add_message(writer.register_channel(topic, "cdr", schema), 5, b"\0\1\0\0anything", 5)
+        writer.finish()  # type: ignore[no-untyped-call]
+    told = coec("play", bag, "--middleware", "rmw_zenoh", "--rate", 0, "--connect", listener.endpoint, "--json")
+    assert told.document["frames"] == {"/word": 1}
+    assert "not played, their types are not ROS's own: /wheels (acme_msgs/msg/Wheels)" in told.err
+    told = coec("play", bag, "--middleware", "rmw_zenoh", "--topics", "/wheels", "--connect", listener.endpoint)
+    assert told.status == 2
+    listener.samples.clear()
+    document = played(coec, listener, bag, "--middleware", "ros2dds", "--start-now")
+    assert document["frames"] == {"/wheels": 1, "/word": 1}
+    assert listener.payloads("wheels") == [b"\0\1\0\0anything"]
+
+
+def test_other_recordings_are_played_below_the_name_of_their_pair(coec: Coec, listener: Listener) -> None:
+    document = played(coec, listener, SMALL, "--middleware", "ros2dds", "--pair", "nose")
+    assert set(document["frames"]) == {
+        "/tf_static", "/nose/camera/image/compressed", "/nose/camera/camera_info", "/nose/lidar/points",
+        "/nose/odometry",
+    }  # fmt: skip
+    assert document["frames"]["/nose/camera/image/compressed"] == 6
+    joint: Any = STORE.deserialize_cdr(listener.payloads("tf_static")[0], "tf2_msgs/msg/TFMessage")
+    assert joint.transforms[0].child_frame_id == "lidar"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--topics", "/points"), "add --middleware"),
+        (("--middleware", "ros2dds", "--encoding", "cdr"), "topics of ROS 2 carry CDR"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(coec: Coec, tmp_path: Path, options: Any, said: str) -> None:
+    told = coec("play", Bag(a_drive()).write(tmp_path / "b.mcap"), *options)
+    assert told.status == 2
+    assert said in told.err
