@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import zenoh
+from rosbags.typesys import Stores, get_typestore
 from zenoh.ext import (
     CacheConfig,
     HistoryConfig,
@@ -25,10 +26,16 @@ from zenoh.ext import (
 
 from peers.environments import PEERS, TIMEOUT_S, python_of
 
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+
 Heard = Callable[[str, bytes], None]
 
 DOMAINS = 101
 """ROS_DOMAIN_ID from 0 on: above, its ports may be those that Linux gives to others."""
+
+
+LATCHED = 100
+"""Messages that a latched topic keeps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +120,8 @@ def node(name: str, publish: Mapping[str, Topic], subscribe: Mapping[str, Topic]
 @contextmanager
 def relay(session: zenoh.Session, to_zenoh: Mapping[str, Topic], to_ros: Mapping[str, Topic]) -> Iterator[Node]:
     """What the bridge does: topics of ROS as keys, raw CDR, no attachment, no encoding, latched ones by the advanced
-    publisher and subscriber."""
+    publisher and subscriber. What it brought itself it does not take back, on either side."""
+    brought: set[tuple[str, bool, str]] = set()
     publishers: dict[str, Any] = {}
     for topic, one in to_zenoh.items():
         key = topic.lstrip("/")
@@ -121,7 +129,7 @@ def relay(session: zenoh.Session, to_zenoh: Mapping[str, Topic], to_ros: Mapping
             declare_advanced_publisher(
                 session,
                 key,
-                cache=CacheConfig(1),
+                cache=CacheConfig(LATCHED),
                 publisher_detection=True,
                 sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             )
@@ -130,14 +138,21 @@ def relay(session: zenoh.Session, to_zenoh: Mapping[str, Topic], to_ros: Mapping
         )
 
     def to_key(topic: str, payload: bytes) -> None:
-        publishers[topic].put(payload)
+        told = values_of(to_zenoh[topic].type, payload)
+        if (topic, True, told) not in brought:
+            brought.add((topic, False, told))
+            publishers[topic].put(payload)
 
     with node("relay", to_ros, to_zenoh, to_key) as running:
         subscribers = []
         for topic, one in to_ros.items():
 
             def to_topic(sample: zenoh.Sample, topic: str = topic) -> None:
-                running.publish(topic, sample.payload.to_bytes())
+                payload = sample.payload.to_bytes()
+                told = values_of(to_ros[topic].type, payload)
+                if (topic, False, told) not in brought:
+                    brought.add((topic, True, told))
+                    running.publish(topic, payload)
 
             key = topic.lstrip("/")
             subscribers.append(
@@ -145,7 +160,7 @@ def relay(session: zenoh.Session, to_zenoh: Mapping[str, Topic], to_ros: Mapping
                     session,
                     key,
                     to_topic,
-                    history=HistoryConfig(detect_late_publishers=True, max_samples=1),
+                    history=HistoryConfig(detect_late_publishers=True, max_samples=LATCHED),
                     recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
                     subscriber_detection=True,
                 )
@@ -157,6 +172,11 @@ def relay(session: zenoh.Session, to_zenoh: Mapping[str, Topic], to_ros: Mapping
         finally:
             for declared in (*subscribers, *publishers.values()):
                 declared.undeclare()
+
+
+def values_of(type_name: str, payload: bytes) -> str:
+    """A message by its values: what fills the gaps between them differs from writer to writer."""
+    return repr(STORE.deserialize_cdr(payload, type_name))
 
 
 class Inbox:

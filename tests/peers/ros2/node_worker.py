@@ -53,7 +53,7 @@ def type_of(name: str) -> Any:
 
 def qos_of(*, latched: bool) -> QoSProfile:
     durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-    return QoSProfile(depth=1 if latched else DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+    return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
 
 def frame(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
