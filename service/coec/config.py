@@ -12,7 +12,7 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from ruamel.yaml import YAML
@@ -100,22 +100,76 @@ class SweepConfig(Stage):
 
 Encoding = Literal["msgpack", "cdr"]
 
+TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$", max_length=247)]
+"""A full name of a topic of ROS 2 (rmw/validate_full_topic_name.h)."""
 
-class CameraConfig(Stage):
+CameraMessage = Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"]
+LidarMessage = Literal["sensor_msgs/msg/PointCloud2"]
+EgoMessage = Literal["nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped"]
+
+
+class StreamConfig(Stage):
+    """Where the samples of a stream come from; one text alone is short for its `topic`."""
+
+    key: KeyExpression | None = Field(default=None, description="Zenoh key of the frames")
+    topic: TopicName | None = Field(
+        default=None, description="of ROS 2, instead of a key, where `middleware` is one of its; its frames are CDR"
+    )
+    encoding: Encoding = Field(default="msgpack", description="assumed when a sample names no encoding")
+
+    @property
+    def place(self) -> str:
+        """The key or the topic, as it was configured."""
+        return self.key or self.topic or ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _completed(cls, document: Any) -> Any:
+        """A text is the name of a topic, and what comes on topics is CDR."""
+        if isinstance(document, str):
+            document = {"topic": document}
+        if isinstance(document, dict) and document.get("topic") is not None:
+            if document.get("encoding", "cdr") != "cdr":
+                raise ValueError("what comes on a topic is CDR: leave `encoding` out")
+            document = {**document, "encoding": "cdr"}
+        return document
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.key is None) == (self.topic is None):
+            raise ValueError("give `key`, a key of Zenoh, or `topic`, a name of ROS 2 that begins with /: one of them")
+        return self
+
+
+class CameraConfig(StreamConfig):
     """Camera stream of a pair."""
 
-    key: KeyExpression
     frame_id: str = Field(default="camera", max_length=128, description="frames of another id are refused")
-    encoding: Encoding = Field(default="msgpack", description="assumed when a sample names no encoding")
-    type: Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"] = "sensor_msgs/msg/CompressedImage"
+    type: CameraMessage | None = Field(
+        default=None,
+        description="of CDR that does not say its own; unless set CompressedImage, and Image where the name of a topic "
+        "does not end with /compressed. What comes on a topic must have it, if it is set",
+    )
     intrinsics: CameraIntrinsics
     mask: FilePath | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
 
+    @property
+    def assumed_type(self) -> CameraMessage:
+        """The type of messages that do not say theirs."""
+        if self.type is not None:
+            return self.type
+        is_raw = self.topic is not None and not self.topic.endswith("/compressed")
+        return "sensor_msgs/msg/Image" if is_raw else "sensor_msgs/msg/CompressedImage"
 
-class LidarConfig(Stage):
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Types of messages that this stream takes."""
+        return _types(CameraMessage, self.type if self.topic else None)
+
+
+class LidarConfig(StreamConfig):
     """LiDAR stream of a pair."""
 
-    key: KeyExpression
     frame_id: str = Field(default="lidar", max_length=128, description="of the LiDAR; clouds of another id are refused")
     T_cloud_lidar: Matrix4x4 = Field(
         default=IDENTITY, description="pose of the LiDAR in the frame in which its driver gives the points"
@@ -123,17 +177,42 @@ class LidarConfig(Stage):
     cloud_frame_id: str | None = Field(
         default=None, max_length=128, description="of the clouds as they come, where it is not that of the LiDAR"
     )
-    encoding: Encoding = "msgpack"
     sweep: SweepConfig | None = Field(default=None, description="needed for clouds without per-point time")
 
+    @property
+    def assumed_type(self) -> LidarMessage:
+        """The type of messages that do not say theirs."""
+        return "sensor_msgs/msg/PointCloud2"
 
-class EgoConfig(Stage):
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Types of messages that this stream takes."""
+        return _types(LidarMessage, None)
+
+
+class EgoConfig(StreamConfig):
     """Ego-motion stream of a pair."""
 
-    key: KeyExpression
-    encoding: Encoding = "msgpack"
-    type: Literal["nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped"] = "nav_msgs/msg/Odometry"
+    type: EgoMessage | None = Field(
+        default=None,
+        description="of CDR that does not say its own; Odometry unless set. What comes on a topic must have it, if set",
+    )
     T_lidar_ego: Matrix4x4 = Field(default=IDENTITY, description="maps ego-frame to LiDAR coordinates")
+
+    @property
+    def assumed_type(self) -> EgoMessage:
+        """The type of messages that do not say theirs."""
+        return self.type or "nav_msgs/msg/Odometry"
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Types of messages that this stream takes."""
+        return _types(EgoMessage, self.type if self.topic else None)
+
+
+def _types(known: Any, only: str | None) -> tuple[str, ...]:
+    """Those of a `Literal`, or the one that was asked for."""
+    return get_args(known) if only is None else (only,)
 
 
 # --- stages of the calibration
@@ -371,7 +450,7 @@ class PolicyConfig(Stage):
 
 
 class PairConfig(Stage):
-    """One camera-LiDAR pair."""
+    """One camera-LiDAR pair. `points: TEXT` is short for `lidar: {topic: TEXT}`."""
 
     name: Name
     camera: CameraConfig
@@ -384,6 +463,22 @@ class PairConfig(Stage):
     monitor: MonitorConfig = MonitorConfig()
     policy: PolicyConfig = PolicyConfig()
     tracker: TrackerConfig = TrackerConfig()
+
+    @property
+    def streams(self) -> dict[str, CameraConfig | LidarConfig | EgoConfig]:
+        """Those that it has, by the names under which they are counted."""
+        streams = {"camera": self.camera, "lidar": self.lidar, "ego": self.ego}
+        return {name: stream for name, stream in streams.items() if stream is not None}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _points_are_the_lidars(cls, document: Any) -> Any:
+        if not isinstance(document, dict) or "points" not in document:
+            return document
+        points = document["points"]
+        if not isinstance(points, str) or "lidar" in document:
+            raise ValueError("`points` is the name of a topic, short for `lidar: {topic: ...}`: give one of the two")
+        return {**{name: value for name, value in document.items() if name != "points"}, "lidar": points}
 
 
 class LimitsConfig(Stage):
@@ -572,6 +667,18 @@ class Config(Stage):
         names = [pair.name for pair in self.pairs]
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
+        return self
+
+    @model_validator(mode="after")
+    def _topics_need_ros(self) -> Config:
+        if self.middleware != "native":
+            return self
+        topics = [f"pairs.{p.name}.{name}: {s.topic}" for p in self.pairs for name, s in p.streams.items() if s.topic]
+        if topics:
+            raise ValueError(
+                f"{', '.join(topics)}: topics of ROS 2 are found where `middleware` is `rmw_zenoh` or `ros2dds`: set "
+                "it, or give the Zenoh `key` of native frames instead"
+            )
         return self
 
 

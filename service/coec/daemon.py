@@ -28,6 +28,7 @@ from coec.adapters.system.threads import ServiceThread
 from coec.adapters.tls.conversation import Listener, credentials_of
 from coec.adapters.zenoh.bus import Answer, Bus, open_session
 from coec.adapters.zenoh.endpoints import redacted
+from coec.adapters.zenoh.inputs import input_of
 from coec.adapters.zenoh.presence import Presence, told
 from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
@@ -48,7 +49,6 @@ from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.api.status import worker_status_of
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.runtime.ingest.stream import Stream
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
@@ -189,10 +189,8 @@ class Daemon:
         for pair_config in self._config.pairs:
             pair = self._pairs[pair_config.name]
             pair.stream.thread.start()
-            streams = {CAMERA: pair_config.camera, LIDAR: pair_config.lidar, EGO: pair_config.ego}
-            for stream, stream_config in streams.items():
-                if stream_config is not None:
-                    self._bus.subscribe(stream_config.key, partial(pair.take_sample, stream))
+            for name, stream in pair_config.streams.items():
+                self._bus.subscribe(input_of(stream, self._config), partial(pair.take_sample, name))
             self._bus.declare_alive(self._keys.alive(pair.name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
         _log.info("serving", extra={"fields": {**fields, "pairs": list(self._pairs)}})

@@ -235,7 +235,7 @@ def watching(
         watch = Watch(running, running.session, running.config, path, truth)
         ego = running.config.pairs[0].ego
         assert ego is not None
-        subscriber = running.session.declare_subscriber(ego.key, watch.heard)
+        subscriber = running.session.declare_subscriber(ego.place, watch.heard)
         try:
             yield watch
         finally:

@@ -185,13 +185,13 @@ def test_a_rate_is_judged_by_what_a_check_wants(tmp_path: Path, rate_hz: float, 
     """By default six pairs in five seconds are wanted, and four are needed."""
     config = load_config(written(tmp_path, ZenohConfig(), "front"))
     (pair,) = config.pairs
-    camera, silent = Heard(pair.camera.key), Heard(pair.lidar.key)
+    camera, silent = Heard(pair.camera.place), Heard(pair.lidar.place)
     for number in range(count):
         camera.arrivals_s.append(number / rate_hz)
         camera.sizes.append(1000)
     found = list(stream_findings(pair, {"camera": camera, "lidar": silent}, config, 5.0))
-    assert of(found, "stream", pair.camera.key)[0] == level
-    assert of(found, "stream", pair.lidar.key)[0] == "fail"
+    assert of(found, "stream", pair.camera.place)[0] == level
+    assert of(found, "stream", pair.lidar.place)[0] == "fail"
 
 
 def test_a_clock_an_hour_off_is_told(vehicle: Sequence[Finding]) -> None:

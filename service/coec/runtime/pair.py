@@ -12,6 +12,7 @@ import logging
 from coec.adapters.files.rig import rig_of
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.system.threads import ServiceThread
+from coec.adapters.zenoh.inputs import Sample
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
@@ -107,9 +108,9 @@ class Pair:
         """Those that wait for nothing outside the process."""
         return self.stream.thread, self.decider.thread
 
-    def take_sample(self, stream: str, payload: bytes, encoding: str) -> None:
+    def take_sample(self, stream: str, sample: Sample) -> None:
         """A sample came: microseconds, on the network's thread."""
-        self.stream.inbox.put(stream, payload, encoding)
+        self.stream.inbox.put(stream, sample)
 
     def finish_window(self) -> None:
         """End the open window; for the end of the service, after the stream's thread has ended."""

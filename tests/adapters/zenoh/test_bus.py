@@ -18,6 +18,7 @@ import pytest
 import zenoh
 
 from coec.adapters.zenoh.bus import JSON, MSGPACK, WAITING, Answer, Bus, Lane, Request, Route, open_session
+from coec.adapters.zenoh.inputs import Sample, on_key
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError, UnavailableError
 from fakes import wait_until
@@ -211,12 +212,12 @@ def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Sessi
 def test_samples_arrive_with_their_encoding_and_a_failing_reader_does_no_harm(bus: Bus, client: zenoh.Session) -> None:
     got: queue.SimpleQueue[tuple[bytes, str]] = queue.SimpleQueue()
 
-    def receive(payload: bytes, encoding: str) -> None:
-        if payload == b"bad":
+    def receive(sample: Sample) -> None:
+        if sample.payload == b"bad":
             raise ValueError
-        got.put((payload, encoding))
+        got.put((sample.payload, sample.encoding))
 
-    bus.subscribe("test/in", receive)
+    bus.subscribe(on_key("test/in"), receive)
     publisher: Any = client.declare_publisher("test/in")
     wait_until(lambda: publisher.matching_status.matching, "the subscription is known to the publisher")
     publisher.put(b"bad")

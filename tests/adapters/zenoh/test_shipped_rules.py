@@ -22,6 +22,7 @@ from certificates import TestAuthority, make_authority
 from coec.adapters.tls.conversation import Speaker
 from coec.adapters.zenoh.bus import JSON, open_session
 from coec.adapters.zenoh.client import ConnectionFailedError, Way, connected_by, is_alive
+from coec.adapters.zenoh.inputs import on_key
 from coec.adapters.zenoh.presence import Presence
 from coec.adapters.zenoh.proven import give
 from coec.config import SenderConfig, ZenohConfig
@@ -88,7 +89,7 @@ def town(request: pytest.FixtureRequest, door: Door, tmp_path_factory: pytest.Te
     may = door.authority.of_service(SenderConfig(name="operator"))
     with ExitStack() as stack:
         vehicle = stack.enter_context(serving(tmp_path_factory.mktemp("state"), config, may))
-        vehicle.bus.subscribe(FRAMES, lambda payload, _: frames.append(payload))
+        vehicle.bus.subscribe(on_key(FRAMES), lambda sample: frames.append(sample.payload))
         sessions = {
             name: stack.enter_context(connected_by(door.way(name), PATIENCE_S))
             for name in ("sensors", "operator", "viewer")

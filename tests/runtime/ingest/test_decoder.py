@@ -13,6 +13,7 @@ import pytest
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import outgoing
 from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.inputs import Sample
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import (
@@ -59,7 +60,7 @@ class Desk:
         self._order = itertools.count()
 
     def take(self, stream: str, payload: bytes, encoding: str = "zenoh/bytes") -> object:
-        return self.intake.frame(Parcel(next(self._order), stream, payload, encoding))
+        return self.intake.frame(Parcel(next(self._order), stream, Sample(payload, encoding)))
 
 
 @pytest.fixture
@@ -178,9 +179,9 @@ def test_samples_are_taken_in_the_order_of_arrival_and_the_oldest_go_first() -> 
     overruns: list[str] = []
     inbox = Inbox({CAMERA: 2, EGO: 8}, 100, lambda parcel: overruns.append(parcel.stream))
     for number, stream in enumerate([CAMERA, EGO, CAMERA, EGO, CAMERA]):
-        inbox.put(stream, bytes([number]), "")
+        inbox.put(stream, Sample(bytes([number]), ""))
     taken = [inbox.take(0.0) for _ in range(5)]
-    assert [item.payload[0] for item in taken if isinstance(item, Parcel)] == [1, 2, 3, 4]
+    assert [item.sample.payload[0] for item in taken if isinstance(item, Parcel)] == [1, 2, 3, 4]
     assert taken[-1] is None
     assert overruns == [CAMERA]
 
@@ -189,40 +190,40 @@ def test_too_many_bytes_take_from_the_stream_that_holds_most() -> None:
     overruns: list[str] = []
     inbox = Inbox({CAMERA: 16, LIDAR: 16, EGO: 16}, 100, lambda parcel: overruns.append(parcel.stream))
     for number in range(3):
-        inbox.put(LIDAR, bytes([number]) * 20, "")
-    inbox.put(EGO, b"e", "")
+        inbox.put(LIDAR, Sample(bytes([number]) * 20, ""))
+    inbox.put(EGO, Sample(b"e", ""))
     for number in range(4):
-        inbox.put(CAMERA, bytes([number]) * 30, "")
+        inbox.put(CAMERA, Sample(bytes([number]) * 30, ""))
     # One camera frame fits beside the three sweeps; of the others each makes room for itself.
     assert overruns == [CAMERA] * 3
     taken = [inbox.take(0.0) for _ in range(6)]
-    payloads = [item.payload for item in taken if isinstance(item, Parcel)]
+    payloads = [item.sample.payload for item in taken if isinstance(item, Parcel)]
     assert payloads == [b"\0" * 20, b"\1" * 20, b"\2" * 20, b"e", b"\3" * 30]
 
 
 def test_a_sample_larger_than_all_that_may_wait_is_taken_alone() -> None:
     overruns: list[str] = []
     inbox = Inbox({CAMERA: 16, LIDAR: 16}, 100, lambda parcel: overruns.append(parcel.stream))
-    inbox.put(LIDAR, b"sweep", "")
-    inbox.put(CAMERA, bytes(200), "")
+    inbox.put(LIDAR, Sample(b"sweep", ""))
+    inbox.put(CAMERA, Sample(bytes(200), ""))
     assert overruns == [LIDAR]
-    inbox.put(CAMERA, b"next", "")
+    inbox.put(CAMERA, Sample(b"next", ""))
     assert overruns == [LIDAR, CAMERA]
     taken = inbox.take(0.0)
     assert isinstance(taken, Parcel)
-    assert taken.payload == b"next"
+    assert taken.sample.payload == b"next"
 
 
 def test_a_call_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
     inbox = Inbox({CAMERA: 2}, 100, lambda _: None)
-    inbox.put(CAMERA, b"", "")
+    inbox.put(CAMERA, Sample(b"", ""))
     inbox.call(lambda: None)
     assert isinstance(inbox.take(0.0), Call)
     assert isinstance(inbox.take(0.0), Parcel)
     got: list[object] = []
     reader = threading.Thread(target=lambda: got.append(inbox.take(60.0)))
     reader.start()
-    inbox.put(CAMERA, b"x", "")
+    inbox.put(CAMERA, Sample(b"x", ""))
     reader.join(20.0)
     assert len(got) == 1
     assert isinstance(got[0], Parcel)

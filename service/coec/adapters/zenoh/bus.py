@@ -20,6 +20,7 @@ import zenoh
 
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.endpoints import without_secrets
+from coec.adapters.zenoh.inputs import Input, Sample
 from coec.adapters.zenoh.settings import endpoints_of, settings_of, where
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
@@ -131,17 +132,18 @@ class Bus:
         """Those of `threads` that wait neither for a disk nor for the worker."""
         return tuple(thread for lane, thread in zip(self._waiting, self.threads, strict=True) if lane is Lane.COMMANDS)
 
-    def subscribe(self, key: str, on_sample: Callable[[bytes, str], None]) -> None:
-        """Call `on_sample(payload, encoding)` for every put on `key`, on Zenoh's thread."""
+    def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> None:
+        """Call `on_sample` for every put on the stream, on Zenoh's thread."""
 
         def receive(sample: zenoh.Sample) -> None:
             try:
                 if sample.kind == zenoh.SampleKind.PUT:
-                    on_sample(sample.payload.to_bytes(), str(sample.encoding))
+                    on_sample(stream.read(sample))
             except Exception:
-                _log.exception("a subscription failed", extra={"fields": {"key": key}})
+                _log.exception("a subscription failed", extra={"fields": {"key": stream.expressions[0]}})
 
-        self._subscribers.append(self._session.declare_subscriber(key, _direct(receive)))
+        for expression in stream.expressions:
+            self._subscribers.append(self._session.declare_subscriber(expression, _direct(receive)))
 
     def serve(self, key: str, find: Callable[[str], Sequence[Route]], *, complete: bool = True) -> None:
         """Answer queries that match `key`. `find` gets the query's key, which may hold wildcards, and returns who

@@ -15,6 +15,7 @@ from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import messages, outgoing
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import PairConfig
+from coec.errors import UsageError
 
 NS_PER_S = 1_000_000_000
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
@@ -32,8 +33,15 @@ class Streams:
 
     @classmethod
     def of_pair(cls, pair: PairConfig) -> Streams:
-        """Those of a configuration."""
-        return cls(pair.camera.key, pair.lidar.key, pair.ego.key if pair.ego else None)
+        """Those of a configuration.
+
+        Raises:
+            UsageError: it names topics of ROS.
+        """
+        topics = [stream.topic for stream in pair.streams.values() if stream.topic]
+        if topics:
+            raise UsageError(f"{', '.join(topics)}: frames of a pair are played on keys, and these are topics of ROS")
+        return cls(pair.camera.place, pair.lidar.place, pair.ego.place if pair.ego else None)
 
     @classmethod
     def default(cls, pair: str) -> Streams:

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 import zenoh
 
 from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.inputs import Sample, input_of
 from coec.config import Config, PairConfig
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame
+from coec.runtime.ingest.decoder import EGO, Decoder, Frame
 from coec.runtime.ingest.inbox import Parcel
 
 SAMPLES_WAITING = 8
@@ -34,6 +35,7 @@ class Heard:
     """What came on one stream.
 
     Attributes:
+        place: its key or topic.
         arrivals_s: when (steady clock) each sample came.
         sizes: bytes of each.
         stamps: of the frames: sensor time, and the wall clock when the sample came, ns, in the order of coming.
@@ -41,7 +43,7 @@ class Heard:
         latest: the last frame.
     """
 
-    key: str
+    place: str
     arrivals_s: list[float] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     stamps: list[tuple[int, int]] = field(default_factory=list)
@@ -78,14 +80,18 @@ class _Ear:
     """Of one pair."""
 
     def __init__(self, session: zenoh.Session, pair: PairConfig, config: Config) -> None:
-        streams = {CAMERA: pair.camera, LIDAR: pair.lidar, EGO: pair.ego}
-        self.heard = {name: Heard(stream.key) for name, stream in streams.items() if stream is not None}
-        self._waiting: dict[str, deque[tuple[int, bytes, str]]] = {
+        inputs = {name: input_of(stream, config) for name, stream in pair.streams.items()}
+        self.heard = {name: Heard(stream.place) for name, stream in pair.streams.items()}
+        self._waiting: dict[str, deque[tuple[int, Sample]]] = {
             name: deque(maxlen=MOTIONS_WAITING if name == EGO else SAMPLES_WAITING) for name in self.heard
         }
         self._losses = LossCounter(_SILENT, pair.name)
         self._decoder = Decoder(pair, config.limits, self._losses)
-        self._subscribers = [self._subscribe(session, name, heard) for name, heard in self.heard.items()]
+        self._subscribers = [
+            self._subscribe(session, expression, stream.read, name)
+            for name, stream in inputs.items()
+            for expression in stream.expressions
+        ]
 
     def close(self) -> None:
         """Hear no more, and look into what waits."""
@@ -101,8 +107,8 @@ class _Ear:
             if not waiting:
                 continue
             found = True
-            wall_ns, payload, encoding = waiting.popleft()
-            frame = self._decoder.frame(Parcel(0, name, payload, encoding))
+            wall_ns, sample = waiting.popleft()
+            frame = self._decoder.frame(Parcel(0, name, sample))
             heard = self.heard[name]
             if frame is not None:
                 heard.latest = frame
@@ -116,15 +122,17 @@ class _Ear:
             )
         return found
 
-    def _subscribe(self, session: zenoh.Session, name: str, heard: Heard) -> zenoh.Subscriber[None]:
-        waiting = self._waiting[name]
+    def _subscribe(
+        self, session: zenoh.Session, expression: str, read: Callable[[zenoh.Sample], Sample], name: str
+    ) -> zenoh.Subscriber[None]:
+        heard, waiting = self.heard[name], self._waiting[name]
 
         def receive(sample: zenoh.Sample) -> None:
             if sample.kind != zenoh.SampleKind.PUT:
                 return
             heard.arrivals_s.append(time.monotonic())
-            payload = sample.payload.to_bytes()
-            heard.sizes.append(len(payload))
-            waiting.append((time.time_ns(), payload, str(sample.encoding)))
+            came = read(sample)
+            heard.sizes.append(len(came.payload))
+            waiting.append((time.time_ns(), came))
 
-        return session.declare_subscriber(heard.key, zenoh.handlers.Callback(receive, indirect=False))
+        return session.declare_subscriber(expression, zenoh.handlers.Callback(receive, indirect=False))

@@ -58,20 +58,20 @@ def _stream(pair: PairConfig, name: str, heard: Heard, config: Config, seconds: 
             "see that its publisher runs, on this router, with this key; and that the router's rules let this "
             "certificate subscribe to it"
         )
-        yield fail("stream", heard.key, text, advice)
+        yield fail("stream", heard.place, text, advice)
         return
     yield _rate(pair, name, heard, seconds)
     largest, limit = max(heard.sizes), config.limits.max_message_bytes
     if largest > LARGE * limit:
         text = f"{name}: {largest / 1e6:.1f} MB in the largest sample, of {limit / 1e6:.1f} that are taken"
-        yield warn("size", heard.key, text, "raise limits.max_message_bytes, here and at the router, or send less")
+        yield warn("size", heard.place, text, "raise limits.max_message_bytes, here and at the router, or send less")
     if heard.refused:
         causes = ", ".join(f"{count} {reason}" for reason, count in heard.refused.most_common())
         advice = "see that encoding, type, frame id and image size are those of the configuration, and its limits"
         if heard.latest is None:
-            yield fail("decoding", heard.key, f"{name}: no sample makes a frame: {causes}", advice)
+            yield fail("decoding", heard.place, f"{name}: no sample makes a frame: {causes}", advice)
         else:
-            yield warn("decoding", heard.key, f"{name}: some samples make no frame: {causes}", advice)
+            yield warn("decoding", heard.place, f"{name}: some samples make no frame: {causes}", advice)
     if heard.stamps:
         yield _clock(name, heard)
 
@@ -91,12 +91,12 @@ def _rate(pair: PairConfig, name: str, heard: Heard, seconds: float) -> Finding:
         why = f"a check wants {monitor.pairs} pairs in {monitor.period_s:g} s, and needs {monitor.min_pairs}"
     advice = "a faster stream, or a longer monitor.period_s"
     if rate_hz < least_hz:
-        return fail("stream", heard.key, f"{text}: {why}", advice)
+        return fail("stream", heard.place, f"{text}: {why}", advice)
     if heard.rate_hz is None:
-        return warn("stream", heard.key, f"{text}: {why}", "listen for longer (--seconds)")
+        return warn("stream", heard.place, f"{text}: {why}", "listen for longer (--seconds)")
     if rate_hz < wanted_hz:
-        return warn("stream", heard.key, f"{text}: {why}", advice)
-    return ok("stream", heard.key, text)
+        return warn("stream", heard.place, f"{text}: {why}", advice)
+    return ok("stream", heard.place, text)
 
 
 def _clock(name: str, heard: Heard) -> Finding:
@@ -107,16 +107,16 @@ def _clock(name: str, heard: Heard) -> Finding:
     here_s = (heard.stamps[-1][1] - heard.stamps[0][1]) / NS_PER_S
     if back:
         advice = "see to the clock of the sensor: it is set back, or two of them send under one key"
-        return warn("stamps", heard.key, f"{name}: {back} stamps step back", advice)
+        return warn("stamps", heard.place, f"{name}: {back} stamps step back", advice)
     if abs(late_s) > OFF_S:
         side = "behind" if late_s > 0 else "ahead of"
         text = f"{name}: its stamps are {abs(late_s):.1f} s {side} the clock of this computer"
         advice = "synchronise the sensor's clock (PTP); the calibration goes on, dates of the history are those stamps"
-        return warn("stamps", heard.key, text, advice)
+        return warn("stamps", heard.place, text, advice)
     if here_s > 1.0 and abs(sensor_s / here_s - 1.0) > PACE:
         text = f"{name}: its time runs {sensor_s / here_s:.2f} times as fast as this computer's"
-        return warn("stamps", heard.key, text, "nothing, if this is a replay; else see to the sensor's clock")
-    return ok("stamps", heard.key, f"{name}: {1e3 * late_s:.0f} ms from stamp to arrival")
+        return warn("stamps", heard.place, text, "nothing, if this is a replay; else see to the sensor's clock")
+    return ok("stamps", heard.place, f"{name}: {1e3 * late_s:.0f} ms from stamp to arrival")
 
 
 def _nearest_ns(stamps_ns: Sequence[int], others_ns: Sequence[int]) -> list[int]:
@@ -162,7 +162,7 @@ def _with_motion(pair: PairConfig, camera: Sequence[tuple[int, int]], ego: Seque
 
 def _point_times(pair: PairConfig, cloud: LidarFrame, rate_hz: float | None) -> Finding:
     """When each point of a sweep was measured."""
-    key, times_s = pair.lidar.key, cloud.time_offset_s
+    key, times_s = pair.lidar.place, cloud.time_offset_s
     count = len(cloud.xyz_m)
     if count == 0:
         return fail("point_times", key, "the last sweep has no point", "see to the LiDAR")
@@ -181,7 +181,7 @@ def _point_times(pair: PairConfig, cloud: LidarFrame, rate_hz: float | None) -> 
 
 
 def _by_azimuth(pair: PairConfig, rate_hz: float | None) -> Finding:
-    key, sweep = pair.lidar.key, pair.lidar.sweep
+    key, sweep = pair.lidar.place, pair.lidar.sweep
     if sweep is None:
         if not pair.calibration.motion_compensation:
             return ok("point_times", key, "none, and none are needed: sweeps are not compensated")
@@ -195,7 +195,7 @@ def _by_azimuth(pair: PairConfig, rate_hz: float | None) -> Finding:
 
 def _image(pair: PairConfig, frame: CameraFrame, config: Config) -> Iterator[Finding]:
     """The picture itself, which the service looks into when a window is cut."""
-    key, window = pair.camera.key, pair.window
+    key, window = pair.camera.place, pair.window
     try:
         quality = Inspector(config.limits).inspect(frame)
     except DecodeError as error:

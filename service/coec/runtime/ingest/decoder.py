@@ -11,6 +11,7 @@ import numpy as np
 from coec.adapters.frames import msgpack_frames
 from coec.adapters.ros import incoming
 from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.frames.origin import OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import LimitsConfig, PairConfig
@@ -21,10 +22,15 @@ from coec.runtime.ingest.sequence_numbers import SequenceNumbers
 _log = logging.getLogger(__name__)
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 
 CLOUD_ORIGIN = "cloud_origin"
 """Cause of a loss: the points were not measured from where the configuration says."""
+
+WRONG_TYPE = "wrong_type"
+"""Cause of a loss: a message that makes no frame of the stream."""
+
+EXPLAINED = frozenset({CLOUD_ORIGIN, WRONG_TYPE})
+"""Causes that the log explains by the sentence of the error, which is ours."""
 
 NUMBERED = b"\xa8sequence"
 """How a native frame that has a number is told from what is no frame without decoding it: the name of the field, found
@@ -46,6 +52,7 @@ class Decoder:
 
     def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:
         self._pair = pair
+        self._streams = pair.streams
         self._limits = limits
         self._losses = losses
         self._numbers: defaultdict[str, SequenceNumbers] = defaultdict(SequenceNumbers)
@@ -62,7 +69,7 @@ class Decoder:
     def overrun(self, parcel: Parcel) -> None:
         """A sample went before it was decoded. Any thread."""
         self._losses.add(parcel.stream, "overrun")
-        if NUMBERED in parcel.payload:
+        if NUMBERED in parcel.sample.payload:
             self._overruns.append(parcel.stream)
 
     def frame(self, parcel: Parcel) -> Frame | None:
@@ -72,14 +79,14 @@ class Decoder:
         while self._overruns:
             self._numbers[self._overruns.popleft()].counted()
         try:
-            if len(parcel.payload) > self._limits.max_message_bytes:
+            if len(parcel.sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
-            frame = self._decode(parcel)
+            frame = self._decode(stream, parcel.sample)
             if frame.sequence is not None and (lost := self._numbers[stream].lost_by(frame.sequence)):
                 self._losses.add(stream, "sequence_gap", lost)
-            frame = self._checked(stream, frame)
+            frame = self._checked(frame)
         except DecodeError as error:
-            self._losses.add(stream, error.reason, detail=str(error) if error.reason == CLOUD_ORIGIN else "")
+            self._losses.add(stream, error.reason, detail=str(error) if error.reason in EXPLAINED else "")
             return None
         except Exception:
             # A fault of a decoder must cost the message, not the service.
@@ -89,33 +96,24 @@ class Decoder:
         self._accepted[stream] += 1
         return frame
 
-    def _decode(self, parcel: Parcel) -> Frame:
-        encoding, _, schema = parcel.encoding.partition(";")
-        if encoding not in ("application/msgpack", "application/cdr"):
-            encoding = f"application/{self._configured_encoding(parcel.stream)}"
-        if encoding == "application/cdr":
-            return incoming.decode(schema or self._configured_type(parcel.stream), parcel.payload, self._limits)
-        if parcel.stream == CAMERA:
-            return msgpack_frames.decode_camera(parcel.payload, self._limits)
-        if parcel.stream == LIDAR:
-            return msgpack_frames.decode_lidar(parcel.payload, self._limits)
-        return msgpack_frames.decode_ego(parcel.payload, self._limits)
-
-    def _configured_encoding(self, stream: str) -> str:
-        configured = {CAMERA: self._pair.camera, LIDAR: self._pair.lidar, EGO: self._pair.ego}[stream]
-        return configured.encoding if configured else "msgpack"
-
-    def _configured_type(self, stream: str) -> str:
+    def _decode(self, stream: str, sample: Sample) -> Frame:
+        configured = self._streams[stream]
+        encoding, _, schema = sample.encoding.partition(";")
+        if encoding not in ("application/msgpack", CDR):
+            encoding = f"application/{configured.encoding}"
+        if encoding == CDR:
+            type_name = schema or configured.assumed_type
+            if type_name not in configured.types:
+                expected = " or ".join(configured.types)
+                raise DecodeError(WRONG_TYPE, f"a message of another type on {configured.place}: expected {expected}")
+            return incoming.decode(type_name, sample.payload, self._limits)
         if stream == CAMERA:
-            return self._pair.camera.type
-        if stream == LIDAR or self._pair.ego is None:
-            return POINT_CLOUD
-        return self._pair.ego.type
+            return msgpack_frames.decode_camera(sample.payload, self._limits)
+        if stream == LIDAR:
+            return msgpack_frames.decode_lidar(sample.payload, self._limits)
+        return msgpack_frames.decode_ego(sample.payload, self._limits)
 
-    def _checked(self, stream: str, frame: Frame) -> Frame:
-        expected = {CAMERA: CameraFrame, LIDAR: LidarFrame, EGO: EgoMotion}[stream]
-        if not isinstance(frame, expected):
-            raise DecodeError("wrong_type", f"a {type(frame).__name__} on the {stream} stream")
+    def _checked(self, frame: Frame) -> Frame:
         if isinstance(frame, CameraFrame):
             self._check_camera(frame)
         elif isinstance(frame, LidarFrame):

@@ -9,15 +9,16 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from coec.adapters.zenoh.inputs import Sample
+
 
 @dataclass(frozen=True, slots=True)
 class Parcel:
-    """One sample as it came. `order` counts arrivals over all streams of the inbox; `encoding` is the sender's."""
+    """One sample as it came. `order` counts arrivals over all streams of the inbox."""
 
     order: int
     stream: str
-    payload: bytes
-    encoding: str
+    sample: Sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +46,11 @@ class _Waiting:
 
     def add(self, parcel: Parcel) -> None:
         self.parcels.append(parcel)
-        self.bytes += len(parcel.payload)
+        self.bytes += len(parcel.sample.payload)
 
     def take(self) -> Parcel:
         parcel = self.parcels.popleft()
-        self.bytes -= len(parcel.payload)
+        self.bytes -= len(parcel.sample.payload)
         return parcel
 
 
@@ -75,11 +76,11 @@ class Inbox:
         self._order = itertools.count()
         self._condition = threading.Condition()
 
-    def put(self, stream: str, payload: bytes, encoding: str) -> None:
+    def put(self, stream: str, sample: Sample) -> None:
         """A sample came."""
         with self._condition:
-            gone = self._make_room(stream, len(payload))
-            self._waiting[stream].add(Parcel(next(self._order), stream, payload, encoding))
+            gone = self._make_room(stream, len(sample.payload))
+            self._waiting[stream].add(Parcel(next(self._order), stream, sample))
             self._came_s[stream] = time.monotonic()
             self._condition.notify()
         for overrun in gone:

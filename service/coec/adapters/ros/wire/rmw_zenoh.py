@@ -25,10 +25,16 @@ HASHLESS: Final = "TypeHashNotSupported"
 CPU_BACKEND: Final = "/backends:cpu:"
 """Behind a subscriber's token: without it Lyrical sends messages with large arrays to a key of the token's own."""
 
+CPU_KEY: Final = "/_buf_cpu"
+"""Behind the key of a topic: there Lyrical's publishers put messages with large arrays for such subscribers."""
+
 MAX_TOKEN: Final = 1024
 """Characters of a token that is read; those of real nodes have some 200."""
 
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
+
+MAX_ATTACHMENT: Final = _ATTACHMENT.size
+"""Bytes; a longer one is none."""
 
 _TYPE: Final = re.compile(r"([A-Za-z][A-Za-z0-9_]{0,127})::(msg|srv|action)::dds_::([A-Za-z][A-Za-z0-9_]{0,127})_")
 
@@ -55,15 +61,17 @@ class TopicKey:
         Raises:
             UsageError: not the key of a topic.
         """
-        chunks = key.removesuffix("/_buf_cpu").split("/")
+        chunks = key.removesuffix(CPU_KEY).split("/")
         if len(chunks) < 4 or not chunks[0].isdecimal() or len(chunks[0]) > 3:
             raise UsageError("not the key of a topic of rmw_zenoh: expected domain/topic/type/hash")
         return cls(int(chunks[0]), "/" + "/".join(chunks[1:-2]), ros_type(chunks[-2]), chunks[-1])
 
 
-def topic_expression(domain: int, topic: str) -> str:
-    """A key expression that matches the topic in whatever type and of whatever release."""
-    return f"{domain}/{topic.strip('/')}/*/*/**"
+def topic_expressions(domain: int, topic: str) -> tuple[str, str]:
+    """Key expressions that match the topic in whatever type, and no other topic; the second one where Lyrical's
+    publishers put messages with large arrays."""
+    key = f"{domain}/{topic.strip('/')}/*/*"
+    return key, key + CPU_KEY
 
 
 def dds_type(type_name: str) -> str:
