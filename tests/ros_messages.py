@@ -13,6 +13,9 @@ SEC, NSEC = 1_700_000_000, 123_456_789
 STAMP = SEC * 10**9 + NSEC
 JPEG = encode_jpeg(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8))
 
+Columns = list[tuple[str, str, list[float]]]
+"""Of a cloud: name, NumPy type, values."""
+
 CODES = {"i1": 1, "u1": 2, "<i2": 3, "<u2": 4, "<i4": 5, "<u4": 6, "<f4": 7, "<f8": 8}
 """Of `sensor_msgs/PointField`, by NumPy type."""
 
@@ -50,9 +53,9 @@ def compressed(data: bytes = JPEG, form: str = "jpeg", **header: Any) -> bytes:
     return Packer().header(**({"frame_id": "camera"} | header)).text(form).octets(data).done()
 
 
-def image(encoding: str, width: int, height: int, step: int, data: bytes) -> bytes:
+def image(encoding: str, width: int, height: int, step: int, data: bytes, *, big: bool = False) -> bytes:
     packer = Packer().header("camera").put("I", height, width).text(encoding)
-    return packer.put("B", 0).put("I", step).octets(data).done()
+    return packer.put("B", big).put("I", step).octets(data).done()
 
 
 def cloud(
@@ -66,26 +69,29 @@ def cloud(
     big: bool = False,
     claimed: int | None = None,
     claimed_fields: int | None = None,
+    counts: int = 1,
+    sec: int = SEC,
+    nsec: int = NSEC,
 ) -> bytes:
-    packer = Packer().header("lidar").put("I", height, width)
+    packer = Packer().header("lidar", sec, nsec).put("I", height, width)
     packer.put("I", len(fields) if claimed_fields is None else claimed_fields)
     for name, offset, datatype in fields:
-        packer.text(name).put("I", offset).put("B", datatype).put("I", 1)
+        packer.text(name).put("I", offset).put("B", datatype).put("I", counts)
     packer.put("?", big).put("I", point_step, width * point_step if row_step is None else row_step)
     return packer.octets(data, claimed).put("?", False).done()
 
 
-def packed(columns: list[tuple[str, str, list[float]]], **options: Any) -> bytes:
+def packed(columns: Columns, *, big: bool = False, **options: Any) -> bytes:
     """A cloud of one row, without padding, its columns in the order given."""
     fields, formats, offset = [], [], 0
     for name, form, _ in columns:
         fields.append((name, offset, CODES[form]))
-        formats.append((name, form))
+        formats.append((name, form.replace("<", ">") if big else form))
         offset += np.dtype(form).itemsize
     rows = np.zeros(len(columns[0][2]), formats)
     for name, _, values in columns:
         rows[name] = values
-    return cloud(fields, rows.tobytes(), len(rows), offset, **options)
+    return cloud(fields, rows.tobytes(), len(rows), offset, big=big, **options)
 
 
 def twist(linear: tuple[float, ...] = (1.5, 0.0, -0.25), angular: tuple[float, ...] = (0.0, 0.5, 0.125)) -> bytes:
@@ -95,3 +101,26 @@ def twist(linear: tuple[float, ...] = (1.5, 0.0, -0.25), angular: tuple[float, .
 def odometry(child: str = "base_link") -> bytes:
     packer = Packer().header("odom").text(child).put("d", *range(7), *[0.0] * 36)
     return packer.put("d", 1.5, 0.0, -0.25, 0.0, 0.5, 0.125, *[0.0] * 36).done()
+
+
+def twist_with_covariance() -> bytes:
+    packer = Packer().header("base_link").put("d", 1.5, 0.0, -0.25, 0.0, 0.5, 0.125)
+    return packer.put("d", *[0.0] * 36).done()
+
+
+def imu(angular: tuple[float, ...] = (0.0, 0.5, 0.125), known: float = 0.0, frame_id: str = "imu_link") -> bytes:
+    packer = Packer().header(frame_id).put("d", 0.0, 0.0, 0.0, 1.0).put("d", *[0.0] * 9)
+    packer.put("d", *angular).put("d", known, *[0.0] * 8)
+    return packer.put("d", 0.0, 0.0, 9.81).put("d", *[0.0] * 9).done()
+
+
+Pose = tuple[float, float, float, float, float, float, float]
+"""x y z, quaternion x y z w."""
+
+
+def transforms(*joints: tuple[str, str, int, Pose], claimed: int | None = None) -> bytes:
+    """A `TFMessage`: parent, child, stamp in ns, pose of the child in the parent."""
+    packer = Packer().put("I", len(joints) if claimed is None else claimed)
+    for parent, child, stamp_ns, pose in joints:
+        packer.header(parent, *divmod(stamp_ns, 10**9)).text(child).put("d", *pose)
+    return packer.done()

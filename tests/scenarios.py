@@ -319,6 +319,7 @@ def images_of_other_frames(window: Window, rng: np.random.Generator) -> Window:
 
 
 def _moving(motion: EgoMotion, factor: float) -> EgoMotion:
+    assert motion.linear_mps is not None
     x, y, z = motion.linear_mps
     p, q, r = motion.angular_radps
     return replace(

@@ -98,6 +98,20 @@ class SweepConfig(Stage):
     stamp_azimuth_deg: float = Field(default=0.0, ge=-360, le=360, description="azimuth that is measured at the stamp")
 
 
+TimeUnit = Literal["s", "ms", "us", "ns"]
+TimeBase = Literal["stamp", "clock"]
+
+
+class PointTimeConfig(Stage):
+    """How the points of a `PointCloud2` are timed, where their values leave it open."""
+
+    field: str = Field(min_length=1, max_length=64, description="name of the field")
+    unit: TimeUnit
+    base: TimeBase = Field(
+        default="stamp", description="counted since the cloud's stamp, or on the clock that its stamp is of"
+    )
+
+
 Encoding = Literal["msgpack", "cdr"]
 
 TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$", max_length=247)]
@@ -105,7 +119,13 @@ TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$", max_le
 
 CameraMessage = Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"]
 LidarMessage = Literal["sensor_msgs/msg/PointCloud2"]
-EgoMessage = Literal["nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped"]
+EgoMessage = Literal[
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/TwistStamped",
+    "geometry_msgs/msg/TwistWithCovarianceStamped",
+    "sensor_msgs/msg/Imu",
+    "tf2_msgs/msg/TFMessage",
+]
 
 
 class StreamConfig(Stage):
@@ -178,6 +198,9 @@ class LidarConfig(StreamConfig):
         default=None, max_length=128, description="of the clouds as they come, where it is not that of the LiDAR"
     )
     sweep: SweepConfig | None = Field(default=None, description="needed for clouds without per-point time")
+    time: PointTimeConfig | None = Field(
+        default=None, description="of clouds of ROS; unless set it is recognised from the values"
+    )
 
     @property
     def assumed_type(self) -> LidarMessage:
@@ -198,6 +221,12 @@ class EgoConfig(StreamConfig):
         description="of CDR that does not say its own; Odometry unless set. What comes on a topic must have it, if set",
     )
     T_lidar_ego: Matrix4x4 = Field(default=IDENTITY, description="maps ego-frame to LiDAR coordinates")
+    parent: str = Field(
+        default="odom", min_length=1, max_length=128, description="frame in which the vehicle moves (TFMessage)"
+    )
+    child: str = Field(
+        default="base_link", min_length=1, max_length=128, description="frame of the vehicle (TFMessage)"
+    )
 
     @property
     def assumed_type(self) -> EgoMessage:

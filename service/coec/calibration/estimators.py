@@ -114,7 +114,7 @@ def _masked(sight: Sight) -> Sight:
     moving = (
         grey
         for grey, pair in zip(sight.greys(), sight.window.pairs, strict=True)
-        if pair.motion is None or pair.motion.speed_mps >= MIN_SPEED_MPS
+        if pair.motion is None or not pair.motion.stays_below(MIN_SPEED_MPS)
     )
     rig = sight.window.rig
     try:

@@ -23,18 +23,31 @@ Matrix4 = NDArray[np.float64]
 
 
 class ImageFormat(StrEnum):
-    """How the bytes of an image are laid out. `mono16` is used for depth maps only."""
+    """How the bytes of an image are laid out. Raw ones are named as in sensor_msgs/image_encodings.hpp."""
 
     JPEG = "jpeg"
     PNG = "png"
     MONO8 = "mono8"
+    MONO16 = "mono16"
     RGB8 = "rgb8"
     BGR8 = "bgr8"
+    RGBA8 = "rgba8"
+    BGRA8 = "bgra8"
+    BAYER_RGGB8 = "bayer_rggb8"
+    BAYER_BGGR8 = "bayer_bggr8"
+    BAYER_GBRG8 = "bayer_gbrg8"
+    BAYER_GRBG8 = "bayer_grbg8"
+    BAYER_RGGB16 = "bayer_rggb16"
+    BAYER_BGGR16 = "bayer_bggr16"
+    BAYER_GBRG16 = "bayer_gbrg16"
+    BAYER_GRBG16 = "bayer_grbg16"
+    YUV422 = "yuv422"
+    YUV422_YUY2 = "yuv422_yuy2"
 
 
 @dataclass(frozen=True, slots=True)
 class EncodedImage:
-    """An image as it came: compressed, or rows of raw pixels without padding.
+    """An image as it came: compressed, or rows of raw pixels without padding, 16-bit values little-endian.
 
     `width` and `height` are in pixels, read from the header when compressed, checked against limits before any decode.
     """
@@ -86,6 +99,7 @@ class LidarFrame:
         intensity: (N,) float32 or None.
         ring: (N,) uint16 or None.
         time_offset_s: (N,) float32 or None: when each point was measured, relative to `stamp_ns`.
+        timed_by: in a line for people, how the times were read of a message that leaves it open; empty otherwise.
     """
 
     stamp_ns: int
@@ -95,29 +109,44 @@ class LidarFrame:
     ring: NDArray[np.uint16] | None = None
     time_offset_s: NDArray[np.float32] | None = None
     sequence: int | None = None
+    timed_by: str = ""
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)
 class EgoMotion:
-    """Velocity of the vehicle at `stamp_ns`, expressed in the ego frame `frame_id` (x forward, y left, z up)."""
+    """Velocity of the vehicle at `stamp_ns`, expressed in the ego frame `frame_id` (x forward, y left, z up).
+
+    `linear_mps` is None where the sensor tells rotation only, as an IMU does: nothing stands in for it.
+    """
 
     stamp_ns: int
     frame_id: str
-    linear_mps: tuple[float, float, float]
+    linear_mps: tuple[float, float, float] | None
     angular_radps: tuple[float, float, float]
     sequence: int | None = None
 
     @property
-    def speed_mps(self) -> float:
-        """Magnitude of the linear velocity in metres per second."""
+    def speed_mps(self) -> float | None:
+        """Magnitude of the linear velocity in metres per second; None where that is not known."""
+        if self.linear_mps is None:
+            return None
         x, y, z = self.linear_mps
         return float(np.sqrt(x * x + y * y + z * z))
+
+    def reaches(self, speed_mps: float) -> bool:
+        """Whether the vehicle is known to be at least so fast."""
+        return self.speed_mps is not None and self.speed_mps >= speed_mps
+
+    def stays_below(self, speed_mps: float) -> bool:
+        """Whether the vehicle is known to be slower."""
+        return self.speed_mps is not None and self.speed_mps < speed_mps
 
 
 class Compensation(StrEnum):
     """What motion compensation did to a pair, and if nothing, why."""
 
     DONE = "done"
+    ROTATION_ONLY = "rotation_only"
     NO_EGO_MOTION = "no_ego_motion"
     NO_POINT_TIME = "no_point_time"
     DISABLED = "disabled"

@@ -5,7 +5,7 @@ Stamps of all frames are known without loading them; of the frames themselves a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -68,8 +68,8 @@ class Fitness:
         points, rings: of a sweep, medians; no rings: 0.
         range_m: (near, far) within which nine of ten points lie.
         point_time: whether points carry their own time, or the rig knows the sweep's.
-        speed_mps, turn_degps: (median, most) of the vehicle; None without ego-motion.
-        standing: share of the pairs that were taken while the vehicle stood; None without ego-motion.
+        speed_mps, turn_degps: (median, most) of the vehicle; None where the ego-motion does not tell.
+        standing: share of the pairs that were taken while the vehicle stood; None where that is not known.
         paired: share of the frames looked at that found a sweep.
         sync_ms: (median, most) of camera stamp minus sweep stamp, milliseconds.
         in_view: share of a sweep's points that the nominal extrinsic puts into the image, median.
@@ -119,7 +119,7 @@ def fitness_of(recording: Recording) -> Fitness:
         pairs += pairer.push(message)
     pairs += pairer.flush()
     rig = recording.rig
-    moving = [pair.motion.speed_mps for pair in pairs if pair.motion is not None]
+    moving = _known(pair.motion.speed_mps for pair in pairs if pair.motion is not None)
     standing = None if not moving else float(np.mean(np.array(moving) < WindowConfig().min_speed_mps))
     sync_ms = np.array([(pair.camera.stamp_ns - pair.lidar.stamp_ns) / 1e6 for pair in pairs])
     ranges_m = np.concatenate([lengths(sweep.xyz_m) for sweep in sweeps] or [np.zeros(1, np.float32)])
@@ -135,7 +135,7 @@ def fitness_of(recording: Recording) -> Fitness:
         rings=_median([0 if sweep.ring is None else len(np.unique(sweep.ring)) for sweep in sweeps]),
         range_m=(near, far),
         point_time=rig.sweep is not None or any(sweep.time_offset_s is not None for sweep in sweeps),
-        speed_mps=_spread([motion.speed_mps for motion in motions]),
+        speed_mps=_spread(_known(motion.speed_mps for motion in motions)),
         turn_degps=_spread([float(np.degrees(np.linalg.norm(motion.angular_radps))) for motion in motions]),
         standing=standing,
         paired=len(pairs) / len(chosen) if chosen else 0.0,
@@ -203,6 +203,9 @@ def _view(seen: Fitness) -> Remark | None:
 def _motion(seen: Fitness) -> Remark | None:
     if seen.motion is None:
         return Remark("warn", "no_ego_motion", "No ego-motion: sweeps taken while driving cannot be compensated.")
+    if seen.speed_mps is None:
+        text = "Ego-motion is rotation only: sweeps are turned back, not shifted; drive slowly, or add an odometry."
+        return Remark("warn", "rotation_only", text)
     if not seen.point_time and seen.speed_mps is not None and seen.speed_mps[1] > SMEARING_MPS:
         text = "Points have no time and the rig no sweep timing: sweeps taken while driving cannot be compensated."
         return Remark("warn", "no_point_time", text)
@@ -233,6 +236,11 @@ def _gaps(seen: Fitness) -> Remark | None:
 
 def _median(counts: Sequence[int]) -> int:
     return int(np.median(counts)) if counts else 0
+
+
+def _known(values: Iterable[float | None]) -> list[float]:
+    """Those that are."""
+    return [value for value in values if value is not None]
 
 
 def _spread(values: Sequence[float]) -> tuple[float, float] | None:

@@ -32,8 +32,27 @@ class Image(Part):
 
     model_config = STRICT
 
-    format: Literal["jpeg", "png", "mono8", "rgb8", "bgr8"] = Field(description="layout of `data`")
-    data: bytes = Field(min_length=1, description="the compressed file, or height × width × channels bytes")
+    format: Literal[
+        "jpeg",
+        "png",
+        "mono8",
+        "mono16",
+        "rgb8",
+        "bgr8",
+        "rgba8",
+        "bgra8",
+        "bayer_rggb8",
+        "bayer_bggr8",
+        "bayer_gbrg8",
+        "bayer_grbg8",
+        "bayer_rggb16",
+        "bayer_bggr16",
+        "bayer_gbrg16",
+        "bayer_grbg16",
+        "yuv422",
+        "yuv422_yuy2",
+    ] = Field(description="layout of `data`; raw ones as sensor_msgs names them, 16 bits little-endian")
+    data: bytes = Field(min_length=1, description="the compressed file, or height × width × bytes of a pixel")
     width: int | None = Field(default=None, ge=1, description="px; required for raw pixels, else read from `data`")
     height: int | None = Field(default=None, ge=1, description="px; required for raw pixels, else read from `data`")
 
@@ -83,5 +102,5 @@ class EgoMotion(Message):
     stamp_ns: StampNs
     frame_id: FrameId
     sequence: Sequence = None
-    linear_mps: Vector3 = Field(description="x y z, m/s")
+    linear_mps: Vector3 | None = Field(description="x y z, m/s; null: not known, as of an IMU")
     angular_radps: Vector3 = Field(description="about x y z, rad/s")

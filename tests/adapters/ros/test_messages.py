@@ -14,24 +14,41 @@ from mcap_ros2.decoder import DecoderFactory
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import encode_depth_png, probe
 from coec.adapters.ros import incoming, messages, outgoing
+from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, build
-from ros_messages import JPEG, NSEC, SEC, STAMP, cloud, compressed, image, odometry, packed, twist
+from ros_messages import (
+    JPEG,
+    NSEC,
+    SEC,
+    STAMP,
+    Columns,
+    cloud,
+    compressed,
+    image,
+    imu,
+    odometry,
+    packed,
+    twist,
+    twist_with_covariance,
+)
 
 LIMITS = LimitsConfig()
 NAN = math.nan
 
 
-XYZ: list[tuple[str, str, list[float]]] = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
+XYZ: Columns = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
 REASONS_OR_NONE = {None, *Refusal}
 MESSAGES = [
     (messages.COMPRESSED_IMAGE, compressed()),
     (messages.IMAGE, image("rgb8", 2, 2, 8, bytes(16))),
-    (messages.POINT_CLOUD, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 9])])),
+    (messages.POINT_CLOUD, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 99_000_000])])),
     (messages.ODOMETRY, odometry()),
     (messages.TWIST, twist()),
+    (messages.TWIST_WITH_COVARIANCE, twist_with_covariance()),
+    (messages.IMU, imu()),
 ]
 
 
@@ -79,7 +96,10 @@ def test_the_padding_of_rows_is_removed() -> None:
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (image("bayer_rggb8", 2, 2, 2, bytes(4)), "image_unknown_format"),
+        (image("32FC1", 2, 2, 8, bytes(16)), "image_unknown_format"),
+        (image("yuv422", 3, 2, 6, bytes(12)), "image_size_mismatch"),
+        (image("bayer_rggb8", 2, 2, 2, bytes(4)), "image_size_mismatch"),
+        (image("mono16", 4, 2, 4, bytes(16)), "image_size_mismatch"),
         (image("jpeg", 2, 2, 2, bytes(4)), "image_unknown_format"),
         (image("mono8", 4, 2, 3, bytes(8)), "image_size_mismatch"),
         (image("mono8", 4, 2, 4, bytes(7)), "image_size_mismatch"),
@@ -138,39 +158,6 @@ def test_ring_of_any_unsigned_type(name: str, form: str) -> None:
     assert frame.ring.tolist() == [7, 63]
 
 
-@pytest.mark.parametrize(
-    ("name", "form", "values"),
-    [
-        ("t", "<u4", [0, 99_000_000]),  # Ouster
-        ("offset_time", "<u4", [0, 99_000_000]),
-        ("time", "<f4", [0.0, 0.099]),  # Velodyne
-        ("time_offset", "<f8", [0.0, 0.099]),
-        ("timestamp", "<f8", [SEC + NSEC * 1e-9, SEC + NSEC * 1e-9 + 0.099]),  # Hesai
-        ("timestamp", "<f8", [float(STAMP), float(STAMP + 99_000_000)]),  # Livox
-    ],
-)
-def test_time_of_every_known_driver(name: str, form: str, values: list[float]) -> None:
-    frame = sweep(packed([*XYZ, (name, form, values)]))
-
-    assert frame.time_offset_s is not None
-    assert frame.time_offset_s.dtype == np.float32
-    assert frame.time_offset_s.tolist() == pytest.approx([0.0, 0.099], abs=1e-6)
-
-
-def test_a_time_before_the_stamp() -> None:
-    frame = sweep(packed([*XYZ, ("timestamp", "<f8", [SEC + NSEC * 1e-9 - 0.05, SEC + NSEC * 1e-9 + 0.05])]))
-
-    assert frame.time_offset_s is not None
-    assert frame.time_offset_s.tolist() == pytest.approx([-0.05, 0.05], abs=1e-6)
-
-
-@pytest.mark.fault("points timed by another clock than their sweep", "the sweep is refused with its reason")
-def test_a_time_of_another_clock_is_refused() -> None:
-    payload = packed([*XYZ, ("timestamp", "<f8", [SEC - 3600.0, SEC - 3599.9])])
-
-    assert reason_of(messages.POINT_CLOUD, payload) == "cloud_time"
-
-
 def test_points_that_are_none_go_with_their_row_whatever_their_other_columns_hold() -> None:
     payload = packed(
         [
@@ -198,7 +185,6 @@ MAX = 2**32 - 1
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (packed(XYZ, big=True), "cloud_big_endian"),
         (packed([("x", "<f4", [NAN]), ("y", "<f4", [0]), ("z", "<f4", [0])]), "cloud_empty"),
         (cloud(SHORT, b"", 0, 12), "cloud_empty"),
         (cloud(SHORT, b"", 5, 12, height=0), "cloud_empty"),
@@ -207,6 +193,9 @@ MAX = 2**32 - 1
         (packed([*XYZ, ("ring", "<u4", [1, 70_000])]), "cloud_fields"),
         (cloud([*SHORT, ("q", 0, 99)], bytes(12), 1, 12), ""),
         (cloud([("x", 9, 7), *SHORT[1:]], bytes(12), 1, 12), "cloud_shape"),
+        (cloud([("x", 4, 7), ("y", 8, 7), ("z", 12, 7)], bytes(12), 1, 12), "cloud_shape"),
+        (cloud(SHORT, bytes(36), 1, 36, counts=3), "cloud_fields"),
+        (cloud([*SHORT, ("n" * 300, 0, 99)], bytes(12), 1, 12), "cloud_fields"),
         (cloud([("x", MAX, 7), *SHORT[1:]], bytes(12), 1, 12), "cloud_shape"),
         (cloud(SHORT, bytes(24), 2, 0), "cloud_shape"),
         (cloud(SHORT, bytes(24), 3, 12), "cloud_shape"),
@@ -237,6 +226,7 @@ def test_a_wrong_cloud_is_refused_by_reason(payload: bytes, reason: str) -> None
         (messages.ODOMETRY, odometry(), "base_link"),  # the twist is expressed in the child frame
         (messages.ODOMETRY, odometry(""), "odom"),
         (messages.TWIST, twist(), "base_link"),
+        (messages.TWIST_WITH_COVARIANCE, twist_with_covariance(), "base_link"),
     ],
 )
 def test_ego_motion(type_name: str, payload: bytes, frame_id: str) -> None:
@@ -245,9 +235,23 @@ def test_ego_motion(type_name: str, payload: bytes, frame_id: str) -> None:
     assert incoming.decode(type_name, payload, LIMITS) == motion
 
 
+def test_an_imu_tells_rotation_only() -> None:
+    assert incoming.decode(messages.IMU, imu(), LIMITS) == EgoMotion(STAMP, "imu_link", None, (0.0, 0.5, 0.125))
+
+
+def test_an_imu_that_has_no_turn_rates_says_so_and_is_refused() -> None:
+    assert reason_of(messages.IMU, imu(known=-1.0)) == "motion_invalid"
+
+
 @pytest.mark.parametrize("value", [NAN, math.inf, -1e30])
 def test_a_velocity_that_is_none_is_refused(value: float) -> None:
     assert reason_of(messages.TWIST, twist(angular=(0.0, value, 0.0))) == "motion_invalid"
+    assert reason_of(messages.IMU, imu(angular=(0.0, value, 0.0))) == "motion_invalid"
+
+
+def test_a_message_of_motion_with_a_name_of_a_megabyte_is_not_even_looked_at() -> None:
+    assert reason_of(messages.IMU, imu(frame_id="x" * 2**20)) == "message_too_large"
+    assert reason_of(messages.ODOMETRY, odometry("x" * 2**20)) == "message_too_large"
 
 
 # --- headers and hostility ----------------------------------------------------------------------------------
@@ -267,6 +271,19 @@ def test_a_wrong_header_is_refused_by_reason(header: dict[str, Any], reason: str
 
 def test_a_type_that_is_not_read_is_refused() -> None:
     assert reason_of("std_msgs/msg/String", b"\0\1\0\0") == "message_type"
+
+
+@pytest.mark.parametrize(
+    ("type_name", "advice"),
+    [
+        ("livox_ros_driver2/msg/CustomMsg", "xfer_format"),
+        ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "JPEG"),
+        ("velodyne_msgs/msg/VelodyneScan", "PointCloud2"),
+    ],
+)
+def test_a_type_that_people_take_for_the_right_one_is_refused_with_what_to_do(type_name: str, advice: str) -> None:
+    with pytest.raises(DecodeError, match=advice):
+        incoming.decode(type_name, b"\0\1\0\0", LIMITS)
 
 
 def test_a_message_beyond_the_limit_is_not_even_looked_at() -> None:
@@ -403,8 +420,9 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
     xyz_m = rng.normal(size=(500, 3)).astype(np.float32)
     frame = LidarFrame(STAMP, "lidar", xyz_m, **{name: columns[name] for name in names})
 
-    back = sweep(outgoing.encode_cloud(frame))
+    back = incoming.decode(messages.POINT_CLOUD, outgoing.encode_cloud(frame), LIMITS, WRITTEN_TIME)
 
+    assert isinstance(back, LidarFrame)
     assert (back.stamp_ns, back.frame_id) == (STAMP, "lidar")
     assert back.xyz_m.tobytes() == xyz_m.tobytes()
     for name, values in columns.items():
@@ -415,10 +433,23 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
 def test_an_odometry_there_and_back() -> None:
     motion = EgoMotion(STAMP, "base_link", (1 / 3, 0.0, -2.0), (1e-9, 0.5, 3.0))
 
-    payload = outgoing.encode_odometry(motion, "base_link")
+    type_name, payload = outgoing.encode_motion(motion)
 
+    assert type_name == messages.ODOMETRY
     assert incoming.decode(messages.ODOMETRY, payload, LIMITS) == motion
     assert read_by_others(messages.ODOMETRY, payload).child_frame_id == "base_link"
+
+
+def test_a_rotation_there_and_back() -> None:
+    motion = EgoMotion(STAMP, "imu_link", None, (1e-9, 0.5, -3.0))
+
+    type_name, payload = outgoing.encode_motion(motion)
+
+    assert type_name == messages.IMU
+    assert incoming.decode(type_name, payload, LIMITS) == motion
+    read = read_by_others(type_name, payload)
+    assert (read.orientation_covariance[0], read.linear_acceleration_covariance[0]) == (-1, -1)
+    assert read.angular_velocity_covariance[0] == 0
 
 
 @pytest.mark.parametrize("model", CAMERAS)

@@ -68,6 +68,18 @@ def test_the_lever_arm_turns_rotation_into_velocity(street: Window) -> None:
     np.testing.assert_allclose(moved, [0.0, 0.02, 0.0], atol=2e-4)
 
 
+def test_where_only_the_turn_is_known_points_are_turned_about_the_lidar_and_not_shifted(street: Window) -> None:
+    """Whatever the lever arm: nobody knows how fast the LiDAR moved."""
+    mounted = replace(street.rig, T_lidar_ego=se3.transform_from(np.eye(3), np.array([0.0, -3.0, 1.0])))
+    lidar = replace(
+        street.pairs[0].lidar, stamp_ns=0, xyz_m=np.array([[10.0, 0.0, 0.0]], np.float32),
+        time_offset_s=np.array([0.1], np.float32), intensity=None, ring=None,
+    )  # fmt: skip
+    motion = EgoMotion(0, "imu", None, (0.0, 0.0, 0.5))
+    moved = compensate(FramePair(replace(street.pairs[0].camera, stamp_ns=0), lidar, motion), mounted, enabled=True)
+    np.testing.assert_allclose(moved, [[10 * np.cos(0.05), 10 * np.sin(0.05), 0.0]], atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("azimuth_deg", "offset_s"), [(0, 0.0), (90, -0.025), (-90, 0.025), (179, -0.0497), (-179, 0.0497)]
 )
@@ -86,6 +98,7 @@ def test_each_reason_for_not_compensating_is_told(street: Window) -> None:
         (replace(pair, motion=None), True, Compensation.NO_EGO_MOTION),
         (replace(pair, lidar=timeless), True, Compensation.NO_POINT_TIME),
         (pair, False, Compensation.DISABLED),
+        (replace(pair, motion=EgoMotion(0, "imu", None, (0.0, 0.0, 0.1))), True, Compensation.ROTATION_ONLY),
     ]
     rig = replace(street.rig, sweep=None)
     for given, enabled, expected in cases:

@@ -82,8 +82,16 @@ def test_the_interleaving_of_the_streams_does_not_matter(order: tuple[int, ...])
 def test_motion_is_interpolated_between_its_neighbours() -> None:
     pairs, _ = run([motion(0, 1.0), motion(100, 3.0), sweep(25), camera(25)], expects_motion=True)
     assert pairs[0].motion is not None
-    assert pairs[0].motion.linear_mps[0] == pytest.approx(1.5)
+    assert pairs[0].motion.linear_mps == pytest.approx((1.5, 0.0, 0.0))
     assert pairs[0].motion.stamp_ns == pairs[0].stamp_ns
+
+
+def test_a_velocity_that_one_of_two_samples_does_not_tell_is_not_known_between_them() -> None:
+    turning = EgoMotion(START, "ego", None, (0.0, 0.0, 0.2))
+    pairs, _ = run([turning, motion(100, 3.0), sweep(25), camera(25)], expects_motion=True)
+    assert pairs[0].motion is not None
+    assert pairs[0].motion.linear_mps is None
+    assert pairs[0].motion.angular_radps == pytest.approx((0.0, 0.0, 0.15))
 
 
 def test_motion_with_the_stamp_of_the_camera_is_taken_as_it_is() -> None:

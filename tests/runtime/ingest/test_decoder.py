@@ -74,7 +74,7 @@ def test_the_samples_encoding_is_believed(desk: Desk) -> None:
     assert desk.take(CAMERA, image, f"{CDR};{type_name}") == camera()
     assert desk.take(CAMERA, image, CDR) == camera(), "the type of the configuration"
     assert isinstance(desk.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK), LidarFrame)
-    assert isinstance(desk.take(EGO, outgoing.encode_odometry(MOTION, "base"), CDR), EgoMotion)
+    assert isinstance(desk.take(EGO, outgoing.encode_motion(MOTION)[1], CDR), EgoMotion)
     assert not desk.losses.snapshot()
 
 

@@ -42,8 +42,8 @@ class Refusal(StrEnum):
     CLOUD_TOO_LARGE = "cloud_too_large"
     CLOUD_SHAPE = "cloud_shape"
     CLOUD_FIELDS = "cloud_fields"
-    CLOUD_BIG_ENDIAN = "cloud_big_endian"
     CLOUD_TIME = "cloud_time"
+    CLOUD_TIME_AMBIGUOUS = "cloud_time_ambiguous"
     MOTION_INVALID = "motion_invalid"
 
 
@@ -80,12 +80,14 @@ def lidar_frame(
     ring: NDArray[np.uint16] | None,
     time_offset_s: NDArray[np.float32] | None,
     sequence: int | None = None,
+    timed_by: str = "",
 ) -> LidarFrame:
     """A sweep without its non-finite points; every column loses the same rows. Copies only when there is one.
 
     Args:
         xyz_m: (N, 3).
         intensity, ring, time_offset_s: (N,) each, or None.
+        timed_by: see `LidarFrame`.
 
     Raises:
         DecodeError: `cloud_empty` when no finite point is left, `cloud_time` when a point is too far from the
@@ -112,4 +114,5 @@ def lidar_frame(
         ring=ring,
         time_offset_s=time_offset_s,
         sequence=sequence,
+        timed_by=timed_by,
     )

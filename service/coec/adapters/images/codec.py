@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.headers import check_body, read_header
+from coec.adapters.images.raw import BYTES_PER_PIXEL, MOSAICS, SUBSAMPLED, bgr_of, eight_bits, grey_of
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat, ImageQuality
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
 
-CHANNELS: dict[ImageFormat, int] = {ImageFormat.MONO8: 1, ImageFormat.RGB8: 3, ImageFormat.BGR8: 3}
-"""Channels of the raw formats, one byte each."""
+_MOSAIC_PX = 4
+"""A side of a mosaic has two pixels of each colour at least, for the others to lie between."""
 
 _REDUCE_FROM_PX = 64
 """Smaller images are judged at full size: half of them would leave too few gradients for a mean."""
@@ -44,13 +45,15 @@ def probe(data: bytes, limits: LimitsConfig) -> EncodedImage:
 
 
 def raw_image(form: ImageFormat, width: int, height: int, data: bytes, limits: LimitsConfig) -> EncodedImage:
-    """Rows of raw pixels without padding, `height × width × channels` bytes.
+    """Rows of raw pixels without padding, `height × width × BYTES_PER_PIXEL` bytes.
 
     Raises:
         DecodeError: `image_too_large` or `image_size_mismatch`.
     """
     _check_size(width, height, limits)
-    expected = width * height * CHANNELS[form]
+    if (form in SUBSAMPLED and width % 2) or (form in MOSAICS and min(width, height) < _MOSAIC_PX):
+        raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, f"{form} pixels come in pairs, not as {width}×{height}")
+    expected = width * height * BYTES_PER_PIXEL[form]
     if len(data) != expected:
         raise DecodeError(
             Refusal.IMAGE_SIZE_MISMATCH,
@@ -79,13 +82,10 @@ def decode_bgr(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
     Raises:
         DecodeError: the reasons of `probe` and `raw_image`.
     """
-    if image.format not in CHANNELS:
-        pixels = _imdecode(image, cv2.IMREAD_COLOR, limits)
-        return _expect(pixels, (image.height, image.width, 3))
-    pixels = _raw(image, limits)
-    if image.format is ImageFormat.MONO8:
-        return np.repeat(pixels, 3, axis=2)
-    return pixels[:, :, ::-1] if image.format is ImageFormat.RGB8 else pixels
+    if image.format in BYTES_PER_PIXEL:
+        return bgr_of(_checked(image, limits))
+    pixels = eight_bits(_imdecode(image, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH, limits))
+    return _expect(pixels, (image.height, image.width, 3))
 
 
 def decode_grey(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
@@ -94,14 +94,10 @@ def decode_grey(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
     Raises:
         DecodeError: the reasons of `probe` and `raw_image`.
     """
-    if image.format not in CHANNELS:
-        return _expect(_imdecode(image, cv2.IMREAD_GRAYSCALE, limits), (image.height, image.width))
-    pixels = _raw(image, limits)
-    if image.format is ImageFormat.MONO8:
-        # A copy, as a decoder's output may be written to: kernels are compiled once more for what may not.
-        return pixels[:, :, 0].copy()
-    code = cv2.COLOR_RGB2GRAY if image.format is ImageFormat.RGB8 else cv2.COLOR_BGR2GRAY
-    return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
+    if image.format in BYTES_PER_PIXEL:
+        return grey_of(_checked(image, limits))
+    pixels = eight_bits(_imdecode(image, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH, limits))
+    return _expect(pixels, (image.height, image.width))
 
 
 def decode_grey_reduced(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
@@ -112,7 +108,7 @@ def decode_grey_reduced(image: EncodedImage, limits: LimitsConfig) -> NDArray[np
     """
     if min(image.width, image.height) < _REDUCE_FROM_PX:
         return decode_grey(image, limits)
-    if image.format not in CHANNELS:
+    if image.format is ImageFormat.JPEG:
         return _imdecode(image, cv2.IMREAD_REDUCED_GRAYSCALE_2, limits)
     size = ((image.width + 1) // 2, (image.height + 1) // 2)
     return np.asarray(cv2.resize(decode_grey(image, limits), size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
@@ -177,9 +173,8 @@ def _expect(pixels: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uin
     return pixels
 
 
-def _raw(image: EncodedImage, limits: LimitsConfig) -> NDArray[np.uint8]:
-    checked = raw_image(image.format, image.width, image.height, image.data, limits)
-    return np.frombuffer(checked.data, np.uint8).reshape(image.height, image.width, CHANNELS[image.format])
+def _checked(image: EncodedImage, limits: LimitsConfig) -> EncodedImage:
+    return raw_image(image.format, image.width, image.height, image.data, limits)
 
 
 # --- quality ------------------------------------------------------------------------------------------------

@@ -98,7 +98,8 @@ def _messages(rig: Rig, frame: Frame) -> list[tuple[str, str, bytes]]:
         case LidarFrame():
             return [(f"/{rig.pair}/lidar/points", messages.POINT_CLOUD, outgoing.encode_cloud(_timed(rig, frame)))]
         case EgoMotion():
-            return [(f"/{rig.pair}/odometry", messages.ODOMETRY, outgoing.encode_odometry(frame, frame.frame_id))]
+            type_name, data = outgoing.encode_motion(frame)
+            return [(f"/{rig.pair}/{'imu' if type_name == messages.IMU else 'odometry'}", type_name, data)]
 
 
 def _timed(rig: Rig, sweep: LidarFrame) -> LidarFrame:

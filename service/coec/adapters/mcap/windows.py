@@ -43,6 +43,7 @@ from coec.adapters.mcap.files import (
     read_records,
 )
 from coec.adapters.ros import incoming, messages, outgoing
+from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
@@ -60,7 +61,8 @@ REWRITE_SUFFIX = ".tmp"
 RIG, CONFIGURATION, MASK, RESULT = "rig.json", "configuration.json", "mask.png", "result.json"
 
 IMAGE, COMPRESSED, DEPTH = "camera/image", "camera/image/compressed", "camera/depth/compressed"
-POINTS, CAMERA_INFO, ODOMETRY, RESULT_TOPIC = "lidar/points", "camera/camera_info", "odometry", "result"
+POINTS, CAMERA_INFO, RESULT_TOPIC = "lidar/points", "camera/camera_info", "result"
+ODOMETRY, IMU = "odometry", "imu"
 """Topics below `/coec/<pair>/`."""
 
 TF_STATIC, DIAGNOSTICS = "/tf_static", "/diagnostics"
@@ -265,8 +267,13 @@ class WindowWriter:
             self._cdr(TF_STATIC, messages.TF, stamp_ns, outgoing.encode_tf_static(self._rig, self._T_start, stamp_ns))
         self._cdr(self._topic(POINTS), messages.POINT_CLOUD, pair.lidar.stamp_ns, outgoing.encode_cloud(pair.lidar))
         if pair.motion is not None:
-            odometry = outgoing.encode_odometry(pair.motion, pair.motion.frame_id)
-            self._cdr(self._topic(ODOMETRY), messages.ODOMETRY, pair.motion.stamp_ns, odometry)
+            motion_type, motion = outgoing.encode_motion(pair.motion)
+            self._cdr(
+                self._topic(IMU if motion_type == messages.IMU else ODOMETRY),
+                motion_type,
+                pair.motion.stamp_ns,
+                motion,
+            )
         if pair.camera.depth is not None:
             depth = outgoing.encode_depth(stamp_ns, pair.camera.frame_id, pair.camera.depth)
             self._cdr(self._topic(DEPTH), messages.COMPRESSED_IMAGE, stamp_ns, depth)
@@ -478,7 +485,7 @@ class _Content:
         if channel is None or schema is None or schema.name not in _FRAME_TYPES:
             return None
         try:
-            frame = incoming.decode(schema.name, message.data, _LIMITS)
+            frame = incoming.decode(schema.name, message.data, _LIMITS, WRITTEN_TIME)
         except DecodeError as error:
             raise WindowError(f"a message on {channel.topic} cannot be decoded: {error}") from error
         parts = self.parts.setdefault(message.sequence, _Parts())
@@ -601,7 +608,7 @@ def _size(path: Path) -> int:
 _JSON = "application/json"
 _METADATA = "coec"
 _KEPT = "coec_kept"
-_FRAME_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY)
+_FRAME_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY, messages.IMU)
 
 _OK, _WARN = 0, 1
 """diagnostic_msgs/DiagnosticStatus.level: an accepted calibration, one that failed."""

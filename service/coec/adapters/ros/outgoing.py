@@ -8,13 +8,14 @@ from typing import Final
 import numpy as np
 from rosbags.typesys.stores import ros2_humble as ros
 
-from coec.adapters.images.codec import CHANNELS
+from coec.adapters.images.raw import BYTES_PER_PIXEL
 from coec.adapters.ros import point_cloud2
 from coec.adapters.ros.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     DIAGNOSTICS,
     IMAGE,
+    IMU,
     ODOMETRY,
     POINT_CLOUD,
     TF,
@@ -48,7 +49,7 @@ def encode_image(frame: CameraFrame) -> tuple[str, bytes]:
     image = frame.image
     header = _header(frame.stamp_ns, frame.frame_id)
     data = np.frombuffer(image.data, np.uint8)
-    if image.format not in CHANNELS:
+    if image.format not in BYTES_PER_PIXEL:
         compressed = ros.sensor_msgs__msg__CompressedImage(header=header, format=image.format.value, data=data)
         return COMPRESSED_IMAGE, serialized(compressed, COMPRESSED_IMAGE)
     raw = ros.sensor_msgs__msg__Image(
@@ -57,7 +58,7 @@ def encode_image(frame: CameraFrame) -> tuple[str, bytes]:
         width=image.width,
         encoding=image.format.value,
         is_bigendian=0,
-        step=image.width * CHANNELS[image.format],
+        step=image.width * BYTES_PER_PIXEL[image.format],
         data=data,
     )
     return IMAGE, serialized(raw, IMAGE)
@@ -76,13 +77,35 @@ def encode_cloud(frame: LidarFrame) -> bytes:
     return serialized(point_cloud2.message_of(frame), POINT_CLOUD)
 
 
-def encode_odometry(motion: EgoMotion, child_frame: str) -> bytes:
-    """`Odometry` whose twist is expressed in `child_frame`; its pose is unknown and says so by its
-    covariance."""
+def encode_motion(motion: EgoMotion) -> tuple[str, bytes]:
+    """Type name and message: `Odometry`, or `Imu` where the linear velocity is not known. Either decodes to an equal
+    motion."""
+    if motion.linear_mps is None:
+        return IMU, _encode_imu(motion)
+    return ODOMETRY, _encode_odometry(motion, motion.linear_mps)
+
+
+def _encode_imu(motion: EgoMotion) -> bytes:
+    """What is not known says so by its covariance, which begins with -1 (sensor_msgs/Imu)."""
+    unknown = np.array([-1.0, *[0.0] * 8])
+    message = ros.sensor_msgs__msg__Imu(
+        header=_header(motion.stamp_ns, motion.frame_id),
+        orientation=ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0),
+        orientation_covariance=unknown,
+        angular_velocity=ros.geometry_msgs__msg__Vector3(*motion.angular_radps),
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0),
+        linear_acceleration_covariance=unknown,
+    )
+    return serialized(message, IMU)
+
+
+def _encode_odometry(motion: EgoMotion, linear_mps: tuple[float, float, float]) -> bytes:
+    """The twist is expressed in the child frame; the pose is unknown and says so by its covariance."""
     unknown = np.diag(np.full(6, _UNKNOWN_POSE_M2)).reshape(-1)
     message = ros.nav_msgs__msg__Odometry(
         header=_header(motion.stamp_ns, "odom"),
-        child_frame_id=child_frame,
+        child_frame_id=motion.frame_id,
         pose=ros.geometry_msgs__msg__PoseWithCovariance(
             pose=ros.geometry_msgs__msg__Pose(
                 position=ros.geometry_msgs__msg__Point(0.0, 0.0, 0.0),
@@ -92,7 +115,7 @@ def encode_odometry(motion: EgoMotion, child_frame: str) -> bytes:
         ),
         twist=ros.geometry_msgs__msg__TwistWithCovariance(
             twist=ros.geometry_msgs__msg__Twist(
-                linear=ros.geometry_msgs__msg__Vector3(*motion.linear_mps),
+                linear=ros.geometry_msgs__msg__Vector3(*linear_mps),
                 angular=ros.geometry_msgs__msg__Vector3(*motion.angular_radps),
             ),
             covariance=np.zeros(36),

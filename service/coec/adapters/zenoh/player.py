@@ -185,4 +185,4 @@ def _cdr(frame: Frame) -> tuple[str, bytes]:
         case LidarFrame():
             return messages.POINT_CLOUD, outgoing.encode_cloud(frame)
         case EgoMotion():
-            return messages.ODOMETRY, outgoing.encode_odometry(frame, frame.frame_id)
+            return outgoing.encode_motion(frame)

@@ -75,6 +75,9 @@ def _rates(window: Window, T_camera_lidar: Matrix4) -> tuple[NDArray[np.float64]
             continue
         omega = T_lidar_ego[:3, :3] @ np.array(pair.motion.angular_radps)
         # The ego frame's origin lies beside the LiDAR: it is carried around by the turn.
+        turn[index] = R_camera_lidar @ omega
+        if pair.motion.linear_mps is None:
+            continue
         linear = T_lidar_ego[:3, :3] @ np.array(pair.motion.linear_mps) - np.cross(omega, T_lidar_ego[:3, 3])
-        velocity[index], turn[index] = R_camera_lidar @ linear, R_camera_lidar @ omega
+        velocity[index] = R_camera_lidar @ linear
     return velocity, turn

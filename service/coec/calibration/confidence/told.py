@@ -128,7 +128,7 @@ def _told(frames: EdgeFrames, window: Window, pose: Matrix4, at_most: int) -> To
 
 def moves(window: Window) -> bool:
     """Whether the vehicle moves enough for a clock to show."""
-    return any(pair.motion is not None and pair.motion.speed_mps >= SLOWEST_MPS for pair in window.pairs)
+    return any(pair.motion is not None and pair.motion.reaches(SLOWEST_MPS) for pair in window.pairs)
 
 
 def _through(camera: Camera, lens: NDArray[np.float64]) -> Camera:

@@ -20,7 +20,8 @@ def compensate(pair: FramePair, rig: Rig, *, enabled: bool, chosen: Choice = EVE
     """(N, 3) float32: the chosen points of the sweep in the LiDAR frame at the camera stamp.
 
     Per-point time comes with the cloud, or follows from azimuth (`rig.sweep`). Without either, the sweep is moved as a
-    whole from its stamp to the camera's. Without ego-motion nothing is moved.
+    whole from its stamp to the camera's. Without ego-motion nothing is moved; where only its rotation is known, points
+    are turned and not shifted.
     """
     xyz_m = np.ascontiguousarray(pair.lidar.xyz_m[chosen])
     if not enabled or pair.motion is None:
@@ -39,7 +40,7 @@ def compensation(pair: FramePair, rig: Rig, *, enabled: bool) -> Compensation:
         return Compensation.NO_EGO_MOTION
     if pair.lidar.time_offset_s is None and rig.sweep is None:
         return Compensation.NO_POINT_TIME
-    return Compensation.DONE
+    return Compensation.ROTATION_ONLY if pair.motion.linear_mps is None else Compensation.DONE
 
 
 def azimuth_offsets_s(xyz_m: NDArray[np.float32], sweep: SweepTiming) -> NDArray[np.float64]:
@@ -52,10 +53,12 @@ def azimuth_offsets_s(xyz_m: NDArray[np.float32], sweep: SweepTiming) -> NDArray
 
 def sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Angular (3,) rad/s and linear velocity (3,) m/s of the LiDAR in its own frame; the lever arm turns rotation into
-    velocity."""
+    velocity. Where the linear velocity of the vehicle is not known, none is assumed of the LiDAR."""
     rotation = T_lidar_ego[:3, :3]
     lidar_in_ego_m = se3.inverse(T_lidar_ego)[:3, 3]
     angular = np.asarray(motion.angular_radps)
+    if motion.linear_mps is None:
+        return rotation @ angular, np.zeros(3)
     linear = np.asarray(motion.linear_mps) + np.cross(angular, lidar_in_ego_m)
     return rotation @ angular, rotation @ linear
 

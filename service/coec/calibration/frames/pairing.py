@@ -166,11 +166,18 @@ class Pairer:
         return EgoMotion(
             stamp_ns,
             before.frame_id,
-            _blend(before.linear_mps, behind.linear_mps, weight),
+            _blended_or_unknown(before.linear_mps, behind.linear_mps, weight),
             _blend(before.angular_radps, behind.angular_radps, weight),
         )
 
 
-def _blend(a: tuple[float, float, float], b: tuple[float, float, float], weight: float) -> tuple[float, float, float]:
+Vector = tuple[float, float, float]
+
+
+def _blended_or_unknown(a: Vector | None, b: Vector | None, weight: float) -> Vector | None:
+    return None if a is None or b is None else _blend(a, b, weight)
+
+
+def _blend(a: Vector, b: Vector, weight: float) -> Vector:
     x, y, z = ((1.0 - weight) * p + weight * q for p, q in zip(a, b, strict=True))
     return x, y, z

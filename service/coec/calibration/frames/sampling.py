@@ -19,7 +19,7 @@ fills the four pairs of a check in four; two more allow for losses. Pairs furthe
 
 def stands(pair: FramePair, window: WindowConfig) -> bool:
     """Whether the vehicle is known to stand: then nothing is seen that was not seen before."""
-    return pair.motion is not None and pair.motion.speed_mps < window.min_speed_mps
+    return pair.motion is not None and pair.motion.stays_below(window.min_speed_mps)
 
 
 class CheckSampler:

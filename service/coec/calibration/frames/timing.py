@@ -55,7 +55,7 @@ def explained_by_motion(
         found: (4, 4) where it is.
         min_significance: below this nothing is explained.
     """
-    moving = [pair for pair in pairs if pair.motion is not None and pair.motion.speed_mps >= MIN_SPEED_MPS]
+    moving = [pair for pair in pairs if pair.motion is not None and pair.motion.reaches(MIN_SPEED_MPS)]
     if 2 * len(moving) < len(pairs):
         return None
     edges = [_edges_only(pair) for pair in pairs]
@@ -100,7 +100,7 @@ def _shifted(pair: FramePair, seconds: float) -> FramePair:
 def _scaled(pair: FramePair, factor: float) -> FramePair:
     """As if the vehicle had moved so many times as fast."""
     motion = pair.motion
-    if motion is None:
+    if motion is None or motion.linear_mps is None:
         return pair
     vx, vy, vz = motion.linear_mps
     wx, wy, wz = motion.angular_radps

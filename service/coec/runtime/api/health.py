@@ -105,6 +105,8 @@ def needs_of(report: StreamStatistics, pair: PairConfig, latest: Estimate | None
             needs.append("motion compensation has no ego-motion")
         elif latest is not None and latest.compensation.get("no_point_time", 0):
             needs.append("motion compensation has no point times")
+        elif latest is not None and latest.compensation.get("rotation_only", 0):
+            needs.append("motion compensation has no linear velocity: rotation is compensated, translation is not")
     return tuple(needs)
 
 

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from coec.adapters.frames import msgpack_frames
-from coec.adapters.ros import incoming
+from coec.adapters.frames.incoming import Refusal
+from coec.adapters.ros import incoming, messages
+from coec.adapters.ros.moving_frames import MovingFrame
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.frames.origin import OriginCheck, from_origin
@@ -29,7 +31,17 @@ CLOUD_ORIGIN = "cloud_origin"
 WRONG_TYPE = "wrong_type"
 """Cause of a loss: a message that makes no frame of the stream."""
 
-EXPLAINED = frozenset({CLOUD_ORIGIN, WRONG_TYPE})
+EXPLAINED = frozenset(
+    {
+        CLOUD_ORIGIN,
+        WRONG_TYPE,
+        Refusal.MESSAGE_TYPE,
+        Refusal.CLOUD_FIELDS,
+        Refusal.CLOUD_TIME,
+        Refusal.CLOUD_TIME_AMBIGUOUS,
+        Refusal.IMAGE_UNKNOWN_FORMAT,
+    }
+)
 """Causes that the log explains by the sentence of the error, which is ours."""
 
 NUMBERED = b"\xa8sequence"
@@ -61,6 +73,7 @@ class Decoder:
         self._accepted: Counter[str] = Counter()
         self._T_cloud_lidar = np.array(pair.lidar.T_cloud_lidar, dtype=np.float64)
         self._origin = OriginCheck()
+        self._moving = MovingFrame(*(("", "") if pair.ego is None else (pair.ego.parent, pair.ego.child)))
 
     def counts(self, stream: str) -> StreamCounts:
         """Counters of a stream since the start."""
@@ -73,7 +86,8 @@ class Decoder:
             self._overruns.append(parcel.stream)
 
     def frame(self, parcel: Parcel) -> Frame | None:
-        """The frame in a sample, or None when it was refused (and counted). Never raises for what a sender sent."""
+        """The frame in a sample, or None when it was refused (and counted), or holds none: transforms of other frames
+        than the vehicle's. Never raises for what a sender sent."""
         stream = parcel.stream
         self._received[stream] += 1
         while self._overruns:
@@ -82,6 +96,8 @@ class Decoder:
             if len(parcel.sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
             frame = self._decode(stream, parcel.sample)
+            if frame is None:
+                return None
             if frame.sequence is not None and (lost := self._numbers[stream].lost_by(frame.sequence)):
                 self._losses.add(stream, "sequence_gap", lost)
             frame = self._checked(frame)
@@ -96,7 +112,7 @@ class Decoder:
         self._accepted[stream] += 1
         return frame
 
-    def _decode(self, stream: str, sample: Sample) -> Frame:
+    def _decode(self, stream: str, sample: Sample) -> Frame | None:
         configured = self._streams[stream]
         encoding, _, schema = sample.encoding.partition(";")
         if encoding not in ("application/msgpack", CDR):
@@ -105,8 +121,13 @@ class Decoder:
             type_name = schema or configured.assumed_type
             if type_name not in configured.types:
                 expected = " or ".join(configured.types)
-                raise DecodeError(WRONG_TYPE, f"a message of another type on {configured.place}: expected {expected}")
-            return incoming.decode(type_name, sample.payload, self._limits)
+                told = incoming.REFUSED.get(type_name, "a message of another type")
+                raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
+            if type_name == messages.TF:
+                return self._moving.motion(sample.payload)
+            frame = incoming.decode(type_name, sample.payload, self._limits, self._pair.lidar.time)
+            self._check_times(frame)
+            return frame
         if stream == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
         if stream == LIDAR:
@@ -129,6 +150,12 @@ class Decoder:
         if contradiction is not None:
             raise DecodeError(CLOUD_ORIGIN, f"{contradiction.sentence} See lidar.T_cloud_lidar.")
         return sweep
+
+    def _check_times(self, frame: Frame) -> None:
+        time = self._pair.lidar.time
+        if time is not None and isinstance(frame, LidarFrame) and frame.time_offset_s is None:
+            what = f"the cloud has no field {time.field} of one number a point, which `lidar.time` names"
+            raise DecodeError(Refusal.CLOUD_FIELDS, what)
 
     def _check_camera(self, frame: CameraFrame) -> None:
         camera = self._pair.camera

@@ -1,0 +1,93 @@
+"""What stands ahead of the data in a message of CDR, read with bounds before a decoder builds anything from it."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from coec.adapters.frames.incoming import MAX_FRAME_ID, Refusal
+from coec.errors import DecodeError
+
+MAX_CLOUD_FIELDS: Final = 64
+"""Drivers write up to about a dozen. Each would become a Python object."""
+
+MAX_FIELD_NAME: Final = 256
+"""Bytes of the name of a field; drivers use up to some twenty."""
+
+_ENCAPSULATION: Final = 4
+"""Bytes ahead of the message; alignment counts from behind them."""
+
+_STAMP: Final = 8
+"""Bytes of `std_msgs/Header.stamp`."""
+
+_CHARACTER: Final = 4
+"""Bytes of a character in UTF-8, at most."""
+
+
+class Head:
+    """Goes through a message from its begin.
+
+    Raises:
+        DecodeError: `message_malformed` where the message ends before what is asked of it.
+    """
+
+    def __init__(self, payload: bytes) -> None:
+        self._payload = payload
+        self._order = "<" if payload[1:2] == b"\x01" else ">"
+        self._at = _ENCAPSULATION
+
+    def number(self) -> int:
+        """The next uint32."""
+        self._at += -(self._at - _ENCAPSULATION) % 4
+        try:
+            (value,) = struct.unpack_from(f"{self._order}I", self._payload, self._at)
+        except struct.error as error:
+            raise DecodeError(Refusal.MESSAGE_MALFORMED, "the message ends within its head") from error
+        self._at += 4
+        return int(value)
+
+    def skip(self, size: int) -> None:
+        """Passes over so many bytes."""
+        self._at += size
+
+    def text(self, max_bytes: int, reason: Refusal, what: str) -> None:
+        """Passes over a string.
+
+        Raises:
+            DecodeError: `reason` where it claims to be longer than `max_bytes`.
+        """
+        length = self.number()
+        if length > max_bytes + 1:  # the zero behind it counts
+            raise DecodeError(reason, f"{what} is longer than {max_bytes} bytes")
+        self.skip(length)
+
+
+def check_header(payload: bytes) -> Head:
+    """Looks at the `std_msgs/Header` with which a message begins; what stands behind it comes next.
+
+    Raises:
+        DecodeError: `frame_id_invalid` or `message_malformed`.
+    """
+    head = Head(payload)
+    head.skip(_STAMP)
+    head.text(_CHARACTER * MAX_FRAME_ID, Refusal.FRAME_ID_INVALID, "the frame id")
+    return head
+
+
+def check_cloud_fields(payload: bytes) -> None:
+    """Looks at the fields of a `PointCloud2`.
+
+    Raises:
+        DecodeError: `cloud_fields`, `frame_id_invalid` or `message_malformed`.
+    """
+    head = check_header(payload)
+    head.number()  # height
+    head.number()  # width
+    count = head.number()
+    if count > MAX_CLOUD_FIELDS:
+        raise DecodeError(Refusal.CLOUD_FIELDS, f"the cloud has more than {MAX_CLOUD_FIELDS} fields")
+    for _ in range(count):
+        head.text(MAX_FIELD_NAME, Refusal.CLOUD_FIELDS, "the name of a field")
+        head.number()  # offset
+        head.skip(1)  # datatype
+        head.number()  # count

@@ -1,0 +1,193 @@
+"""The times of points: recognised from their values, said in a line, refused where they may mean two things."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coec.adapters.ros import incoming, messages
+from coec.calibration.types import LidarFrame
+from coec.config import LimitsConfig, PointTimeConfig, TimeUnit
+from coec.errors import DecodeError
+from ros_messages import NSEC, SEC, STAMP, Columns, packed
+
+LIMITS = LimitsConfig()
+POINTS = 5
+SWEEP_S = np.linspace(0.0, 0.0999, POINTS)
+TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+
+
+def cloud_timed(name: str, form: str, values: list[float], *, stamp_ns: int = STAMP, big: bool = False) -> bytes:
+    xyz: Columns = [(axis, "<f4", [float(k + 1) for k in range(len(values))]) for axis in "xyz"]
+    sec, nsec = divmod(stamp_ns, 10**9)
+    return packed([*xyz, (name, form, values)], big=big, sec=sec, nsec=nsec)
+
+
+def sweep(payload: bytes, said: PointTimeConfig | None = None) -> LidarFrame:
+    frame = incoming.decode(messages.POINT_CLOUD, payload, LIMITS, said)
+    assert isinstance(frame, LidarFrame)
+    return frame
+
+
+def offsets_s(frame: LidarFrame) -> list[float]:
+    assert frame.time_offset_s is not None
+    assert frame.time_offset_s.dtype == np.float32
+    return [float(v) for v in frame.time_offset_s]
+
+
+def refused(payload: bytes) -> DecodeError:
+    with pytest.raises(DecodeError) as error:
+        sweep(payload)
+    return error.value
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+@pytest.mark.parametrize("form", ["<f4", "<f8"])
+@pytest.mark.parametrize("begin_s", [0.0, -0.0999, -0.04995, 0.03])
+def test_a_sweep_is_recognised_in_every_unit_wherever_its_stamp_lies(
+    form: str, unit: str, begin_s: float, big: bool
+) -> None:
+    values = ((SWEEP_S + begin_s) * TICKS[unit]).tolist()
+
+    frame = sweep(cloud_timed("time", form, values, big=big))
+
+    assert offsets_s(frame) == pytest.approx(SWEEP_S + begin_s, abs=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["us", "ns"])
+@pytest.mark.parametrize(("form", "begin_s"), [("<u4", 0.0), ("<i4", -0.0999)])
+def test_whole_numbers_are_micro_or_nanoseconds(form: str, unit: str, begin_s: float) -> None:
+    values = np.rint((SWEEP_S + begin_s) * TICKS[unit]).tolist()
+
+    assert offsets_s(sweep(cloud_timed("t", form, values))) == pytest.approx(SWEEP_S + begin_s, abs=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+@pytest.mark.parametrize("begin_s", [0.0, -0.0999, -0.15])
+@pytest.mark.parametrize("stamp_ns", [STAMP, 345 * 10**9 + 6_789_000])
+def test_a_time_of_day_or_since_the_start_counts_from_the_stamp(unit: str, begin_s: float, stamp_ns: int) -> None:
+    """`timestamp` is on the clock that the stamp is of, whatever that counts from."""
+    values = ((SWEEP_S + begin_s + stamp_ns * 1e-9) * TICKS[unit]).tolist()
+
+    frame = sweep(cloud_timed("timestamp", "<f8", values, stamp_ns=stamp_ns))
+
+    assert offsets_s(frame) == pytest.approx(SWEEP_S + begin_s, abs=1e-6)
+    assert "on the stamp's clock" in frame.timed_by
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "values", "line"),
+    [
+        ("t", "<u4", [0, 99_900_000], "t: uint32, ns since the stamp; 0.0 to 99.9 ms, stamped at its begin"),
+        ("time", "<f4", [-0.1, 0.0], "time: float32, s since the stamp; -100.0 to 0.0 ms, stamped at its end"),
+        (
+            "timestamp",
+            "<f8",
+            [SEC + NSEC * 1e-9 - 0.05, SEC + NSEC * 1e-9 + 0.05],
+            "timestamp: float64, s on the stamp's clock; -50.0 to 50.0 ms from the stamp, stamped in its middle",
+        ),
+        ("time_stamp", "<u4", [150_000, 200_000], "time_stamp: uint32, µs since the stamp; 150.0 to 200.0 ms"),
+        ("time", "<f4", [0.0, 0.0], "time: float32, s since the stamp; 0.0 to 0.0 ms"),
+    ],
+)
+def test_what_was_recognised_is_said(name: str, form: str, values: list[float], line: str) -> None:
+    assert sweep(cloud_timed(name, form, values)).timed_by == line
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "values", "stamp_ns", "candidates"),
+    [
+        # A simulation that began a moment ago: since the stamp, or since the begin?
+        ("timestamp", "<f8", [0.5, 0.6], 500_000_000, ["s since the stamp", "s on the stamp's clock"]),
+        # A slow scanner's seconds, or a fast one's milliseconds.
+        ("time", "<f4", [0.0, 5.0], STAMP, ["s since the stamp", "ms since the stamp"]),
+        # Whole milliseconds, or a flash.
+        ("t", "<u4", [0, 99], STAMP, ["ms since the stamp", "ns since the stamp"]),
+        ("t", "<u4", [50_000, 50_000], STAMP, ["ns since the stamp", "µs since the stamp"]),
+    ],
+)
+@pytest.mark.fault("point times that may be read in two ways", "the sweep is refused, and the candidates are named")
+def test_what_may_mean_two_things_is_refused_with_the_candidates(
+    name: str, form: str, values: list[float], stamp_ns: int, candidates: list[str]
+) -> None:
+    error = refused(cloud_timed(name, form, values, stamp_ns=stamp_ns))
+
+    assert error.reason == "cloud_time_ambiguous"
+    for candidate in [*candidates, f"lidar.time: {{field: {name}"]:
+        assert candidate in str(error)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("s", 1.0), ("ms", 1e-3)])
+def test_what_the_configuration_says_is_taken_as_said(unit: TimeUnit, scale: float) -> None:
+    payload = cloud_timed("time", "<f4", [0.0, 5.0])
+
+    frame = sweep(payload, PointTimeConfig(field="time", unit=unit))
+
+    assert offsets_s(frame) == pytest.approx([0.0, 5.0 * scale])
+
+
+def test_the_configuration_names_a_field_that_nobody_knows() -> None:
+    payload = cloud_timed("fired_at", "<f8", [STAMP * 1e-3, STAMP * 1e-3 + 1e5])
+
+    assert sweep(payload).time_offset_s is None
+    said = PointTimeConfig(field="fired_at", unit="us", base="clock")
+    assert offsets_s(sweep(payload, said)) == pytest.approx([0.0, 0.1], abs=1e-6)
+
+
+@pytest.mark.fault("points timed by another clock than their sweep", "the sweep is refused with its reason")
+@pytest.mark.parametrize("ago_s", [3600.0, -3600.0, 2.0])
+def test_a_time_of_another_clock_is_refused(ago_s: float) -> None:
+    error = refused(cloud_timed("timestamp", "<f8", [SEC - ago_s, SEC - ago_s + 0.1]))
+
+    assert error.reason == "cloud_time"
+
+
+def test_a_name_that_speaks_of_the_time_since_the_stamp_is_believed() -> None:
+    """In the first second of a clock the values alone would leave it open."""
+    assert offsets_s(sweep(cloud_timed("time", "<f4", [0.0, 0.1], stamp_ns=10**8))) == pytest.approx([0.0, 0.1])
+
+
+def test_points_that_are_none_do_not_count_whatever_their_time() -> None:
+    nan = math.nan
+    payload = packed(
+        [
+            ("x", "<f4", [nan, 1.0, 2.0, 3.0]),
+            ("y", "<f4", [1.0] * 4),
+            ("z", "<f4", [1.0] * 4),
+            ("timestamp", "<f8", [0.0, SEC + NSEC * 1e-9, nan, SEC + NSEC * 1e-9 + 0.1]),
+        ]
+    )
+
+    frame = sweep(payload)
+
+    assert frame.xyz_m[:, 0].tolist() == [1.0, 3.0]
+    assert offsets_s(frame) == pytest.approx([0.0, 0.1], abs=1e-6)
+
+
+def test_a_cloud_without_a_time_has_none_and_says_nothing() -> None:
+    frame = sweep(packed([(axis, "<f4", [1.0, 2.0]) for axis in "xyz"]))
+
+    assert (frame.time_offset_s, frame.timed_by) == (None, "")
+
+
+@given(
+    begin_s=st.floats(-1.0, 0.9),
+    lasts_s=st.floats(0.011, 0.99),
+    unit=st.sampled_from(["s", "ms", "us", "ns"]),
+    seconds=st.integers(100, 2**31 - 10),
+    clock=st.booleans(),
+)
+def test_no_usual_sweep_is_read_in_another_way_than_it_was_written(
+    begin_s: float, lasts_s: float, unit: str, seconds: int, clock: bool
+) -> None:
+    """Between 1 and 90 Hz, its stamp up to a second away: one reading, and the right one."""
+    begin_s = max(begin_s, -1.0 - lasts_s)
+    base_s = seconds if clock else 0
+    values = [(base_s + begin_s) * TICKS[unit], (base_s + begin_s + lasts_s) * TICKS[unit]]
+
+    frame = sweep(cloud_timed("timestamp", "<f8", values, stamp_ns=seconds * 10**9))
+
+    assert offsets_s(frame) == pytest.approx([begin_s, begin_s + lasts_s], abs=2e-6)
