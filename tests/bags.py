@@ -15,7 +15,7 @@ from coec.geometry import se3
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 WIDTH, HEIGHT = 64, 48
-FLOAT32 = 7  # sensor_msgs/PointField
+FLOAT32, FLOAT64 = 7, 8  # sensor_msgs/PointField
 
 R_OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 T_BASE_LIDAR = se3.transform_from(se3.rotation_exp(np.array([0.0, 0.0, 0.3])), np.array([1.0, 0.0, 1.9]))
@@ -56,6 +56,25 @@ def an_odometry(stamp_ns: int, forward_mps: float) -> Any:
     )
 
 
+def an_imu(stamp_ns: int, turn_radps: float) -> Any:
+    zero = ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0)
+    turn = ros.geometry_msgs__msg__Vector3(0.0, 0.0, turn_radps)
+    level = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0)
+    return ros.sensor_msgs__msg__Imu(header(stamp_ns, "base"), level, np.zeros(9), turn, np.zeros(9), zero, np.zeros(9))
+
+
+def a_timed_cloud(stamp_ns: int, name: str, times: list[float]) -> Any:
+    """Points of x y z, and a time as float64."""
+    fields = [ros.sensor_msgs__msg__PointField(axis, 4 * i, FLOAT32, 1) for i, axis in enumerate("xyz")]
+    fields.append(ros.sensor_msgs__msg__PointField(name, 12, FLOAT64, 1))
+    rows = np.ones(len(times), [("xyz", "<f4", 3), ("time", "<f8")])
+    rows["time"] = times
+    data, step = np.frombuffer(rows.tobytes(), np.uint8), rows.itemsize
+    return ros.sensor_msgs__msg__PointCloud2(
+        header(stamp_ns, "lidar"), 1, len(times), fields, False, step, len(data), data, True
+    )
+
+
 def an_info(model: str, d: list[float], frame_id: str = "optical", width: int = WIDTH) -> Any:
     return ros.sensor_msgs__msg__CameraInfo(
         header(0, frame_id),
@@ -72,9 +91,9 @@ def an_info(model: str, d: list[float], frame_id: str = "optical", width: int = 
     )
 
 
-def a_joint(parent: str, child: str, T: NDArray[np.float64]) -> Any:
+def a_joint(parent: str, child: str, T: NDArray[np.float64], stamp_ns: int = 0) -> Any:
     return ros.geometry_msgs__msg__TransformStamped(
-        header(0, parent),
+        header(stamp_ns, parent),
         child,
         ros.geometry_msgs__msg__Transform(
             ros.geometry_msgs__msg__Vector3(*T[:3, 3].tolist()),

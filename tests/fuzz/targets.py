@@ -26,9 +26,11 @@ from coec.adapters.files.baseline_file import baseline_to_json, load_baseline
 from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import rig_of, rig_to_json
 from coec.adapters.frames.msgpack_frames import decode_camera, decode_ego, decode_lidar
-from coec.adapters.images.codec import Inspector, decode_depth, encode_depth_png, encode_png
+from coec.adapters.images.codec import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
 from coec.adapters.mcap.windows import PART_SUFFIX, is_window, read_result, read_window, salvage
 from coec.adapters.ros import incoming, messages, outgoing
+from coec.adapters.ros.images import ENCODINGS
+from coec.adapters.ros.moving_frames import MovingFrame, frames_in
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.settings import mode_of, settings_of
 from coec.calibration.lifecycle import Rules, after_estimate, initial_state, restored
@@ -37,6 +39,7 @@ from coec.config import (
     CalibrationConfig,
     LimitsConfig,
     MonitorConfig,
+    PointTimeConfig,
     PolicyConfig,
     StateConfig,
     TrackerConfig,
@@ -82,7 +85,21 @@ from fuzz.formats import (
 )
 from fuzz.loop import Target
 from pair_bench import InstantScribe
-from ros_messages import JPEG, Packer, cloud, compressed, image, odometry, packed, twist
+from ros_messages import (
+    JPEG,
+    STAMP,
+    Columns,
+    Packer,
+    cloud,
+    compressed,
+    image,
+    imu,
+    odometry,
+    packed,
+    transforms,
+    twist,
+    twist_with_covariance,
+)
 
 LOG = logging.getLogger(__name__)
 LIMITS = LimitsConfig()
@@ -99,6 +116,7 @@ def _inspected(frame: object) -> None:
     """A frame that was taken is looked at by the thread that took it."""
     if isinstance(frame, CameraFrame):
         INSPECTOR.inspect(frame)
+        decode_bgr(frame.image, LIMITS)
         if frame.depth is not None:
             decode_depth(frame.depth, LIMITS)
     if isinstance(frame, LidarFrame):
@@ -139,30 +157,57 @@ MESSAGES: Final = (
     messages.ODOMETRY,
     messages.TWIST,
     "other/msg/Type",
+    messages.TWIST_WITH_COVARIANCE,
+    messages.IMU,
 )
 
 
 def _cdr(data: bytes, folder: Path) -> None:
-    """The first byte chooses the type of the message."""
+    """The first byte chooses the type of the message, and whether the times of points are said."""
     del folder
-    _inspected(incoming.decode(MESSAGES[data[0] % len(MESSAGES) if data else 0], data[1:], LIMITS))
+    kind = data[0] if data else 0
+    said = TIME_SAID if kind >= 2**7 else None
+    _inspected(incoming.decode(MESSAGES[kind % 2**7 % len(MESSAGES)], data[1:], LIMITS, point_time=said))
 
 
-XYZ: list[tuple[str, str, list[float]]] = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
+def _transforms(data: bytes, folder: Path) -> None:
+    """As a vehicle sends them: again and again."""
+    del folder
+    moving = MovingFrame("odom", "base_link")
+    for _ in range(2):
+        motion = moving.motion(data)
+        assert motion is None or np.isfinite([*(motion.linear_mps or ()), *motion.angular_radps]).all()
+    frames_in(data)
+
+
+def _transforms_seeds() -> list[bytes]:
+    begin, end = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.2, 0.0, 0.0, 0.0, 0.0, 0.1, 1.0)
+    vehicle = [("odom", "base_link", STAMP + k * 20_000_000, pose) for k, pose in enumerate((begin, end))]
+    wheel = ("base_link", "wheel", STAMP, end)
+    return [transforms(), transforms(*vehicle), transforms(vehicle[0], wheel, vehicle[1])]
+
+
+TIME_SAID = PointTimeConfig(field="t", unit="us", base="clock")
+XYZ: Columns = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
 
 
 def _cdr_seeds() -> list[bytes]:
-    doubles: list[tuple[str, str, list[float]]] = [(name, "<f8", values) for name, _, values in XYZ]
+    doubles: Columns = [(name, "<f8", values) for name, _, values in XYZ]
     messages = [
         (0, compressed()),
         (0, compressed(GREY, "png")),
         (1, image("rgb8", 2, 2, 8, bytes(16))),
         (1, image("mono8", 4, 3, 4, bytes(12))),
-        (2, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 9])])),
-        (2, packed([*doubles, ("ring", "<u2", [1, 2]), ("timestamp", "<f8", [1.7e9, 1.7e9])])),
+        *((1, image(name, 8, 8, 64, bytes(range(256)) * 2, big=True)) for name in ENCODINGS),
+        (2, packed([*XYZ, ("intensity", "<f4", [7, 8]), ("t", "<u4", [0, 99_000_000])])),
+        (2, packed([*XYZ, ("intensity", "u1", [7, 8]), ("t", "<i4", [-99_000, 0])], big=True)),
+        (2 + 2**7, packed([*XYZ, ("t", "<f8", [STAMP * 1e-3, STAMP * 1e-3 + 9])])),
+        (2, packed([*doubles, ("ring", "<u2", [1, 2]), ("timestamp", "<f8", [1.7e9, 1.7e9 + 0.1])])),
         (2, cloud([("x", 0, 7), ("y", 4, 7), ("z", 8, 7)], bytes(96), 2, 16, height=2, row_step=48)),
         (3, odometry()),
         (4, twist()),
+        (6, twist_with_covariance()),
+        (7, imu()),
     ]
     return [bytes([kind]) + message for kind, message in messages]
 
@@ -308,7 +353,15 @@ def _bag_seeds() -> list[bytes]:
     header = (Opcode.HEADER, struct.pack("<I", 5) + b"ros2\0" + bytes(4))
     records = _recorded(topics)
     twisted = _recorded([topics[0], topics[1], ("/twist", messages.TWIST, twist()), *topics[3:]])
-    return [mcap_file([header, *records]), mcap_file([(Opcode.CHUNK, chunk(packed_records(twisted)))])]
+    poses = [("odom", "base_link", STAMP + k * 50_000_000, (0.2 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) for k in range(2)]
+    moved = _recorded(
+        [*topics[:2], ("/tf", messages.TF, transforms(*poses)), ("/imu", messages.IMU, imu()), *topics[3:]]
+    )
+    return [
+        mcap_file([header, *records]),
+        mcap_file([(Opcode.CHUNK, chunk(packed_records(twisted)))]),
+        mcap_file([(Opcode.CHUNK, chunk(packed_records(moved)))]),
+    ]
 
 
 def _window(data: bytes, folder: Path) -> None:
@@ -653,7 +706,10 @@ TARGETS: Final = {
         Target("camera", lambda data, _: _inspected(decode_camera(data, LIMITS)), _camera_seeds, (in_msgpack,)),
         Target("lidar", lambda data, _: _inspected(decode_lidar(data, LIMITS)), _lidar_seeds, (in_msgpack,)),
         Target("ego", lambda data, _: _inspected(decode_ego(data, LIMITS)), _ego_seeds, (in_msgpack,)),
-        Target("cdr", _cdr, _cdr_seeds),
+        Target(
+            "cdr", _cdr, _cdr_seeds, words=(*(name.encode() for name in ENCODINGS), b"timestamp", b"time_offset_ns")
+        ),
+        Target("transforms", _transforms, _transforms_seeds, words=(b"odom\0", b"base_link\0")),
         Target(
             "pcd", lambda data, folder: _cloud_file(data, folder, "pcd"), _pcd_seeds, words=(b"FIELDS", b"_", b"ring")
         ),

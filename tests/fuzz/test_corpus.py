@@ -74,6 +74,11 @@ def test_cdr(held: Replay) -> None:
     held("cdr")
 
 
+@pytest.mark.fault("transforms on /tf, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
+def test_transforms(held: Replay) -> None:
+    held("transforms")
+
+
 @pytest.mark.fault("a PCD file, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_pcd(held: Replay) -> None:
     held("pcd")

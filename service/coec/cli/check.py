@@ -89,6 +89,8 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
     _add(streams, "LiDAR", seen.lidar, lidar)
     _add(streams, "motion", seen.motion, _motion_text(seen))
     console.out.print(streams)
+    if seen.timed_by:
+        console.show(f"point times are {seen.timed_by}")
     sync = (
         ""
         if seen.sync_ms is None
@@ -118,9 +120,9 @@ def _add(table: Any, name: str, cadence: Cadence | None, what: str) -> None:
 
 
 def _motion_text(seen: Fitness) -> str:
-    if seen.speed_mps is None or seen.turn_degps is None:
+    if seen.turn_degps is None:
         return ""
-    return (
-        f"{seen.speed_mps[0]:.1f} m/s ({seen.speed_mps[1]:.1f} at most), "
-        f"{seen.turn_degps[0]:.1f} deg/s ({seen.turn_degps[1]:.1f})"
-    )
+    turn = f"{seen.turn_degps[0]:.1f} deg/s ({seen.turn_degps[1]:.1f})"
+    if seen.speed_mps is None:
+        return f"rotation only, {turn}"
+    return f"{seen.speed_mps[0]:.1f} m/s ({seen.speed_mps[1]:.1f} at most), {turn}"

@@ -68,6 +68,7 @@ class Fitness:
         points, rings: of a sweep, medians; no rings: 0.
         range_m: (near, far) within which nine of ten points lie.
         point_time: whether points carry their own time, or the rig knows the sweep's.
+        timed_by: how the times of points were read, in a line; empty where that is not open.
         speed_mps, turn_degps: (median, most) of the vehicle; None where the ego-motion does not tell.
         standing: share of the pairs that were taken while the vehicle stood; None where that is not known.
         paired: share of the frames looked at that found a sweep.
@@ -86,6 +87,7 @@ class Fitness:
     rings: int
     range_m: tuple[float, float]
     point_time: bool
+    timed_by: str
     speed_mps: tuple[float, float] | None
     turn_degps: tuple[float, float] | None
     standing: float | None
@@ -135,6 +137,7 @@ def fitness_of(recording: Recording) -> Fitness:
         rings=_median([0 if sweep.ring is None else len(np.unique(sweep.ring)) for sweep in sweeps]),
         range_m=(near, far),
         point_time=rig.sweep is not None or any(sweep.time_offset_s is not None for sweep in sweeps),
+        timed_by=next((sweep.timed_by for sweep in sweeps), ""),
         speed_mps=_spread(_known(motion.speed_mps for motion in motions)),
         turn_degps=_spread([float(np.degrees(np.linalg.norm(motion.angular_radps))) for motion in motions]),
         standing=standing,

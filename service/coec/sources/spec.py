@@ -11,7 +11,8 @@ from coec.errors import UsageError
 FORMS = """accepted forms of a source:
   FILE.mcap                                     a recorded window
   BAG?camera=/TOPIC&points=/TOPIC&...           any ROS 2 bag: FILE.mcap, FILE.db3 or rosbag2's folder (topics are found
-                                                by type where they are unique; lidar_frame=NAME for clouds in another)
+                                                by type where they are unique; lidar_frame=NAME for clouds in another,
+                                                moving=PARENT,CHILD for motion on /tf, time=FIELD,UNIT[,BASE])
   kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
   kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
   FOLDER or dataset.yaml                        images and clouds listed in a manifest

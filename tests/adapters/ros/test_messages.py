@@ -420,7 +420,7 @@ def test_a_sweep_there_and_back(names: tuple[str, ...]) -> None:
     xyz_m = rng.normal(size=(500, 3)).astype(np.float32)
     frame = LidarFrame(STAMP, "lidar", xyz_m, **{name: columns[name] for name in names})
 
-    back = incoming.decode(messages.POINT_CLOUD, outgoing.encode_cloud(frame), LIMITS, WRITTEN_TIME)
+    back = incoming.decode(messages.POINT_CLOUD, outgoing.encode_cloud(frame), LIMITS, point_time=WRITTEN_TIME)
 
     assert isinstance(back, LidarFrame)
     assert (back.stamp_ns, back.frame_id) == (STAMP, "lidar")

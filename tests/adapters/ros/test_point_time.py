@@ -26,7 +26,7 @@ def cloud_timed(name: str, form: str, values: list[float], *, stamp_ns: int = ST
 
 
 def sweep(payload: bytes, said: PointTimeConfig | None = None) -> LidarFrame:
-    frame = incoming.decode(messages.POINT_CLOUD, payload, LIMITS, said)
+    frame = incoming.decode(messages.POINT_CLOUD, payload, LIMITS, point_time=said)
     assert isinstance(frame, LidarFrame)
     return frame
 

@@ -25,9 +25,11 @@ from coec.config import (
     LimitsConfig,
     PairConfig,
     PairingConfig,
+    PointTimeConfig,
 )
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
 from coec.runtime.ingest.inbox import Call, Inbox, Parcel
+from ros_messages import packed, transforms
 from sweeps import ROOF, a_sweep, in_frame
 
 MSGPACK, CDR = "application/msgpack", "application/cdr"
@@ -123,6 +125,48 @@ def test_what_does_not_fit_is_counted_by_reason(
     assert desk.take(stream, payload, encoding) is None
     assert desk.losses.snapshot() == {(stream, reason): 1}
     assert (desk.intake.counts(stream).received, desk.intake.counts(stream).accepted) == (1, 0)
+
+
+TF_EGO = EgoConfig(topic="/tf", type="tf2_msgs/msg/TFMessage", parent="map", child="ego")
+
+
+def test_the_motion_in_transforms_takes_two_and_what_tells_none_is_no_loss() -> None:
+    desk = Desk(PAIR.model_copy(update={"ego": TF_EGO}))
+    begin, end = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    messages = [
+        transforms(("map", "ego", 10**9, begin)),
+        transforms(("ego", "wheel", 10**9, begin)),
+        transforms(("map", "ego", 10**9 + 20_000_000, end)),
+    ]
+    frames = [desk.take(EGO, message, f"{CDR};tf2_msgs/msg/TFMessage") for message in messages]
+    assert frames[:2] == [None, None]
+    assert isinstance(frames[2], EgoMotion)
+    assert frames[2].linear_mps == pytest.approx((5.0, 0.0, 0.0))
+    assert (desk.intake.counts(EGO).received, desk.intake.counts(EGO).accepted) == (3, 1)
+    assert not desk.losses.snapshot()
+
+
+def test_times_that_may_mean_two_things_are_counted_and_the_log_says_what_to_do(
+    desk: Desk, caplog: pytest.LogCaptureFixture
+) -> None:
+    columns = [*((axis, "<f4", [1.0, 2.0]) for axis in "xyz"), ("time", "<f4", [0.0, 5.0])]
+    assert desk.take(LIDAR, packed(columns), CDR) is None
+    assert desk.losses.snapshot() == {(LIDAR, "cloud_time_ambiguous"): 1}
+    assert "lidar.time: {field: time, unit: s, base: stamp}" in caplog.text
+
+    said = Desk(PAIR.model_copy(update={"lidar": LidarConfig(key="l", time=PointTimeConfig(field="time", unit="ms"))}))
+    frame = said.take(LIDAR, packed(columns), CDR)
+    assert isinstance(frame, LidarFrame)
+    assert frame.time_offset_s is not None
+    assert frame.time_offset_s.tolist() == pytest.approx([0.0, 0.005])
+    assert said.take(LIDAR, packed(columns[:3]), CDR) is None, "a field that was named has to be there"
+    assert said.losses.snapshot() == {(LIDAR, "cloud_fields"): 1}
+
+
+def test_a_type_that_people_take_for_the_right_one_is_told_apart(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+    assert desk.take(LIDAR, b"", f"{CDR};livox_ros_driver2/msg/CustomMsg") is None
+    assert desk.losses.snapshot() == {(LIDAR, "wrong_type"): 1}
+    assert "xfer_format" in caplog.text
 
 
 @pytest.mark.fault("rubbish on a sensor's key", "it is counted once, by its reason")

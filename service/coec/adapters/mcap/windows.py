@@ -485,7 +485,7 @@ class _Content:
         if channel is None or schema is None or schema.name not in _FRAME_TYPES:
             return None
         try:
-            frame = incoming.decode(schema.name, message.data, _LIMITS, WRITTEN_TIME)
+            frame = incoming.decode(schema.name, message.data, _LIMITS, point_time=WRITTEN_TIME)
         except DecodeError as error:
             raise WindowError(f"a message on {channel.topic} cannot be decoded: {error}") from error
         parts = self.parts.setdefault(message.sequence, _Parts())

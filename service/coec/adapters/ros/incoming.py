@@ -53,7 +53,7 @@ REFUSED: Final = {
 
 
 def decode(
-    type_name: str, payload: bytes, limits: LimitsConfig, point_time: PointTimeConfig | None = None
+    type_name: str, payload: bytes, limits: LimitsConfig, *, point_time: PointTimeConfig | None = None
 ) -> CameraFrame | LidarFrame | EgoMotion:
     """The frame in a message of one of the types in `KNOWN`.
 
@@ -107,4 +107,4 @@ def _point_cloud(payload: bytes, limits: LimitsConfig, point_time: PointTimeConf
     check_cloud_fields(payload)
     message = deserialized(ros.sensor_msgs__msg__PointCloud2, payload)
     frame_id(message.header.frame_id)
-    return point_cloud2.frame_of(message, stamp_ns(message.header), limits, point_time)
+    return point_cloud2.frame_of(message, stamp_ns(message.header), limits, point_time=point_time)

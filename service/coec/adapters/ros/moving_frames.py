@@ -83,6 +83,17 @@ class MovingFrame:
         return checked(middle_ns, frame_id(self._child), (vx, vy, vz), (wx, wy, wz))
 
 
+def frames_in(payload: bytes) -> set[tuple[str, str]]:
+    """Parent and child of every transform in a `TFMessage` in CDR.
+
+    Raises:
+        DecodeError: no such message.
+    """
+    return {
+        (frame_id(t.header.frame_id.lstrip("/")), frame_id(t.child_frame_id.lstrip("/"))) for t in _transforms(payload)
+    }
+
+
 def _transforms(payload: bytes) -> list[Any]:
     if len(payload) > MAX_TRANSFORMS_BYTES or Head(payload).number() > MAX_TRANSFORMS:
         raise DecodeError(

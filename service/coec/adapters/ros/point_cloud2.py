@@ -14,7 +14,8 @@ from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointField as P
 from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 
 from coec.adapters.frames.incoming import Refusal, finite_rows, lidar_frame
-from coec.adapters.ros import point_time
+from coec.adapters.ros.point_time import FIELDS as TIME_FIELDS
+from coec.adapters.ros.point_time import offsets_s
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig
 from coec.errors import DecodeError
@@ -35,12 +36,12 @@ _PLACE = np.dtype("V12")
 
 
 def frame_of(
-    message: PointCloud2, stamp_ns: int, limits: LimitsConfig, time: PointTimeConfig | None = None
+    message: PointCloud2, stamp_ns: int, limits: LimitsConfig, *, point_time: PointTimeConfig | None = None
 ) -> LidarFrame:
     """The sweep of a message whose header is already checked.
 
     `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned
-    integer; time one of `point_time.FIELDS`, any number, as recognised there or as `time` says. Optional
+    integer; time one of `TIME_FIELDS`, any number, as recognised there or as `point_time` says. Optional
     fields of other types are left out, as are fields with several values a point.
 
     Raises:
@@ -55,14 +56,14 @@ def frame_of(
         ring = _column(message, next((by_name[n] for n in ("ring", "channel", "line") if n in by_name), None), "u")
         if ring is not None and ring.itemsize > 2 and int(ring.max()) > 0xFFFF:
             raise DecodeError(Refusal.CLOUD_FIELDS, "a ring number exceeds 65535")
-        offsets_s, timed_by = _times(message, by_name, finite_rows(xyz_m), stamp_ns, time)
+        times_s, timed_by = _times(message, by_name, finite_rows(xyz_m), stamp_ns, point_time)
         return lidar_frame(
             stamp_ns,
             message.header.frame_id,
             xyz_m,
             None if intensity is None else intensity.astype(np.float32),
             None if ring is None else ring.astype(np.uint16),
-            offsets_s,
+            times_s,
             timed_by=timed_by,
         )
 
@@ -158,12 +159,12 @@ def _times(
     said: PointTimeConfig | None,
 ) -> tuple[NDArray[np.float32] | None, str]:
     """(N,) seconds after the stamp and how they were read, or None where no field tells; `keep` as in `offsets_s`."""
-    names = point_time.FIELDS if said is None else (said.field,)
+    names = TIME_FIELDS if said is None else (said.field,)
     name = next((name for name in names if name in by_name), None)
     column = None if name is None else _column(message, by_name[name], "fiu")
     if name is None or column is None:
         return None, ""
-    return point_time.offsets_s(name, column, keep, stamp_ns, said)
+    return offsets_s(name, column, keep, stamp_ns, said)
 
 
 def _column(message: PointCloud2, field: PointField | None, kinds: str) -> NDArray[Any] | None:

@@ -149,7 +149,8 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
     raise DecodeError(
         Refusal.CLOUD_TIME_AMBIGUOUS,
         f"the field {name} of the points may be {told}: say which with "
-        f"`lidar.time: {{field: {name}, unit: {first.unit}, base: {first.base}}}`",
+        f"`lidar.time: {{field: {name}, unit: {first.unit}, base: {first.base}}}`, of a bag with "
+        f"`?time={name},{first.unit},{first.base}`",
     )
 
 

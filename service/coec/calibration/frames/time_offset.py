@@ -98,7 +98,9 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
         return _unobservable("motion compensation is switched off", nan)
     moving = tuple(p for p in window.pairs if p.motion is not None and p.motion.linear_mps is not None)
     if len(moving) <= len(FITTED):
-        return _unobservable(f"{len(moving)} pairs have a known velocity, it takes more than {len(FITTED)}", nan)
+        return _unobservable(
+            f"{len(moving)} pairs have ego-motion with a velocity, it takes more than {len(FITTED)}", nan
+        )
     rig = window.rig
     twists = [sensor_twist(pair.motion, rig.T_lidar_ego) for pair in moving if pair.motion is not None]
     spread = _spread(np.array([angular for angular, _ in twists]))

@@ -125,7 +125,7 @@ class Decoder:
                 raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
             if type_name == messages.TF:
                 return self._moving.motion(sample.payload)
-            frame = incoming.decode(type_name, sample.payload, self._limits, self._pair.lidar.time)
+            frame = incoming.decode(type_name, sample.payload, self._limits, point_time=self._pair.lidar.time)
             self._check_times(frame)
             return frame
         if stream == CAMERA:

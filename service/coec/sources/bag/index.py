@@ -22,7 +22,8 @@ from coec.sources.bag.storage import Entry, Storage
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
 CLOUD_TYPES = (messages.POINT_CLOUD,)
-MOTION_TYPES = (messages.ODOMETRY, messages.TWIST)
+VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
+ROTATION_TYPES = (messages.IMU,)
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -62,12 +63,14 @@ class Index:
         streams: frames by topic.
         infos: the first camera info of each topic.
         parents: static transforms: T_neighbour_frame (4, 4) by frame and neighbour.
+        transforms_at: places of the messages of all other transforms, by topic, as they lie in the bag.
     """
 
     path: Path
     streams: dict[str, Stream] = field(default_factory=dict)
     infos: dict[str, Any] = field(default_factory=dict)
     parents: dict[str, dict[str, Matrix4]] = field(default_factory=dict)
+    transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
 
     def topic(self, types: tuple[str, ...], asked: str | None, key: str) -> str:
         """The topic of these types that was asked for, or the only one."""
@@ -110,7 +113,7 @@ class Index:
             SourceError: it is not what its topic says.
         """
         name = entry.type_name
-        if name in (*IMAGE_TYPES, *CLOUD_TYPES, *MOTION_TYPES):
+        if name in (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES):
             stream = self.streams.setdefault(entry.topic, Stream(name))
             stamp_ns = _header_stamp_ns(entry.data)
             if stamp_ns is None:
@@ -121,6 +124,8 @@ class Index:
         elif name == messages.TF and entry.topic == "/tf_static":
             for joint in self._decoded(entry).transforms:
                 self._join(entry.topic, joint)
+        elif name == messages.TF:
+            self.transforms_at.setdefault(entry.topic, []).append(entry.place)
 
     def _join(self, topic: str, joint: Any) -> None:
         rotation, translation = joint.transform.rotation, joint.transform.translation

@@ -9,12 +9,15 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from coec.adapters.mcap.windows import is_window, read_window
 from coec.adapters.ros import incoming
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
-from coec.config import CalibrationConfig, LimitsConfig
-from coec.errors import DecodeError, SourceError
-from coec.sources.bag.index import CLOUD_TYPES, IMAGE_TYPES, MOTION_TYPES, Place, index_of
+from coec.config import CalibrationConfig, LimitsConfig, PointTimeConfig, describe
+from coec.errors import DecodeError, SourceError, UsageError
+from coec.sources.bag.index import CLOUD_TYPES, IMAGE_TYPES, Index, Place, index_of
+from coec.sources.bag.motion import VEHICLE, motion_topic, moved_on
 from coec.sources.bag.rig import rig_of_bag
 from coec.sources.bag.storage import Reader, Storage, open_storage
 from coec.sources.clouds import measured_from
@@ -33,45 +36,46 @@ _EGO, _LIDAR, _CAMERA = 0, 1, 2
 
 
 def open_bag(spec: SourceSpec) -> Recording:
-    """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]`.
+    """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]
+    [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]]`.
 
     Without a query, a recorded window is opened as such. In any other bag topics are found by their type where there is
     only one of it. Intrinsics come from the `CameraInfo` of the camera's frame (or of the topic named), or from a YAML
     file; the extrinsic from that file, else from `/tf_static`, over any number of joints. Where `/tf_static` does not
     lead to the frame of the odometry, its twist is taken as the LiDAR's own. Points that a driver gives in another
     frame than the LiDAR's (`base_link`) are taken back to it where `lidar_frame` names it and `/tf_static` leads there.
+    Where no topic tells a velocity, the transforms of `/tf` do, from frame to frame as `moving` names them (`odom` and
+    `base_link` unless it does), else an IMU tells the rotation. `time` says how points are timed, where their values
+    leave it open (see `config.PointTimeConfig`).
 
     Raises:
-        UsageError: unknown query key.
+        UsageError: unknown query key, or a value that is none.
         SourceError: no bag, cut off or damaged; no topic, or several, of a type; no intrinsics, no extrinsic.
         WindowError: a recorded window that is damaged.
     """
-    query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame")
+    query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame", "moving", "time")
     if not query and spec.path.suffix == ".mcap" and is_window(spec.path):
         return _window_recording(spec.path)
+    point_time, frames = _point_time(query.get("time")), _frames(query.get("moving"))
     storage = open_storage(spec.path)
     index = index_of(storage)
     camera_topic = index.topic(IMAGE_TYPES, query.get("camera"), "camera")
     lidar_topic = index.topic(CLOUD_TYPES, query.get("points"), "points")
-    motion_topic = index.optional_topic(MOTION_TYPES, query.get("odometry"), "odometry")
-    streams = Streams(
-        index.streams[camera_topic].ordered(),
-        index.streams[lidar_topic].ordered(),
-        [] if motion_topic is None else index.streams[motion_topic].ordered(),
-    )
     with storage.open() as reader:
+        streams = _streams(index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")))
         camera = _load(storage, reader, streams.camera[0])
-        cloud = _load(storage, reader, streams.lidar[0])
-        motion = _load(storage, reader, streams.motion[0]) if streams.motion else None
+        cloud = _load(storage, reader, streams.lidar[0], point_time=point_time)
+        motions = [*streams.moved[:1], *(_load(storage, reader, place) for place in streams.motion[:1])]
+        motion = motions[0] if motions else None
     if not isinstance(camera, CameraFrame) or not isinstance(motion, EgoMotion | None):
-        raise SourceError(f"{spec.path}: {camera_topic} holds no images, or {motion_topic} no motion")
+        raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion where it was said to be")
     lidar_frame = query.get("lidar_frame", cloud.frame_id)
     T_cloud_lidar = index.transform(cloud.frame_id.lstrip("/"), lidar_frame.lstrip("/"))
     if T_cloud_lidar is None:
         raise SourceError(f"{spec.path}: /tf_static does not connect {cloud.frame_id!r} and {lidar_frame!r}")
     rig = rig_of_bag(index, query.get("intrinsics"), camera, lidar_frame, motion)
     name = f"{spec.path.name}{camera_topic}"
-    return BagRecording(name, rig, rig.T_camera_lidar_nominal, storage, streams, T_cloud_lidar)
+    return BagRecording(name, rig, rig.T_camera_lidar_nominal, storage, streams, T_cloud_lidar, point_time)
 
 
 def _window_recording(path: Path) -> FramewiseRecording:
@@ -92,11 +96,21 @@ def _window_recording(path: Path) -> FramewiseRecording:
 
 @dataclass(frozen=True, slots=True)
 class Streams:
-    """Places of a pair's messages, each ascending by stamp; `motion` may be empty."""
+    """Places of a pair's messages, each ascending by stamp; `motion` may be empty.
+
+    Attributes:
+        moved: the motion itself, instead of `motion`, where it was taken from transforms; ascending by stamp.
+    """
 
     camera: list[Place]
     lidar: list[Place]
     motion: list[Place]
+    moved: tuple[EgoMotion, ...] = ()
+
+    @property
+    def motions(self) -> list[Place | EgoMotion]:
+        """One of the two."""
+        return [*self.motion, *self.moved]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +121,7 @@ class BagRecording:
         storage: of the bag.
         streams: places of the messages.
         T_cloud_lidar: (4, 4) pose of the LiDAR in the frame in which the points are given.
+        point_time: how points are timed, where that was said.
     """
 
     name: str
@@ -115,6 +130,7 @@ class BagRecording:
     storage: Storage
     streams: Streams
     T_cloud_lidar: Matrix4
+    point_time: PointTimeConfig | None = None
     configuration: CalibrationConfig | None = None
 
     @property
@@ -130,23 +146,27 @@ class BagRecording:
     @property
     def motion_stamps_ns(self) -> tuple[int, ...]:
         """See `Recording`."""
-        return tuple(place.stamp_ns for place in self.streams.motion)
+        return tuple(motion.stamp_ns for motion in self.streams.motions)
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
         """See `Recording.messages`. Of the sweeps, the nearest to each chosen camera frame is handed out."""
         chosen = [self.streams.camera[index] for index in chosen_indices(cameras, len(self.streams.camera))]
-        sweeps, motions = self.streams.lidar, self.streams.motion
+        sweeps = self.streams.lidar
+        motions = self.streams.motions
         if cameras is not None:
             sweeps = sorted({min(sweeps, key=lambda place: abs(place.stamp_ns - c.stamp_ns)) for c in chosen})
             motions = [m for m in motions if any(abs(m.stamp_ns - c.stamp_ns) <= MOTION_REACH_NS for c in chosen)]
-        queue = [
-            (place.stamp_ns, kind, place)
-            for kind, places in ((_EGO, motions), (_LIDAR, sweeps), (_CAMERA, chosen))
-            for place in places
+        queue: list[tuple[int, int, int, Place | EgoMotion]] = [
+            (item.stamp_ns, kind, number, item)
+            for kind, items in ((_EGO, motions), (_LIDAR, sweeps), (_CAMERA, chosen))
+            for number, item in enumerate(items)
         ]
         with self.storage.open() as reader:
-            for _, _, place in sorted(queue):
-                message = _load(self.storage, reader, place)
+            for *_, item in sorted(queue, key=lambda entry: entry[:3]):
+                if isinstance(item, EgoMotion):
+                    yield item
+                    continue
+                message = _load(self.storage, reader, item, point_time=self.point_time)
                 yield self._from_origin(message) if isinstance(message, LidarFrame) else message
 
     def _from_origin(self, cloud: LidarFrame) -> LidarFrame:
@@ -154,9 +174,40 @@ class BagRecording:
         return measured_from(cloud, self.T_cloud_lidar, self.rig.lidar_frame, self.storage.path, advice)
 
 
-def _load(storage: Storage, reader: Reader, place: Place) -> Message:
+def _streams(
+    index: Index, reader: Reader, camera: str, lidar: str, motion: tuple[tuple[str, str], str | None]
+) -> Streams:
+    """`motion`: the vehicle's frames, and the topic that was asked for."""
+    frames, asked = motion
+    found = motion_topic(index, reader, frames, asked)
+    places = index.streams[found].ordered() if found in index.streams else []
+    moved = moved_on(index, reader, found, frames) if found is not None and not places else ()
+    return Streams(index.streams[camera].ordered(), index.streams[lidar].ordered(), places, moved)
+
+
+def _frames(text: str | None) -> tuple[str, str]:
+    if text is None:
+        return VEHICLE
+    parent, comma, child = text.partition(",")
+    if not (parent and comma and child):
+        raise UsageError(
+            f"moving={text}: give the frame in which the vehicle moves, and its own: moving=odom,base_link"
+        )
+    return parent, child
+
+
+def _point_time(text: str | None) -> PointTimeConfig | None:
+    if text is None:
+        return None
+    try:
+        return PointTimeConfig.model_validate(dict(zip(("field", "unit", "base"), text.split(",", 2), strict=False)))
+    except ValidationError as error:
+        raise UsageError(f"time={text}: {describe(error)}; for example time=timestamp,s,clock") from error
+
+
+def _load(storage: Storage, reader: Reader, place: Place, *, point_time: PointTimeConfig | None = None) -> Message:
     data = reader.read(place.at)
     try:
-        return incoming.decode(place.type_name, data, LimitsConfig())
+        return incoming.decode(place.type_name, data, LimitsConfig(), point_time=point_time)
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error

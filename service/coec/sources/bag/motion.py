@@ -1,0 +1,71 @@
+"""Which topic of a bag tells how the vehicle moves, and the motion in the transforms of `/tf`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from coec.adapters.ros.moving_frames import MovingFrame, frames_in
+from coec.calibration.types import EgoMotion
+from coec.errors import DecodeError, SourceError
+from coec.sources.bag.index import ROTATION_TYPES, VELOCITY_TYPES, Index
+from coec.sources.bag.storage import Reader
+
+VEHICLE: Final = ("odom", "base_link")
+"""The frame in which a vehicle moves, and its own, as REP 105 names them."""
+
+_LISTED: Final = 12
+"""Joints that an error names."""
+
+
+def motion_topic(index: Index, reader: Reader, frames: tuple[str, str], asked: str | None) -> str | None:
+    """The topic that was asked for; else the only one of velocities, else of transforms of the vehicle (`frames`:
+    parent, child), else the only one of turn rates; None where there is none.
+
+    Raises:
+        SourceError: there is no such topic, or several of the best kind.
+    """
+    if asked in index.transforms_at:
+        return asked
+    if asked is not None:
+        return index.optional_topic((*VELOCITY_TYPES, *ROTATION_TYPES), asked, "odometry")
+    found = index.optional_topic(VELOCITY_TYPES, None, "odometry")
+    if found is None:
+        # Most bags have /tf, and in most of those it is the joints of a robot that move.
+        found = next((topic for topic in sorted(index.transforms_at) if _moved(index, reader, topic, frames)), None)
+    return found or index.optional_topic(ROTATION_TYPES, None, "odometry")
+
+
+def moved_on(index: Index, reader: Reader, topic: str, frames: tuple[str, str]) -> tuple[EgoMotion, ...]:
+    """The motion of the vehicle in the transforms of a topic, in the order of their stamps.
+
+    Raises:
+        SourceError: they do not have its frames; names those that they have.
+    """
+    motions = _moved(index, reader, topic, frames)
+    if not motions:
+        there = sorted(_joints(index, reader, topic))
+        told = ", ".join(f"{parent},{child}" for parent, child in there[:_LISTED])
+        more = ", ..." if len(there) > _LISTED else ""
+        raise SourceError(
+            f"{index.path}: {topic} does not tell how {frames[1]!a} moves in {frames[0]!a}; name the frames with "
+            f"?moving=PARENT,CHILD; there: {told or 'none'}{more}"
+        )
+    return tuple(sorted(motions, key=lambda motion: motion.stamp_ns))
+
+
+def _moved(index: Index, reader: Reader, topic: str, frames: tuple[str, str]) -> list[EgoMotion]:
+    moving = MovingFrame(*frames)
+    try:
+        found = [moving.motion(data) for data in _messages(index, reader, topic)]
+    except DecodeError as error:
+        raise SourceError(f"{index.path}: a message on {topic} is refused: {error}") from error
+    return [motion for motion in found if motion is not None]
+
+
+def _joints(index: Index, reader: Reader, topic: str) -> set[tuple[str, str]]:
+    return {joint for data in _messages(index, reader, topic) for joint in frames_in(data)}
+
+
+def _messages(index: Index, reader: Reader, topic: str) -> Iterable[bytes]:
+    return (reader.read(place) for place in index.transforms_at[topic])
