@@ -77,6 +77,8 @@ def health(payload: bytes) -> None:
     figures = "  ".join(f"{name} {console.figure(value)}" for name, value in known.items() if value is not None)
     if figures:
         console.show(figures)
+    if quality.point_times:
+        console.show(f"point times are {quality.point_times}")
     if quality.frozen_image:
         console.show("the camera repeats the same picture", "bold red")
     _losses(quality.drops)

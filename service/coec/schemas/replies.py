@@ -223,6 +223,7 @@ class DataQuality(Part):
     mean_level: float | None = Field(default=None, description="latest exposure, mean grey value, 0 to 255")
     clipped: float | None = Field(default=None, description="latest exposure, share of black or white pixels")
     frozen_image: bool = Field(default=False, description="the camera repeats the same picture")
+    point_times: str = Field(default="", description="how the times of points are read, of clouds that leave it open")
 
 
 class CheckReply(Part):

@@ -169,7 +169,8 @@ def _point_times(pair: PairConfig, cloud: LidarFrame, rate_hz: float | None) -> 
     if times_s is None:
         return _by_azimuth(pair, rate_hz)
     first_s, last_s = float(np.min(times_s)), float(np.max(times_s))
-    text = f"{count} points, measured {1e3 * first_s:+.1f} to {1e3 * last_s:+.1f} ms from the stamp"
+    read = cloud.timed_by or f"measured {1e3 * first_s:+.1f} to {1e3 * last_s:+.1f} ms from the stamp"
+    text = f"{count} points, {read}"
     period_s = 1.0 / rate_hz if rate_hz else 0.1
     if max(abs(first_s), abs(last_s)) > 2.0 * period_s:
         advice = "the field holds another unit, or time since another moment: correct it in the driver"

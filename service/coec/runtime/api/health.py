@@ -124,6 +124,7 @@ def data_quality_of(report: StreamStatistics, losses: Mapping[tuple[str, str], i
         mean_level=quality.mean_level if quality else None,
         clipped=quality.clipped if quality else None,
         frozen_image=chosen.frozen,
+        point_times=report.timed_by,
     )
 
 

@@ -60,7 +60,11 @@ class StreamCounts:
 
 
 class Decoder:
-    """Decodes and checks the samples of one pair's streams."""
+    """Decodes and checks the samples of one pair's streams.
+
+    Attributes:
+        timed_by: of the latest sweep, see `LidarFrame`.
+    """
 
     def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:
         self._pair = pair
@@ -73,6 +77,7 @@ class Decoder:
         self._accepted: Counter[str] = Counter()
         self._T_cloud_lidar = np.array(pair.lidar.T_cloud_lidar, dtype=np.float64)
         self._origin = OriginCheck()
+        self.timed_by = ""
         self._moving = MovingFrame(*(("", "") if pair.ego is None else (pair.ego.parent, pair.ego.child)))
 
     def counts(self, stream: str) -> StreamCounts:
@@ -110,6 +115,8 @@ class Decoder:
             self._losses.add(stream, "decoder_fault")
             return None
         self._accepted[stream] += 1
+        if isinstance(frame, LidarFrame):
+            self.timed_by = frame.timed_by
         return frame
 
     def _decode(self, stream: str, sample: Sample) -> Frame | None:

@@ -21,6 +21,7 @@ class StreamStatistics:
         rate_hz: pairs per second of sensor time; 0 when the streams have stopped, None before the second pair.
         pace: seconds of sensor time that pass in a second; None before the second pair.
         sync_error_s: how much later than its sweep the latest camera frame was taken.
+        timed_by: how the times of the latest sweep's points were read, see `LidarFrame`.
     """
 
     streams: dict[str, StreamCounts] = field(default_factory=dict)
@@ -31,3 +32,4 @@ class StreamStatistics:
     rate_hz: float | None = None
     pace: float | None = None
     sync_error_s: float | None = None
+    timed_by: str = ""
