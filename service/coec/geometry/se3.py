@@ -105,7 +105,7 @@ def rotation_from_quaternion_xyzw(quaternion_xyzw: Array) -> Array:
     """Rotation matrix (3, 3) of a quaternion [x y z w] of any length. Raises ValueError if it is zero or not finite, or
     if its square is."""
     q = _vector("quaternion_xyzw", quaternion_xyzw, 4)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # a NaN may be a signalling one
         norm = float(np.linalg.norm(q))
     if not (norm > 0.0 and math.isfinite(norm)):
         raise ValueError(f"quaternion_xyzw must be finite and not zero, got {q.tolist()}")

@@ -1,6 +1,7 @@
 """Ego-motion from `/tf`: held to drives of which every pose and velocity is known."""
 
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -16,6 +17,9 @@ START = 1_700_000_000 * 10**9
 MS = 10**6
 TWIST = np.array([0.01, -0.02, 0.4, 9.0, 0.5, -0.1])
 """A sharp turn at 9 m/s: rad/s and m/s, in the vehicle's frame."""
+
+SIGNALLING: float = struct.unpack("<d", b"\1\0\0\0\0\0\xf0\x7f")[0]
+"""A NaN at which arithmetic raises its hand (IEEE 754)."""
 
 AT = se3.transform_from(se3.rotation_exp(np.array([0.0, 0.1, 2.5])), np.array([3.4e5, 5.8e6, 110.0]))
 """Far from the origin of the map, as in UTM."""
@@ -111,6 +115,8 @@ def test_nothing_is_said_across_a_gap_or_a_step_back(later_ms: float) -> None:
         (1e30, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         (0.0, 0.0, 0.0, math.inf, 0.0, 0.0, 1.0),
+        (0.0, 0.0, 0.0, SIGNALLING, 0.0, 0.0, 1.0),
+        (SIGNALLING, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         (5e8, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),  # a filter was reset
     ],
 )

@@ -106,11 +106,11 @@ def _transforms(payload: bytes) -> list[Any]:
 
 def _pose(stamped: Any) -> _Pose:
     rotation, place = stamped.transform.rotation, stamped.transform.translation
-    place_m = np.array([place.x, place.y, place.z])
-    if not (np.abs(place_m) <= MAX_PLACE_M).all():
+    place_m = (place.x, place.y, place.z)
+    if not all(abs(value) <= MAX_PLACE_M for value in place_m):
         raise DecodeError(Refusal.MOTION_INVALID, "a pose has no finite place, or lies far away")
     try:
         turn = se3.rotation_from_quaternion_xyzw(np.array([rotation.x, rotation.y, rotation.z, rotation.w]))
     except ValueError as error:
         raise DecodeError(Refusal.MOTION_INVALID, f"a pose is none: {error}") from error
-    return _Pose(stamp_ns(stamped.header), se3.transform_from(turn, place_m))
+    return _Pose(stamp_ns(stamped.header), se3.transform_from(turn, np.array(place_m)))
