@@ -129,7 +129,8 @@ def _camera_seeds() -> list[bytes]:
     head = {"stamp_ns": 12, "frame_id": "camera", "sequence": 3, "schema_version": 1}
     raw = {"format": "mono8", "data": bytes(range(12)), "width": 4, "height": 3}
     images = ({"format": "jpeg", "data": JPEG}, {"format": "png", "data": GREY, "width": 8, "height": 8}, raw)
-    messages: list[dict[str, Any]] = [{**head, "image": image} for image in images]
+    mosaic = {"format": "bayer_grbg16", "data": bytes(range(40)), "width": 5, "height": 4}
+    messages: list[dict[str, Any]] = [{**head, "image": image} for image in (*images, mosaic)]
     messages.append({**messages[0], "depth": {"format": "png", "data": DEPTH}})
     return [msgpack.packb(message) for message in messages]
 

@@ -112,6 +112,7 @@ def test_fields_of_a_newer_sender_are_ignored() -> None:
         CameraFrame(5, "camera", probe(JPEG, LIMITS), 3, probe(DEPTH, LIMITS)),
         CameraFrame(5, "camera", probe(DEPTH, LIMITS)),
         CameraFrame(5, "camera", EncodedImage(ImageFormat.RGB8, 2, 1, bytes(range(6))), 2**40),
+        CameraFrame(5, "camera", EncodedImage(ImageFormat.BAYER_RGGB16, 4, 4, bytes(range(32)))),
     ],
 )
 def test_a_camera_frame_there_and_back(frame: CameraFrame) -> None:
@@ -257,6 +258,13 @@ def test_a_wrong_image_is_refused_by_reason(change: dict[str, Any], reason: str)
 @pytest.mark.parametrize("value", [NAN, math.inf, 1e300, "1", None])
 def test_a_velocity_that_is_none_is_refused(value: object) -> None:
     assert reason_of(decode_ego, EGO | {"linear_mps": [0.0, value, 0.0]}) == "motion_invalid"
+
+
+def test_a_velocity_that_is_not_known_is_said_to_be_so() -> None:
+    turning = EgoMotion(5, "imu", None, (0.0, 0.0, 0.5), 7)
+    assert decode_ego(encode_ego(turning), LIMITS) == turning
+    silent = {name: value for name, value in EGO.items() if name != "linear_mps"}
+    assert reason_of(decode_ego, silent) == "motion_invalid", "to leave it out is no way to say so"
 
 
 def test_a_velocity_of_two_numbers_is_refused() -> None:

@@ -200,6 +200,23 @@ def test_reads_back_to_the_same_bits(tmp_path: Path, mask: bool, raw: bool) -> N
         assert_same_pair(got, expected)
 
 
+def test_a_mosaic_and_a_turn_are_recorded_as_they_came(tmp_path: Path) -> None:
+    """And times of points that in another's cloud would leave their unit open."""
+    mosaic = EncodedImage(ImageFormat.BAYER_GRBG16, WIDTH, HEIGHT, np.random.default_rng(8).bytes(2 * WIDTH * HEIGHT))
+    whole = a_pair(0)
+    turning = EgoMotion(whole.stamp_ns, "imu", None, (1 / 3, -2 / 3, 1e-300))
+    times_s = np.linspace(-4.0, 4.0, len(whole.lidar.xyz_m), dtype=np.float32)
+    pair = FramePair(replace(whole.camera, image=mosaic), replace(whole.lidar, time_offset_s=times_s), turning)
+
+    window, _ = read_window(a_window(tmp_path / "front-1.mcap", [pair]).path)
+
+    (back,) = window.pairs
+    assert back.camera == pair.camera
+    assert back.motion == turning
+    assert back.lidar.time_offset_s is not None
+    assert back.lidar.time_offset_s.tobytes() == times_s.tobytes()
+
+
 def test_a_sweep_without_optional_columns_comes_back_without_them(tmp_path: Path) -> None:
     pair = a_pair(0)
     bare = replace(pair, lidar=LidarFrame(pair.lidar.stamp_ns, "lidar", pair.lidar.xyz_m))
