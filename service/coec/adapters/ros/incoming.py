@@ -12,19 +12,9 @@ from typing import Final
 from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.adapters.frames.incoming import Refusal, check_size
-from coec.adapters.ros import images, motion, point_cloud2
+from coec.adapters.ros import images, messages, motion, point_cloud2
 from coec.adapters.ros.heads import check_cloud_fields, check_header
-from coec.adapters.ros.messages import (
-    COMPRESSED_IMAGE,
-    IMAGE,
-    IMU,
-    ODOMETRY,
-    POINT_CLOUD,
-    TF,
-    TWIST,
-    TWIST_WITH_COVARIANCE,
-    deserialized,
-)
+from coec.adapters.ros.messages import deserialized
 from coec.adapters.ros.stamps import frame_id, stamp_ns
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig
@@ -47,7 +37,7 @@ REFUSED: Final = {
     "hesai_ros_driver/msg/UdpFrame": _PACKETS,
     "rslidar_msg/msg/RslidarPacket": _PACKETS,
     "sensor_msgs/msg/PointCloud": "PointCloud has been replaced by PointCloud2: convert it (point_cloud_converter)",
-    TF: "a transform tells where a frame is: its motion takes two of them, see `moving_frames`",
+    messages.TF: "a transform tells where a frame is, not what it sees; motion it tells where `ego.type` is this one",
 }
 """Types that people take for the right ones, and what to do."""
 
@@ -67,11 +57,11 @@ def decode(
         return _MOTIONS[type_name](payload)
     check_size(payload, limits)
     match type_name:
-        case "sensor_msgs/msg/CompressedImage":
+        case messages.COMPRESSED_IMAGE:
             return _compressed_image(payload, limits)
-        case "sensor_msgs/msg/Image":
+        case messages.IMAGE:
             return _image(payload, limits)
-        case "sensor_msgs/msg/PointCloud2":
+        case messages.POINT_CLOUD:
             return _point_cloud(payload, limits, point_time)
         case _:
             instead = REFUSED.get(type_name, f"messages of this type are not read; known: {', '.join(KNOWN)}")
@@ -79,13 +69,13 @@ def decode(
 
 
 _MOTIONS: Final[dict[str, Callable[[bytes], EgoMotion]]] = {
-    ODOMETRY: motion.odometry,
-    TWIST: motion.twist,
-    TWIST_WITH_COVARIANCE: motion.twist_with_covariance,
-    IMU: motion.imu,
+    messages.ODOMETRY: motion.odometry,
+    messages.TWIST: motion.twist,
+    messages.TWIST_WITH_COVARIANCE: motion.twist_with_covariance,
+    messages.IMU: motion.imu,
 }
 
-KNOWN: Final = (COMPRESSED_IMAGE, IMAGE, POINT_CLOUD, *_MOTIONS)
+KNOWN: Final = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, *_MOTIONS)
 """Types of messages that hold a frame."""
 
 
