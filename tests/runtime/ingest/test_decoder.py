@@ -159,7 +159,7 @@ def test_times_that_may_mean_two_things_are_counted_and_the_log_says_what_to_do(
     assert isinstance(frame, LidarFrame)
     assert frame.time_offset_s is not None
     assert frame.time_offset_s.tolist() == pytest.approx([0.0, 0.005])
-    assert said.intake.timed_by == "time: float32, ms since the stamp; 0.0 to 5.0 ms, stamped at its begin"
+    assert said.intake.ros.timed_by == "time: float32, ms since the stamp; 0.0 to 5.0 ms, stamped at its begin"
     assert said.take(LIDAR, packed(columns[:3]), CDR) is None, "a field that was named has to be there"
     assert said.losses.snapshot() == {(LIDAR, "cloud_fields"): 1}
 

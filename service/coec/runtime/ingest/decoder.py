@@ -9,15 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from coec.adapters.frames import msgpack_frames
-from coec.adapters.frames.incoming import Refusal
-from coec.adapters.ros import incoming, messages
-from coec.adapters.ros.moving_frames import MovingFrame
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.frames.origin import OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import LimitsConfig, PairConfig
 from coec.errors import DecodeError
+from coec.runtime.ingest import ros_frames
 from coec.runtime.ingest.inbox import Parcel
 from coec.runtime.ingest.sequence_numbers import SequenceNumbers
 
@@ -31,17 +29,7 @@ CLOUD_ORIGIN = "cloud_origin"
 WRONG_TYPE = "wrong_type"
 """Cause of a loss: a message that makes no frame of the stream."""
 
-EXPLAINED = frozenset(
-    {
-        CLOUD_ORIGIN,
-        WRONG_TYPE,
-        Refusal.MESSAGE_TYPE,
-        Refusal.CLOUD_FIELDS,
-        Refusal.CLOUD_TIME,
-        Refusal.CLOUD_TIME_AMBIGUOUS,
-        Refusal.IMAGE_UNKNOWN_FORMAT,
-    }
-)
+EXPLAINED = frozenset({CLOUD_ORIGIN, WRONG_TYPE, *ros_frames.EXPLAINED})
 """Causes that the log explains by the sentence of the error, which is ours."""
 
 NUMBERED = b"\xa8sequence"
@@ -63,7 +51,7 @@ class Decoder:
     """Decodes and checks the samples of one pair's streams.
 
     Attributes:
-        timed_by: of the latest sweep, see `LidarFrame`.
+        ros: reads those that are messages of ROS.
     """
 
     def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:
@@ -77,8 +65,7 @@ class Decoder:
         self._accepted: Counter[str] = Counter()
         self._T_cloud_lidar = np.array(pair.lidar.T_cloud_lidar, dtype=np.float64)
         self._origin = OriginCheck()
-        self.timed_by = ""
-        self._moving = MovingFrame(*(("", "") if pair.ego is None else (pair.ego.parent, pair.ego.child)))
+        self.ros = ros_frames.RosFrames(pair, limits)
 
     def counts(self, stream: str) -> StreamCounts:
         """Counters of a stream since the start."""
@@ -115,8 +102,6 @@ class Decoder:
             self._losses.add(stream, "decoder_fault")
             return None
         self._accepted[stream] += 1
-        if isinstance(frame, LidarFrame):
-            self.timed_by = frame.timed_by
         return frame
 
     def _decode(self, stream: str, sample: Sample) -> Frame | None:
@@ -127,14 +112,9 @@ class Decoder:
         if encoding == CDR:
             type_name = schema or configured.assumed_type
             if type_name not in configured.types:
-                expected = " or ".join(configured.types)
-                told = incoming.REFUSED.get(type_name, "a message of another type")
-                raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
-            if type_name == messages.TF:
-                return self._moving.motion(sample.payload)
-            frame = incoming.decode(type_name, sample.payload, self._limits, point_time=self._pair.lidar.time)
-            self._check_times(frame)
-            return frame
+                what = ros_frames.of_another_type(type_name, configured.place, configured.types)
+                raise DecodeError(WRONG_TYPE, what)
+            return self.ros.frame(type_name, sample.payload)
         if stream == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
         if stream == LIDAR:
@@ -157,12 +137,6 @@ class Decoder:
         if contradiction is not None:
             raise DecodeError(CLOUD_ORIGIN, f"{contradiction.sentence} See lidar.T_cloud_lidar.")
         return sweep
-
-    def _check_times(self, frame: Frame) -> None:
-        time = self._pair.lidar.time
-        if time is not None and isinstance(frame, LidarFrame) and frame.time_offset_s is None:
-            what = f"the cloud has no field {time.field} of one number a point, which `lidar.time` names"
-            raise DecodeError(Refusal.CLOUD_FIELDS, what)
 
     def _check_camera(self, frame: CameraFrame) -> None:
         camera = self._pair.camera

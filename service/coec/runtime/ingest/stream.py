@@ -204,5 +204,5 @@ class Stream:
             rate_hz=0.0 if silent and rate_hz is not None else rate_hz,
             pace=self._clock.pace,
             sync_error_s=self._sync_error_s,
-            timed_by=self._decoder.timed_by,
+            timed_by=self._decoder.ros.timed_by,
         )
