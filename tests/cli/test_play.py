@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,11 +44,14 @@ class Listener:
         self.samples: defaultdict[str, list[zenoh.Sample]] = defaultdict(list)
         self.tokens: set[str] = set()
         self._open = [
-            session.declare_subscriber("**", zenoh.handlers.Callback(self._take, indirect=False)),
+            session.declare_subscriber("**", zenoh.handlers.Callback(self._hear, indirect=False)),
             session.liveliness().declare_subscriber("@ros2_lv/**", zenoh.handlers.Callback(self._note, indirect=False)),
         ]
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _hear(self, sample: zenoh.Sample) -> None:
+        self.take(sample)
+
+    def take(self, sample: zenoh.Sample) -> None:
         self.samples[str(sample.key_expr)].append(sample)
 
     def _note(self, sample: zenoh.Sample) -> None:
@@ -138,6 +143,29 @@ def test_stamps_begin_now_where_asked_and_all_else_is_as_recorded(
     # The recorder's clock began at 0, the sensors' at 1 s.
     began_ns = stamps[0] - 10**9
     assert 0 < listener.attachments(IMAGE_KEY)[0].source_ns - began_ns < SECONDS * 10**9
+
+
+def test_a_loop_goes_on_in_time_until_it_is_told_to_stop(
+    coec: Coec, listener: Listener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive = a_drive()
+    take = listener.take
+
+    def counted(sample: zenoh.Sample) -> None:
+        take(sample)
+        if listener.count() == 2 * len(drive) + 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(listener, "take", counted)
+    bag = Bag(drive).write(tmp_path / "b.mcap")
+    told = coec("play", bag, "--middleware", "ros2dds", "--loop", "--rate", 0, "--connect", listener.endpoint)
+    assert told.status == 0, told.err
+    payloads = listener.payloads("front/image")
+    assert payloads[:4] == recorded(drive, "/front/image")
+    stamps = [decode("sensor_msgs/msg/CompressedImage", payload, LimitsConfig()).stamp_ns for payload in payloads]
+    assert len(stamps) > 4
+    # Times between recorder's stamps: the pass, and the pause before the next.
+    assert stamps[4] - stamps[0] == len(drive) - 1 + 100_000_000
 
 
 def test_types_that_are_not_ros_own_have_no_key_of_rmw_zenoh(coec: Coec, listener: Listener, tmp_path: Path) -> None:
