@@ -39,7 +39,7 @@ def a_cloud(name: str = "lidar_id", form: str = "u1", sources: list[int] = SOURC
 
 
 def taken(message: bytes, source: int | None) -> LidarFrame:
-    frame = decode(POINT_CLOUD, message, LimitsConfig(), source)
+    frame = decode(POINT_CLOUD, message, LimitsConfig(), source=source)
     assert isinstance(frame, LidarFrame)
     return frame
 

@@ -27,7 +27,7 @@ _MAX_CLOUD_FIELDS = 64
 
 
 def decode(
-    type_name: str, payload: bytes, limits: LimitsConfig, source: int | None = None
+    type_name: str, payload: bytes, limits: LimitsConfig, *, source: int | None = None
 ) -> CameraFrame | LidarFrame | EgoMotion:
     """The frame in a message of type `CompressedImage`, `Image`, `PointCloud2`, `Odometry` or `TwistStamped`.
 
@@ -79,7 +79,7 @@ def _point_cloud(payload: bytes, limits: LimitsConfig, source: int | None = None
     _check_cloud_fields(payload)
     message = deserialized(ros.sensor_msgs__msg__PointCloud2, payload)
     _frame_id(message.header.frame_id)
-    return point_cloud2.frame_of(message, _stamp_ns(message.header), limits, source)
+    return point_cloud2.frame_of(message, _stamp_ns(message.header), limits, source=source)
 
 
 def _odometry(payload: bytes, limits: LimitsConfig) -> EgoMotion:

@@ -38,7 +38,7 @@ _RELATIVE_S = 1.0
 1970."""
 
 
-def frame_of(message: PointCloud2, stamp_ns: int, limits: LimitsConfig, source: int | None = None) -> LidarFrame:
+def frame_of(message: PointCloud2, stamp_ns: int, limits: LimitsConfig, *, source: int | None = None) -> LidarFrame:
     """The sweep of a message whose header is already checked.
 
     `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned

@@ -104,7 +104,7 @@ class Decoder:
             if type_name not in configured.types:
                 expected = " or ".join(configured.types)
                 raise DecodeError(WRONG_TYPE, f"a message of another type on {configured.place}: expected {expected}")
-            return incoming.decode(type_name, sample.payload, self._limits, self._pair.lidar.source)
+            return incoming.decode(type_name, sample.payload, self._limits, source=self._pair.lidar.source)
         if stream == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
         if stream == LIDAR:

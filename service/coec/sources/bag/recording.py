@@ -177,6 +177,6 @@ def _number(text: str | None) -> int | None:
 def _load(storage: Storage, reader: Reader, place: Place, source: int | None = None) -> Message:
     data = reader.read(place.at)
     try:
-        return incoming.decode(place.type_name, data, LimitsConfig(), source)
+        return incoming.decode(place.type_name, data, LimitsConfig(), source=source)
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error
