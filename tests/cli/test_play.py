@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,11 +44,14 @@ class Listener:
         self.samples: defaultdict[str, list[zenoh.Sample]] = defaultdict(list)
         self.tokens: set[str] = set()
         self._open = [
-            session.declare_subscriber("**", zenoh.handlers.Callback(self._take, indirect=False)),
+            session.declare_subscriber("**", zenoh.handlers.Callback(self._hear, indirect=False)),
             session.liveliness().declare_subscriber("@ros2_lv/**", zenoh.handlers.Callback(self._note, indirect=False)),
         ]
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _hear(self, sample: zenoh.Sample) -> None:
+        self.take(sample)
+
+    def take(self, sample: zenoh.Sample) -> None:
         self.samples[str(sample.key_expr)].append(sample)
 
     def _note(self, sample: zenoh.Sample) -> None:
@@ -140,6 +145,29 @@ def test_stamps_begin_now_where_asked_and_all_else_is_as_recorded(
     assert 0 < listener.attachments(IMAGE_KEY)[0].source_ns - began_ns < SECONDS * 10**9
 
 
+def test_a_loop_goes_on_in_time_until_it_is_told_to_stop(
+    coec: Coec, listener: Listener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive = a_drive()
+    take = listener.take
+
+    def counted(sample: zenoh.Sample) -> None:
+        take(sample)
+        if listener.count() == 2 * len(drive) + 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(listener, "take", counted)
+    bag = Bag(drive).write(tmp_path / "b.mcap")
+    told = coec("play", bag, "--middleware", "ros2dds", "--loop", "--rate", 0, "--connect", listener.endpoint)
+    assert told.status == 0, told.err
+    payloads = listener.payloads("front/image")
+    assert payloads[:4] == recorded(drive, "/front/image")
+    stamps = [decode("sensor_msgs/msg/CompressedImage", payload, LimitsConfig()).stamp_ns for payload in payloads]
+    assert len(stamps) > 4
+    # Times between recorder's stamps: the pass, and the pause before the next.
+    assert stamps[4] - stamps[0] == len(drive) - 1 + 100_000_000
+
+
 def test_types_that_are_not_ros_own_have_no_key_of_rmw_zenoh(coec: Coec, listener: Listener, tmp_path: Path) -> None:
     bag = tmp_path / "b.mcap"
     with bag.open("wb") as stream:
@@ -151,13 +179,23 @@ def test_types_that_are_not_ros_own_have_no_key_of_rmw_zenoh(coec: Coec, listene
         writer.finish()  # type: ignore[no-untyped-call]
     told = coec("play", bag, "--middleware", "rmw_zenoh", "--rate", 0, "--connect", listener.endpoint, "--json")
     assert told.document["frames"] == {"/word": 1}
-    assert "not played, their types are not ROS's own: /wheels (acme_msgs/msg/Wheels)" in told.err
+    assert "hash is not known: '/wheels' ('acme_msgs/msg/Wheels')" in told.err
     told = coec("play", bag, "--middleware", "rmw_zenoh", "--topics", "/wheels", "--connect", listener.endpoint)
     assert told.status == 2
     listener.samples.clear()
     document = played(coec, listener, bag, "--middleware", "ros2dds", "--start-now")
     assert document["frames"] == {"/wheels": 1, "/word": 1}
     assert listener.payloads("wheels") == [b"\0\1\0\0anything"]
+
+
+@pytest.mark.fault("a bag with topics that are no names of ROS", "they are named, escaped, and not played")
+@pytest.mark.parametrize("topic", ["/**", "/a/*/b", "a", "/", "//a", "/a$b", "/a\x1b[2J", "/" + 300 * "a", "/@ros2_lv"])
+def test_names_that_are_none_are_left_out(coec: Coec, listener: Listener, tmp_path: Path, topic: str) -> None:
+    bag = Bag([*a_drive(), (topic, a_drive()[1][1])]).write(tmp_path / "b.mcap")
+    told = coec("play", bag, "--middleware", "ros2dds", "--rate", 0, "--connect", listener.endpoint, "--json")
+    assert told.status == 0, told.err
+    assert len(told.document["frames"]) == 5
+    assert ascii(topic) in told.err.replace("\n", "")
 
 
 def test_other_recordings_are_played_below_the_name_of_their_pair(coec: Coec, listener: Listener) -> None:

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
-from coec.evaluation.fitness import cadence, fitness_of, in_view
+from coec.evaluation.fitness import cadence, fitness_of, in_view, passes
 from coec.geometry.cameras import build
 from coec.sources.recording import FramewiseRecording, RecordedFrame
 
@@ -84,6 +85,37 @@ def test_a_cadence_tells_its_longest_gap() -> None:
 )
 def test_what_is_missing_is_said(recording: FramewiseRecording, code: str, level: str) -> None:
     assert codes(recording)[code] == level
+
+
+@pytest.mark.parametrize(
+    ("times_s", "told"),
+    [
+        (np.linspace(0.0, 0.1, 60), 1),
+        (np.tile(np.linspace(0.0, 0.1, 30), 2), 2),
+        (np.tile(np.linspace(-0.1, 0.0, 20), 3), 3),
+        (np.tile(np.linspace(0.0, 0.1, 4), 16), 16),
+        (np.random.default_rng(1).uniform(0.0, 0.01, 50) + np.linspace(0.0, 0.1, 50), 1),
+        (np.zeros(9), 1),
+        (None, 0),
+    ],
+    ids=range(7),
+)
+def test_passes_are_counted_in_the_order_in_which_points_lie(times_s: NDArray[np.float64] | None, told: int) -> None:
+    count = 5 if times_s is None else len(times_s)
+    times = None if times_s is None else times_s.astype(np.float32)
+    assert passes(LidarFrame(0, "lidar", np.ones((count, 3), np.float32), time_offset_s=times)) == told
+
+
+@pytest.mark.parametrize(("rings", "told"), [(False, True), (True, False)])
+def test_a_cloud_that_may_be_of_several_lidars_is_said(rings: bool, told: bool) -> None:
+    recording = a_recording(ring=rings)
+    times_s = np.array([0.0, 0.1, 0.0, 0.1], np.float32)
+
+    def timed(frame: RecordedFrame) -> RecordedFrame:
+        return replace(frame, load_lidar=lambda: replace(frame.load_lidar(), time_offset_s=times_s))
+
+    timed_recording = replace(recording, frames=tuple(map(timed, recording.frames)))
+    assert ("perhaps_concatenated" in codes(timed_recording)) is told
 
 
 def test_an_extrinsic_the_wrong_way_round_is_said() -> None:

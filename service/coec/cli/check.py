@@ -131,7 +131,9 @@ def _show_topics(source: str) -> None:
         bag = open_topics(replace(spec, query={}))
         table = console.table("topic", "type", "messages", "Hz", right=(2, 3))
         for topic, info in bag.infos.items():
-            table.add_row(topic, info.type_name, str(info.count), f"{info.rate_hz:.2f}")
+            # Nobody vouches for the names in a file.
+            name, kind = (text if text.isprintable() else ascii(text) for text in (topic, info.type_name))
+            table.add_row(name, kind, str(info.count), f"{info.rate_hz:.2f}")
         console.out.print(table)
 
 

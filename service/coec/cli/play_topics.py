@@ -122,12 +122,12 @@ def _chosen(programme: Programme, asked: tuple[str, ...], middleware: Middleware
         told = ", ".join(f"{topic} ({info.type_name}, {info.count} messages)" for topic, info in infos.items())
         raise UsageError(f"{programme.name} has no topic {', '.join(unknown)}; there: {told or 'none'}")
     wanted = {topic: info for topic, info in infos.items() if not asked or topic in asked}
-    chosen = {topic: info for topic, info in wanted.items() if is_playable(middleware, info.type_name)}
-    left = ", ".join(f"{topic} ({info.type_name})" for topic, info in wanted.items() if topic not in chosen)
+    chosen = {topic: info for topic, info in wanted.items() if is_playable(middleware, topic, info.type_name)}
+    left = ", ".join(f"{topic!a} ({info.type_name!a})" for topic, info in wanted.items() if topic not in chosen)
     if left and (asked or not chosen):
-        raise UsageError(f"rmw_zenoh's key of {left} holds a hash of the type, which is not one of ROS's own")
+        raise UsageError(f"{left} cannot be played: no names of ROS, or rmw_zenoh's hash of the type is not known")
     if left:
-        console.say(f"coec: not played, their types are not ROS's own: {left}")
+        console.say(f"coec: not played, no names of ROS, or types of which rmw_zenoh's hash is not known: {left}")
     return chosen
 
 

@@ -36,6 +36,9 @@ SMEARING_MPS = 1.0
 MANY_GAPS = 3.0
 """Gaps between frames are long from so many median intervals on."""
 
+FEW_PASSES = range(2, 9)
+"""How often the times of a cloud of several LiDARs begin anew; those of one that is stored row by row do so oftener."""
+
 Level = Literal["ok", "warn", "fail"]
 
 
@@ -67,6 +70,8 @@ class Fitness:
         width, height: of the images, pixels.
         points, rings: of a sweep, medians; no rings: 0.
         range_m: (near, far) within which nine of ten points lie.
+        passes: how often the points' times run from the begin of a sweep to its end, in the order in which they lie,
+            median; 0 without times.
         point_time: whether points carry their own time, or the rig knows the sweep's.
         timed_by: how the times of points were read, in a line; empty where that is not open.
         speed_mps, turn_degps: (median, most) of the vehicle; None where the ego-motion does not tell.
@@ -86,6 +91,7 @@ class Fitness:
     points: int
     rings: int
     range_m: tuple[float, float]
+    passes: int
     point_time: bool
     timed_by: str
     speed_mps: tuple[float, float] | None
@@ -136,6 +142,7 @@ def fitness_of(recording: Recording) -> Fitness:
         points=_median([len(sweep.xyz_m) for sweep in sweeps]),
         rings=_median([0 if sweep.ring is None else len(np.unique(sweep.ring)) for sweep in sweeps]),
         range_m=(near, far),
+        passes=_median([passes(sweep) for sweep in sweeps]),
         point_time=rig.sweep is not None or any(sweep.time_offset_s is not None for sweep in sweeps),
         timed_by=next((sweep.timed_by for sweep in sweeps), ""),
         speed_mps=_spread(_known(motion.speed_mps for motion in motions)),
@@ -167,6 +174,16 @@ def in_view(sweep: LidarFrame, rig: Rig) -> float:
     return float(inside.mean()) if len(inside) else 0.0
 
 
+def passes(sweep: LidarFrame) -> int:
+    """How often the times of a sweep's points begin anew, in the order in which they lie, and once more; 0 where they
+    have none."""
+    times_s = sweep.time_offset_s
+    if times_s is None or len(times_s) == 0:
+        return 0
+    span_s = float(times_s.max() - times_s.min())
+    return 1 + int((np.diff(times_s) < -0.5 * span_s).sum())
+
+
 def _with_remarks(seen: Fitness) -> Fitness:
     remarks = [remark for remark in _remarks(seen) if remark is not None]
     return replace(seen, remarks=tuple(sorted(remarks, key=lambda remark: _ORDER[remark.level])))
@@ -176,7 +193,16 @@ _ORDER: dict[Level, int] = {"fail": 0, "warn": 1, "ok": 2}
 
 
 def _remarks(seen: Fitness) -> list[Remark | None]:
-    return [_too_short(seen), _unpaired(seen), _view(seen), _motion(seen), _standing(seen), _rings(seen), _gaps(seen)]
+    return [
+        _too_short(seen),
+        _unpaired(seen),
+        _view(seen),
+        _motion(seen),
+        _standing(seen),
+        _rings(seen),
+        _joined(seen),
+        _gaps(seen),
+    ]
 
 
 def _too_short(seen: Fitness) -> Remark | None:
@@ -227,6 +253,17 @@ def _rings(seen: Fitness) -> Remark | None:
     if seen.rings != 1:
         return None
     return Remark("warn", "constant_ring", "The field `ring` holds one number: beams are told by their elevation.")
+
+
+def _joined(seen: Fitness) -> Remark | None:
+    if seen.rings > 0 or seen.passes not in FEW_PASSES:
+        return None
+    return Remark(
+        "warn",
+        "perhaps_concatenated",
+        f"The points' times begin anew {seen.passes} times in a sweep, and no ring tells beams apart: if the cloud is "
+        "of several LiDARs (concatenated), take the topic of one.",
+    )
 
 
 def _gaps(seen: Fitness) -> Remark | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections import Counter
@@ -9,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Final, Literal
 
 import zenoh
+from pydantic import TypeAdapter, ValidationError
 
 from coec.adapters.ros import messages
 from coec.adapters.ros.topics import TopicMessage, qos_of
@@ -17,10 +19,16 @@ from coec.adapters.ros.wire.rmw_zenoh import Node, RmwZenoh
 from coec.adapters.ros.wire.ros2dds import Ros2dds
 from coec.adapters.zenoh.cadence import Played, paced
 from coec.adapters.zenoh.ros_publisher import RosNode, RosPublisher, RosPublishers
+from coec.config import TopicName
 
 Middleware = Literal["rmw_zenoh", "ros2dds"]
 
 NODE: Final = "coec_play"
+
+TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,127}/msg/[A-Za-z][A-Za-z0-9]{0,127}")
+"""Full names of messages (rosidl_parser, definition.py)."""
+
+_TOPIC: Final = TypeAdapter[str](TopicName)
 
 LOOK_AGAIN_S: Final = 0.05
 """Between two looks at who listens."""
@@ -34,9 +42,14 @@ def dialect_of(middleware: Middleware, session: zenoh.Session, domain: int, name
     return RmwZenoh(Node(domain, name, 0, "/", NODE), messages.type_hash)
 
 
-def is_playable(middleware: Middleware, type_name: str) -> bool:
-    """Whether messages of a type have a key: that of rmw_zenoh holds the type's hash, known of ROS's own types."""
-    return middleware == "ros2dds" or messages.is_known(type_name)
+def is_playable(middleware: Middleware, topic: str, type_name: str) -> bool:
+    """Whether a topic has a key: names are ROS's (nobody vouches for those in a file, and `*` in a key is no name); and
+    that of rmw_zenoh holds the type's hash, known of ROS's own types."""
+    try:
+        _TOPIC.validate_python(topic)
+    except ValidationError:
+        return False
+    return TYPE.fullmatch(type_name) is not None and (middleware == "ros2dds" or messages.is_known(type_name))
 
 
 class TopicPlayer:
