@@ -690,7 +690,8 @@ def _model_card_seeds() -> list[bytes]:
 
 # --- the worker -------------------------------------------------------------------------------------------------------
 
-KINDS: Final = (*Kind, None)
+KINDS: Final = (Kind.SOLVE, Kind.CHECK, Kind.OVERLAY, Kind.COMMISSION, None)
+"""A picture is answered as an overlay is."""
 
 
 def _worker(data: bytes, folder: Path) -> None:

@@ -105,7 +105,7 @@ def test_a_knock_is_an_error_until_the_new_calibration_is_served(told: Told) -> 
 
 
 def test_diagnostics_come_unasked(told: Told) -> None:
-    stamps = [told.topic("/diagnostics").next().header.stamp for _ in range(4)]
+    stamps = [told.topic("/diagnostics").next().header.stamp for _ in range(2)]
     times_s = [stamp.sec + stamp.nanosec / 1e9 for stamp in stamps]
     assert times_s == sorted(times_s)
 

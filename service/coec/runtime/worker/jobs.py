@@ -49,13 +49,12 @@ DEADLINE_S = {
     Kind.SOLVE: 600.0,
     Kind.CHECK: 180.0,
     Kind.OVERLAY: 60.0,
-    Kind.PICTURE: 15.0,
+    Kind.PICTURE: 60.0,
     Kind.COMMISSION: 1800.0,
 }
 """From asking to the last moment of an answer, s. A live window: the two attempts of 120 s that `worker` allows by
 default, behind another window that has them, and two minutes for new processes. A check: the first start of a
-worker, which compiles its kernels for a minute and a half on two busy cores, twice over. A picture of a window: six
-solves of 10 s; of what is on the road now: a solve and a half, beyond which it is not now any more.
+worker, which compiles its kernels for a minute and a half on two busy cores, twice over. A picture: six solves of 10 s.
 A commissioning: twice `COMMISSIONING_TIMEOUT_S`."""
 
 BACKLOG_DEADLINE_S = 86_400.0
