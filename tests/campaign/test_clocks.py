@@ -60,13 +60,13 @@ def windows_of(folder: Path) -> list[str]:
 
 def after_a_jump(what: str, samples: Sequence[Sample], begin_s: float) -> list[Figure]:
     """What must hold from the moment at which a clock jumped. Memory is compared at its most, with no more pairs
-    that wait for the worker than before: they are what a busy computer adds, and go when they are judged."""
+    that wait for the worker than before, or the fewest: they are what a busy computer adds, and go when judged."""
     before = [sample for sample in samples if sample.wall_s < begin_s]
     later = samples[len(before) :]
     seconds = {id(sample): (sample.wall_s - begin_s) * rate() for sample in later}
     said = [seconds[id(sample)] for sample in later if sample.state in SAID and sample.reasons]
     checked = [seconds[id(sample)] for sample in later if sample.checks > later[0].checks]
-    held = max(sample.held for sample in before)
+    held = max(max(sample.held for sample in before), min(sample.held for sample in later))
     most_before = max(sample.rss_bytes for sample in before)
     most = max(sample.rss_bytes for sample in later if sample.held <= held)
     quiet = longest_unchecked(later, rate())

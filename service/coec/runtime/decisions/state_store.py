@@ -250,7 +250,10 @@ def _estimate(stored: CalibrationResult) -> Estimate:
     moved = () if stored.moved is None else (stored.moved.before, stored.moved.after)
     for transform in (stored.camera_from_lidar, *moved):
         _pose(transform.matrix)
-    return estimate_of(stored)
+    estimate = estimate_of(stored)
+    if (estimate.uncertainty.noise.diagonal() < 0.0).any():
+        raise ValueError("a variance is negative")
+    return estimate
 
 
 def _track(stored: dict[str, Any]) -> Track:
