@@ -49,9 +49,9 @@ BASINS = 2
 NEAR_SHARE = 0.9
 """Of the significance of the best maximum within reach on the sharpest edges, from which the one next to the pose is
 believed instead: a mount that is as it was is far likelier than one that moved to a place which fits hardly better.
-Between guard rails, lane markings and a horizon, all of which run to one point, edges fit as well a degree beside: of
-24 checks of right mounts on simulated highways that ended 0.6 to 1.9° off, 13 end within 0.2° so. From 0.8 to 0.95 the
-same do."""
+Between guard rails, lane markings and a horizon, all of which run to one point, edges fit nearly as well a degree
+beside. Of 180 checks of right mounts on simulated drives 27 with clear edges ended more than 0.45° off, most of them on
+highways; with this 15, of which 14 have few edges in view. From 0.8 to 0.95 it is 14 to 16."""
 
 ROTATION_DOF, POSE_DOF = 3, 6
 """Axes of ξ that the two optima of a check are searched over: rotations, and all."""

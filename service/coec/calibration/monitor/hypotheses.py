@@ -83,7 +83,8 @@ def after_check(tests: Hypotheses, told: Told, axes: Axes, share: float, most: f
     scored = score(told, right.wider(told.place), axes.reach)
     # Neighbouring checks say the same of their street: what they say of the rig is worth no more than a street.
     of_rig = plus(told.noise, told.place)
-    learnt = right.after(replace(told, noise=of_rig), scored, share)
+    # Faint checks of one place are off alike, however many: they teach nothing of the rig.
+    learnt = right if told.weak else right.after(replace(told, noise=of_rig), scored, share)
     least = three([max(v, n / OLDEST) for v, n in zip(learnt.variance, of_rig, strict=True)])
     learnt = replace(learnt, variance=least)
     return Hypotheses(learnt, _thinned(running), told.offset)
