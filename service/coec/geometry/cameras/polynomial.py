@@ -22,8 +22,13 @@ def monotonic_limit_squared(coefficients: tuple[float, ...]) -> float:
 
 
 def first_positive_root(polynomial: NDArray[np.float64]) -> float:
-    """The smallest s > 0 at which a polynomial, its coefficients (N,) ascending, is zero; infinite if there is none."""
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(polynomial, "b"))
+    """The smallest s > 0 at which a polynomial, its coefficients (N,) ascending, is zero; infinite if there is none.
+    Raises ValueError if they are of so different sizes that a double cannot hold their ratio: no lens is like that."""
+    trimmed = np.trim_zeros(polynomial, "b")
+    with np.errstate(over="ignore", invalid="ignore"):
+        if not np.isfinite(trimmed / trimmed[-1]).all():
+            raise ValueError("the distortion coefficients are of too different sizes")
+    roots = np.polynomial.polynomial.polyroots(trimmed)
     # A root counts as real if its imaginary part is rounding only (eigenvalues of the companion matrix, relative).
     real = np.sort(roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)])
     return float(real[0]) if real.size else math.inf

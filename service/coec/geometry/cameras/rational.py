@@ -87,8 +87,9 @@ def _growing_squared(above: NDArray[np.float64], below: NDArray[np.float64]) -> 
     """Square of the radius up to which r above(r^2) / below(r^2) grows: with s = r^2 its slope has the sign of
     above below + 2 s (above' below - above below')."""
     numerator, denominator = Polynomial(above), Polynomial(below)
-    turned = numerator.deriv() * denominator - numerator * denominator.deriv()
-    slope = numerator * denominator + Polynomial([0.0, 2.0]) * turned
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused with its root
+        turned = numerator.deriv() * denominator - numerator * denominator.deriv()
+        slope = numerator * denominator + Polynomial([0.0, 2.0]) * turned
     return min(first_positive_root(np.asarray(slope.coef, np.float64)), first_positive_root(below))
 
 
