@@ -18,7 +18,7 @@ from coec.calibration.types import CameraFrame, LidarFrame
 from fakes import wait_until
 
 HASHES = {
-    "CompressedImage": "RIHS01_15640771531571185e2efc8a100baf923961a4a15d5569652e6cb6691e8e371a",
+    "CompressedImage": "RIHS01_15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a",
     "Image": "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
     "PointCloud2": "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
     "Odometry": "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",

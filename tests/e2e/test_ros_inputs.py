@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -83,6 +84,10 @@ def test_ros_sees_who_listens_and_a_topic_that_nobody_publishes_is_told(
     assert f"no publisher of {TOPICS['camera']}" in examined.stdout
 
 
+def _has_received(pictures: int, pair: Any) -> bool:
+    return bool(pair["camera"]["received"] >= pictures)
+
+
 @pytest.mark.fault("two publishers on one topic of a running service", "health names their nodes until one ends")
 def test_two_drivers_on_one_topic_are_a_trouble_with_their_names(
     stack: ExitStack, running: Service, router: Router, drive: Drive
@@ -104,7 +109,7 @@ def test_two_drivers_on_one_topic_are_a_trouble_with_their_names(
         for _ in range(9):
             left.put(next(images))
             sent += 1
-        running.until(running.counters, lambda pair, wanted=sent: pair["camera"]["received"] >= wanted, "taken")
+        running.until(running.counters, partial(_has_received, sent), "they are taken")
     running.until(lambda: reasons(running), lambda told: "two_senders" not in told, "one sender")
     assert "sequence_gap" not in losses(running)
 

@@ -16,7 +16,7 @@ from coec.adapters.zenoh.client import connected, single_key
 from coec.adapters.zenoh.player import Player, Streams, shifted
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.cli.stopping import until_signal
-from coec.config import Config, PairConfig, RosConfig, ZenohConfig, load_config
+from coec.config import Config, OpenPairConfig, RosConfig, ZenohConfig, load_config
 from coec.errors import SourceError, UsageError
 from coec.reports import console
 from coec.sources import Recording, open_source
@@ -53,7 +53,7 @@ class Options:
 class Target:
     """Where to publish: the pair of the configuration, if there is one, the routers, and how ROS is spoken there."""
 
-    pair: PairConfig | None
+    pair: OpenPairConfig | None
     endpoints: tuple[str, ...]
     middleware: Middleware
     ros: RosConfig
@@ -113,17 +113,17 @@ def _ros(configured: RosConfig, options: Options) -> RosConfig:
     return configured if options.domain is None else configured.model_copy(update={"domain": options.domain})
 
 
-def _pair(config: Config, name: str | None) -> PairConfig:
-    pairs = [pair for pair in config.pairs if name in (None, pair.name)]
+def _pair(config: Config, name: str | None) -> OpenPairConfig:
+    pairs = [pair for pair in config.every_pair if name in (None, pair.name)]
     if len(pairs) == 1:
         return pairs[0]
-    known = ", ".join(pair.name for pair in config.pairs)
+    known = ", ".join(pair.name for pair in config.every_pair)
     raise UsageError(
         f"the configuration has {'no pair ' + name if name else 'several pairs'}: choose --pair of {known}"
     )
 
 
-def _warn(recording: Recording, pair: PairConfig | None, encoding: str) -> None:
+def _warn(recording: Recording, pair: OpenPairConfig | None, encoding: str) -> None:
     """What the receiver is going to refuse, or to miss."""
     for frame in recording.messages([0]):
         if isinstance(frame, CameraFrame) and frame.depth is not None and encoding == "cdr":

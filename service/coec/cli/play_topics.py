@@ -25,7 +25,7 @@ from coec.cli.play import (
     say_without_depth,
 )
 from coec.cli.stopping import until_signal
-from coec.config import PairConfig
+from coec.config import OpenPairConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.reports import console
 from coec.sources import open_source
@@ -93,7 +93,7 @@ def _bag(spec: SourceSpec) -> Programme:
     return Programme(bag.name, bag.infos, lambda topics: bag.messages(frozenset(topics)), DEFAULT_PERIOD_NS)
 
 
-def _frames(options: Options, pair: PairConfig | None) -> Programme:
+def _frames(options: Options, pair: OpenPairConfig | None) -> Programme:
     """Another recording, on the topics of the configuration's pair, or else on those below `/<pair>/`."""
     recording = open_source(options.source)
     rig: Rig = recording.rig
@@ -131,7 +131,7 @@ def _chosen(programme: Programme, asked: tuple[str, ...], middleware: Middleware
     return chosen
 
 
-def _awaited(chosen: Iterable[str], pair: PairConfig | None) -> list[str]:
+def _awaited(chosen: Iterable[str], pair: OpenPairConfig | None) -> list[str]:
     """The topics to which somebody should listen before the first message: the configured pair's, or all."""
     ours = [topic for topic in chosen if topic != TF_STATIC]
     configured = {stream.topic for stream in pair.streams.values()} if pair is not None else None

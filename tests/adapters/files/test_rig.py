@@ -100,6 +100,8 @@ def test_json_gives_back_the_same_bits(model: str) -> None:
         "k2": 0.01,
         "k3": 1e-3,
         "k4": 1e-4,
+        "k5": 1e-5,
+        "k6": 1e-6,
         "p1": 1e-4,
         "p2": 0.0,
     }

@@ -18,7 +18,7 @@ from ports import free_port
 IMAGE = "0/front/image_raw/sensor_msgs::msg::dds_::Image_/"
 IMAGE += "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"
 COMPRESSED = "0/front/image_raw/compressed/sensor_msgs::msg::dds_::CompressedImage_/"
-COMPRESSED += "RIHS01_15640771531571185e2efc8a100baf923961a4a15d5569652e6cb6691e8e371a"
+COMPRESSED += "RIHS01_15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a"
 ATTACHMENT = bytes.fromhex("01000000000000000028d1a6c92a601810000102030405060708090a0b0c0d0e0f")
 """The first message of a publisher: its number, the wall clock, the length of its id, and the id."""
 

@@ -24,15 +24,16 @@ POOL_MIB = 16
 RECEIVER = """
 import sys
 from coec.adapters.zenoh.bus import Bus, open_session
+from coec.adapters.zenoh.inputs import on_key
 from coec.config import LimitsConfig, ZenohConfig
 from pathlib import Path
 
-def shared_kib(payload, encoding):
+def shared_kib(sample):
     lines = Path("/proc/self/status").read_text().splitlines()
     print(next(line.split()[1] for line in lines if line.startswith("RssShmem")), flush=True)
 
 bus = Bus(open_session(ZenohConfig(connect=(sys.argv[1],)), LimitsConfig()))
-bus.subscribe("in/camera", shared_kib)
+bus.subscribe(on_key("in/camera"), shared_kib)
 sys.stdin.read()
 bus.undeclare_inputs()
 bus.close(5.0)

@@ -16,7 +16,7 @@ from coec.adapters.ros import messages, outgoing
 from coec.adapters.ros.wire.qos import Qos
 from coec.calibration.frames.motion_compensation import azimuth_offsets_s
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
-from coec.config import PairConfig
+from coec.config import OpenPairConfig
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 
@@ -76,7 +76,7 @@ class PairTopics:
         return cls(f"{image}/compressed", image, f"/{pair}/camera/camera_info", points, motion, turns)
 
     @classmethod
-    def of_pair(cls, pair: PairConfig) -> PairTopics:
+    def of_pair(cls, pair: OpenPairConfig) -> PairTopics:
         """Those of a configuration; the camera info lies beside the image, as image_transport has it."""
         image = pair.camera.place
         info = f"{image.removesuffix('/compressed').rpartition('/')[0]}/camera_info"

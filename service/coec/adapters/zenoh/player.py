@@ -16,7 +16,7 @@ from coec.adapters.ros import messages, outgoing
 from coec.adapters.zenoh.cadence import Played, paced
 from coec.adapters.zenoh.matching import is_heard
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.config import PairConfig
+from coec.config import OpenPairConfig
 from coec.errors import UsageError
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
@@ -33,7 +33,7 @@ class Streams:
     ego: str | None
 
     @classmethod
-    def of_pair(cls, pair: PairConfig) -> Streams:
+    def of_pair(cls, pair: OpenPairConfig) -> Streams:
         """Those of a configuration.
 
         Raises:
