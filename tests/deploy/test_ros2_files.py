@@ -9,7 +9,6 @@ import pytest
 
 from coec.adapters.ros import messages
 from coec.adapters.ros.diagnostics import Level
-from coec.adapters.ros.dialects import namespace_of
 from coec.adapters.ros.outgoing import MAX_RESIDUAL_PX
 from coec.config import Config, RosConfig, parse_yaml
 from coec.schemas import ros_names
@@ -94,4 +93,3 @@ def test_the_page_says_the_defaults_and_limits() -> None:
 def test_names_become_tokens_of_ros(name: str, token: str) -> None:
     assert ros_names.ros_name(name) == token
     assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", ros_names.overlay_topic(name))
-    assert namespace_of(name) == f"/{token}"

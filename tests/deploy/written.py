@@ -104,7 +104,7 @@ def exec_start() -> list[str]:
 
 def shipped_configurations() -> list[str]:
     """The service's, by their path below the root of the checkout."""
-    found = [DEPLOY / "coec.yaml", *sorted((DEPLOY / "examples").glob("*.yaml"))]
+    found = [DEPLOY / "coec.yaml", DEPLOY / "ros2" / "coec.yaml", *sorted((DEPLOY / "examples").glob("*.yaml"))]
     return [path.relative_to(REPOSITORY).as_posix() for path in found]
 
 

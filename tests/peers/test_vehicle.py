@@ -12,10 +12,11 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from coec.adapters.ros import messages
-from coec.adapters.ros.topics import TF_STATIC, FrameTopics, PairTopics
+from coec.adapters.ros.topics import FrameTopics, PairTopics
 from coec.adapters.zenoh.player import Frame
 from coec.calibration.types import CameraFrame
 from coec.geometry import se3
+from coec.schemas.ros_names import TF_STATIC
 from e2e.drives import SECONDS, STEP_S, STEPPED, Drive, rendered
 from e2e.processes import PORTION, Router, Service, service
 from peers.environments import peer

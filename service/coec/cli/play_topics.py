@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from coec.adapters.ros.later import shifted
-from coec.adapters.ros.topics import TF_STATIC, FrameTopics, PairTopics, TopicInfo, TopicMessage
+from coec.adapters.ros.topics import FrameTopics, PairTopics, TopicInfo, TopicMessage
 from coec.adapters.zenoh.cadence import repeated
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.topic_player import Middleware, TopicPlayer, dialect_of, is_playable
@@ -28,6 +28,7 @@ from coec.cli.stopping import until_signal
 from coec.config import OpenPairConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.reports import console
+from coec.schemas.ros_names import TF_STATIC
 from coec.sources import open_source
 from coec.sources.spec import SourceSpec, is_bag, parse_spec
 

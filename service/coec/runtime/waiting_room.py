@@ -19,10 +19,11 @@ from coec.calibration.types import Reason
 from coec.config import AnyStreamConfig, Config, PairConfig, StreamConfig
 from coec.errors import ConfigError
 from coec.runtime.api.awaited import AwaitedAnswers
-from coec.runtime.nominal.findings import CANNOT_BE_BUILT, TF_STATIC, Found, info_topic_of, needs_transforms
+from coec.runtime.nominal.findings import CANNOT_BE_BUILT, Found, info_topic_of, needs_transforms
 from coec.runtime.nominal.kept import KeptNominals, completed
 from coec.runtime.nominal.watch import Nominal, NominalWatch
 from coec.runtime.outside import Outside
+from coec.schemas.ros_names import TF_STATIC
 
 _log = logging.getLogger(__name__)
 

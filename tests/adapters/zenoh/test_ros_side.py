@@ -9,12 +9,12 @@ from contextlib import ExitStack
 import pytest
 import zenoh
 
-from coec.adapters.ros.dialects import namespace_of
 from coec.adapters.zenoh import ros_topics
 from coec.adapters.zenoh.bus import Bus, open_session
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.ros_topics import Topics, listed
 from coec.config import Config, LimitsConfig, ZenohConfig
+from coec.schemas.ros_names import ros_name
 from fakes import wait_until
 from ports import free_port
 
@@ -101,7 +101,7 @@ def test_elsewhere_subscribing_is_enough(session: zenoh.Session, stack: ExitStac
     ("vehicle", "namespace"), [("shuttle-7", "/shuttle_7"), ("7.up", "/_7_up"), ("bus_1", "/bus_1")]
 )
 def test_a_vehicle_has_a_name_that_ros_takes(vehicle: str, namespace: str) -> None:
-    assert namespace_of(vehicle) == namespace
+    assert f"/{ros_name(vehicle)}" == namespace
 
 
 def test_publishers_are_seen_with_type_and_node_while_they_are_there(

@@ -9,10 +9,11 @@ import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from coec.adapters.ros.messages import TF
-from coec.adapters.ros.topics import TF_STATIC, TopicMessage
+from coec.adapters.ros.topics import TopicMessage
 from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.topic_player import TopicPlayer, dialect_of
 from coec.config import LimitsConfig, ZenohConfig
+from coec.schemas.ros_names import TF_STATIC
 from ports import free_port
 
 SECONDS = 20.0

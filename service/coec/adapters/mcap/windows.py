@@ -50,6 +50,7 @@ from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
 from coec.errors import ConfigError, DecodeError, RecordingError, WindowError
 from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import CalibrationResult
+from coec.schemas.ros_names import DIAGNOSTICS, TF_STATIC
 
 SUFFIX = ".mcap"
 PART_SUFFIX = ".part"
@@ -65,7 +66,6 @@ POINTS, CAMERA_INFO, RESULT_TOPIC = "lidar/points", "camera/camera_info", "resul
 ODOMETRY, IMU = "odometry", "imu"
 """Topics below `/coec/<pair>/`."""
 
-TF_STATIC, DIAGNOSTICS = "/tf_static", "/diagnostics"
 
 CHUNK_BYTES = 64 * 1024
 """A chunk is closed at the first message past this size, so that a killed recorder loses a pair at most."""

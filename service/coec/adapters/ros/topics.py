@@ -17,10 +17,10 @@ from coec.adapters.ros.wire.qos import Qos
 from coec.calibration.frames.motion_compensation import azimuth_offsets_s
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 from coec.config import OpenPairConfig
+from coec.schemas.ros_names import TF_STATIC
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 
-TF_STATIC: Final = "/tf_static"
 
 LATCHED: Final = 100
 """Messages of `/tf_static` that are kept for whoever comes later: as many as tf2's listeners ask for

@@ -21,10 +21,10 @@ from coec.calibration.types import Matrix4, Reason
 from coec.config import IDENTITY, AnyStreamConfig, CameraIntrinsics, Matrix4x4, OpenPairConfig, PairConfig, describe
 from coec.errors import SourceError
 from coec.geometry.se3 import difference
+from coec.schemas.ros_names import TF_STATIC
 
 T = TypeVar("T")
 
-TF_STATIC = "/tf_static"
 
 CHANGED_RAD, CHANGED_M = 1e-6, 1e-6
 """Of a transform: more is another one. What is published anew is rounded to float64; a thousandth of what is found."""

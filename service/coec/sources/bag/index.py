@@ -16,6 +16,7 @@ from coec.adapters.ros.camera_info import Info, decode_info
 from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
 from coec.calibration.types import Matrix4
 from coec.errors import DecodeError, SourceError
+from coec.schemas.ros_names import TF_STATIC
 from coec.sources.bag.storage import Entry, Storage
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
@@ -115,7 +116,7 @@ class Index:
             stream.places.append(Place(stamp_ns, entry.place, name))
         elif name == messages.CAMERA_INFO and entry.topic not in self.infos:
             self.infos[entry.topic] = self._decoded(entry, decode_info)
-        elif name == messages.TF and entry.topic == "/tf_static":
+        elif name == messages.TF and entry.topic == TF_STATIC:
             self._decoded(entry, lambda data: self.transforms.take(decode_joints(data)))
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
