@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.adapters.ros.moving_frames import MAX_BETWEEN_S, MAX_TRANSFORMS, MovingFrame
+from coec.adapters.ros.moving_frames import MAX_BETWEEN_S, MovingFrame
+from coec.adapters.ros.transforms import MAX_TRANSFORMS
 from coec.calibration.types import EgoMotion
 from coec.errors import DecodeError
 from coec.geometry import se3
@@ -109,23 +110,23 @@ def test_nothing_is_said_across_a_gap_or_a_step_back(later_ms: float) -> None:
 
 @pytest.mark.fault("a pose that is none on /tf, or one that nobody can have driven to", "refused, and it goes on")
 @pytest.mark.parametrize(
-    "broken",
+    ("broken", "reason"),
     [
-        (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-        (1e30, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        (0.0, 0.0, 0.0, math.inf, 0.0, 0.0, 1.0),
-        (0.0, 0.0, 0.0, SIGNALLING, 0.0, 0.0, 1.0),
-        (SIGNALLING, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-        (5e8, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),  # a filter was reset
+        ((math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "transform_invalid"),
+        ((1e30, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "transform_invalid"),
+        ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), "transform_invalid"),
+        ((0.0, 0.0, 0.0, math.inf, 0.0, 0.0, 1.0), "transform_invalid"),
+        ((0.0, 0.0, 0.0, SIGNALLING, 0.0, 0.0, 1.0), "transform_invalid"),
+        ((SIGNALLING, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "transform_invalid"),
+        ((5e8, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "motion_invalid"),  # a filter was reset
     ],
 )
-def test_a_pose_that_is_none_is_refused(broken: Pose) -> None:
+def test_a_pose_that_is_none_is_refused(broken: Pose, reason: str) -> None:
     moving = MovingFrame("odom", "base_link")
     taken(at(0), at(20), frame=moving)
     with pytest.raises(DecodeError) as refused:
         moving.motion(at(40, where=broken))
-    assert refused.value.reason == "motion_invalid"
+    assert refused.value.reason == reason
     later = taken(*(at(ms) for ms in (1000, 1050)), frame=moving)
     assert later[1] is not None
 
@@ -134,9 +135,9 @@ def test_a_pose_that_is_none_is_refused(broken: Pose) -> None:
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (transforms(claimed=2**32 - 1), "message_too_large"),
+        (transforms(claimed=2**32 - 1), "transforms_too_many"),
         (transforms(claimed=MAX_TRANSFORMS), "message_malformed"),
-        (transforms(*[("a", "b", START, there(0))] * (MAX_TRANSFORMS + 1)), "message_too_large"),
+        (transforms(*[("a", "b", START, there(0))] * (MAX_TRANSFORMS + 1)), "transforms_too_many"),
         (at(0, child="x" * 2**20), "message_too_large"),
         (at(0)[:-9], "message_malformed"),
         (b"", "message_malformed"),

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from coec.adapters.ros.static_transforms import (
     MAX_JOINTS,
-    MAX_MESSAGE_BYTES,
     Joint,
     StaticTransforms,
     decode_joints,
 )
+from coec.adapters.ros.transforms import MAX_MESSAGE_BYTES
 from coec.errors import DecodeError
 from coec.geometry import se3
 from ros_messages import Packer

@@ -46,6 +46,8 @@ class Refusal(StrEnum):
     CLOUD_TIME_AMBIGUOUS = "cloud_time_ambiguous"
     CLOUD_CONCATENATED = "cloud_concatenated"
     MOTION_INVALID = "motion_invalid"
+    TRANSFORM_INVALID = "transform_invalid"
+    TRANSFORMS_TOO_MANY = "transforms_too_many"
 
 
 def check_size(payload: bytes, limits: LimitsConfig) -> None:

@@ -14,6 +14,9 @@ MAX_CLOUD_FIELDS: Final = 64
 MAX_FIELD_NAME: Final = 256
 """Bytes of the name of a field; drivers use up to some twenty."""
 
+_ORDERS: Final = {b"\x00": ">", b"\x01": "<"}
+"""Byte order by the second byte of the encapsulation (plain CDR)."""
+
 _ENCAPSULATION: Final = 4
 """Bytes ahead of the message; alignment counts from behind them."""
 
@@ -28,12 +31,15 @@ class Head:
     """Goes through a message from its begin.
 
     Raises:
-        DecodeError: `message_malformed` where the message ends before what is asked of it.
+        DecodeError: `message_malformed` where it is no CDR, or the message ends before what is asked of it.
     """
 
     def __init__(self, payload: bytes) -> None:
+        order = _ORDERS.get(payload[1:2])
+        if order is None:
+            raise DecodeError(Refusal.MESSAGE_MALFORMED, "not a message in CDR")
         self._payload = payload
-        self._order = "<" if payload[1:2] == b"\x01" else ">"
+        self._order = order
         self._at = _ENCAPSULATION
 
     def number(self) -> int:

@@ -10,32 +10,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numpy as np
-from rosbags.typesys.stores import ros2_humble as ros
-
-from coec.adapters.frames.incoming import Refusal
-from coec.adapters.ros.heads import Head
-from coec.adapters.ros.messages import deserialized
 from coec.adapters.ros.motion import checked
 from coec.adapters.ros.stamps import frame_id, stamp_ns
+from coec.adapters.ros.transforms import bare, pose_of, transforms_in
 from coec.calibration.types import EgoMotion, Matrix4
-from coec.errors import DecodeError
 from coec.geometry import se3
-
-MAX_TRANSFORMS: Final = 1024
-"""Of a message; robots with many joints send some hundred at once."""
-
-MAX_TRANSFORMS_BYTES: Final = 2**19
-"""Of a message: so many transforms, with names of usual length."""
 
 MIN_BETWEEN_S: Final = 0.01
 """Least time between the two poses: a millimetre, as fine as a filter's poses lie, is then 0.1 m/s."""
 
 MAX_BETWEEN_S: Final = 0.5
 """Most time: a vehicle changes its velocity within it, and what happened in a longer gap nobody knows."""
-
-MAX_PLACE_M: Final = 1e9
-"""Of a pose, per axis, metres: frames of maps may lie at the centre of the earth, 6.4e6 m away."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +33,7 @@ class MovingFrame:
     """One frame in another, from message to message. Not safe for use from several threads."""
 
     def __init__(self, parent: str, child: str) -> None:
-        self._parent, self._child = parent.lstrip("/"), child.lstrip("/")
+        self._parent, self._child = bare(parent), bare(child)
         self._before: _Pose | None = None
 
     def motion(self, payload: bytes) -> EgoMotion | None:
@@ -59,10 +44,10 @@ class MovingFrame:
             DecodeError: no such message; its pose is none, or cannot be reached from the one before.
         """
         found = None
-        for stamped in _transforms(payload):
-            if stamped.child_frame_id.lstrip("/") != self._child:
+        for stamped in transforms_in(payload):
+            if bare(stamped.child_frame_id) != self._child:
                 continue
-            if stamped.header.frame_id.lstrip("/") == self._parent:
+            if bare(stamped.header.frame_id) == self._parent:
                 found = self._moved_to(_pose(stamped)) or found
         return found
 
@@ -89,28 +74,8 @@ def frames_in(payload: bytes) -> set[tuple[str, str]]:
     Raises:
         DecodeError: no such message.
     """
-    return {
-        (frame_id(t.header.frame_id.lstrip("/")), frame_id(t.child_frame_id.lstrip("/"))) for t in _transforms(payload)
-    }
-
-
-def _transforms(payload: bytes) -> list[Any]:
-    if len(payload) > MAX_TRANSFORMS_BYTES or Head(payload).number() > MAX_TRANSFORMS:
-        raise DecodeError(
-            Refusal.MESSAGE_TOO_LARGE,
-            f"a message of transforms has at most {MAX_TRANSFORMS}, in {MAX_TRANSFORMS_BYTES} bytes",
-        )
-    transforms: list[Any] = deserialized(ros.tf2_msgs__msg__TFMessage, payload).transforms
-    return transforms
+    return {(frame_id(bare(t.header.frame_id)), frame_id(bare(t.child_frame_id))) for t in transforms_in(payload)}
 
 
 def _pose(stamped: Any) -> _Pose:
-    rotation, place = stamped.transform.rotation, stamped.transform.translation
-    place_m = (place.x, place.y, place.z)
-    if not all(abs(value) <= MAX_PLACE_M for value in place_m):
-        raise DecodeError(Refusal.MOTION_INVALID, "a pose has no finite place, or lies far away")
-    try:
-        turn = se3.rotation_from_quaternion_xyzw(np.array([rotation.x, rotation.y, rotation.z, rotation.w]))
-    except ValueError as error:
-        raise DecodeError(Refusal.MOTION_INVALID, f"a pose is none: {error}") from error
-    return _Pose(stamp_ns(stamped.header), se3.transform_from(turn, np.array(place_m)))
+    return _Pose(stamp_ns(stamped.header), pose_of(stamped))

@@ -7,32 +7,21 @@ calibration off them to judge.
 
 from __future__ import annotations
 
-import struct
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from rosbags.typesys.stores import ros2_humble as ros
 
-from coec.adapters.frames.incoming import MAX_FRAME_ID
-from coec.adapters.ros.messages import deserialized
+from coec.adapters.frames.incoming import MAX_FRAME_ID, Refusal
+from coec.adapters.ros.transforms import bare, pose_of, transforms_in
 from coec.calibration.types import Matrix4
 from coec.errors import DecodeError
-from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
-
-MAX_JOINT_M: Final = 1e9
-"""Of a static transform, per axis, metres: frames of maps may lie at the centre of the earth, 6.4e6 m away."""
+from coec.geometry.se3 import inverse
 
 MAX_JOINTS: Final = 2048
 """Kept in all; vehicles have some hundred."""
-
-MAX_MESSAGE_BYTES: Final = 2**20
-"""Of a message: as many joints with names of usual length have 300 kB."""
-
-_COUNT: Final = {1: struct.Struct("<I"), 0: struct.Struct(">I")}
-"""The number of transforms, with which a `TFMessage` begins, by the byte order of the message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +58,7 @@ class StaticTransforms:
         known = {(joint.child, joint.parent) for parents in self._joints.values() for joint in parents.values()}
         fresh = {(joint.child, joint.parent) for joint in joints} - known
         if len(known) + len(fresh) > MAX_JOINTS:
-            raise DecodeError("transforms_too_many", f"more than {MAX_JOINTS} static transforms")
+            raise DecodeError(Refusal.TRANSFORMS_TOO_MANY, f"more than {MAX_JOINTS} static transforms")
         for joint in joints:
             parents = self._joints.setdefault(joint.child, {})
             before = parents.get(joint.parent)
@@ -143,49 +132,20 @@ class StaticTransforms:
             done.update(way)
 
 
-def bare(frame_id: str) -> str:
-    """A frame id without the slash that ROS 1 put before it."""
-    return frame_id.lstrip("/")
-
-
 def decode_joints(payload: bytes) -> tuple[Joint, ...]:
     """The joints of a `TFMessage` in CDR.
 
     Raises:
         DecodeError: not such a message, or one of its transforms is none.
     """
-    if len(payload) > MAX_MESSAGE_BYTES:
-        raise DecodeError("message_too_large", f"a message of static transforms has at most {MAX_MESSAGE_BYTES} bytes")
-    layout = _COUNT.get(payload[1]) if len(payload) >= 8 else None
-    if layout is None:
-        raise DecodeError("message_malformed", "not a TFMessage in CDR, or cut off")
-    (count,) = layout.unpack_from(payload, 4)
-    if count > MAX_JOINTS:
-        raise DecodeError("transforms_too_many", f"more than {MAX_JOINTS} static transforms in a message")
-    return joints_of(deserialized(ros.tf2_msgs__msg__TFMessage, payload))
-
-
-def joints_of(message: Any) -> tuple[Joint, ...]:
-    """The joints of a deserialised `TFMessage`.
-
-    Raises:
-        DecodeError: one of its transforms is none.
-    """
-    return tuple(_joint(transform) for transform in message.transforms)
+    return tuple(_joint(stamped) for stamped in transforms_in(payload))
 
 
 def _joint(stamped: Any) -> Joint:
     parent, child = bare(stamped.header.frame_id), bare(stamped.child_frame_id)
     if not 0 < len(parent) <= MAX_FRAME_ID or not 0 < len(child) <= MAX_FRAME_ID:
-        raise DecodeError("frame_id_invalid", f"a frame id of a transform is empty or longer than {MAX_FRAME_ID}")
+        what = f"a frame id of a transform is empty or longer than {MAX_FRAME_ID}"
+        raise DecodeError(Refusal.FRAME_ID_INVALID, what)
     if parent == child:
-        raise DecodeError("transform_invalid", "a transform leads from a frame to itself")
-    rotation, translation = stamped.transform.rotation, stamped.transform.translation
-    offset_m = np.array([translation.x, translation.y, translation.z])
-    if not (np.abs(offset_m) <= MAX_JOINT_M).all():
-        raise DecodeError("transform_invalid", "a transform is not one: no finite place, or far away")
-    try:
-        turn = rotation_from_quaternion_xyzw(np.array([rotation.x, rotation.y, rotation.z, rotation.w]))
-    except ValueError as error:
-        raise DecodeError("transform_invalid", f"a transform is not one: {error}") from error
-    return Joint(parent, child, transform_from(turn, offset_m))
+        raise DecodeError(Refusal.TRANSFORM_INVALID, "a transform leads from a frame to itself")
+    return Joint(parent, child, pose_of(stamped))

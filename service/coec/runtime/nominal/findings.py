@@ -16,7 +16,8 @@ from pydantic import ValidationError
 
 from coec.adapters.files.rig import matrix_rows
 from coec.adapters.ros.camera_info import Info, info_topic, is_rectified, lens_of
-from coec.adapters.ros.static_transforms import StaticTransforms, bare
+from coec.adapters.ros.static_transforms import StaticTransforms
+from coec.adapters.ros.transforms import bare
 from coec.calibration.types import Matrix4, Reason
 from coec.config import IDENTITY, AnyStreamConfig, CameraIntrinsics, Matrix4x4, OpenPairConfig, PairConfig, describe
 from coec.errors import SourceError

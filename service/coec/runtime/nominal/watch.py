@@ -17,7 +17,8 @@ from types import MappingProxyType
 
 from coec.adapters.ros import messages
 from coec.adapters.ros.camera_info import MAX_INFO_BYTES, decode_info
-from coec.adapters.ros.static_transforms import MAX_MESSAGE_BYTES, StaticTransforms, decode_joints
+from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
+from coec.adapters.ros.transforms import MAX_MESSAGE_BYTES
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Reason

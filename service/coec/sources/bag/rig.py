@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.ros.camera_info import Info, Lens, info_topic, is_rectified, lens_of
-from coec.adapters.ros.static_transforms import bare
+from coec.adapters.ros.transforms import bare
 from coec.calibration.types import CameraFrame, EgoMotion, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe, load_yaml
 from coec.errors import ConfigError, SourceError
