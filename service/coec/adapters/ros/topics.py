@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from coec.adapters.ros import messages, outgoing
+from coec.adapters.ros.camera_info import info_topic
 from coec.adapters.ros.wire.qos import Qos
 from coec.calibration.frames.motion_compensation import azimuth_offsets_s
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
@@ -77,9 +78,9 @@ class PairTopics:
 
     @classmethod
     def of_pair(cls, pair: OpenPairConfig) -> PairTopics:
-        """Those of a configuration; the camera info lies beside the image, as image_transport has it."""
+        """Those of a configuration; the camera info lies where a service looks for it."""
         image = pair.camera.place
-        info = f"{image.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        info = pair.camera.info_topic or info_topic(image)
         motion = pair.ego.place if pair.ego else None
         return cls(image, image, info, pair.lidar.place, motion, motion)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, defaultdict, deque
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,7 @@ from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.frames.concatenation import SeveralOrigins
 from coec.calibration.frames.origin import ApparentOrigin, OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.config import AnyStreamConfig, LimitsConfig, OpenEgoConfig, OpenLidarConfig, PairConfig
+from coec.config import LimitsConfig, OpenPairConfig, PairConfig
 from coec.errors import DecodeError
 from coec.runtime.ingest.inbox import Parcel
 from coec.runtime.ingest.senders import Senders
@@ -76,12 +75,11 @@ class StreamCounts:
 class SampleReader:
     """Frames of the samples of a pair's streams, as they come."""
 
-    def __init__(self, streams: Mapping[str, AnyStreamConfig], limits: LimitsConfig) -> None:
-        self._streams = streams
+    def __init__(self, pair: OpenPairConfig, limits: LimitsConfig) -> None:
+        self._streams = pair.streams
         self._limits = limits
-        lidar, ego = streams[LIDAR], streams.get(EGO)
-        self._lidar = lidar if isinstance(lidar, OpenLidarConfig) else None
-        self._moving = MovingFrame(ego.parent, ego.child) if isinstance(ego, OpenEgoConfig) else None
+        self._lidar = pair.lidar
+        self._moving = None if pair.ego is None else MovingFrame(pair.ego.parent, pair.ego.child)
 
     def frame(self, stream: str, sample: Sample) -> Frame | None:
         """The frame in a sample of a stream, `CAMERA`, `LIDAR` or `EGO`; None where it holds transforms of other frames
@@ -102,8 +100,8 @@ class SampleReader:
                 raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
             if type_name == messages.TF and self._moving is not None:
                 return self._moving.motion(sample.payload)
-            point_time, source = (None, None) if self._lidar is None else (self._lidar.time, self._lidar.source)
-            return incoming.decode(type_name, sample.payload, self._limits, point_time=point_time, source=source)
+            time, source = self._lidar.time, self._lidar.source
+            return incoming.decode(type_name, sample.payload, self._limits, point_time=time, source=source)
         if stream == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
         if stream == LIDAR:
@@ -120,7 +118,7 @@ class Decoder:
 
     def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:
         self._pair = pair
-        self._samples = SampleReader(pair.streams, limits)
+        self._samples = SampleReader(pair, limits)
         self._limits = limits
         self._losses = losses
         self._senders: defaultdict[str, Senders] = defaultdict(Senders)

@@ -98,7 +98,7 @@ class NominalWatch:
         self._config = config
         asked = {pair.name: pair for pair in config.awaited}
         self._pairs = {
-            name: _Pair(pair, SampleReader(pair.streams, config.limits), found=earlier.get(name), built=name in earlier)
+            name: _Pair(pair, SampleReader(pair, config.limits), found=earlier.get(name), built=name in earlier)
             for name, pair in asked.items()
         }
         self._transforms = StaticTransforms()
