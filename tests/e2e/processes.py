@@ -235,7 +235,7 @@ class Service:
         player = Player(self.session, Streams.of_pair(self.config.pairs[0]), "msgpack")
         try:
             assert not player.wait_for_listener(PATIENCE_S)
-            for portion in _portions(frames):
+            for portion in portions(frames):
                 player.play(portion, 0.0, threading.Event(), self._count)
                 self.until_received()
         finally:
@@ -243,7 +243,7 @@ class Service:
 
     def send_by(self, put: Callable[[Frame], None], frames: Sequence[Frame]) -> None:
         """The same, in another form than native frames."""
-        for portion in _portions(frames):
+        for portion in portions(frames):
             for frame in portion:
                 put(frame)
                 self.sent[stream_of(frame)] += 1
@@ -295,7 +295,7 @@ class Service:
         self.process.wait()
 
 
-def _portions(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+def portions(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
     pictures = [index for index, frame in enumerate(frames) if stream_of(frame) == CAMERA]
     ends = [0, *(index + 1 for index in pictures[PORTION - 1 :: PORTION]), len(frames)]
     return (frames[begin:end] for begin, end in pairwise(ends) if begin < end)

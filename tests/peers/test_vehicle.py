@@ -13,12 +13,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from coec.adapters.ros import messages
 from coec.adapters.ros.topics import FrameTopics, PairTopics
-from coec.adapters.zenoh.player import Frame
-from coec.calibration.types import CameraFrame
+from coec.adapters.zenoh.player import Frame, stream_of
+from coec.calibration.types import EgoMotion
 from coec.geometry import se3
 from coec.schemas.ros_names import TF_STATIC
 from e2e.drives import SECONDS, STEP_S, STEPPED, Drive, rendered
-from e2e.processes import PORTION, Router, Service, service
+from e2e.processes import Router, Service, portions, service
 from peers.environments import peer
 from peers.nodes import Inbox, Node, Topic, node, relay
 from peers.test_messages_by_rclpy import has_tf
@@ -87,16 +87,18 @@ class Drivers:
                 self._vehicle.publish(message.topic, message.data)
 
     def send(self, running: Service, frames: Sequence[Frame]) -> None:
-        """In portions that the service's inbox holds."""
-        pictures = 0
-        for frame in frames:
-            self.publish([frame])
-            running.sent["camera" if isinstance(frame, CameraFrame) else ""] += 1
-            pictures += isinstance(frame, CameraFrame)
-            if pictures == PORTION:
-                running.until_received()
-                pictures = 0
+        """In portions that the service's inbox holds, of each the motion first: a drive in seconds overtakes what comes
+        on another topic by more than any vehicle does."""
+        for portion in portions(frames):
+            motions = [frame for frame in portion if isinstance(frame, EgoMotion)]
+            self._publish_counted(running, "ego", motions)
+            self._publish_counted(running, "camera", [frame for frame in portion if not isinstance(frame, EgoMotion)])
         running.rest()
+
+    def _publish_counted(self, running: Service, stream: str, frames: Sequence[Frame]) -> None:
+        due = running.counters()[stream]["received"] + sum(stream_of(frame) == stream for frame in frames)
+        self.publish(frames)
+        running.until(running.counters, lambda pair: pair[stream]["received"] >= due, f"what was sent of {stream}")
 
 
 def levels(inbox: Inbox) -> list[int]:

@@ -112,6 +112,19 @@ def test_a_pair_waits_for_its_motion() -> None:
     assert len(pairer.push(motion(10))) == 1
 
 
+def test_motion_that_comes_nine_tenths_of_a_second_late_is_used() -> None:
+    pictures = [message for i in range(10) for message in (sweep(i * 100), camera(i * 100))]
+    pairs, _ = run([*pictures, *(motion(i * 50, speed=i) for i in range(20))], expects_motion=True)
+    assert [pair.motion.linear_mps for pair in pairs if pair.motion] == [(i * 2, 0.0, 0.0) for i in range(10)]
+
+
+@pytest.mark.fault("ego-motion stops", "pairs go on without it, a second later")
+def test_a_pair_goes_without_its_motion_when_pictures_are_more_than_a_second_ahead() -> None:
+    pairer = Pairer(PairingConfig(), expects_motion=True)
+    released = [len(pairer.push(message)) for i in range(13) for message in (sweep(i * 100), camera(i * 100))]
+    assert sum(released) == 2
+
+
 @pytest.mark.fault("a single stamp an hour ahead", "it is refused, and the stream goes on")
 def test_a_single_stamp_an_hour_ahead_is_refused_and_the_stream_goes_on() -> None:
     hour_ms = 3_600_000

@@ -20,6 +20,10 @@ AGREEING_STAMPS = 5
 MOTION_SAMPLES = 512
 """Ego-motion samples kept: more than two seconds at 200 Hz, against pairs that wait at most a few frames."""
 
+MOTION_LATE_NS = NS_PER_S
+"""How far pictures may be ahead of ego-motion, in sensor time, before a pair goes without it: filters and bridges hold
+motion back by some tenths of a second, and a pair that is not compensated is worth less than one that comes later."""
+
 Frame = TypeVar("Frame", CameraFrame, LidarFrame, EgoMotion)
 
 
@@ -143,7 +147,8 @@ class Pairer:
         newest_motion, newest_camera = self._motion_time.latest_ns, self._camera_time.latest_ns
         if newest_motion is not None and newest_motion >= stamp_ns:
             return True
-        return (newest_camera is not None and newest_camera - stamp_ns > self._motion_tolerance_ns) or len(
+        patience_ns = max(self._motion_tolerance_ns, MOTION_LATE_NS)
+        return (newest_camera is not None and newest_camera - stamp_ns > patience_ns) or len(
             self._waiting
         ) > self._queue_frames
 
