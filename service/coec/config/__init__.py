@@ -1,0 +1,96 @@
+"""Everything a user may set, with its default, unit and reason: one frozen model per stage, unknown keys refused.
+
+`load_config` reads the one YAML file of a daemon. The same stage models (`WindowConfig`, `CalibrationConfig`, ...)
+serve the command line, so a default exists once. Others import from
+here: which room holds what is the package's own affair.
+"""
+
+from coec.config.authority import AuthorityConfig, SenderConfig
+from coec.config.base import IDENTITY, FilePath, Matrix4x4, Name
+from coec.config.decisions import MonitorConfig, PolicyConfig
+from coec.config.metrics import MetricsConfig, is_loopback
+from coec.config.pair import OpenPairConfig, PairConfig
+from coec.config.reading import describe, load_config
+from coec.config.ros import RosConfig, RosOutput
+from coec.config.service import LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
+from coec.config.stages import (
+    CalibrationConfig,
+    DepthConfig,
+    ObjectiveConfig,
+    PairingConfig,
+    SearchConfig,
+    TimeOffsetConfig,
+    TrackerConfig,
+    VerdictConfig,
+    WindowConfig,
+)
+from coec.config.streams import (
+    AnyStreamConfig,
+    CameraConfig,
+    CameraIntrinsics,
+    CameraMessage,
+    EgoConfig,
+    EgoMessage,
+    LidarConfig,
+    LidarMessage,
+    PointTimeConfig,
+    StreamConfig,
+    SweepConfig,
+    TimeBase,
+    TimeUnit,
+    TopicName,
+)
+from coec.config.whole import Config, config_hash
+from coec.config.yaml_text import MAX_YAML_BYTES, load_yaml, parse_yaml
+
+__all__ = [
+    "IDENTITY",
+    "MAX_YAML_BYTES",
+    "AnyStreamConfig",
+    "AuthorityConfig",
+    "CalibrationConfig",
+    "CameraConfig",
+    "CameraIntrinsics",
+    "CameraMessage",
+    "Config",
+    "DepthConfig",
+    "EgoConfig",
+    "EgoMessage",
+    "FilePath",
+    "LidarConfig",
+    "LidarMessage",
+    "LimitsConfig",
+    "LogConfig",
+    "Matrix4x4",
+    "MetricsConfig",
+    "MonitorConfig",
+    "Name",
+    "ObjectiveConfig",
+    "OpenPairConfig",
+    "PairConfig",
+    "PairingConfig",
+    "PointTimeConfig",
+    "PolicyConfig",
+    "RosConfig",
+    "RosOutput",
+    "SearchConfig",
+    "SenderConfig",
+    "StateConfig",
+    "StreamConfig",
+    "SweepConfig",
+    "TimeBase",
+    "TimeOffsetConfig",
+    "TimeUnit",
+    "TopicName",
+    "TrackerConfig",
+    "VerdictConfig",
+    "WindowConfig",
+    "WorkerConfig",
+    "ZenohConfig",
+    "config_hash",
+    "describe",
+    "is_loopback",
+    "load_config",
+    "load_yaml",
+    "parse_yaml",
+]

@@ -1,0 +1,48 @@
+"""What every model of the configuration is built of: names, paths, matrices, and the base of all models."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
+"""A name that becomes one chunk of a Zenoh key and part of a file name."""
+
+KeyExpression = Annotated[str, Field(pattern=r"^[^\s/*$?#]+(/[^\s/*$?#]+)*$", max_length=256)]
+"""A Zenoh key without wildcards, and without empty chunks."""
+
+MAX_NAME_BYTES = 255
+"""Of one name in a path: what Linux's file systems take (limits.h, NAME_MAX)."""
+
+MAX_PATH_BYTES = 2048
+"""Of a path: half of what Linux takes (limits.h, PATH_MAX); the folder that it is relative to may have the rest."""
+
+
+def _path(path: Path) -> Path:
+    if "\0" in str(path) or any(len(os.fsencode(name)) > MAX_NAME_BYTES for name in path.parts):
+        raise ValueError(f"a name in a path has no zero byte, and at most {MAX_NAME_BYTES} bytes")
+    if len(os.fsencode(path)) > MAX_PATH_BYTES:
+        raise ValueError(f"a path has at most {MAX_PATH_BYTES} bytes")
+    return path
+
+
+FilePath = Annotated[Path, AfterValidator(_path)]
+"""A path that can be asked for. What a text file says may be none, and Python raises whatever it likes about it."""
+
+Matrix4x4 = tuple[
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+]
+
+IDENTITY: Matrix4x4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+class Stage(BaseModel):
+    """Base of every configuration model: frozen, no unknown keys, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

@@ -1,0 +1,57 @@
+"""The door for a scraper on the same computer."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+
+from pydantic import Field, model_validator
+
+from coec.config.base import Stage
+
+
+class MetricsConfig(Stage):
+    """HTTP for a scraper on the same computer: `/metrics` (OpenMetrics) and `/health` (200, or 503 when a
+    calibration is not known to be right). Whoever reaches it reads; nobody changes anything."""
+
+    http: str | None = Field(default=None, description="HOST:PORT, as 127.0.0.1:9464; null: nobody listens")
+    insecure: bool = Field(default=False, description="listen on other addresses than loopback, too; health says so")
+
+    @property
+    def address(self) -> tuple[str, int] | None:
+        """Host, without brackets, and port; None: nobody listens."""
+        if self.http is None:
+            return None
+        host, _, port = self.http.rpartition(":")
+        return host.removeprefix("[").removesuffix("]"), int(port)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether other computers may get in."""
+        return self.address is not None and not is_loopback(self.address[0])
+
+    @model_validator(mode="after")
+    def _nobody_from_outside(self) -> MetricsConfig:
+        if self.http is None:
+            return self
+        if not re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]+):\d{1,5}", self.http) or not 0 < self._port < 65536:
+            raise ValueError(f"http: {self.http!r} is no HOST:PORT: write 127.0.0.1:9464")
+        if self.is_open and not self.insecure:
+            raise ValueError(
+                f"http: whoever reaches {self.http} would read the metrics, without a certificate: listen on loopback, "
+                "as 127.0.0.1:9464, or set `metrics.insecure: true`, and health will say so"
+            )
+        return self
+
+    @property
+    def _port(self) -> int:
+        return 0 if self.address is None else self.address[1]
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer gets to an address, without brackets. A name but `localhost` does not count: who
+    answers to it is not for us to know."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

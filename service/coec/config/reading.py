@@ -1,0 +1,64 @@
+"""From the file of a user to the configuration of a daemon; complaints name their places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import ValidationError
+
+from coec.config.pair import OpenPairConfig
+from coec.config.whole import Config
+from coec.config.yaml_text import load_yaml
+from coec.errors import ConfigError
+
+
+def load_config(path: Path) -> Config:
+    """The validated configuration of a daemon; relative paths in it are relative to the file.
+
+    Raises:
+        ConfigError: unreadable, not YAML, unknown key, wrong type or value out of range; names each place.
+    """
+    document = load_yaml(path)
+    if not isinstance(document, dict):
+        raise ConfigError(f"{path}: expected a mapping at the top, found {type(document).__name__}")
+    try:
+        config = Config.model_validate(document)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {describe(error)}") from error
+    return _resolve_paths(config, path.parent)
+
+
+def describe(error: ValidationError) -> str:
+    """Each complaint of pydantic on a line: where, what."""
+    lines = [f"{'.'.join(str(part) for part in item['loc']) or '(top)'}: {item['msg']}" for item in error.errors()]
+    return "; ".join(lines)
+
+
+def _resolve_paths(config: Config, folder: Path) -> Config:
+    """Relative paths are relative to the configuration file, not to wherever the daemon was started."""
+    zenoh = config.zenoh
+    if zenoh.file is not None:
+        zenoh = zenoh.model_copy(update={"file": folder / zenoh.file})
+    own = config.authority
+    files = {"certificate": own.certificate, "private_key": own.private_key, "root_ca": own.root_ca}
+    authority = own.model_copy(update={name: None if path is None else folder / path for name, path in files.items()})
+    state = config.state.model_copy(update={"directory": folder / config.state.directory})
+    pairs = tuple(_resolve_pair_paths(pair, folder) for pair in config.pairs)
+    awaited = tuple(_resolve_pair_paths(pair, folder) for pair in config.awaited)
+    return config.model_copy(
+        update={"pairs": pairs, "awaited": awaited, "state": state, "zenoh": zenoh, "authority": authority}
+    )
+
+
+_P = TypeVar("_P", bound=OpenPairConfig)
+
+
+def _resolve_pair_paths(pair: _P, folder: Path) -> _P:
+    camera, depth = pair.camera, pair.calibration.depth
+    if camera.mask is not None:
+        camera = camera.model_copy(update={"mask": folder / camera.mask})
+    if depth.model.endswith(".onnx"):
+        depth = depth.model_copy(update={"model": str(folder / depth.model)})
+    calibration = pair.calibration.model_copy(update={"depth": depth})
+    return pair.model_copy(update={"camera": camera, "calibration": calibration})

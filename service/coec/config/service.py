@@ -1,0 +1,80 @@
+"""The process itself: limits, state, worker, session, log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from coec.config.base import FilePath, Stage
+
+
+class LimitsConfig(Stage):
+    """Hard limits on what a message may hold: larger is refused before it is decoded."""
+
+    max_message_bytes: int = Field(default=32 * 2**20, ge=2**16, le=2**30, description="as Zenoh's max_message_size")
+    max_image_pixels: int = Field(default=33_000_000, ge=2**12, description="8K UHD")
+    max_points: int = Field(default=1_000_000, ge=2**10)
+    max_waiting_bytes: int = Field(
+        default=64 * 2**20,
+        ge=2**20,
+        description="per pair, messages that have come and wait to be decoded; beyond, the oldest are lost",
+    )
+    max_held_bytes: int = Field(
+        default=256 * 2**20,
+        ge=2**20,
+        description="per pair, frames that wait until what was seen before them is judged; beyond, they do not wait",
+    )
+
+
+class StateConfig(Stage):
+    """The state directory; deleting it returns the vehicle to nominal."""
+
+    directory: FilePath = Path("coec-state")
+    max_bytes: int = Field(default=4 * 2**30, ge=2**20, description="windows kept, bytes; the oldest go first")
+    max_age_days: float = Field(default=90.0, gt=0)
+    min_free_bytes: int = Field(
+        default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
+    )
+    history: int = Field(default=500, ge=1, le=10_000, description="kept per pair: results, states, commands, each")
+    checks: int = Field(default=2000, ge=1, le=100_000, description="checks of the monitor kept per pair, 2 kB each")
+    evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
+
+
+class WorkerConfig(Stage):
+    """The process that infers and solves."""
+
+    timeout_s: float = Field(default=120.0, gt=0, description="one job; a worker that needs longer is replaced")
+    max_memory_bytes: int = Field(default=3 * 2**30, ge=2**28, description="resident; a worker above is replaced")
+    attempts: int = Field(
+        default=2, ge=1, le=10, description="workers that may die on one window before it is given up"
+    )
+    threads: int = Field(default=2, ge=1, le=64)
+    niceness: int = Field(default=10, ge=0, le=19, description="so that queries are answered first")
+
+
+class ZenohConfig(Stage):
+    """The session. `file` is a Zenoh configuration (JSON5) for TLS, access control and the like."""
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    embedded_router: bool = Field(default=False, description="be the router and listen on `listen`")
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    insecure: bool = Field(
+        default=False, description="listen even where whoever comes is let in without a certificate; health says so"
+    )
+    file: FilePath | None = None
+
+    @property
+    def router(self) -> tuple[str, ...]:
+        """Endpoints at which a client reaches the router that the service uses, or is."""
+        return self.listen if self.embedded_router else self.connect
+
+
+class LogConfig(Stage):
+    """The log, on standard output."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    format: Literal["auto", "json", "human"] = Field(
+        default="auto", description="auto: for people where it goes to a terminal, else JSON lines"
+    )

@@ -1,0 +1,232 @@
+"""Where the samples of a sensor come from and how they are read: cameras, LiDARs, ego-motion."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self, get_args
+
+from pydantic import Field, model_validator
+
+from coec.config.base import IDENTITY, FilePath, KeyExpression, Matrix4x4, Stage
+
+
+class CameraIntrinsics(Stage):
+    """Intrinsics as in `dataset.yaml`; which of the optional parameters are needed depends on `model`."""
+
+    model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"]
+    width: int = Field(gt=0, le=16384, description="image width, px")
+    height: int = Field(gt=0, le=16384, description="image height, px")
+    fx: float = Field(gt=0, description="focal length, px")
+    fy: float = Field(gt=0, description="focal length, px")
+    cx: float = Field(description="principal point, px; pixel centres at integers")
+    cy: float = Field(description="principal point, px; pixel centres at integers")
+    xi: float | None = None
+    alpha: float | None = None
+    beta: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    k5: float | None = None
+    k6: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+
+    def parameters(self) -> dict[str, float]:
+        """Every intrinsic that was given, by name, without `model`."""
+        return self.model_dump(exclude={"model"}, exclude_none=True)
+
+
+class SweepConfig(Stage):
+    """Azimuth timing of a spinning LiDAR without per-point time: a point at azimuth a was measured
+    `sign · wrap(a - stamp_azimuth_deg) / 360°` revolutions after the stamp."""
+
+    period_s: float = Field(default=0.1, gt=0, le=10, description="one revolution, s")
+    sign: Literal[-1, 1] = Field(default=-1, description="-1 clockwise seen from above, 1 counter-clockwise")
+    stamp_azimuth_deg: float = Field(default=0.0, ge=-360, le=360, description="azimuth that is measured at the stamp")
+
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+TimeBase = Literal["stamp", "clock"]
+
+
+class PointTimeConfig(Stage):
+    """How the points of a `PointCloud2` are timed, where their values leave it open."""
+
+    field: str = Field(min_length=1, max_length=64, description="name of the field")
+    unit: TimeUnit
+    base: TimeBase = Field(
+        default="stamp", description="counted since the cloud's stamp, or on the clock that its stamp is of"
+    )
+
+
+Encoding = Literal["msgpack", "cdr"]
+
+TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$", max_length=247)]
+"""A full name of a topic of ROS 2 (rmw/validate_full_topic_name.h)."""
+
+CameraMessage = Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"]
+LidarMessage = Literal["sensor_msgs/msg/PointCloud2"]
+EgoMessage = Literal[
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/TwistStamped",
+    "geometry_msgs/msg/TwistWithCovarianceStamped",
+    "sensor_msgs/msg/Imu",
+    "tf2_msgs/msg/TFMessage",
+]
+
+
+class StreamConfig(Stage):
+    """Where the samples of a stream come from; one text alone is short for its `topic`."""
+
+    key: KeyExpression | None = Field(default=None, description="Zenoh key of the frames")
+    topic: TopicName | None = Field(
+        default=None, description="of ROS 2, instead of a key, where `middleware` is one of its; its frames are CDR"
+    )
+    encoding: Encoding = Field(default="msgpack", description="assumed when a sample names no encoding")
+
+    @property
+    def place(self) -> str:
+        """The key or the topic, as it was configured."""
+        return self.key or self.topic or ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _completed(cls, document: Any) -> Any:
+        """A text is the name of a topic, and what comes on topics is CDR."""
+        if isinstance(document, str):
+            document = {"topic": document}
+        if isinstance(document, dict) and document.get("topic") is not None:
+            if document.get("encoding", "cdr") != "cdr":
+                raise ValueError("what comes on a topic is CDR: leave `encoding` out")
+            document = {**document, "encoding": "cdr"}
+        return document
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.key is None) == (self.topic is None):
+            raise ValueError("give `key`, a key of Zenoh, or `topic`, a name of ROS 2 that begins with /: one of them")
+        return self
+
+
+class OpenCameraConfig(StreamConfig):
+    """Camera stream of a pair, which may leave its calibration to be found."""
+
+    frame_id: str | None = Field(default=None, max_length=128, description="frames of another id are refused")
+    type: CameraMessage | None = Field(
+        default=None,
+        description="of CDR that does not say its own; unless set CompressedImage, and Image where the name of a topic "
+        "does not end with /compressed. What comes on a topic must have it, if it is set",
+    )
+    intrinsics: CameraIntrinsics | None = Field(default=None, description="of the images as they come")
+    info_topic: TopicName | None = Field(
+        default=None,
+        description="of the `CameraInfo` that tells intrinsics left out; unless set, `camera_info` beside the images",
+    )
+    mask: FilePath | None = Field(default=None, description="PNG of the image's size, 0 = ignore this pixel")
+    hardware_id: str | None = Field(
+        default=None, max_length=128, description="its serial number, for ROS diagnostics; null: vehicle/pair"
+    )
+
+    @property
+    def assumed_type(self) -> CameraMessage:
+        """The type of messages that do not say theirs."""
+        if self.type is not None:
+            return self.type
+        is_raw = self.topic is not None and not self.topic.endswith("/compressed")
+        return "sensor_msgs/msg/Image" if is_raw else "sensor_msgs/msg/CompressedImage"
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Types of messages that this stream takes."""
+        return _types(CameraMessage, self.type if self.topic else None)
+
+
+class CameraConfig(OpenCameraConfig):
+    """Camera stream of a pair."""
+
+    frame_id: str = Field(default="camera", max_length=128, description="frames of another id are refused")
+    intrinsics: CameraIntrinsics
+
+
+class OpenLidarConfig(StreamConfig):
+    """LiDAR stream of a pair, which may leave its frames to be found."""
+
+    frame_id: str | None = Field(
+        default=None, max_length=128, description="of the LiDAR; clouds of another id are refused"
+    )
+    T_cloud_lidar: Matrix4x4 | None = Field(
+        default=None, description="pose of the LiDAR in the frame in which its driver gives the points"
+    )
+    cloud_frame_id: str | None = Field(
+        default=None, max_length=128, description="of the clouds as they come, where it is not that of the LiDAR"
+    )
+    source: int | None = Field(
+        default=None,
+        ge=-(2**31),
+        lt=2**32,
+        description="of a cloud of several LiDARs: this one's number in the field that tells them apart (lidar_id, "
+        "sensor_id, source_id, device_id or source)",
+    )
+    sweep: SweepConfig | None = Field(default=None, description="needed for clouds without per-point time")
+    time: PointTimeConfig | None = Field(
+        default=None, description="of clouds of ROS; unless set it is recognised from the values"
+    )
+
+    @property
+    def assumed_type(self) -> LidarMessage:
+        """The type of messages that do not say theirs."""
+        return "sensor_msgs/msg/PointCloud2"
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Types of messages that this stream takes."""
+        return _types(LidarMessage, None)
+
+
+class LidarConfig(OpenLidarConfig):
+    """LiDAR stream of a pair."""
+
+    frame_id: str = Field(default="lidar", max_length=128, description="of the LiDAR; clouds of another id are refused")
+    T_cloud_lidar: Matrix4x4 = Field(
+        default=IDENTITY, description="pose of the LiDAR in the frame in which its driver gives the points"
+    )
+
+
+class OpenEgoConfig(StreamConfig):
+    """Ego-motion stream of a pair, which may leave its place to be found."""
+
+    type: EgoMessage | None = Field(
+        default=None,
+        description="of CDR that does not say its own; Odometry unless set. What comes on a topic must have it, if set",
+    )
+    T_lidar_ego: Matrix4x4 | None = Field(default=None, description="maps ego-frame to LiDAR coordinates")
+    parent: str = Field(
+        default="odom", min_length=1, max_length=128, description="frame in which the vehicle moves (TFMessage)"
+    )
+    child: str = Field(
+        default="base_link", min_length=1, max_length=128, description="frame of the vehicle (TFMessage)"
+    )
+
+    @property
+    def assumed_type(self) -> EgoMessage:
+        """The type of messages that do not say theirs."""
+        return self.type or "nav_msgs/msg/Odometry"
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Types of messages that this stream takes."""
+        return _types(EgoMessage, self.type if self.topic else None)
+
+
+class EgoConfig(OpenEgoConfig):
+    """Ego-motion stream of a pair."""
+
+    T_lidar_ego: Matrix4x4 = Field(default=IDENTITY, description="maps ego-frame to LiDAR coordinates")
+
+
+AnyStreamConfig = OpenCameraConfig | OpenLidarConfig | OpenEgoConfig
+
+
+def _types(known: Any, only: str | None) -> tuple[str, ...]:
+    """Those of a `Literal`, or the one that was asked for."""
+    return get_args(known) if only is None else (only,)

@@ -1,0 +1,119 @@
+"""The one configuration of a daemon, and what its parts must agree on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field, model_validator
+
+from coec.config.authority import AuthorityConfig
+from coec.config.base import KeyExpression, Name, Stage
+from coec.config.metrics import MetricsConfig
+from coec.config.pair import OpenPairConfig, PairConfig
+from coec.config.ros import RosConfig
+from coec.config.service import LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
+from coec.schemas.ros_names import ros_name
+
+MAX_PAIRS = 32
+
+
+class Config(Stage):
+    """The one configuration file of a daemon."""
+
+    vehicle: Name = "vehicle"
+    prefix: KeyExpression = "coec"
+    zenoh: ZenohConfig = ZenohConfig()
+    middleware: Literal["native", "rmw_zenoh", "ros2dds"] = Field(
+        default="native", description="how topics lie on the bus: native keys, or as ROS 2 nodes or a bridge put them"
+    )
+    ros: RosConfig = RosConfig()
+    authority: AuthorityConfig = AuthorityConfig()
+    state: StateConfig = StateConfig()
+    worker: WorkerConfig = WorkerConfig()
+    limits: LimitsConfig = LimitsConfig()
+    stale_after_s: float = Field(
+        default=600.0, gt=0, description="age of the last completed check at which a pair is called stale, s"
+    )
+    log: LogConfig = LogConfig()
+    metrics: MetricsConfig = MetricsConfig()
+    pairs: tuple[PairConfig, ...] = Field(default=(), max_length=MAX_PAIRS)
+    awaited: tuple[OpenPairConfig, ...] = Field(
+        default=(),
+        max_length=MAX_PAIRS,
+        description="entries of `pairs` that leave out what topics of ROS 2 tell; each joins them when it is found",
+    )
+
+    @property
+    def every_pair(self) -> tuple[OpenPairConfig, ...]:
+        """Those of which everything is known, and then those that are awaited."""
+        return (*self.pairs, *self.awaited)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _open_pairs_are_awaited(cls, document: Any) -> Any:
+        if not isinstance(document, dict) or document.get("middleware", "native") == "native":
+            return document
+        pairs, awaited = document.get("pairs", ()), document.get("awaited", ())
+        if not isinstance(pairs, list | tuple) or not isinstance(awaited, list | tuple):
+            return document
+        still = [pair for pair in pairs if _leaves_out(pair)]
+        return {**document, "pairs": [pair for pair in pairs if pair not in still], "awaited": [*still, *awaited]}
+
+    @model_validator(mode="after")
+    def _some_pairs(self) -> Config:
+        if not 0 < len(self.every_pair) <= MAX_PAIRS:
+            raise ValueError(f"pairs: give 1 to {MAX_PAIRS}")
+        if self.awaited and self.middleware == "native":
+            raise ValueError("awaited: nothing tells what a pair leaves out where `middleware` is `native`")
+        return self
+
+    @model_validator(mode="after")
+    def _names_unique(self) -> Config:
+        names = [pair.name for pair in self.every_pair]
+        if len(set(names)) != len(names):
+            raise ValueError("pair names must be unique")
+        return self
+
+    @model_validator(mode="after")
+    def _topics_need_ros(self) -> Config:
+        if self.middleware != "native":
+            return self
+        topics = [f"pairs.{p.name}.{name}: {s.topic}" for p in self.pairs for name, s in p.streams.items() if s.topic]
+        if topics:
+            raise ValueError(
+                f"{', '.join(topics)}: topics of ROS 2 are found where `middleware` is `rmw_zenoh` or `ros2dds`: set "
+                "it, or give the Zenoh `key` of native frames instead"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _ros_can_be_told(self) -> Config:
+        if not self.ros.publish:
+            return self
+        if self.middleware == "native":
+            raise ValueError(
+                "ros.publish: nobody is told of ROS topics on native keys: set `middleware` to `rmw_zenoh` or `ros2dds`"
+            )
+        tokens = [ros_name(pair.name) for pair in self.every_pair]
+        if len(set(tokens)) != len(tokens):
+            raise ValueError("ros.publish: names of pairs must differ in letters, digits or underscores: others are _")
+        return self
+
+
+def _leaves_out(pair: Any) -> bool:
+    """Whether a pair, as it is written, leaves out what topics of ROS 2 tell."""
+    if not isinstance(pair, dict):
+        return False
+    lidar, ego = pair.get("lidar", pair.get("points")), pair.get("ego")
+    places = [(pair, "T_camera_lidar"), (pair.get("camera"), "intrinsics"), (pair.get("camera"), "frame_id")]
+    places += [(lidar, "frame_id"), *([] if ego is None else [(ego, "T_lidar_ego")])]
+    return any(isinstance(part, str) or (isinstance(part, dict) and part.get(name) is None) for part, name in places)
+
+
+def config_hash(*parts: BaseModel | str) -> str:
+    """First 16 hexadecimal digits of the sha256 over the canonical JSON of the parts."""
+    canonical = [part if isinstance(part, str) else part.model_dump(mode="json") for part in parts]
+    text = json.dumps(canonical, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
