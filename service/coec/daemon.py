@@ -215,7 +215,15 @@ class Daemon:
             self._bus.declare_alive(self._keys.alive(name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
         _log.info(
-            "serving", extra={"fields": {**fields, "pairs": list(self._pairs), "awaited": list(self._room.answers)}}
+            "serving",
+            extra={
+                "fields": {
+                    **fields,
+                    "pairs": list(self._pairs),
+                    "awaited": list(self._room.answers),
+                    "left_out": list(self._config.left_out),
+                }
+            },
         )
 
     def _run(self, config: PairConfig) -> None:

@@ -50,6 +50,8 @@ def run(path: Path | None, *, defaults: bool, as_json: bool) -> int:
     config = load_config(path)
     checks = [check for pair in config.pairs for check in _check(pair, config)]
     checks += [check for pair in config.awaited for check in _check_awaited(pair, config)]
+    if config.left_out:
+        checks.append(f"no pairs of sensors that see nothing in common: {', '.join(config.left_out)}")
     if config.zenoh.file is not None:
         checks.append(_check_file(config.zenoh.file, "zenoh.file"))
     settings_of(config.zenoh, config.limits)

@@ -6,11 +6,12 @@ here: which room holds what is the package's own affair.
 """
 
 from coec.config.authority import AuthorityConfig, SenderConfig
-from coec.config.base import IDENTITY, FilePath, Matrix4x4, Name
+from coec.config.base import IDENTITY, FilePath, Matrix4x4, Name, describe
 from coec.config.decisions import MonitorConfig, PolicyConfig
+from coec.config.links import LinkConfig
 from coec.config.metrics import MetricsConfig, is_loopback
 from coec.config.pair import OpenPairConfig, PairConfig
-from coec.config.reading import describe, load_config
+from coec.config.reading import config_of, load_config
 from coec.config.ros import RosConfig, RosOutput
 from coec.config.service import LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
 from coec.config.stages import (
@@ -60,6 +61,7 @@ __all__ = [
     "LidarConfig",
     "LidarMessage",
     "LimitsConfig",
+    "LinkConfig",
     "LogConfig",
     "Matrix4x4",
     "MetricsConfig",
@@ -88,6 +90,7 @@ __all__ = [
     "WorkerConfig",
     "ZenohConfig",
     "config_hash",
+    "config_of",
     "describe",
     "is_loopback",
     "load_config",

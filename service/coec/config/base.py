@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
+MAX_NAME = 64
+"""Characters of a name."""
+
+Name = Annotated[str, Field(pattern=rf"^[A-Za-z0-9_.-]{{1,{MAX_NAME}}}$")]
 """A name that becomes one chunk of a Zenoh key and part of a file name."""
 
 KeyExpression = Annotated[str, Field(pattern=r"^[^\s/*$?#]+(/[^\s/*$?#]+)*$", max_length=256)]
@@ -46,3 +50,15 @@ class Stage(BaseModel):
     """Base of every configuration model: frozen, no unknown keys, no NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def describe(error: ValidationError, names: Mapping[str, Sequence[str]] | None = None) -> str:
+    """Each complaint of pydantic on a line: where, what. `names` are those of the entries of lists at the top, by which
+    people know them."""
+    known, lines = names or {}, []
+    for item in error.errors():
+        place = list(item["loc"])
+        if len(place) > 1 and isinstance(place[1], int) and place[1] < len(known.get(str(place[0]), ())):
+            place[1] = known[str(place[0])][place[1]]
+        lines.append(f"{'.'.join(str(part) for part in place) or '(top)'}: {item['msg']}")
+    return "; ".join(lines)

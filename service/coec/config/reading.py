@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from coec.config.base import describe
 from coec.config.pair import OpenPairConfig
+from coec.config.rig import is_rig, written_out
 from coec.config.whole import Config
 from coec.config.yaml_text import load_yaml
 from coec.errors import ConfigError
@@ -20,19 +22,26 @@ def load_config(path: Path) -> Config:
         ConfigError: unreadable, not YAML, unknown key, wrong type or value out of range; names each place.
     """
     document = load_yaml(path)
-    if not isinstance(document, dict):
-        raise ConfigError(f"{path}: expected a mapping at the top, found {type(document).__name__}")
     try:
-        config = Config.model_validate(document)
+        return _resolve_paths(config_of(document), path.parent)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def config_of(document: Any) -> Config:
+    """The configuration that a document tells, whose sensors may stand in it once each (see `config.rig`).
+
+    Raises:
+        ConfigError: no mapping, unknown key, wrong type or value out of range; names each place.
+    """
+    if not isinstance(document, dict):
+        raise ConfigError(f"expected a mapping at the top, found {type(document).__name__}")
+    if is_rig(document):
+        document = written_out(document)
+    try:
+        return Config.model_validate(document)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {describe(error)}") from error
-    return _resolve_paths(config, path.parent)
-
-
-def describe(error: ValidationError) -> str:
-    """Each complaint of pydantic on a line: where, what."""
-    lines = [f"{'.'.join(str(part) for part in item['loc']) or '(top)'}: {item['msg']}" for item in error.errors()]
-    return "; ".join(lines)
+        raise ConfigError(describe(error)) from error
 
 
 def _resolve_paths(config: Config, folder: Path) -> Config:

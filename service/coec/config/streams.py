@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from coec.config.base import IDENTITY, FilePath, KeyExpression, Matrix4x4, Stage
+from coec.config.base import IDENTITY, FilePath, KeyExpression, Matrix4x4, Name, Stage
 
 
 class CameraIntrinsics(Stage):
@@ -111,6 +111,8 @@ class StreamConfig(Stage):
 class OpenCameraConfig(StreamConfig):
     """Camera stream of a pair, which may leave its calibration to be found."""
 
+    name: Name | None = Field(default=None, description="of the camera, whatever pairs it is of: `links` speak of it")
+
     frame_id: str | None = Field(default=None, max_length=128, description="frames of another id are refused")
     type: CameraMessage | None = Field(
         default=None,
@@ -150,6 +152,8 @@ class CameraConfig(OpenCameraConfig):
 
 class OpenLidarConfig(StreamConfig):
     """LiDAR stream of a pair, which may leave its frames to be found."""
+
+    name: Name | None = Field(default=None, description="of the LiDAR, whatever pairs it is of: `links` speak of it")
 
     frame_id: str | None = Field(
         default=None, max_length=128, description="of the LiDAR; clouds of another id are refused"

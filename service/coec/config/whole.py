@@ -10,8 +10,10 @@ from pydantic import BaseModel, Field, model_validator
 
 from coec.config.authority import AuthorityConfig
 from coec.config.base import KeyExpression, Name, Stage
+from coec.config.links import LinkConfig
 from coec.config.metrics import MetricsConfig
 from coec.config.pair import OpenPairConfig, PairConfig
+from coec.config.rig import MAX_LINKS, MAX_SENSORS
 from coec.config.ros import RosConfig
 from coec.config.service import LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
 from coec.schemas.ros_names import ros_name
@@ -44,6 +46,16 @@ class Config(Stage):
         max_length=MAX_PAIRS,
         description="entries of `pairs` that leave out what topics of ROS 2 tell; each joins them when it is found",
     )
+    links: tuple[LinkConfig, ...] = Field(
+        default=(),
+        max_length=MAX_LINKS,
+        description="between two cameras, or two LiDARs, whose pose to one another is known",
+    )
+    left_out: tuple[str, ...] = Field(
+        default=(),
+        max_length=MAX_SENSORS**2,
+        description="what `pairs: all` made no pairs of, as their sensors see nothing in common; only told",
+    )
 
     @property
     def every_pair(self) -> tuple[OpenPairConfig, ...]:
@@ -74,6 +86,22 @@ class Config(Stage):
         names = [pair.name for pair in self.every_pair]
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
+        return self
+
+    @model_validator(mode="after")
+    def _one_sensor_a_name(self) -> Config:
+        for kind in ("camera", "lidar"):
+            places: dict[str, str] = {}
+            for sensor in (pair.streams[kind] for pair in self.every_pair):
+                name = getattr(sensor, "name", None)
+                if name is not None and places.setdefault(name, sensor.place) != sensor.place:
+                    raise ValueError(f"pairs: {kind} {name} cannot be on {places[name]} and on {sensor.place}")
+            for index, link in enumerate(self.links):
+                ends = [end for end in (getattr(link, f"{kind}_a"), getattr(link, f"{kind}_b")) if end is not None]
+                absent = [end for end in ends if end not in places]
+                if absent:
+                    known = ", ".join(places) or "none has a `name`"
+                    raise ValueError(f"links.{index}: no pair has a {kind} of the name {absent[0]}; there are: {known}")
         return self
 
     @model_validator(mode="after")

@@ -1,0 +1,284 @@
+"""The sensors of a vehicle, each told once, and the pairs that follow: the long form of `pairs` is written from it.
+
+A pair of camera C and LiDAR L is named `C-L`, and `C` alone where the vehicle has one LiDAR. Its nominal calibration is
+inverse(T_vehicle_camera) · T_vehicle_lidar where both are told, else it is awaited, as that of any pair. On native keys
+a sensor's `frame_id` is its name unless it is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Self, TypeVar
+
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
+
+from coec.config.base import IDENTITY, MAX_NAME, Name, Stage, describe
+from coec.config.decisions import MonitorConfig, PolicyConfig
+from coec.config.links import LinkConfig, Pose
+from coec.config.stages import CalibrationConfig, PairingConfig, TrackerConfig, WindowConfig
+from coec.config.streams import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig
+from coec.errors import ConfigError
+
+MAX_SENSORS = 16
+"""Cameras, and LiDARs, of a vehicle."""
+
+MAX_LINKS = 64
+
+LEAST_OF_LIDAR = 0.005
+"""Share of a LiDAR's directions that a camera must see: 500 points, without which a window takes no pair
+(`window.min_points_in_view`), of the 100,000 of a sweep of 64 beams."""
+
+LEAST_OF_CAMERA = 0.1
+"""Share of what a camera would see of a LiDAR all around. Less is a strip at the edge of the image: there lenses are
+known worst, the vehicle itself is in the way, and a strip cannot tell the three rotations apart."""
+
+ALL = "all"
+
+T = TypeVar("T")
+
+
+class FieldOfView(Stage):
+    """Where a LiDAR measures, in its own frame: x ahead, y left, z up."""
+
+    azimuth_deg: tuple[float, float] = Field(default=(-180.0, 180.0), description="from, to; counter-clockwise")
+    elevation_deg: tuple[float, float] = Field(default=(-25.0, 15.0), description="from, to; up")
+
+    @model_validator(mode="after")
+    def _from_to(self) -> Self:
+        if not 0 < self.azimuth_deg[1] - self.azimuth_deg[0] <= 360 or abs(self.azimuth_deg[0]) > 360:
+            raise ValueError("azimuth_deg is [from, to], counter-clockwise, at most 360 apart: [120, 240] is behind")
+        if not -90 <= self.elevation_deg[0] < self.elevation_deg[1] <= 90:
+            raise ValueError("elevation_deg is [from, to], between -90 and 90")
+        return self
+
+
+class RigCamera(OpenCameraConfig):
+    """A camera of the vehicle."""
+
+    name: Name
+    T_vehicle_camera: Pose | None = Field(default=None, description="pose of the camera in the vehicle's frame")
+
+
+class RigLidar(OpenLidarConfig):
+    """A LiDAR of the vehicle."""
+
+    name: Name
+    T_vehicle_lidar: Pose | None = Field(default=None, description="pose of the LiDAR in the vehicle's frame")
+    field_of_view: FieldOfView = FieldOfView()
+
+
+class RigEgo(OpenEgoConfig):
+    """The ego-motion of the vehicle."""
+
+    T_lidar_ego: None = Field(default=None, description="follows from the poses of each LiDAR and of this")
+    T_vehicle_ego: Pose = Field(default=IDENTITY, description="pose of the frame in which motion is told")
+
+
+class RigStages(Stage):
+    """What may be set of a pair but its sensors."""
+
+    pairing: PairingConfig = PairingConfig()
+    window: WindowConfig = WindowConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
+    monitor: MonitorConfig = MonitorConfig()
+    policy: PolicyConfig = PolicyConfig()
+    tracker: TrackerConfig = TrackerConfig()
+
+
+class RigPair(RigStages):
+    """A camera and a LiDAR that make a pair."""
+
+    camera: Name
+    lidar: Name
+    name: Name | None = Field(default=None, description="of the pair, where it is not to be that of its sensors")
+
+
+def _listed(value: Any) -> Any:
+    if value == ALL:
+        return None
+    if isinstance(value, list | tuple):
+        return value
+    raise ValueError(f"give `{ALL}`, or a list of {{camera: NAME, lidar: NAME}}")
+
+
+class RigConfig(Stage):
+    """The sensors of a vehicle."""
+
+    cameras: tuple[RigCamera, ...] = Field(min_length=1, max_length=MAX_SENSORS)
+    lidars: tuple[RigLidar, ...] = Field(min_length=1, max_length=MAX_SENSORS)
+    ego: RigEgo | None = None
+    pairs: Annotated[tuple[RigPair, ...] | None, BeforeValidator(_listed)] = Field(
+        description="`all` that see something in common; or a list"
+    )
+    stages: RigStages = Field(default=RigStages(), description="of every pair, unless it says otherwise")
+    links: tuple[LinkConfig, ...] = Field(default=(), max_length=MAX_LINKS)
+
+    @model_validator(mode="after")
+    def _each_once(self) -> Self:
+        for place, sensors in (("cameras", self.cameras), ("lidars", self.lidars)):
+            names = [sensor.name for sensor in sensors]
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"{place}: {', '.join(twice)} stands there twice")
+        return self
+
+
+def is_rig(document: Mapping[str, Any]) -> bool:
+    """Whether a configuration, as it is written, tells its sensors once each."""
+    return "cameras" in document or "lidars" in document or document.get("pairs") == ALL
+
+
+def written_out(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of a rig, as it is written, in the long form: each pair with its streams.
+
+    Raises:
+        ConfigError: names each place.
+    """
+    own = {name: document[name] for name in RigConfig.model_fields if name in document}
+    try:
+        rig = RigConfig.model_validate(own)
+    except ValidationError as error:
+        names = {kind: _names(document.get(kind)) for kind in ("cameras", "lidars")}
+        raise ConfigError(describe(error, names)) from error
+    found = _Pairs(rig, native=document.get("middleware", "native") == "native")
+    pairs = list(found)
+    if not pairs:
+        raise ConfigError(
+            "pairs: by the poses that are told no camera sees what a LiDAR sees: look at T_vehicle_camera, "
+            "T_vehicle_lidar and field_of_view, or list the pairs"
+        )
+    links = [link.model_dump(exclude_none=True) for link in rig.links]
+    rest = {name: value for name, value in document.items() if name not in own}
+    return {**rest, "pairs": pairs, "links": links, "left_out": found.left_out}
+
+
+def _names(sensors: Any) -> list[str]:
+    """By index, of sensors as they are written."""
+    if not isinstance(sensors, list | tuple):
+        return []
+    names = [sensor.get("name") if isinstance(sensor, dict) else None for sensor in sensors[: 2 * MAX_SENSORS]]
+    return [name if isinstance(name, str) and len(name) <= MAX_NAME else str(i) for i, name in enumerate(names)]
+
+
+class _Pairs:
+    """The pairs of a rig in their long form.
+
+    Attributes:
+        left_out: names of those that see nothing in common, when all have been asked for.
+    """
+
+    def __init__(self, rig: RigConfig, *, native: bool) -> None:
+        self._rig = rig
+        self._native = native
+        self._cameras = {camera.name: camera for camera in rig.cameras}
+        self._lidars = {lidar.name: lidar for lidar in rig.lidars}
+        self.left_out: list[str] = []
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """All of them.
+
+        Raises:
+            ConfigError: a sensor is not there, or lacks what nothing else tells.
+        """
+        if self._rig.pairs is None:
+            for camera in self._rig.cameras:
+                for lidar in self._rig.lidars:
+                    if _see_something(camera, lidar):
+                        yield self._pair(camera, lidar, None)
+                    else:
+                        self.left_out.append(self._name(camera, lidar))
+            return
+        for index, pair in enumerate(self._rig.pairs):
+            camera_of = _found(self._cameras, pair.camera, f"pairs.{index}.camera", "camera")
+            yield self._pair(camera_of, _found(self._lidars, pair.lidar, f"pairs.{index}.lidar", "LiDAR"), pair)
+
+    def _name(self, camera: RigCamera, lidar: RigLidar) -> str:
+        return camera.name if len(self._lidars) == 1 else f"{camera.name}-{lidar.name}"
+
+    def _pair(self, camera: RigCamera, lidar: RigLidar, written: RigPair | None) -> dict[str, Any]:
+        if self._native:
+            _check_told(camera, lidar)
+        # Frames of eight cameras have eight names, and those that are told nothing else carry the sensor's.
+        frames = {kind: {"frame_id": sensor.name} for kind, sensor in (("camera", camera), ("lidar", lidar))}
+        frames = frames if self._native else {"camera": {}, "lidar": {}}
+        own = {} if written is None else written.model_dump(exclude_unset=True, exclude={"camera", "lidar"})
+        name = own.pop("name", None) or self._name(camera, lidar)
+        if len(name) > MAX_NAME:
+            raise ConfigError(
+                f"pairs: {name} has more than {MAX_NAME} characters: list the pairs, and give it a `name`"
+            )
+        pair = {
+            "name": name,
+            "camera": frames["camera"] | camera.model_dump(exclude_unset=True, exclude={"T_vehicle_camera"}),
+            "lidar": frames["lidar"]
+            | lidar.model_dump(exclude_unset=True, exclude={"T_vehicle_lidar", "field_of_view"}),
+            "T_camera_lidar": _nominal(camera, lidar),
+            **_merged(self._rig.stages.model_dump(exclude_unset=True), own),
+        }
+        if self._rig.ego is not None:
+            pair["ego"] = _ego(self._rig.ego, lidar)
+        return pair
+
+
+def _found(sensors: Mapping[str, T], name: str, where: str, kind: str) -> T:
+    if name not in sensors:
+        raise ConfigError(f"{where}: there is no {kind} {name}; there are {', '.join(sensors)}")
+    return sensors[name]
+
+
+def _check_told(camera: RigCamera, lidar: RigLidar) -> None:
+    """Native frames tell nothing of their sensors."""
+    lacking = {
+        f"cameras.{camera.name}.intrinsics": camera.intrinsics,
+        f"cameras.{camera.name}.T_vehicle_camera": camera.T_vehicle_camera,
+        f"lidars.{lidar.name}.T_vehicle_lidar": lidar.T_vehicle_lidar,
+    }
+    places = ", ".join(place for place, value in lacking.items() if value is None)
+    if places:
+        raise ConfigError(f"{places}: to be given where `middleware` is `native`, as nothing on the bus tells it")
+
+
+def _nominal(camera: RigCamera, lidar: RigLidar) -> Any:
+    from coec.config import poses
+
+    if camera.T_vehicle_camera is None or lidar.T_vehicle_lidar is None:
+        return None
+    return poses.relative(camera.T_vehicle_camera, lidar.T_vehicle_lidar)
+
+
+def _ego(ego: RigEgo, lidar: RigLidar) -> dict[str, Any]:
+    from coec.config import poses
+
+    document = ego.model_dump(exclude_unset=True, exclude={"T_vehicle_ego", "T_lidar_ego"})
+    if lidar.T_vehicle_lidar is not None:
+        document["T_lidar_ego"] = poses.relative(lidar.T_vehicle_lidar, ego.T_vehicle_ego)
+    return document
+
+
+def _see_something(camera: RigCamera, lidar: RigLidar) -> bool:
+    """Whether both see enough of the same; True where that is not known yet.
+
+    Raises:
+        ConfigError: the model of the camera refuses its parameters.
+    """
+    from coec.config import poses
+
+    nominal, intrinsics = _nominal(camera, lidar), camera.intrinsics
+    if nominal is None or intrinsics is None:
+        return True
+    field = lidar.field_of_view
+    told = (intrinsics.model, intrinsics.parameters(), nominal)
+    try:
+        common = poses.common(*told, field.azimuth_deg, field.elevation_deg)
+    except ValueError as error:
+        raise ConfigError(f"cameras.{camera.name}.intrinsics: {error}") from error
+    return common.of_lidar >= LEAST_OF_LIDAR and common.of_camera >= LEAST_OF_CAMERA
+
+
+def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Both, key by key; where both say something the second counts."""
+    merged = {**common, **own}
+    for name in common.keys() & own.keys():
+        if isinstance(common[name], dict) and isinstance(own[name], dict):
+            merged[name] = _merged(common[name], own[name])
+    return merged
