@@ -41,6 +41,7 @@ from coec.runtime import pair as runtime_pair
 from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.inbox import Call
+from coec.runtime.ingest.intake import Intake
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import RecordingPlan
@@ -295,10 +296,12 @@ class Bench:
         windows = WindowStore(self.folder / "windows", self.config.state)
         self.worker = self.kind()
         store = StateStore(self.folder, self.config.vehicle)
+        self.intake = Intake(self.config.limits)
         self.published: list[str] = []
         self.shown: list[str] = []
         outside = Outside(
             Keys("coec", self.config.vehicle),
+            self.intake,
             store,
             InstantScribe(self.folder),
             windows,
@@ -324,7 +327,7 @@ class Bench:
 
     @property
     def losses(self) -> dict[tuple[str, str], int]:
-        return self.answers._losses.snapshot()
+        return self.pair.stream.losses()
 
     def drive(self, begin_s: int, end_s: int, speed_mps: float = 5.0) -> None:
         for stamp_ns in range(begin_s * S, end_s * S, S // 2):
@@ -339,7 +342,7 @@ class Bench:
         going = True
         while going:
             going = False
-            while isinstance(item := self.pair.stream.inbox.take(0.0), Call):
+            while isinstance(item := self.intake.inbox.take(0.0), Call):
                 item.run()
                 going = True
             going |= self.pair.stream.choose_next()

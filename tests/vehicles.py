@@ -85,7 +85,7 @@ def serving(folder: Path, config: ZenohConfig, authority: AuthorityConfig | None
     """A vehicle in a session of its own, until the end of the block."""
     bench = Bench(folder, vehicle=VEHICLE, authority=authority)
     bus = Bus(open_session(config, LIMITS))
-    threads = (*bus.threads, bench.pair.stream.thread, bench.pair.decider.thread)
+    threads = (*bus.threads, bench.intake.thread, bench.pair.decider.thread)
     for thread in threads:
         thread.start()
     try:
@@ -93,7 +93,7 @@ def serving(folder: Path, config: ZenohConfig, authority: AuthorityConfig | None
         yield Vehicle(bench, bus)
     finally:
         bus.undeclare_inputs()
-        bench.pair.stream.request_stop()
+        bench.intake.request_stop()
         bench.pair.decider.request_stop()
         for thread in threads:
             thread.request_stop()

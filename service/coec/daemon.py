@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Literal
@@ -34,7 +33,7 @@ from coec.adapters.zenoh.ros_publisher import RosPublishers
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
-from coec.config import AuthorityConfig, Config, PairConfig, config_hash
+from coec.config import AuthorityConfig, Config, config_hash
 from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
 from coec.runtime.api.authority import Authority
@@ -53,7 +52,7 @@ from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.api.status import worker_status_of
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.state_store import StateStore
-from coec.runtime.ingest.stream import Stream
+from coec.runtime.ingest.intake import Intake
 from coec.runtime.nominal.kept import completed
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
@@ -155,7 +154,8 @@ class Daemon:
         self._scribe = Scribe(config.state.directory)
         own = (self._worker, self._publish, self._troubles, self._ros_outputs.show)
         of_ros = (self._ros_side.topics, self._room.nominal)
-        self._outside = Outside(self._keys, store, self._scribe, self._folder, *own, *of_ros)
+        self._intake = Intake(config.limits)
+        self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *own, *of_ros)
         self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
         awaited = self._room.open(config, self._outside)
         self._commands: dict[str, Commands | AwaitedCommands] = {
@@ -202,14 +202,13 @@ class Daemon:
     # --- start, tick, stop ------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
-        for thread in (self._scribe.thread, self._presence.thread, *self._bus.threads):
+        for thread in (self._scribe.thread, self._presence.thread, self._intake.thread, *self._bus.threads):
             thread.start()
         self._ros_outputs.start(self._told)
         self._worker.start()
         self._answers.declare(self._bus)
         self._door.use(self._config.metrics)
-        for pair in self._config.pairs:
-            self._run(pair)
+        self._run(self._pairs.values())
         self._room.listen(self._bus, self._ros_side.input_of)
         for name in (each.name for each in self._config.every_pair):
             self._bus.declare_alive(self._keys.alive(name))
@@ -226,13 +225,12 @@ class Daemon:
             },
         )
 
-    def _run(self, config: PairConfig) -> None:
-        """Start a pair that is built."""
-        pair = self._pairs[config.name]
-        for thread in (pair.decider.thread, pair.recorder.thread, pair.stream.thread):
-            thread.start()
-        for name, stream in config.streams.items():
-            self._bus.subscribe(self._ros_side.input_of(stream), partial(pair.take_sample, name))
+    def _run(self, pairs: Iterable[Pair]) -> None:
+        """Start pairs that are built, and listen to what they have that no other has."""
+        for pair in pairs:
+            for thread in (pair.decider.thread, pair.recorder.thread):
+                thread.start()
+        self._intake.listen(lambda stream, take: self._bus.subscribe(self._ros_side.input_of(stream), take))
 
     def _admit(self) -> None:
         """Build and start the pairs of which everything has been found."""
@@ -244,10 +242,10 @@ class Daemon:
         fresh = {name: Pair(config, whole, self._outside) for name, config in found.items()}
         self._pairs = {**self._pairs, **fresh}  # before the configuration that names them
         self._config = whole
-        for name, config in found.items():
-            self._commands[name] = fresh[name].commands
-            self._answers.replace(fresh[name].answers)
-            self._run(config)
+        for name, pair in fresh.items():
+            self._commands[name] = pair.commands
+            self._answers.replace(pair.answers)
+        self._run(fresh.values())
         self._reception.use(self._rules)  # for the commands of new pairs, too
         self._shown = self._shown_now()
         fields = {"pairs": list(found), "config_hash": config_hash(self._config)}
@@ -298,7 +296,7 @@ class Daemon:
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
             ("look for no more pairs", lambda: _stopped(self._room.threads, LOOK_OUT_STOP_S)),
-            ("end the streams", lambda: self._end(pairs, lambda pair: pair.stream, INGEST_STOP_S)),
+            ("end the intake", self._end_intake),
             ("finish the open windows", self._finish_windows),
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
@@ -319,19 +317,23 @@ class Daemon:
         return bool(ended and closed)
 
     @staticmethod
-    def _end(pairs: Iterable[Pair], part: Callable[[Pair], Stream | Recorder | Decider], within_s: float) -> None:
+    def _end(pairs: Iterable[Pair], part: Callable[[Pair], Recorder | Decider], within_s: float) -> None:
         for pair in pairs:
             part(pair).request_stop()
         _joined([part(pair).thread for pair in pairs], within_s)
+
+    def _end_intake(self) -> None:
+        self._intake.request_stop()
+        _joined([self._intake.thread], INGEST_STOP_S)
 
     def _end_scribe(self) -> None:
         self._scribe.request_stop()
         _joined([self._scribe.thread], SCRIBE_STOP_S)
 
     def _finish_windows(self) -> None:
-        """Of the pairs whose stream has ended: nobody else may touch its open window."""
-        for pair in self._pairs.values():
-            if pair.stream.thread.join(0.0):
+        """Once the intake has ended: nobody else may touch them."""
+        if self._intake.thread.join(0.0):
+            for pair in self._pairs.values():
                 _attempt("finish a window", pair.finish_window)
 
     def _reload(self, reread: Callable[[], Config] | None) -> None:
@@ -421,7 +423,7 @@ class Daemon:
     def _prompt_threads(self) -> list[ServiceThread]:
         """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
         restart would make it quicker, and none is asked for."""
-        own = [thread for pair in self._pairs.values() for thread in pair.threads]
+        own = [self._intake.thread, *(pair.decider.thread for pair in self._pairs.values())]
         of_ros = (*self._room.threads, *self._ros_outputs.threads)
         return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *of_ros, *own]
 
@@ -487,7 +489,7 @@ class Daemon:
         pairs = self._pairs.items()
         took = {
             metrics.QUERY: [Took((), self._answers.took)],
-            metrics.DECODE: [Took((name,), pair.stream.decoding_took) for name, pair in pairs],
+            metrics.DECODE: [Took((sensor.config.sensor,), sensor.took) for sensor in self._intake.sensors],
             metrics.PAIR_WAIT: [Took((name,), pair.stream.waiting_took) for name, pair in pairs],
             metrics.WRITE: [Took((name,), pair.recorder.writing_took) for name, pair in pairs],
             metrics.JOB: [Took((), self._worker.jobs_took)],

@@ -7,7 +7,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -67,8 +66,8 @@ def test_what_zenoh_drops_is_counted_as_far_as_it_can_be_known(
         connected([endpoint], PATIENCE_S) as session,
     ):
         publishers = {}
+        vehicle.bench.intake.listen(lambda stream, take: vehicle.bus.subscribe(on_key(stream.place), take))
         for name in counted:
-            vehicle.bus.subscribe(on_key(f"in/{name}"), partial(vehicle.bench.pair.take_sample, name))
             block = zenoh.CongestionControl.BLOCK
             publishers[name] = session.declare_publisher(f"in/{name}", congestion_control=block)
         wait_until(lambda: all(map(is_heard, publishers.values())), "the service", PATIENCE_S)

@@ -95,7 +95,7 @@ def test_a_stream_that_has_waited_for_too_long_goes_on_and_says_so(tmp_path: Pat
     waiting = len(bench.pair.stream._held)
     assert waiting > 0
     assert ("monitor", "not_awaited") not in bench.losses
-    bench.pair.stream._held._max_bytes = 0
+    bench.intake.waiting_frames._max_bytes = 0
     while bench.pair.stream.choose_next():
         pass
     assert len(bench.pair.stream._held) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from pydantic import Field, model_validator
@@ -13,6 +14,7 @@ from coec.config.streams import (
     AnyStreamConfig,
     CameraConfig,
     EgoConfig,
+    KnownStreamConfig,
     LidarConfig,
     OpenCameraConfig,
     OpenEgoConfig,
@@ -38,7 +40,7 @@ class OpenPairConfig(Stage):
     tracker: TrackerConfig = TrackerConfig()
 
     @property
-    def streams(self) -> dict[str, AnyStreamConfig]:
+    def streams(self) -> Mapping[str, AnyStreamConfig]:
         """Those that it has, by the names under which they are counted."""
         streams = {"camera": self.camera, "lidar": self.lidar, "ego": self.ego}
         return {name: stream for name, stream in streams.items() if stream is not None}
@@ -61,3 +63,9 @@ class PairConfig(OpenPairConfig):
     lidar: LidarConfig
     ego: EgoConfig | None = None
     T_camera_lidar: Matrix4x4 = Field(description="workshop calibration: LiDAR to camera")
+
+    @property
+    def streams(self) -> Mapping[str, KnownStreamConfig]:
+        """Those that it has, by the names under which they are counted."""
+        streams = {"camera": self.camera, "lidar": self.lidar, "ego": self.ego}
+        return {name: stream for name, stream in streams.items() if stream is not None}

@@ -17,14 +17,14 @@ class LimitsConfig(Stage):
     max_image_pixels: int = Field(default=33_000_000, ge=2**12, description="8K UHD")
     max_points: int = Field(default=1_000_000, ge=2**10)
     max_waiting_bytes: int = Field(
-        default=64 * 2**20,
+        default=128 * 2**20,
         ge=2**20,
-        description="per pair, messages that have come and wait to be decoded; beyond, the oldest are lost",
+        description="of all streams, messages that have come and wait to be decoded; beyond, the oldest are lost",
     )
     max_held_bytes: int = Field(
         default=256 * 2**20,
         ge=2**20,
-        description="per pair, frames that wait until what was seen before them is judged; beyond, they do not wait",
+        description="of all pairs, frames that wait until what came before them is judged; beyond, they do not wait",
     )
 
 

@@ -89,6 +89,11 @@ class StreamConfig(Stage):
         """The key or the topic, as it was configured."""
         return self.key or self.topic or ""
 
+    @property
+    def sensor(self) -> str:
+        """What it is called, whatever pairs it is of: its name, or its place where it has none."""
+        return str(getattr(self, "name", None) or self.place)
+
     @model_validator(mode="before")
     @classmethod
     def _completed(cls, document: Any) -> Any:
@@ -229,6 +234,7 @@ class EgoConfig(OpenEgoConfig):
 
 
 AnyStreamConfig = OpenCameraConfig | OpenLidarConfig | OpenEgoConfig
+KnownStreamConfig = CameraConfig | LidarConfig | EgoConfig
 
 
 def _types(known: Any, only: str | None) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.types import FramePair, Matrix4, Reason
 from coec.config import PairConfig
 from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.ingest.intake import Intake
 from coec.runtime.nominal.watch import Nominal
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.supervisor import Worker
@@ -28,12 +29,14 @@ class Outside:
     """Everything that a pair shares. All that can be called may be called from any thread.
 
     Attributes:
+        intake: takes the samples of all pairs.
         show: `show(pair, drawn, pose)` tells of a pair of the stream that is being checked at an extrinsic (4, 4).
         topics: those that the vehicle's ROS publishes now.
         nominal: where a pair's nominal calibration comes from.
     """
 
     keys: Keys
+    intake: Intake
     store: StateStore
     scribe: Scribe
     folder: WindowStore

@@ -1,8 +1,9 @@
 """One camera-LiDAR pair: what it is made of, and how it starts and ends. No logic.
 
-Three threads, each the only writer of its part: the stream's (samples, pairs, what becomes of each), the recorder's
-(files) and the one that decides (answers, commands, ages). What crosses from one to another goes through the inbox, the
-recorder's queue and the mailbox; what is asked of the worker comes back through the mailbox, too.
+Three threads, each the only writer of its part: the intake's, which all pairs of a vehicle share (samples, pairs, what
+becomes of each), the recorder's (files) and the one that decides (answers, commands, ages). What crosses from one to
+another goes through the inbox, the recorder's queue and the mailbox; what is asked of the worker comes back through the
+mailbox, too.
 """
 
 from __future__ import annotations
@@ -11,8 +12,6 @@ import logging
 
 from coec.adapters.files.rig import rig_of
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.system.threads import ServiceThread
-from coec.adapters.zenoh.inputs import Sample
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.runtime.api.commands import Commands
 from coec.runtime.api.pair_answers import PairAnswers
@@ -24,7 +23,7 @@ from coec.runtime.decisions.questions import Questions
 from coec.runtime.decisions.queue import DecisionQueue
 from coec.runtime.decisions.rig_baseline import RigBaseline
 from coec.runtime.ingest.chooser import Chooser
-from coec.runtime.ingest.stream import Stream
+from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder, RecordingPlan
 from coec.runtime.reload import settings_hash
@@ -33,7 +32,8 @@ _log = logging.getLogger(__name__)
 
 
 class Pair:
-    """One pair. `stream`, `recorder` and `decider` have a thread each; `answers` and `commands` are for any thread."""
+    """One pair. `stream` is on the thread of the intake, `recorder` and `decider` have one each; `answers` and
+    `commands` are for any thread."""
 
     def __init__(self, pair: PairConfig, config: Config, outside: Outside) -> None:
         """Build the pair and recall its state.
@@ -52,9 +52,9 @@ class Pair:
         plan = self._plan(pair, baseline.calibration)
         self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost)
         chooser = Chooser(pair, config.limits, rig, store.served, questions, self.recorder, losses, store.kept)
-        self.stream = Stream(pair, config, chooser, lambda: self.recorder.has_room, losses)
+        self.stream = PairStream(pair, config, outside.intake, chooser, lambda: self.recorder.has_room, losses)
         self.answers = PairAnswers(
-            pair, config, rig, store, folder, self.recorder, self.stream, losses, outside, lambda: self.commands.counts
+            pair, config, rig, store, folder, self.recorder, self.stream, outside, lambda: self.commands.counts
         )
         pictures = IncidentPictures(store.add_picture, folder, questions, losses)
         self.decider = Decider(
@@ -101,16 +101,7 @@ class Pair:
         metadata = {"vehicle": self._vehicle, "pair": pair.name, "settings_hash": settings_hash(pair)}
         return RecordingPlan(self._rig, calibration, pair.window.min_pairs, metadata)
 
-    @property
-    def threads(self) -> tuple[ServiceThread, ...]:
-        """Those that wait for nothing outside the process."""
-        return self.stream.thread, self.decider.thread
-
-    def take_sample(self, stream: str, sample: Sample) -> None:
-        """A sample came: microseconds, on the network's thread."""
-        self.stream.inbox.put(stream, sample)
-
     def finish_window(self) -> None:
-        """End the open window; for the end of the service, after the stream's thread has ended."""
+        """End the open window; for the end of the service, after the intake's thread has ended."""
         self.stream.finish_pairs()
         self._chooser.finish()

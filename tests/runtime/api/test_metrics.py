@@ -156,7 +156,7 @@ def test_durations_fall_into_buckets_that_hold_their_own_ends() -> None:
     assert took.value("_bucket", resource="health", le="0.003") == 3
     assert took.value("_bucket", resource="health", le="+Inf") == took.value("_count", resource="health") == 4
     assert took.value("_sum", resource="health") == pytest.approx(99.00215)
-    assert read()[metrics.DECODE].value("_count", pair="front", stream="camera") == 1
+    assert read()[metrics.DECODE].value("_count", sensor="front", stream="camera") == 1
 
 
 def test_a_label_holds_whatever_text_there_is() -> None:

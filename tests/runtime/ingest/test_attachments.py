@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from dataclasses import replace
 
@@ -14,7 +13,6 @@ from coec.adapters.zenoh.inputs import Sample
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig, PairConfig
 from coec.runtime.ingest.decoder import CAMERA, Decoder
-from coec.runtime.ingest.inbox import Parcel
 
 PAIR = PairConfig.model_validate(
     {
@@ -44,14 +42,13 @@ def image(stamp_ns: int = 5) -> bytes:
 class Desk:
     def __init__(self) -> None:
         self.losses = LossCounter(logging.getLogger("test"), "front")
-        self.decoder = Decoder(PAIR, LimitsConfig(), self.losses)
-        self._order = itertools.count()
+        self.decoder = Decoder(CAMERA, PAIR.camera, LimitsConfig(), self.losses)
 
-    def parcel(self, attachment: bytes, payload: bytes | None = None, encoding: str = IMAGE) -> Parcel:
-        return Parcel(next(self._order), CAMERA, Sample(payload or image(), encoding, attachment))
+    def sample(self, attachment: bytes, payload: bytes | None = None, encoding: str = IMAGE) -> Sample:
+        return Sample(payload or image(), encoding, attachment)
 
     def take(self, attachment: bytes, payload: bytes | None = None, encoding: str = IMAGE) -> CameraFrame | None:
-        frame = self.decoder.frame(self.parcel(attachment, payload, encoding))
+        frame = self.decoder.frame(self.sample(attachment, payload, encoding))
         assert frame is None or isinstance(frame, CameraFrame)
         return frame
 
@@ -72,7 +69,7 @@ def test_a_publisher_that_is_started_again_is_a_new_one(desk: Desk) -> None:
         for number in range(1, 30):
             desk.take(beside(1000 * (2 - sender) + number, sender))
     assert desk.losses.snapshot() == {}
-    assert desk.decoder.counts(CAMERA).taking_turns == ()
+    assert desk.decoder.counts().taking_turns == ()
 
 
 @pytest.mark.fault("two publishers on one topic of ROS", "their losses are counted apart, and health names them")
@@ -80,10 +77,10 @@ def test_two_publishers_at_a_time_are_told_apart_until_one_ends(desk: Desk) -> N
     for number in range(1, 11):
         desk.take(beside(number, 1))
         desk.take(beside(500 + number, 2))
-    assert set(desk.decoder.counts(CAMERA).taking_turns) == {b"\1" * 16, b"\2" * 16}
+    assert set(desk.decoder.counts().taking_turns) == {b"\1" * 16, b"\2" * 16}
     for number in range(11, 80):
         desk.take(beside(number, 1))
-    assert not desk.decoder.counts(CAMERA).taking_turns
+    assert not desk.decoder.counts().taking_turns
     assert desk.losses.snapshot() == {}
 
 
@@ -114,7 +111,7 @@ def test_a_refused_message_is_no_gap(desk: Desk) -> None:
 def test_an_overrun_of_a_numbered_message_is_counted_once(desk: Desk) -> None:
     for number in range(1, 40):
         if number == 3:
-            desk.decoder.overrun(desk.parcel(beside(number)))
+            desk.decoder.overrun(desk.sample(beside(number)))
         else:
             desk.take(beside(number))
     assert desk.losses.snapshot() == {(CAMERA, "overrun"): 1}
@@ -125,7 +122,7 @@ def test_the_stamp_of_the_header_is_the_truth_and_the_senders_stands_in_for_none
     for number, stamp_ns in enumerate((5, 0, 7), 1):
         frame = desk.take(beside(number), image(stamp_ns))
         assert frame is not None
-        told.append((frame.stamp_ns, desk.decoder.counts(CAMERA).stamped_by_sender))
+        told.append((frame.stamp_ns, desk.decoder.counts().stamped_by_sender))
     assert told == [(5, False), (SENT_NS, True), (7, False)]
 
 

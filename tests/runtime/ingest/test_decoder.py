@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import threading
 from dataclasses import replace
@@ -54,15 +53,16 @@ def camera(sequence: int | None = None, frame_id: str = "camera", width: int = 4
 
 
 class Desk:
-    """An intake and what it lost."""
+    """Decoders and what they lost."""
 
     def __init__(self, pair: PairConfig = PAIR) -> None:
         self.losses = LossCounter(logging.getLogger("test"), "front")
-        self.intake = Decoder(pair, LimitsConfig(), self.losses)
-        self._order = itertools.count()
+        self.decoders = {
+            name: Decoder(name, stream, LimitsConfig(), self.losses) for name, stream in pair.streams.items()
+        }
 
     def take(self, stream: str, payload: bytes, encoding: str = "zenoh/bytes") -> object:
-        return self.intake.frame(Parcel(next(self._order), stream, Sample(payload, encoding)))
+        return self.decoders[stream].frame(Sample(payload, encoding))
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def test_else_the_configurations(desk: Desk) -> None:
     assert desk.take(CAMERA, msgpack_frames.encode_camera(camera())) == camera()
     assert isinstance(desk.take(LIDAR, outgoing.encode_cloud(CLOUD)), LidarFrame)
     assert desk.take(EGO, msgpack_frames.encode_ego(MOTION), "text/plain") == MOTION
-    assert desk.intake.counts(EGO).accepted == 1
+    assert desk.decoders[EGO].counts().accepted == 1
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_what_does_not_fit_is_counted_by_reason(
 ) -> None:
     assert desk.take(stream, payload, encoding) is None
     assert desk.losses.snapshot() == {(stream, reason): 1}
-    assert (desk.intake.counts(stream).received, desk.intake.counts(stream).accepted) == (1, 0)
+    assert (desk.decoders[stream].counts().received, desk.decoders[stream].counts().accepted) == (1, 0)
 
 
 TF_EGO = EgoConfig(topic="/tf", type="tf2_msgs/msg/TFMessage", parent="map", child="ego")
@@ -168,7 +168,7 @@ def test_the_motion_in_transforms_takes_two_and_what_tells_none_is_no_loss() -> 
     assert frames[:2] == [None, None]
     assert isinstance(frames[2], EgoMotion)
     assert frames[2].linear_mps == pytest.approx((5.0, 0.0, 0.0))
-    assert (desk.intake.counts(EGO).received, desk.intake.counts(EGO).accepted) == (3, 1)
+    assert (desk.decoders[EGO].counts().received, desk.decoders[EGO].counts().accepted) == (3, 1)
     assert not desk.losses.snapshot()
 
 
@@ -185,7 +185,7 @@ def test_times_that_may_mean_two_things_are_counted_and_the_log_says_what_to_do(
     assert isinstance(frame, LidarFrame)
     assert frame.time_offset_s is not None
     assert frame.time_offset_s.tolist() == pytest.approx([0.0, 0.005])
-    assert said.intake.timed_by == "time: float32, ms since the stamp; 0.0 to 5.0 ms, stamped at its begin"
+    assert said.decoders[LIDAR].timed_by == "time: float32, ms since the stamp; 0.0 to 5.0 ms, stamped at its begin"
     assert said.take(LIDAR, packed(columns[:3]), CDR) is None, "a field that was named has to be there"
     assert said.losses.snapshot() == {(LIDAR, "cloud_fields"): 1}
 

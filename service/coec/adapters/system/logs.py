@@ -74,9 +74,10 @@ class LossCounter:
     Reasons come from fixed sets, never from a sender. Safe to use from several threads.
     """
 
-    def __init__(self, logger: logging.Logger, pair: str) -> None:
+    def __init__(self, logger: logging.Logger, name: str, kind: str = "pair") -> None:
+        """`name` stands in the log: of the pair, or of another `kind` of thing, whose losses these are."""
         self._logger = logger
-        self._pair = pair
+        self._whose = {kind: name}
         self._lock = threading.Lock()
         self._counts: Counter[tuple[str, str]] = Counter()
 
@@ -87,7 +88,7 @@ class LossCounter:
             after = before + count
             self._counts[place, reason] = after
         if after.bit_length() != before.bit_length():
-            fields = {"pair": self._pair, "place": place, "reason": reason, "count": after}
+            fields = {**self._whose, "place": place, "reason": reason, "count": after}
             self._logger.warning(f"lost: {detail or reason}", extra={"fields": fields})
 
     def snapshot(self) -> dict[tuple[str, str], int]:

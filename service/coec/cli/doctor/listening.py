@@ -18,7 +18,6 @@ from coec.adapters.zenoh.inputs import Sample
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.config import Config, PairConfig
 from coec.runtime.ingest.decoder import EGO, Decoder, Frame, StreamCounts
-from coec.runtime.ingest.inbox import Parcel
 
 SAMPLES_WAITING = 8
 """Of a stream; more are counted and not looked into."""
@@ -89,7 +88,9 @@ class _Ear:
             name: deque(maxlen=MOTIONS_WAITING if name == EGO else SAMPLES_WAITING) for name in self.heard
         }
         self._losses = LossCounter(_SILENT, pair.name)
-        self._decoder = Decoder(pair, config.limits, self._losses)
+        self._decoders = {
+            name: Decoder(name, stream, config.limits, self._losses) for name, stream in pair.streams.items()
+        }
         self._subscribers = [
             self._subscribe(session, expression, stream.read, name)
             for name, stream in inputs.items()
@@ -107,7 +108,7 @@ class _Ear:
         while self.take():
             pass
         for name, heard in self.heard.items():
-            heard.counts = self._decoder.counts(name)
+            heard.counts = self._decoders[name].counts()
 
     def take(self) -> bool:
         """Look into the next sample of each stream; whether there was one."""
@@ -117,7 +118,7 @@ class _Ear:
                 continue
             found = True
             wall_ns, sample = waiting.popleft()
-            frame = self._decoder.frame(Parcel(0, name, sample))
+            frame = self._decoders[name].frame(sample)
             heard = self.heard[name]
             if frame is not None:
                 heard.latest = frame

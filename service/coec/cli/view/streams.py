@@ -44,10 +44,12 @@ class Streams:
         self._begin()
 
     def _begin(self) -> None:
-        self._decoder = Decoder(self._pair, self._limits, self._losses)
+        self._decoders = {
+            name: Decoder(name, stream, self._limits, self._losses) for name, stream in self._pair.streams.items()
+        }
         self._pairer = Pairer(self._pair.pairing, expects_motion=self._pair.ego is not None)
         self._since_s = time.monotonic()
-        self._inbox = Inbox(DEPTHS, self._limits.max_waiting_bytes, self._decoder.overrun)
+        self._inbox = Inbox(DEPTHS, self._limits.max_waiting_bytes, self._overrun)
 
     @property
     def not_shown(self) -> Counter[tuple[str, str]]:
@@ -93,7 +95,7 @@ class Streams:
         parcel = self._inbox.take(wait_s)
         end_s = time.monotonic() + BUSY_S
         while isinstance(parcel, Parcel):
-            frame = self._decoder.frame(parcel)
+            frame = self._decoders[parcel.stream].frame(parcel.sample)
             formed = [] if frame is None else self._pairer.push(frame)
             pair = formed[-1] if formed else pair
             parcel = self._inbox.take(0.0) if time.monotonic() < end_s else None
@@ -102,6 +104,9 @@ class Streams:
     def refused(self, stream: str, cause: str) -> None:
         """Count what could not be shown, or be understood."""
         self._losses.add(stream, cause)
+
+    def _overrun(self, parcel: Parcel) -> None:
+        self._decoders[parcel.stream].overrun(parcel.sample)
 
     def close(self) -> None:
         """Withdraw the subscriptions."""

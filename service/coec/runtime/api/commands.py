@@ -25,7 +25,7 @@ from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.decisions.questions import Questions
 from coec.runtime.handover import BusyError
 from coec.runtime.ingest.chooser import Chooser
-from coec.runtime.ingest.stream import Stream
+from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
 from coec.schemas.commands import NAMES
@@ -53,7 +53,7 @@ class Commands:
         decider: Decider,
         mailbox: Mailbox,
         store: PairStore,
-        stream: Stream,
+        stream: PairStream,
         chooser: Chooser,
         recorder: Recorder,
         folder: WindowStore,

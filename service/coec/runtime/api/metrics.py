@@ -316,7 +316,7 @@ FAMILIES: tuple[Family, ...] = (
         ("queue",),
         _of_worker(lambda view: view.status.queries_waiting),
     ),
-    Family(DECODE, "histogram", "Decoding of a sample.", _STREAM),
+    Family(DECODE, "histogram", "Decoding of a sample, once for all pairs.", ("sensor", "stream")),
     Family(PAIR_WAIT, "histogram", "From a pair's last frame until it is looked at.", _PAIR),
     Family(WRITE, "histogram", "Writing of a pair into its window.", _PAIR),
     Family(JOB, "histogram", "From a question to the worker to its result, by kind: check, solve, ...", ("kind",)),

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from coec.adapters.exports import FORMATS
 from coec.adapters.exports.told import Frames, NotAcceptedError
 from coec.adapters.files.conversions import result_of
-from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.bus import Answer
 from coec.calibration.lifecycle import Health, HealthState
 from coec.calibration.types import Reason, Rig
@@ -24,7 +23,7 @@ from coec.runtime.api.status import pair_status_of
 from coec.runtime.decisions.decider import Known
 from coec.runtime.decisions.incidents import NO_EVENT, Side
 from coec.runtime.decisions.pair_store import PairStore
-from coec.runtime.ingest.stream import Stream
+from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
@@ -43,8 +42,7 @@ class PairAnswers:
         store: PairStore,
         folder: WindowStore,
         recorder: Recorder,
-        stream: Stream,
-        losses: LossCounter,
+        stream: PairStream,
         outside: Outside,
         commands: Callable[[], dict[str, int]],
     ) -> None:
@@ -57,7 +55,6 @@ class PairAnswers:
         self._folder = folder
         self._recorder = recorder
         self._stream = stream
-        self._losses = losses
         self._outside = outside
         self._commands = commands
         self._overlays = Overlays(pair.name, outside.worker)
@@ -81,12 +78,12 @@ class PairAnswers:
         accepted = None if known.state.accepted is None else result_of(known.state.accepted, rig, self._vehicle)
         extrinsic = extrinsic_of(self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash)
         own = () if self._recorder.trouble is None else (self._recorder.trouble,)
-        topics, arrivals = self._outside.topics(), self._stream.inbox.arrivals(time.monotonic())
+        topics, arrivals = self._outside.topics(), self._stream.arrivals()
         changed = self._outside.nominal(self.name).changed
         ailing = (*streams.troubles_of(report.streams, self._pair, topics), *(() if changed is None else (changed,)))
         troubles = (*own, *ailing, *self._outside.vehicle_troubles())
         missed = streams.missed_of(arrivals, self._pair, topics)
-        health = health_of(known, report, self._losses.snapshot(), troubles, missed, self._pair, rig, self._vehicle)
+        health = health_of(known, report, self._stream.losses(), troubles, missed, self._pair, rig, self._vehicle)
         self._known, self._health = known, Told(health, time.monotonic())
         self.extrinsic_reply = extrinsic
         self._snapshots = {"extrinsic": Snapshot.of(extrinsic), "health": Snapshot.of(health)}
@@ -225,10 +222,10 @@ class PairAnswers:
             self.name,
             self._known,
             self._stream.report,
-            self._losses.snapshot(),
+            self._stream.losses(),
             self._recorder.recorded,
             self._commands(),
-            self._stream.inbox.arrivals(time.monotonic()),
+            self._stream.arrivals(),
             self._recorder.waiting,
             has_ego=self._pair.ego is not None,
         )

@@ -1,1 +1,1 @@
-"""From a sample to a pair: inbox, decoder, buffer, the clock of the sensors, statistics of the streams."""
+"""From a sample to a pair: inbox, sensors, intake, pairs, the clock of the sensors, statistics."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter, defaultdict, deque
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,9 +18,17 @@ from coec.adapters.zenoh.inputs import CDR, Sample
 from coec.calibration.frames.concatenation import SeveralOrigins
 from coec.calibration.frames.origin import ApparentOrigin, OriginCheck, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.config import LimitsConfig, OpenPairConfig, PairConfig
+from coec.config import (
+    IDENTITY,
+    AnyStreamConfig,
+    CameraConfig,
+    KnownStreamConfig,
+    LidarConfig,
+    LimitsConfig,
+    OpenEgoConfig,
+    OpenLidarConfig,
+)
 from coec.errors import DecodeError
-from coec.runtime.ingest.inbox import Parcel
 from coec.runtime.ingest.senders import Senders
 
 _log = logging.getLogger(__name__)
@@ -73,22 +81,22 @@ class StreamCounts:
 
 
 class SampleReader:
-    """Frames of the samples of a pair's streams, as they come."""
+    """Frames of the samples of one stream, as they come."""
 
-    def __init__(self, pair: OpenPairConfig, limits: LimitsConfig) -> None:
-        self._streams = pair.streams
+    def __init__(self, kind: str, stream: AnyStreamConfig, limits: LimitsConfig) -> None:
+        """`kind` is what the stream brings: `CAMERA`, `LIDAR` or `EGO`."""
+        self._kind = kind
+        self._stream = stream
         self._limits = limits
-        self._lidar = pair.lidar
-        self._moving = None if pair.ego is None else MovingFrame(pair.ego.parent, pair.ego.child)
+        self._moving = MovingFrame(stream.parent, stream.child) if isinstance(stream, OpenEgoConfig) else None
 
-    def frame(self, stream: str, sample: Sample) -> Frame | None:
-        """The frame in a sample of a stream, `CAMERA`, `LIDAR` or `EGO`; None where it holds transforms of other frames
-        than the vehicle's, or the first ones.
+    def frame(self, sample: Sample) -> Frame | None:
+        """The frame in a sample; None where it holds transforms of other frames than the vehicle's, or the first ones.
 
         Raises:
             DecodeError: there is none, or one of another kind.
         """
-        configured = self._streams[stream]
+        configured = self._stream
         encoding, _, schema = sample.encoding.partition(";")
         if encoding not in ("application/msgpack", CDR):
             encoding = f"application/{configured.encoding}"
@@ -100,121 +108,119 @@ class SampleReader:
                 raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {told}")
             if type_name == messages.TF and self._moving is not None:
                 return self._moving.motion(sample.payload)
-            time, source = self._lidar.time, self._lidar.source
+            time, source = None, None
+            if isinstance(configured, OpenLidarConfig):
+                time, source = configured.time, configured.source
             return incoming.decode(type_name, sample.payload, self._limits, point_time=time, source=source)
-        if stream == CAMERA:
+        if self._kind == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
-        if stream == LIDAR:
+        if self._kind == LIDAR:
             return msgpack_frames.decode_lidar(sample.payload, self._limits)
         return msgpack_frames.decode_ego(sample.payload, self._limits)
 
 
 class Decoder:
-    """Decodes and checks the samples of one pair's streams.
+    """Decodes and checks the samples of one stream.
 
     Attributes:
         timed_by: of the latest sweep, see `LidarFrame`.
     """
 
-    def __init__(self, pair: PairConfig, limits: LimitsConfig, losses: LossCounter) -> None:
-        self._pair = pair
-        self._samples = SampleReader(pair, limits)
+    def __init__(self, kind: str, stream: KnownStreamConfig, limits: LimitsConfig, losses: LossCounter) -> None:
+        """`kind` is what the stream brings, `CAMERA`, `LIDAR` or `EGO`, and the place at which its losses are
+        counted."""
+        self._kind = kind
+        self._stream = stream
+        self._samples = SampleReader(kind, stream, limits)
         self._limits = limits
         self._losses = losses
-        self._senders: defaultdict[str, Senders] = defaultdict(Senders)
-        self._overruns: deque[tuple[str, bytes]] = deque()
-        self._stamped_by_sender: dict[str, bool] = {}
-        self._received: Counter[str] = Counter()
-        self._accepted: Counter[str] = Counter()
-        self._T_cloud_lidar = np.array(pair.lidar.T_cloud_lidar, dtype=np.float64)
+        self._senders = Senders()
+        self._overruns: deque[bytes] = deque()
+        self._stamped_by_sender = False
+        self._received = self._accepted = 0
+        lidar = stream if isinstance(stream, LidarConfig) else None
+        self._T_cloud_lidar = np.array(IDENTITY if lidar is None else lidar.T_cloud_lidar, dtype=np.float64)
         self._origin = OriginCheck()
         self._looked_in: int | None = None
         self._contradicted = False
         self.timed_by = ""
 
-    def counts(self, stream: str) -> StreamCounts:
-        """Counters of a stream since the start."""
-        return StreamCounts(
-            self._received[stream],
-            self._accepted[stream],
-            self._senders[stream].taking_turns,
-            self._stamped_by_sender.get(stream, False),
-        )
+    def counts(self) -> StreamCounts:
+        """Counters since the start."""
+        return StreamCounts(self._received, self._accepted, self._senders.taking_turns, self._stamped_by_sender)
 
-    def overrun(self, parcel: Parcel) -> None:
+    def overrun(self, sample: Sample) -> None:
         """A sample went before it was decoded. Any thread."""
-        self._losses.add(parcel.stream, "overrun")
-        sample = parcel.sample
+        self._losses.add(self._kind, "overrun")
         told = Attachment.parse(sample.attachment)
         if told is not None:
-            self._overruns.append((parcel.stream, told.gid))
+            self._overruns.append(told.gid)
         elif sample.attachment is None and NUMBERED in sample.payload:
-            self._overruns.append((parcel.stream, NOBODY))
+            self._overruns.append(NOBODY)
 
-    def frame(self, parcel: Parcel) -> Frame | None:
+    def frame(self, sample: Sample) -> Frame | None:
         """The frame in a sample, or None when it was refused (and counted), or holds none: transforms of other frames
         than the vehicle's. Never raises for what a sender sent."""
-        stream = parcel.stream
-        self._received[stream] += 1
+        self._received += 1
         while self._overruns:
-            overrun, sender = self._overruns.popleft()
-            self._senders[overrun].counted(sender)
-        told = self._told(stream, parcel.sample)
+            self._senders.counted(self._overruns.popleft())
+        told = self._told(sample)
         try:
-            if len(parcel.sample.payload) > self._limits.max_message_bytes:
+            if len(sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
-            frame = self._samples.frame(stream, parcel.sample)
+            frame = self._samples.frame(sample)
             if frame is None:
                 return None
             self._check_times(frame)
             if told is None and frame.sequence is not None:
-                self._number(stream, NOBODY, frame.sequence)
-            frame = self._checked(self._stamped(stream, frame, told))
+                self._number(NOBODY, frame.sequence)
+            frame = self._checked(self._stamped(frame, told))
         except DecodeError as error:
-            self._losses.add(stream, error.reason, detail=str(error) if error.reason in EXPLAINED else "")
+            self._losses.add(self._kind, error.reason, detail=str(error) if error.reason in EXPLAINED else "")
             return None
         except Exception:
             # A fault of a decoder must cost the message, not the service.
-            _log.exception("a decoder failed", extra={"fields": {"pair": self._pair.name, "stream": stream}})
-            self._losses.add(stream, "decoder_fault")
+            _log.exception("a decoder failed", extra={"fields": {"sensor": self._stream.sensor, "stream": self._kind}})
+            self._losses.add(self._kind, "decoder_fault")
             return None
-        self._accepted[stream] += 1
+        self._accepted += 1
         if isinstance(frame, LidarFrame):
             self.timed_by = frame.timed_by
         return frame
 
-    def _told(self, stream: str, sample: Sample) -> Attachment | None:
+    def _told(self, sample: Sample) -> Attachment | None:
         """What the sender tells beside the message; a message beside which something else lies is taken, too."""
         told = Attachment.parse(sample.attachment)
         if told is not None:
-            self._number(stream, told.gid, told.sequence)
+            self._number(told.gid, told.sequence)
         elif sample.attachment is not None:
-            self._losses.add(stream, "attachment_malformed")
+            self._losses.add(self._kind, "attachment_malformed")
         return told
 
-    def _number(self, stream: str, sender: bytes, number: int) -> None:
-        lost = self._senders[stream].lost_by(sender, number)
+    def _number(self, sender: bytes, number: int) -> None:
+        lost = self._senders.lost_by(sender, number)
         if lost:
-            self._losses.add(stream, "sequence_gap", lost)
+            self._losses.add(self._kind, "sequence_gap", lost)
 
-    def _stamped(self, stream: str, frame: Frame, told: Attachment | None) -> Frame:
+    def _stamped(self, frame: Frame, told: Attachment | None) -> Frame:
         """A frame without a stamp gets the sender's: when it was sent, not when the sensor saw."""
         without = frame.stamp_ns == 0 and told is not None and told.source_ns > 0
-        self._stamped_by_sender[stream] = without
+        self._stamped_by_sender = without
         return replace(frame, stamp_ns=told.source_ns) if told is not None and without else frame
 
     def _checked(self, frame: Frame) -> Frame:
-        if isinstance(frame, CameraFrame):
-            self._check_camera(frame)
-        elif isinstance(frame, LidarFrame):
-            return self._from_origin(frame)
+        stream = self._stream
+        if isinstance(frame, CameraFrame) and isinstance(stream, CameraConfig):
+            _check_camera(frame, stream)
+        elif isinstance(frame, LidarFrame) and isinstance(stream, LidarConfig):
+            return self._from_origin(frame, stream)
         return frame
 
-    def _from_origin(self, cloud: LidarFrame) -> LidarFrame:
+    def _from_origin(self, cloud: LidarFrame, lidar: LidarConfig) -> LidarFrame:
         """The sweep in the LiDAR's own frame, from which its ranges must have been measured."""
-        if cloud.frame_id != (self._pair.lidar.cloud_frame_id or self._pair.lidar.frame_id):
+        if cloud.frame_id != (lidar.cloud_frame_id or lidar.frame_id):
             raise DecodeError("frame_id", "not the frame id of the configuration")
-        sweep = from_origin(cloud, self._T_cloud_lidar, self._pair.lidar.frame_id)
+        sweep = from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
         contradiction = self._contradiction(sweep)
         if contradiction is not None:
             raise DecodeError(contradiction.cause, f"{contradiction.sentence} See lidar.{contradiction.setting}.")
@@ -232,14 +238,14 @@ class Decoder:
         return found
 
     def _check_times(self, frame: Frame) -> None:
-        time = self._pair.lidar.time
+        time = self._stream.time if isinstance(self._stream, LidarConfig) else None
         if time is not None and isinstance(frame, LidarFrame) and frame.time_offset_s is None:
             what = f"the cloud has no field {time.field} of one number a point, which `lidar.time` names"
             raise DecodeError(Refusal.CLOUD_FIELDS, what)
 
-    def _check_camera(self, frame: CameraFrame) -> None:
-        camera = self._pair.camera
-        if frame.frame_id != camera.frame_id:
-            raise DecodeError("frame_id", "not the frame id of the configuration")
-        if (frame.image.width, frame.image.height) != (camera.intrinsics.width, camera.intrinsics.height):
-            raise DecodeError("image_size", "not the size of the intrinsics")
+
+def _check_camera(frame: CameraFrame, camera: CameraConfig) -> None:
+    if frame.frame_id != camera.frame_id:
+        raise DecodeError("frame_id", "not the frame id of the configuration")
+    if (frame.image.width, frame.image.height) != (camera.intrinsics.width, camera.intrinsics.height):
+        raise DecodeError("image_size", "not the size of the intrinsics")

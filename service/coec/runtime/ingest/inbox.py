@@ -1,4 +1,5 @@
-"""Where samples wait between the network's thread and the ingest thread of a pair: bounded in number and in bytes."""
+"""Where samples wait between the network's threads and the ingest thread: bounded in number for each stream, and in
+bytes for all."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from coec.adapters.zenoh.inputs import Sample
 
@@ -55,7 +57,7 @@ class _Waiting:
 
 
 class Inbox:
-    """The streams of one pair. `put` takes microseconds and never blocks on the reader; one thread takes.
+    """The streams of one reader. `put` takes microseconds and never blocks on the reader; one thread takes.
 
     What is too much goes: of a stream with too many samples its oldest; of too many bytes in all the oldest of the
     stream that holds most, so that large messages on one stream push nothing out of another.
@@ -86,6 +88,15 @@ class Inbox:
         for overrun in gone:
             self._on_overrun(overrun)
 
+    def receiver(self, stream: str) -> Callable[[Sample], None]:
+        """`put` of one stream."""
+        return partial(self.put, stream)
+
+    def open(self, stream: str, depth: int) -> None:
+        """One more stream, of which so many samples may wait."""
+        with self._condition:
+            self._waiting = {**self._waiting, stream: _Waiting(depth)}
+
     def call(self, run: Callable[[], None]) -> None:
         """Have `run` called by the reader, before the samples that wait."""
         with self._condition:
@@ -100,6 +111,11 @@ class Inbox:
                 for stream, waiting in self._waiting.items()
                 for came_s in (self._came_s.get(stream),)
             }
+
+    def waiting(self) -> set[str]:
+        """Streams of which samples wait."""
+        with self._condition:
+            return {stream for stream, waiting in self._waiting.items() if waiting.parcels}
 
     def wake(self) -> None:
         """Let a waiting `take` return."""

@@ -1,22 +1,55 @@
-"""Pairs that have come and wait until what was seen before them is judged: bounded in bytes and in time."""
+"""Pairs that have come and wait until what was seen before them is judged: bounded in bytes, over all pairs of a
+vehicle, and in time."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 
-from coec.calibration.types import FramePair
+from coec.calibration.types import CameraFrame, FramePair, LidarFrame
 from coec.runtime.ingest.frame_budget import frame_bytes
+
+
+class WaitingFrames:
+    """The frames of all buffers of a vehicle, each counted once however many pairs it is of; one thread uses it."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._holders: Counter[int] = Counter()
+        self._bytes = 0
+        self._buffers: list[PairBuffer] = []
+
+    def join(self, buffer: PairBuffer) -> None:
+        """One more buffer holds frames of these."""
+        self._buffers.append(buffer)
+
+    def add(self, frame: CameraFrame | LidarFrame) -> None:
+        """A buffer holds a frame."""
+        self._holders[id(frame)] += 1
+        if self._holders[id(frame)] == 1:
+            self._bytes += frame_bytes(frame)
+
+    def remove(self, frame: CameraFrame | LidarFrame) -> None:
+        """A buffer holds a frame no more."""
+        self._holders[id(frame)] -= 1
+        if not self._holders[id(frame)]:
+            del self._holders[id(frame)]
+            self._bytes -= frame_bytes(frame)
+
+    def has_to_go(self, buffer: PairBuffer) -> bool:
+        """Whether a buffer must let go: there are too many, and none holds more pairs. Who waits for long pushes nobody
+        else on."""
+        return self._bytes > self._max_bytes and len(buffer) == max(map(len, self._buffers))
 
 
 class PairBuffer:
     """A queue of pairs, oldest first; one thread uses it."""
 
-    def __init__(self, max_bytes: int, max_wait_s: float) -> None:
-        self._max_bytes = max_bytes
+    def __init__(self, frames: WaitingFrames, max_wait_s: float) -> None:
+        self._frames = frames
         self._max_wait_s = max_wait_s
         self._pairs: deque[FramePair] = deque()
-        self._bytes = 0
         self._since_s: float | None = None
+        frames.join(self)
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -29,24 +62,21 @@ class PairBuffer:
     def add(self, pair: FramePair) -> None:
         """A pair came."""
         self._pairs.append(pair)
-        self._bytes += bytes_of(pair)
+        self._frames.add(pair.camera)
+        self._frames.add(pair.lidar)
 
     def take(self) -> FramePair:
         """The pair whose turn it is."""
         pair = self._pairs.popleft()
-        self._bytes -= bytes_of(pair)
+        self._frames.remove(pair.camera)
+        self._frames.remove(pair.lidar)
         return pair
 
     def has_waited(self, monotonic_s: float) -> bool:
-        """The next pair has to wait: whether it has done so for too long by now, or with too many behind it."""
+        """The next pair has to wait: whether it has done so for too long by now, or with too many."""
         self._since_s = monotonic_s if self._since_s is None else self._since_s
-        return self._bytes > self._max_bytes or monotonic_s - self._since_s > self._max_wait_s
+        return self._frames.has_to_go(self) or monotonic_s - self._since_s > self._max_wait_s
 
     def may_go(self) -> None:
         """The next pair need not wait."""
         self._since_s = None
-
-
-def bytes_of(pair: FramePair) -> int:
-    """Of its images and its points."""
-    return frame_bytes(pair.camera) + frame_bytes(pair.lidar)

@@ -79,7 +79,7 @@ class _Pair:
     """One pair, on the thread."""
 
     pair: OpenPairConfig
-    samples: SampleReader
+    samples: Mapping[str, SampleReader]
     heard: Heard = field(default_factory=Heard)
     found: Found | None = None
     built: bool = False
@@ -98,7 +98,7 @@ class NominalWatch:
         self._config = config
         asked = {pair.name: pair for pair in config.awaited}
         self._pairs = {
-            name: _Pair(pair, SampleReader(pair, config.limits), found=earlier.get(name), built=name in earlier)
+            name: _Pair(pair, _readers(pair, config), found=earlier.get(name), built=name in earlier)
             for name, pair in asked.items()
         }
         self._transforms = StaticTransforms()
@@ -224,7 +224,7 @@ class NominalWatch:
     def _take_frame(self, each: _Pair, stream: str, sample: Sample) -> None:
         heard = each.heard
         before = (heard.image, heard.cloud, heard.ego)
-        match each.samples.frame(stream, sample):
+        match each.samples[stream].frame(sample):
             case CameraFrame() as frame:
                 heard.image = Image(frame.frame_id, frame.image.width, frame.image.height)
             case LidarFrame() as frame:
@@ -288,3 +288,8 @@ def _payload(sample: Sample, expected: str) -> bytes:
     if encoding == CDR and type_name not in ("", expected):
         raise DecodeError("wrong_type", f"a message of another type: expected {expected}")
     return sample.payload
+
+
+def _readers(pair: OpenPairConfig, config: Config) -> dict[str, SampleReader]:
+    """By stream."""
+    return {name: SampleReader(name, stream, config.limits) for name, stream in pair.streams.items()}

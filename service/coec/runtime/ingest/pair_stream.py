@@ -1,85 +1,83 @@
-"""The thread that takes the samples of a pair: sample -> frame -> pair, and each pair in its turn to the chooser."""
+"""The pairs of one camera and one LiDAR: frames -> pair, and each pair in its turn to the chooser."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 from coec.adapters.system.logs import LossCounter
-from coec.adapters.system.threads import ServiceThread
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.frames.window import KeptPairs
 from coec.calibration.types import FramePair
 from coec.config import Config, PairConfig
 from coec.runtime.handover import Handover
 from coec.runtime.ingest.chooser import Chooser, Served
-from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
-from coec.runtime.ingest.frame_budget import FrameBudget
-from coec.runtime.ingest.inbox import Call, Inbox, Parcel
+from coec.runtime.ingest.decoder import LIDAR, Frame
+from coec.runtime.ingest.inbox import Arrivals
+from coec.runtime.ingest.intake import Intake
 from coec.runtime.ingest.pair_buffer import PairBuffer
+from coec.runtime.ingest.sensor import SensorStream
 from coec.runtime.ingest.sensor_clock import NS_PER_S, SensorClock
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.timings import QUICK_S, Histogram
 
 T = TypeVar("T")
 
-FRAMES_WAITING = 16
-"""Samples of camera or LiDAR that may wait for the ingest thread: 1.6 s at 10 Hz."""
-
-MOTIONS_WAITING = 512
-"""Ego-motion samples that may wait: 2.5 s at 200 Hz."""
-
-ALL_FRAMES = 1.5
-"""Bytes of all frames that a pair may have in memory, in those that may be held: the others wait for their partner, the
-disk or the worker, 25 pairs of 2.5 MB."""
-
 GRACE_NS = NS_PER_S
 """Sensor time after the end of a slice before silence ends it: late pairs may still be on their way."""
 
-TOLD_S = 0.1
-"""Between two reports while samples come; whoever reads them looks once a second."""
-
-IDLE_S = 0.25
-"""Longest wait for a sample: how soon silence is noticed."""
+QUIET_TICKS = 3
+"""Ticks without a frame before a stream may be silent. A tick may be late by whatever the process slept: what came
+meanwhile needs another to get here."""
 
 
-class Stream:
-    """Takes the samples of one pair. `inbox` is for any thread, `report` is what the thread last told of itself.
+class PairStream:
+    """Takes the frames of one pair, on the thread of the intake. `ask`, `call`, `arrivals` and `losses` are for any
+    thread, `report` is what that thread last told of the pair.
 
     Attributes:
-        decoding_took: of each sample, by stream.
+        sensors: the streams, by kind; other pairs may have them, too.
         waiting_took: of each pair, from when it was certain until it was looked at.
     """
 
     def __init__(
-        self, pair: PairConfig, config: Config, chooser: Chooser, has_room: Callable[[], bool], losses: LossCounter
+        self,
+        pair: PairConfig,
+        config: Config,
+        intake: Intake,
+        chooser: Chooser,
+        has_room: Callable[[], bool],
+        losses: LossCounter,
     ) -> None:
-        """`has_room()` says whether the recorder would take a chosen pair now."""
-        depths = {CAMERA: FRAMES_WAITING, LIDAR: FRAMES_WAITING, EGO: MOTIONS_WAITING}
-        self._decoder = Decoder(pair, config.limits, losses)
-        self.inbox = Inbox(depths, config.limits.max_waiting_bytes, self._decoder.overrun)
-        self.thread = ServiceThread(f"ingest-{pair.name}", self._run)
+        """`has_room()` says whether the recorder would take a chosen pair now; `losses` are the pair's own."""
+        self._intake = intake
+        self.sensors: Mapping[str, SensorStream] = intake.sensors_of(pair)
         self.report = StreamStatistics()
-        self.decoding_took = Histogram(QUICK_S)
         self.waiting_took = Histogram(QUICK_S)
         self._chooser = chooser
         self._has_room = has_room
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._clock = SensorClock()
-        self._held = PairBuffer(config.limits.max_held_bytes, config.worker.timeout_s)
+        self._held = PairBuffer(intake.waiting_frames, config.worker.timeout_s)
         self._came_s: deque[float] = deque()
-        self._budget = FrameBudget(round(ALL_FRAMES * config.limits.max_held_bytes))
         self._losses = losses
         self._pairs = 0
         self._sync_error_s: float | None = None
-        self._told_s = 0.0
+        self._quiet_ticks = 0
+        intake.join(self)
 
-    def request_stop(self) -> None:
-        """End the thread."""
-        self.thread.request_stop()
-        self.inbox.wake()
+    def losses(self) -> dict[tuple[str, str], int]:
+        """Of the pair and of its streams, by place and cause."""
+        counted = self._losses.snapshot()
+        for sensor in self.sensors.values():
+            counted |= sensor.losses.snapshot()
+        return counted
+
+    def arrivals(self) -> dict[str, Arrivals]:
+        """What came on its streams, by kind."""
+        return self._intake.arrivals(self.sensors)
 
     def ask(self, work: Callable[[], T], timeout_s: float) -> T:
         """Have `work` done between two samples, once every pair that has come was looked at, and wait for what it
@@ -94,13 +92,12 @@ class Stream:
             return work()
 
         handed = Handover(everything_first)
-        self.inbox.call(handed.run)
+        self._intake.inbox.call(handed.run)
         return handed.result(timeout_s)
 
     def call(self, effect: Callable[[], None]) -> None:
         """Have an effect of a decision run on this thread, between two samples."""
-        self.inbox.call(effect)
-        self.inbox.wake()
+        self._intake.inbox.call(effect)
 
     def adopt(self, served: Served) -> None:
         """See `Chooser`; on this thread."""
@@ -119,10 +116,16 @@ class Stream:
         self._chooser.calm()
 
     def finish_pairs(self) -> None:
-        """Look at every pair that has come, whatever it waits for. For the stream's thread, or after its end."""
+        """Look at every pair that has come, whatever it waits for. For the thread of the intake, or after its
+        end."""
         self._hold(self._pairer.flush())
         while self._held:
             self._choose()
+
+    def push(self, frame: Frame) -> None:
+        """The next frame of one of its streams came."""
+        self._quiet_ticks = 0
+        self.take(self._pairer.push(frame))
 
     def take(self, pairs: list[FramePair]) -> None:
         """Pairs came: they tell the time, and wait their turn."""
@@ -143,37 +146,12 @@ class Stream:
 
     def choose_next(self) -> bool:
         """Look at the pair whose turn it is, if it may be looked at; whether one was."""
-        if not self._may_choose():
+        if not self.may_choose():
             return False
         self._choose()
         return True
 
-    def _run(self, thread: ServiceThread) -> None:
-        while not thread.stopping:
-            thread.beat()
-            item = self.inbox.take(0.0 if self._may_choose() else IDLE_S)
-            if isinstance(item, Call):
-                item.run()
-            elif item is not None:
-                self._take_frame(item)
-            self.choose_next()
-            if item is None:
-                self._end_in_silence()
-            if item is None or time.monotonic() - self._told_s >= TOLD_S:
-                self.tell()
-
-    def _take_frame(self, parcel: Parcel) -> None:
-        begun_s = time.monotonic()
-        frame = self._decoder.frame(parcel)
-        self.decoding_took.add(time.monotonic() - begun_s, parcel.stream)
-        if frame is None:
-            return
-        if not self._budget.admit(frame):
-            self._losses.add(parcel.stream, "memory_full")
-            return
-        self.take(self._pairer.push(frame))
-
-    def _may_choose(self) -> bool:
+    def may_choose(self) -> bool:
         """Whether the next pair has come, and all is judged that has to be before it is looked at; or it has waited for
         too long, or with too many."""
         if not self._held:
@@ -182,6 +160,14 @@ class Stream:
             self._held.may_go()
             return True
         return self._held.has_waited(time.monotonic())
+
+    def tick(self, *, waiting: bool) -> None:
+        """Time has passed; samples of its streams are `waiting` to be taken, or none. End a slice in silence, and renew
+        the report."""
+        self._quiet_ticks = 0 if waiting else self._quiet_ticks + 1
+        if self._quiet_ticks > QUIET_TICKS:
+            self._end_in_silence()
+        self.tell()
 
     def _end_in_silence(self) -> None:
         """Let the slice end by extrapolated time when the streams have stopped."""
@@ -198,11 +184,10 @@ class Stream:
 
     def tell(self) -> None:
         """Renew the report."""
-        self._told_s = time.monotonic()
         silent = self._clock.is_silent(time.monotonic())
         rate_hz = self._clock.rate_hz
         self.report = StreamStatistics(
-            streams={stream: self._decoder.counts(stream) for stream in (CAMERA, LIDAR, EGO)},
+            streams={kind: sensor.decoder.counts() for kind, sensor in self.sensors.items()},
             unpaired=dict(self._pairer.losses),
             pairs=self._pairs,
             held=len(self._held),
@@ -210,5 +195,5 @@ class Stream:
             rate_hz=0.0 if silent and rate_hz is not None else rate_hz,
             pace=self._clock.pace,
             sync_error_s=self._sync_error_s,
-            timed_by=self._decoder.timed_by,
+            timed_by=self.sensors[LIDAR].decoder.timed_by,
         )
