@@ -24,10 +24,7 @@ from coec.cli.bench import load, scene
 from coec.cli.bench.process import ProcessReading
 from coec.config import (
     CalibrationConfig,
-    CameraConfig,
     Config,
-    EgoConfig,
-    LidarConfig,
     LogConfig,
     PairConfig,
     SearchConfig,
@@ -39,7 +36,7 @@ from coec.errors import NotFoundError
 from coec.runtime.worker.child import PACKAGE_ROOT
 from coec.schemas.keys import Keys
 
-VEHICLE, PAIR = "bench", "front"
+VEHICLE, PAIR = "bench", "0-0"
 KEYS = Keys("coec", VEHICLE)
 SETTLE_S, SECONDS = 10.0, 25.0
 """Under load before anything counts; and each of the two times that count."""
@@ -71,7 +68,7 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     Raises:
         ConnectionFailedError: the daemon did not become ready.
     """
-    return native(folder, heard) | ros(folder, heard)
+    return native(folder, heard) | ros(folder, heard) | rig(folder, heard, "rig") | rig(folder, heard, "large_rig")
 
 
 def native(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
@@ -88,11 +85,17 @@ def ros(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
         return {f"ros_{name}": figure for name, figure in _resources(session, process, heard).items()}
 
 
+def rig(folder: Path, heard: Callable[[str], None], name: str) -> dict[str, Any]:
+    """By several cameras below LiDARs that they share, with windows as long as they are by default."""
+    with _loaded(folder, name, WindowConfig(), heard) as (session, process):
+        return {f"{name}_{figure}": value for figure, value in _resources(session, process, heard).items()}
+
+
 @contextmanager
 def _loaded(
     folder: Path, form: str, window: WindowConfig, heard: Callable[[str], None]
 ) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
-    """A daemon that has been under load for a while, as `form` of `load.SENDERS` sends it, and who may ask it."""
+    """A daemon that has been under load for a while, `form` of `load.LOADS`, and who may ask it."""
     heard(f"the daemon starts, {form}")
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     configuration = folder / f"{form}.yaml"
@@ -170,16 +173,15 @@ def _await_running(session: zenoh.Session, keys: Keys) -> None:
 
 
 def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
-    """What came and what became of it, since the start."""
-    pair = _status(session, keys)["pairs"][0]
-    streams = {f"{name}s": pair[name]["accepted"] for name in ("camera", "lidar")}
-    return {
-        **streams,
-        "pairs": pair["pairs"],
-        "windows": pair["windows"],
-        "solved": pair["solved"],
-        "checks": pair["checks"],
+    """What came and what became of it, since the start; a stream of several pairs counts once."""
+    pairs = _status(session, keys)["pairs"]
+    streams = {
+        f"{kind}s": sum({pair["name"].split("-")[index]: pair[kind]["accepted"] for pair in pairs}.values())
+        for index, kind in ((0, "camera"), (-1, "lidar"))
     }
+    counted = {name: sum(pair[name] for pair in pairs) for name in ("pairs", "windows", "solved", "checks")}
+    lost = sum(sum(pair["losses"].values()) for pair in pairs)
+    return {**streams, **counted, "lost": lost}
 
 
 def _status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
@@ -188,26 +190,39 @@ def _status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
 
 
 def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig) -> Config:
-    intrinsics = intrinsics_config(scene.CAMERAS[load.CAMERA])
-    is_ros = form == "ros"
-    places = {name: {"topic": load.TOPICS[name]} if is_ros else {"key": key} for name, key in load.KEYS.items()}
-    pair = PairConfig(
-        name=PAIR,
-        camera=CameraConfig.model_validate({**places["camera"], "intrinsics": intrinsics}),
-        lidar=LidarConfig.model_validate(places["lidar"]),
-        ego=EgoConfig.model_validate(places["ego"]),
-        T_camera_lidar=scene.T_TRUE.tolist(),
-        window=window,
-        calibration=CalibrationConfig(search=SearchConfig(dof=6)),
-    )
+    """Every camera with every LiDAR, as if all were at one place: what is found there does not matter."""
+    what = load.LOADS[form]
+    many = {"camera": range(what.cameras), "lidar": range(what.lidars)}
+    stages = {"window": window, "calibration": CalibrationConfig(search=SearchConfig(dof=6))}
+    pairs = [
+        PairConfig.model_validate(
+            {
+                "name": f"{camera}-{lidar}",
+                "camera": _place(what, "camera", camera) | {"intrinsics": _INTRINSICS},
+                "lidar": _place(what, "lidar", lidar),
+                "ego": _place(what, "ego", 0),
+                "T_camera_lidar": scene.T_TRUE.tolist(),
+                **stages,
+            }
+        )
+        for camera in many["camera"]
+        for lidar in many["lidar"]
+    ]
     return Config(
         vehicle=VEHICLE,
         zenoh=ZenohConfig(embedded_router=True, listen=(endpoint,), connect=()),
-        middleware="rmw_zenoh" if is_ros else "native",
+        middleware="rmw_zenoh" if what.is_ros else "native",
         state=StateConfig(directory=state, min_free_bytes=0),
         log=LogConfig(level="error"),
-        pairs=(pair,),
+        pairs=tuple(pairs),
     )
+
+
+_INTRINSICS = intrinsics_config(scene.CAMERAS[load.CAMERA])
+
+
+def _place(what: load.Load, kind: str, index: int) -> dict[str, str]:
+    return {"topic": load.TOPICS[kind]} if what.is_ros else {"key": load.key(kind, index)}
 
 
 def _free_port() -> int:

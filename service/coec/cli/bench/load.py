@@ -1,5 +1,5 @@
-"""The sensors of the benchmark, in a process of their own, until its standard input ends: camera, LiDAR and ego-motion
-of one pair at the rates of a vehicle, as native frames or as nodes of ROS 2 send them.
+"""The sensors of the benchmark, in a process of their own, until its standard input ends: cameras, LiDARs and
+ego-motion at the rates of a vehicle, as native frames or as nodes of ROS 2 send them.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import select
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import zenoh
 
@@ -24,8 +24,32 @@ from coec.cli.bench import scene
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 
-CAMERA_HZ, SWEEP_EVERY = 30.0, 3
-"""Images a second, and of how many images each has a sweep: 10 sweeps a second."""
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What is sent.
+
+    Attributes:
+        cameras, lidars: how many.
+        camera_hz: images a second of each.
+        sweep_every: of how many images each LiDAR has a sweep.
+        is_ros: as nodes of ROS.
+    """
+
+    cameras: int = 1
+    lidars: int = 1
+    camera_hz: float = 30.0
+    sweep_every: int = 3
+    is_ros: bool = False
+
+
+LOADS: Mapping[str, Load] = {
+    "native": Load(),
+    "ros": Load(is_ros=True),
+    "rig": Load(cameras=4, camera_hz=10.0, sweep_every=1),
+    "large_rig": Load(cameras=8, lidars=3, camera_hz=10.0, sweep_every=1),
+}
+"""By name. A rig is that of issue 17: four fisheyes and a LiDAR; and eight with three."""
 
 ROOMS = 7
 """Different frames that are sent in turn: a camera that sends one and the same would look frozen."""
@@ -34,51 +58,70 @@ CAMERA = "double_sphere"
 CONNECT_S = 60.0
 SPEED_MPS = 10.0
 TOPICS = {"camera": "/bench/camera/compressed", "lidar": "/bench/points", "ego": "/bench/odometry"}
-KEYS = {"camera": "bench/camera", "lidar": "bench/lidar", "ego": "bench/ego"}
+"""Of one pair."""
 
 
-def main(endpoint: str, form: str) -> int:
-    """Publishes until standard input ends; always 0. `form` is one of `SENDERS`."""
+def key(kind: str, index: int = 0) -> str:
+    """Of the native frames of the camera, the LiDAR or the ego-motion of this number."""
+    return f"bench/{kind}-{index}"
+
+
+def main(endpoint: str, name: str) -> int:
+    """Publishes until standard input ends; always 0. `name` is one of `LOADS`."""
+    load = LOADS[name]
     pairs = [scene.pair(scene.CAMERAS[CAMERA], seed, 0) for seed in range(ROOMS)]
     with connected([endpoint], CONNECT_S) as session:
-        send = SENDERS[form](session)
+        send = (_ros if load.is_ros else _native)(session, load)
         begin_s = time.monotonic()
         for count in itertools.count():
-            if _ended(begin_s + count / CAMERA_HZ - time.monotonic()):
+            if _ended(begin_s + count / load.camera_hz - time.monotonic()):
                 return 0
-            room, stamp_ns = pairs[count % ROOMS], time.time_ns()
-            send(EgoMotion(stamp_ns, "ego", (SPEED_MPS, 0.0, 0.0), (0.0, 0.0, 0.0), count))
-            send(replace(room.camera, stamp_ns=stamp_ns, sequence=count))
-            if count % SWEEP_EVERY == 0:
-                send(replace(room.lidar, stamp_ns=stamp_ns, sequence=count // SWEEP_EVERY))
+            stamp_ns = time.time_ns()
+            send(EgoMotion(stamp_ns, "ego", (SPEED_MPS, 0.0, 0.0), (0.0, 0.0, 0.0), count), 0)
+            for index in range(load.cameras):
+                room = pairs[(count + index) % ROOMS]
+                send(replace(room.camera, stamp_ns=stamp_ns, sequence=count), index)
+            for index in range(load.lidars if count % load.sweep_every == 0 else 0):
+                room = pairs[(count + index) % ROOMS]
+                send(replace(room.lidar, stamp_ns=stamp_ns, sequence=count // load.sweep_every), index)
     return 0
 
 
-def _native(session: zenoh.Session) -> Callable[[Frame], None]:
-    """Native frames on `KEYS`."""
-    encoding = zenoh.Encoding("application/msgpack")
-    streams = {name: session.declare_publisher(key, encoding=encoding) for name, key in KEYS.items()}
+Send = Callable[[Frame, int], None]
+"""Sends a frame of the sensor of this number."""
 
-    def send(frame: Frame) -> None:
+
+def _native(session: zenoh.Session, load: Load) -> Send:
+    """Native frames on their keys."""
+    encoding = zenoh.Encoding("application/msgpack")
+    many = {"camera": load.cameras, "lidar": load.lidars, "ego": 1}
+    streams = {
+        kind: [session.declare_publisher(key(kind, index), encoding=encoding) for index in range(count)]
+        for kind, count in many.items()
+    }
+
+    def send(frame: Frame, index: int) -> None:
         match frame:
             case CameraFrame():
-                streams["camera"].put(encode_camera(frame))
+                streams["camera"][index].put(encode_camera(frame))
             case LidarFrame():
-                streams["lidar"].put(encode_lidar(frame))
+                streams["lidar"][index].put(encode_lidar(frame))
             case EgoMotion():
-                streams["ego"].put(encode_ego(frame))
+                streams["ego"][index].put(encode_ego(frame))
 
     return send
 
 
-def _ros(session: zenoh.Session) -> Callable[[Frame], None]:
+def _ros(session: zenoh.Session, load: Load) -> Send:
     """CDR on `TOPICS`, as nodes of rmw_zenoh publish it."""
+    del load
     node = RosNode(session, RmwZenoh(Node(0, str(session.info.zid()), 0, "/bench", "sensors"), messages.type_hash))
     publishers = RosPublishers(session, node)
     types = {"camera": messages.COMPRESSED_IMAGE, "lidar": messages.POINT_CLOUD, "ego": messages.ODOMETRY}
     streams = {name: publishers.publisher(TOPICS[name], of_type, SENSOR_DATA) for name, of_type in types.items()}
 
-    def send(frame: Frame) -> None:
+    def send(frame: Frame, index: int) -> None:
+        del index
         match frame:
             case CameraFrame():
                 streams["camera"].put(outgoing.encode_image(frame)[1], frame.stamp_ns)
@@ -88,10 +131,6 @@ def _ros(session: zenoh.Session) -> Callable[[Frame], None]:
                 streams["ego"].put(outgoing.encode_motion(frame)[1], frame.stamp_ns)
 
     return send
-
-
-SENDERS: Mapping[str, Callable[[zenoh.Session], Callable[[Frame], None]]] = {"native": _native, "ros": _ros}
-"""By the form in which frames are sent."""
 
 
 def _ended(wait_s: float) -> bool:

@@ -124,19 +124,23 @@ class Intake:
         for sensor in pair.sensors.values():
             sensor.takers = (*sensor.takers, pair.push)
 
+    def turn(self, idle_s: float) -> bool:
+        """Take what came first, and look at a pair of each that has one; whether anything came within `idle_s`."""
+        in_turn = any(pair.may_choose() for pair in self._pairs)
+        item = self.inbox.take(0.0 if in_turn else idle_s)
+        if isinstance(item, Call):
+            item.run()
+        elif item is not None:
+            self._by_number[item.stream].take(item.sample, self._budget)
+        chosen = [pair.choose_next() for pair in self._pairs]
+        if time.monotonic() - self._ticked_s >= TICK_S:
+            self._tick()
+        return item is not None or any(chosen)
+
     def _run(self, thread: ServiceThread) -> None:
         while not thread.stopping:
             thread.beat()
-            in_turn = any(pair.may_choose() for pair in self._pairs)
-            item = self.inbox.take(0.0 if in_turn else IDLE_S)
-            if isinstance(item, Call):
-                item.run()
-            elif item is not None:
-                self._by_number[item.stream].take(item.sample, self._budget)
-            for pair in self._pairs:
-                pair.choose_next()
-            if time.monotonic() - self._ticked_s >= TICK_S:
-                self._tick()
+            self.turn(IDLE_S)
 
     def _tick(self) -> None:
         self._ticked_s = time.monotonic()

@@ -1,0 +1,332 @@
+"""What pairs of a vehicle share: each stream is taken, decoded and counted once, and its frames go to all of them."""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from coec.adapters.frames.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.adapters.system.logs import LossCounter
+from coec.adapters.zenoh.inputs import Sample
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame
+from coec.config import Config, KnownStreamConfig
+from coec.runtime.ingest import pair_stream
+from coec.runtime.ingest.chooser import Chooser, Chosen
+from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR
+from coec.runtime.ingest.intake import Intake
+from coec.runtime.ingest.pair_stream import PairStream
+from coec.runtime.ingest.sensor import FRAMES_WAITING, read_alike
+from pair_bench import HEIGHT, WIDTH, configuration
+
+HZ10_NS = 100_000_000
+BEGIN_NS = 10**18
+ENCODING = "application/msgpack"
+MB = 2**20
+
+
+def rig_of(cameras: int, lidars: int, **limits: int) -> Config:
+    """Every camera with every LiDAR, and one ego-motion for all; nobody waits for it."""
+    document = configuration(Path("state")).pairs[0].model_dump(exclude={"ego"}, exclude_none=True)
+    pairs = [
+        {
+            **document,
+            "name": f"{camera}-{lidar}",
+            "camera": {**document["camera"], "key": f"camera/{camera}"},
+            "lidar": {**document["lidar"], "key": f"lidar/{lidar}"},
+        }
+        for camera in range(cameras)
+        for lidar in range(lidars)
+    ]
+    return Config.model_validate({"limits": limits, "pairs": pairs})
+
+
+@dataclass
+class Looks:
+    """In place of the chooser: what it was given, and when it ended a slice."""
+
+    chosen: Chosen = field(default_factory=Chosen)
+    slice_end_ns: int | None = None
+    pairs: list[FramePair] = field(default_factory=list)
+    ended: list[int] = field(default_factory=list)
+    waits: bool = False
+    keeps: bool = True
+
+    def must_wait(self, stamp_ns: int) -> bool:
+        del stamp_ns
+        return self.waits
+
+    def choose(self, pair: FramePair) -> None:
+        if self.keeps:
+            self.pairs.append(pair)
+
+    def advance(self, now_ns: int, end_ns: int) -> None:
+        assert now_ns > end_ns
+        self.ended.append(end_ns)
+        self.slice_end_ns = None
+
+
+class Vehicle:
+    """An intake without a thread, and what its pairs come to."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.intake = Intake(config.limits)
+        self.looks: dict[str, Looks] = {}
+        self.streams: dict[str, PairStream] = {}
+        for pair in config.pairs:
+            self.join(pair.name)
+        self.heard: dict[str, Callable[[Sample], None]] = {}
+        self.listen()
+
+    def join(self, name: str) -> None:
+        (pair,) = [one for one in self.config.pairs if one.name == name]
+        self.looks[name] = Looks()
+        losses = LossCounter(logging.getLogger("test"), name)
+        chooser = cast("Chooser", self.looks[name])
+        self.streams[name] = PairStream(pair, self.config, self.intake, chooser, lambda: True, losses)
+
+    def listen(self) -> list[str]:
+        subscribed: list[str] = []
+
+        def subscribe(stream: KnownStreamConfig, take: Callable[[Sample], None]) -> None:
+            subscribed.append(stream.place)
+            self.heard[stream.place] = take
+
+        self.intake.listen(subscribe)
+        return subscribed
+
+    def put(self, key: str, frame: CameraFrame | LidarFrame | EgoMotion | bytes) -> None:
+        match frame:
+            case CameraFrame():
+                payload = encode_camera(frame)
+            case LidarFrame():
+                payload = encode_lidar(frame)
+            case EgoMotion():
+                payload = encode_ego(frame)
+            case bytes():
+                payload = frame
+        self.heard[key](Sample(payload, ENCODING))
+
+    def settle(self) -> None:
+        while self.intake.turn(0.0):
+            pass
+        for stream in self.streams.values():
+            stream.tell()
+
+    def drive(self, numbers: Sequence[int], cameras: int, lidars: int) -> None:
+        for number in numbers:
+            for index in range(lidars):
+                self.put(f"lidar/{index}", sweep(number))
+            for index in range(cameras):
+                self.put(f"camera/{index}", image(number, index))
+            self.settle()
+
+
+def image(number: int, seed: int = 0, sequence: int | None = None) -> CameraFrame:
+    pixels = np.random.default_rng((number, seed)).bytes(WIDTH * HEIGHT)
+    encoded = EncodedImage(ImageFormat.MONO8, WIDTH, HEIGHT, pixels)
+    return CameraFrame(BEGIN_NS + number * HZ10_NS, "camera", encoded, sequence)
+
+
+def sweep(number: int, points: int = 2) -> LidarFrame:
+    xyz_m = np.linspace([5.0, -5.0, 0.0], [20.0, 5.0, 1.0], points).astype(np.float32)
+    return LidarFrame(BEGIN_NS + number * HZ10_NS + 5_000_000, "lidar", xyz_m)
+
+
+def test_a_stream_is_listened_to_once_however_many_pairs_it_is_of() -> None:
+    vehicle = Vehicle(rig_of(cameras=8, lidars=3))
+    assert sorted(vehicle.heard) == sorted([*(f"camera/{i}" for i in range(8)), *(f"lidar/{i}" for i in range(3))])
+    assert vehicle.listen() == [], "once"
+
+
+def test_every_pair_gets_the_same_frame_and_it_is_counted_once() -> None:
+    vehicle = Vehicle(rig_of(cameras=2, lidars=2))
+    vehicle.drive(range(6), 2, 2)
+    pairs = {name: looks.pairs for name, looks in vehicle.looks.items()}
+    assert [len(each) for each in pairs.values()] == [5, 5, 5, 5], "the last may have a nearer partner still"
+    for one, other in zip(pairs["0-0"], pairs["1-0"], strict=True):
+        assert one.lidar is other.lidar
+        assert one.camera is not other.camera
+    for one, other in zip(pairs["0-0"], pairs["0-1"], strict=True):
+        assert one.camera is other.camera
+    for sensor in vehicle.intake.sensors:
+        assert (sensor.decoder.counts().received, sensor.decoder.counts().accepted) == (6, 6)
+    assert [stream.report.streams[LIDAR].accepted for stream in vehicle.streams.values()] == [6] * 4
+
+
+def test_a_pair_of_a_rig_is_given_what_it_would_be_given_alone() -> None:
+    rng = np.random.default_rng(1)
+    together, alone = Vehicle(rig_of(2, 1)), Vehicle(rig_of(1, 1))
+    waiting: dict[str, list[CameraFrame | LidarFrame]] = {
+        "camera/0": [image(number) for number in range(40) if number % 7],
+        "camera/1": [image(number, 1) for number in range(40) if number % 5],
+        "lidar/0": [sweep(number) for number in range(40) if number % 11],
+    }
+    while keys := [key for key, frames in waiting.items() if frames]:
+        key = str(rng.choice(keys))
+        frame = waiting[key].pop(0)
+        together.put(key, frame)
+        if key != "camera/1":
+            alone.put(key, frame)
+        if rng.random() < 0.3:
+            together.settle()
+            alone.settle()
+    for vehicle in (together, alone):
+        vehicle.settle()
+        vehicle.streams["0-0"].finish_pairs()
+
+    def told(vehicle: Vehicle) -> list[tuple[int, int]]:
+        return [(pair.camera.stamp_ns, pair.lidar.stamp_ns) for pair in vehicle.looks["0-0"].pairs]
+
+    assert told(together) == told(alone)
+    assert len(told(alone)) > 25
+    assert together.streams["0-0"].losses() == alone.streams["0-0"].losses()
+
+
+def test_what_is_lost_of_a_stream_is_counted_once_and_every_pair_of_it_tells() -> None:
+    vehicle = Vehicle(rig_of(2, 1))
+    vehicle.put("lidar/0", b"rubbish")
+    vehicle.put("camera/0", image(0, sequence=0))
+    vehicle.put("camera/0", image(20, sequence=20))
+    vehicle.put("camera/0", image(40, sequence=40))
+    vehicle.settle()
+    assert vehicle.streams["0-0"].losses() == {(LIDAR, "message_malformed"): 1, (CAMERA, "sequence_gap"): 22}
+    assert vehicle.streams["1-0"].losses() == {(LIDAR, "message_malformed"): 1}
+
+
+def test_only_what_is_read_alike_is_one_stream() -> None:
+    (pair,) = rig_of(1, 1).pairs
+    lidar = pair.lidar
+    alike = lidar.model_copy(update={"name": "roof"})
+    assert read_alike(LIDAR, lidar) == read_alike(LIDAR, alike)
+    masked = pair.camera.model_copy(update={"mask": Path("mask.png"), "hardware_id": "7"})
+    assert read_alike(CAMERA, pair.camera) == read_alike(CAMERA, masked)
+    for other in ({"source": 1}, {"frame_id": "left"}, {"key": "lidar/1"}, {"cloud_frame_id": "base"}):
+        assert read_alike(LIDAR, lidar) != read_alike(LIDAR, lidar.model_copy(update=other))
+
+
+def test_two_lidars_in_one_cloud_are_two_streams_of_one_key() -> None:
+    config = rig_of(1, 2)
+    pairs = [
+        pair.model_copy(update={"lidar": pair.lidar.model_copy(update={"key": "lidar/0", "source": number})})
+        for number, pair in enumerate(config.pairs)
+    ]
+    vehicle = Vehicle(config.model_copy(update={"pairs": tuple(pairs)}))
+    assert [sensor.kind for sensor in vehicle.intake.sensors] == [CAMERA, LIDAR, LIDAR]
+
+
+def test_a_pair_that_joins_later_gets_what_comes_then() -> None:
+    config = rig_of(2, 1)
+    vehicle = Vehicle(config.model_copy(update={"pairs": config.pairs[:1]}))
+    vehicle.drive(range(5), 1, 1)
+    vehicle.config = config
+    vehicle.join("1-0")
+    assert vehicle.listen() == ["camera/1"], "its LiDAR is listened to"
+    vehicle.drive(range(5, 10), 2, 1)
+    assert [len(looks.pairs) for looks in vehicle.looks.values()] == [9, 4]
+    assert vehicle.looks["1-0"].pairs[0].lidar is vehicle.looks["0-0"].pairs[5].lidar
+
+
+@pytest.mark.fault("a pair whose answers are late", "the other pairs of the vehicle are looked at meanwhile")
+def test_a_pair_that_waits_keeps_no_other_waiting(record_property: Callable[[str, object], None]) -> None:
+    vehicle = Vehicle(rig_of(2, 1))
+    vehicle.looks["0-0"].waits = True
+    vehicle.drive(range(30), 2, 1)
+    told = [len(looks.pairs) for looks in vehicle.looks.values()]
+    record_property("figure", f"{told[1]} of 29 pairs of the other")
+    assert told == [0, 29]
+    assert vehicle.streams["0-0"].report.held == 29
+    vehicle.looks["0-0"].waits = False
+    vehicle.settle()
+    assert len(vehicle.looks["0-0"].pairs) == 29
+
+
+@pytest.mark.fault("a sensor that floods one stream", "other streams of the vehicle lose nothing")
+def test_each_stream_has_room_of_its_own(record_property: Callable[[str, object], None]) -> None:
+    vehicle = Vehicle(rig_of(2, 1))
+    vehicle.settle()
+    for number in range(10):
+        vehicle.put("camera/1", image(number, 1))
+        vehicle.put("lidar/0", sweep(number))
+    for number in range(500):
+        vehicle.put("camera/0", image(number))
+    vehicle.settle()
+    lost = {
+        (sensor.config.place, *cause): count
+        for sensor in vehicle.intake.sensors
+        for cause, count in sensor.losses.snapshot().items()
+    }
+    record_property("figure", f"{lost}")
+    assert lost == {("camera/0", CAMERA, "overrun"): 500 - FRAMES_WAITING}
+    assert len(vehicle.looks["1-0"].pairs) == 9
+
+
+@pytest.mark.fault("pairs that nobody lets go of", "memory of a vehicle's frames is bounded, each counted once")
+def test_frames_of_all_pairs_are_bounded_together_and_each_counts_once(
+    record_property: Callable[[str, object], None],
+) -> None:
+    vehicle = Vehicle(rig_of(4, 1, max_held_bytes=MB))
+    points = 8192  # 96 kB
+    for number in range(40):
+        vehicle.put("lidar/0", sweep(number, points))
+        for index in range(4):
+            vehicle.put(f"camera/{index}", image(number, index))
+        vehicle.settle()
+    held = {id(pair.lidar): pair.lidar.xyz_m.nbytes for looks in vehicle.looks.values() for pair in looks.pairs}
+    record_property("figure", f"{sum(held.values()) / MB:.2f} MiB of 1.5 in sweeps")
+    assert 1.2 * MB < sum(held.values()) <= 1.5 * MB
+    (lidar,) = [sensor for sensor in vehicle.intake.sensors if sensor.kind == LIDAR]
+    assert lidar.losses.snapshot()[LIDAR, "memory_full"] > 0
+    held.clear()
+    for looks in vehicle.looks.values():
+        looks.pairs.clear()
+        looks.keeps = False
+    vehicle.drive(range(100, 110), 4, 1)
+    gc.collect()
+    before = lidar.losses.snapshot()
+    vehicle.drive(range(110, 120), 4, 1)
+    assert lidar.losses.snapshot() == before, "there is room again"
+
+
+@pytest.mark.fault("one camera of a vehicle falls silent", "its slice ends by the clock although all others go on")
+def test_silence_of_a_pair_is_noticed_while_others_speak(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(pair_stream, "time", SimpleNamespace(monotonic=lambda: now_s))
+    vehicle = Vehicle(rig_of(2, 2))
+    vehicle.looks["0-0"].slice_end_ns = vehicle.looks["1-1"].slice_end_ns = BEGIN_NS + 20 * HZ10_NS
+    for number in range(20):
+        now_s += 0.1
+        vehicle.drive([number], 2, 2)
+    for number in range(20, 400):
+        now_s += 0.1
+        vehicle.put("camera/1", image(number, 1))
+        vehicle.put("lidar/1", sweep(number))
+        vehicle.settle()
+        for stream in vehicle.streams.values():
+            waiting = {sensor.number for sensor in stream.sensors.values()} & vehicle.intake.inbox.waiting()
+            stream.tick(waiting=bool(waiting))
+    assert vehicle.looks["0-0"].ended == [BEGIN_NS + 20 * HZ10_NS]
+    assert vehicle.looks["1-1"].ended == []
+
+
+def test_motion_is_of_every_lidar_that_it_moves() -> None:
+    config = rig_of(1, 2)
+    T = [[1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    documents: list[dict[str, Any]] = [pair.model_dump(exclude_none=True) for pair in config.pairs]
+    documents[0]["ego"] = {"key": "odometry"}
+    documents[1]["ego"] = {"key": "odometry", "T_lidar_ego": T}
+    vehicle = Vehicle(Config.model_validate({"pairs": documents}))
+    assert [sensor.kind for sensor in vehicle.intake.sensors].count(EGO) == 1
+    for number in range(5):
+        vehicle.put("odometry", EgoMotion(BEGIN_NS + number * HZ10_NS, "ego", (5.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+        vehicle.drive([number], 1, 2)
+    assert all(pair.motion is not None for looks in vehicle.looks.values() for pair in looks.pairs)
+    assert [len(looks.pairs) for looks in vehicle.looks.values()] == [4, 4]
