@@ -299,7 +299,7 @@ class Bench:
         self.intake = Intake(self.config.limits)
         self.published: list[str] = []
         self.shown: list[str] = []
-        outside = Outside(
+        self.outside = Outside(
             Keys("coec", self.config.vehicle),
             self.intake,
             store,
@@ -313,7 +313,7 @@ class Bench:
         )
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)
-            self.pair = Pair(self.config.pairs[0], self.config, outside)
+            self.pair = Pair(self.config.pairs[0], self.config, self.outside)
         self.recorder.worker = self.worker
         self.answers = self.pair.answers
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import Input, input_of
+from coec.adapters.zenoh.inputs import Input, Sample, input_of
 from coec.calibration.types import Reason
 from coec.config import AnyStreamConfig, Config, PairConfig, StreamConfig
 from coec.errors import ConfigError
@@ -26,6 +26,37 @@ from coec.runtime.outside import Outside
 from coec.schemas.ros_names import TF_STATIC
 
 _log = logging.getLogger(__name__)
+
+
+class _Shared:
+    """What is heard on one topic or key, for all pairs that wait for it: it is listened to once."""
+
+    def __init__(self) -> None:
+        self._takers: dict[str, Callable[[Sample], None]] = {}
+        self.end: Callable[[], None] = lambda: None
+
+    @property
+    def is_new(self) -> bool:
+        """Whether only one pair has joined."""
+        return len(self._takers) == 1
+
+    def join(self, name: str, take: Callable[[Sample], None]) -> None:
+        """A pair waits for it."""
+        self._takers = {**self._takers, name: take}
+
+    def leave(self, name: str) -> bool:
+        """A pair waits no more; whether none does, and nobody listens now."""
+        waited = name in self._takers
+        self._takers = {other: take for other, take in self._takers.items() if other != name}
+        if not waited or self._takers:
+            return False
+        self.end()
+        return True
+
+    def take(self, sample: Sample) -> None:
+        """Something came. On the network's thread."""
+        for taker in self._takers.values():
+            taker(sample)
 
 
 class WaitingRoom:
@@ -48,7 +79,7 @@ class WaitingRoom:
         self._kept = KeptNominals(folder)
         earlier = self._kept.found(config)
         self._watch = NominalWatch(config, earlier)
-        self._ends: dict[str, list[Callable[[], None]]] = {}
+        self._streams: dict[str, _Shared] = {}
         self._outside: Outside
         self.answers: dict[str, AwaitedAnswers] = {}
 
@@ -84,16 +115,19 @@ class WaitingRoom:
         if any(needs_transforms(pair) for pair in self._asked.values()):
             stream = StreamConfig(topic=TF_STATIC)
             bus.subscribe_latched(input_of(stream, self._read), self._watch.take_transforms)
+        infos: dict[str, _Shared] = {}
         for name, pair in self._asked.items():
             topic = info_topic_of(pair)
             if topic is not None:
-                stream = StreamConfig(topic=topic)
-                bus.subscribe_latched(input_of(stream, self._read), partial(self._watch.take_info, name))
-            if name in self.answers:
-                self._ends[name] = [
-                    bus.subscribe(input_of_stream(stream), partial(self._watch.take_frame, name, place))
-                    for place, stream in pair.streams.items()
-                ]
+                shared = infos.setdefault(topic, _Shared())
+                shared.join(name, partial(self._watch.take_info, name))
+                if shared.is_new:
+                    bus.subscribe_latched(input_of(StreamConfig(topic=topic), self._read), shared.take)
+            for kind, stream in pair.streams.items() if name in self.answers else ():
+                shared = self._streams.setdefault(stream.place, _Shared())
+                shared.join(name, partial(self._watch.take_frame, name, kind))
+                if shared.is_new:
+                    shared.end = bus.subscribe(input_of_stream(stream), shared.take)
 
     def found(self) -> dict[str, PairConfig]:
         """Pairs of which everything is known by now, and that can be built; each once."""
@@ -111,8 +145,9 @@ class WaitingRoom:
         return good
 
     def _admit(self, name: str, found: Found) -> None:
-        for end in self._ends.pop(name, ()):
-            end()
+        for place, shared in list(self._streams.items()):
+            if shared.leave(name):
+                del self._streams[place]
         self.answers = {other: answers for other, answers in self.answers.items() if other != name}
         self._kept.keep(found, self._asked[name], self._read, time.time_ns())
         self._outside.scribe.write(self._kept)
