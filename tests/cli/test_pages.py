@@ -52,7 +52,11 @@ def test_every_way_to_end_is_in_the_table() -> None:
 def reasons_made() -> set[str]:
     """Codes of the reasons that the service makes itself, as they stand in its source."""
     found: set[str] = set()
-    for path in (PACKAGE / "daemon.py", PACKAGE / "adapters/files/scribe.py", *(PACKAGE / "runtime").rglob("*.py")):
+    for path in (
+        *(PACKAGE / "daemon").glob("*.py"),
+        PACKAGE / "adapters/files/scribe.py",
+        *(PACKAGE / "runtime").rglob("*.py"),
+    ):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         named = {
             target.id: node.value.value

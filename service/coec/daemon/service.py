@@ -5,17 +5,10 @@ Any thread that dies takes the process down, after `health` has said why: no sil
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from types import FrameType
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal
 
 from coec import __version__
@@ -34,6 +27,8 @@ from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.settings import connected_of, mode_of, settings_of, unguarded
 from coec.calibration.types import Reason
 from coec.config import AuthorityConfig, Config, config_hash
+from coec.daemon.asked import Signals
+from coec.daemon.ending import attempt, joined, stopped
 from coec.errors import CoecError, UnavailableError
 from coec.runtime.api import metrics
 from coec.runtime.api.authority import Authority
@@ -71,9 +66,6 @@ _log = logging.getLogger(__name__)
 EXIT_THREAD_DIED = 70
 """EX_SOFTWARE of sysexits.h."""
 
-SWITCH_INTERVAL_S = 0.0005
-"""How long a thread may keep the interpreter while a query waits for it; Python's own 5 ms would be half the budget."""
-
 TOKENS_HIDDEN = Reason(
     "tokens_hidden",
     "The router hides the liveliness tokens of this vehicle: a second daemon could serve it unseen. Its rules must "
@@ -90,30 +82,6 @@ STALLED_S = 20.0
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 1.5
 QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
-
-
-def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit status. `reread` reads the configuration again on SIGHUP."""
-    logs.configure(config.log.level, config.log.format)
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    try:
-        with _signals() as signals, _state_folder(config.state.directory):
-            return Daemon(config, Notifier.from_environment()).serve(signals, reread)
-    except CoecError as error:
-        _log.error(str(error), extra={"fields": {"code": error.reply_code}})
-        return error.exit_code
-
-
-class Signals:
-    """What the process was asked from outside."""
-
-    def __init__(self) -> None:
-        self.stop = threading.Event()
-        self.reread = threading.Event()
-
-    def receive(self, number: int, _frame: FrameType | None) -> None:
-        """A signal handler."""
-        (self.reread if number == signal.SIGHUP else self.stop).set()
 
 
 class Daemon:
@@ -295,24 +263,24 @@ class Daemon:
             ("announce", self._notifier.stopping),
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
-            ("look for no more pairs", lambda: _stopped(self._room.threads, LOOK_OUT_STOP_S)),
+            ("look for no more pairs", lambda: stopped(self._room.threads, LOOK_OUT_STOP_S)),
             ("end the intake", self._end_intake),
             ("finish the open windows", self._finish_windows),
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
             ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
             ("write all books", self._end_scribe),
-            ("end the answers", lambda: _stopped(self._bus.threads, QUERIES_STOP_S)),
+            ("end the answers", lambda: stopped(self._bus.threads, QUERIES_STOP_S)),
             ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
             ("tell ROS no more", lambda: self._ros_outputs.close(ROS_STOP_S)),
             ("take the answers away", self._bus.undeclare_queryables),
             ("be no node of ROS", self._ros_side.close),
         )
         for name, step in steps:
-            _attempt(name, step)
-        ended = _attempt("look for no other daemon", lambda: self._presence.close(LOOK_OUT_STOP_S))
-        closed = _attempt("close the session", lambda: self._bus.close(SESSION_STOP_S))
-        _attempt("wait for the worker", lambda: _joined([self._worker.thread], WORKER_STOP_S))
+            attempt(name, step)
+        ended = attempt("look for no other daemon", lambda: self._presence.close(LOOK_OUT_STOP_S))
+        closed = attempt("close the session", lambda: self._bus.close(SESSION_STOP_S))
+        attempt("wait for the worker", lambda: joined([self._worker.thread], WORKER_STOP_S))
         _log.info("stopped", extra={"fields": {"session_closed": closed}})
         return bool(ended and closed)
 
@@ -320,21 +288,21 @@ class Daemon:
     def _end(pairs: Iterable[Pair], part: Callable[[Pair], Recorder | Decider], within_s: float) -> None:
         for pair in pairs:
             part(pair).request_stop()
-        _joined([part(pair).thread for pair in pairs], within_s)
+        joined([part(pair).thread for pair in pairs], within_s)
 
     def _end_intake(self) -> None:
         self._intake.request_stop()
-        _joined([self._intake.thread], INGEST_STOP_S)
+        joined([self._intake.thread], INGEST_STOP_S)
 
     def _end_scribe(self) -> None:
         self._scribe.request_stop()
-        _joined([self._scribe.thread], SCRIBE_STOP_S)
+        joined([self._scribe.thread], SCRIBE_STOP_S)
 
     def _finish_windows(self) -> None:
         """Once the intake has ended: nobody else may touch them."""
         if self._intake.thread.join(0.0):
             for pair in self._pairs.values():
-                _attempt("finish a window", pair.finish_window)
+                attempt("finish a window", pair.finish_window)
 
     def _reload(self, reread: Callable[[], Config] | None) -> None:
         """SIGHUP: read the configuration again and take what can be taken without a restart; a file that could not be
@@ -509,61 +477,3 @@ def _insecure(doors: Sequence[str]) -> Reason | None:
         "certificates."
     )
     return Reason("insecure", text)
-
-
-def _attempt(name: str, step: Callable[[], object]) -> object:
-    """A step of the end. What it raises is logged; None then."""
-    try:
-        return step()
-    except Exception:
-        _log.exception("a step of the end failed", extra={"fields": {"step": name}})
-        return None
-
-
-def _stopped(threads: Sequence[ServiceThread], timeout_s: float) -> bool:
-    for thread in threads:
-        thread.request_stop()
-    return _joined(threads, timeout_s)
-
-
-def _joined(threads: Sequence[ServiceThread], timeout_s: float) -> bool:
-    """Wait for threads that were asked to stop; False, and a line in the log, when one does not within the time."""
-    deadline_s = time.monotonic() + timeout_s
-    late = [thread.name for thread in threads if not thread.join(max(deadline_s - time.monotonic(), 0.0))]
-    if late:
-        _log.error("threads did not stop in time", extra={"fields": {"threads": late}})
-    return not late
-
-
-@contextmanager
-def _signals() -> Iterator[Signals]:
-    """Signals of the process while the daemon serves."""
-    signals = Signals()
-    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-    before = {number: signal.signal(number, signals.receive) for number in numbers}
-    try:
-        yield signals
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
-def _state_folder(folder: Path) -> Iterator[None]:
-    """The state directory, made if need be, and nobody else's while the daemon serves.
-
-    Raises:
-        UnavailableError: it cannot be made or written, or another daemon uses it.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / "lock").open("w")
-    except OSError as error:
-        text = f"state.directory {folder} cannot be made or written: {error.strerror}; see to its disk and its owner"
-        raise UnavailableError(text) from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise UnavailableError(f"state.directory {folder} is in use by another daemon") from error
-        yield

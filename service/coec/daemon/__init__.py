@@ -1,0 +1,34 @@
+"""The daemon: what a process is while it serves."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+
+from coec.adapters.system import logs
+from coec.adapters.system.notify import Notifier
+from coec.config import Config
+from coec.daemon.asked import received
+from coec.daemon.service import EXIT_THREAD_DIED, Daemon
+from coec.daemon.state_folder import locked
+from coec.errors import CoecError
+
+__all__ = ["EXIT_THREAD_DIED", "run"]
+
+_log = logging.getLogger(__name__)
+
+SWITCH_INTERVAL_S = 0.0005
+"""How long a thread may keep the interpreter while a query waits for it; Python's own 5 ms would be half the budget."""
+
+
+def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit status. `reread` reads the configuration again on SIGHUP."""
+    logs.configure(config.log.level, config.log.format)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    try:
+        with received() as signals, locked(config.state.directory):
+            return Daemon(config, Notifier.from_environment()).serve(signals, reread)
+    except CoecError as error:
+        _log.error(str(error), extra={"fields": {"code": error.reply_code}})
+        return error.exit_code

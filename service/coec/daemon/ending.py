@@ -1,0 +1,35 @@
+"""Steps of an orderly end: each is tried, and none waits for longer than it may."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from coec.adapters.system.threads import ServiceThread
+
+_log = logging.getLogger(__name__)
+
+
+def attempt(name: str, step: Callable[[], object]) -> object:
+    """A step of the end. What it raises is logged; None then."""
+    try:
+        return step()
+    except Exception:
+        _log.exception("a step of the end failed", extra={"fields": {"step": name}})
+        return None
+
+
+def stopped(threads: Sequence[ServiceThread], timeout_s: float) -> bool:
+    for thread in threads:
+        thread.request_stop()
+    return joined(threads, timeout_s)
+
+
+def joined(threads: Sequence[ServiceThread], timeout_s: float) -> bool:
+    """Wait for threads that were asked to stop; False, and a line in the log, when one does not within the time."""
+    deadline_s = time.monotonic() + timeout_s
+    late = [thread.name for thread in threads if not thread.join(max(deadline_s - time.monotonic(), 0.0))]
+    if late:
+        _log.error("threads did not stop in time", extra={"fields": {"threads": late}})
+    return not late
