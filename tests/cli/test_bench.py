@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,8 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What the measurements of processes would bring."""
-    figures = {
-        row.key: 1.0 for row in rows.ROWS if row.key.startswith(("worker", "solve_memory", "io", "ros", "query"))
-    }
+    of_processes = ("worker", "solve_memory", "io", "ros", "rig", "large_rig", "query")
+    figures = {row.key: 1.0 for row in rows.ROWS if row.key.startswith(of_processes)}
     document = {**figures, "io_per_second": {"pairs": 10.0}}
     monkeypatch.setattr(worker, "measure", lambda *_: {})
     monkeypatch.setattr(live, "measure", lambda *_: dict(document))
@@ -84,7 +84,12 @@ def test_a_worker_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize(
-    ("measure", "prefix"), [pytest.param(live.native, "", marks=pytest.mark.slow), (live.ros, "ros_")]
+    ("measure", "prefix"),
+    [
+        pytest.param(live.native, "", marks=pytest.mark.slow),
+        (live.ros, "ros_"),
+        pytest.param(partial(live.rig, name="rig"), "rig_", marks=pytest.mark.slow),
+    ],
 )
 def test_a_daemon_is_measured_under_load(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, measure: Callable[..., dict[str, Any]], prefix: str
@@ -92,7 +97,7 @@ def test_a_daemon_is_measured_under_load(
     monkeypatch.setattr(live, "SETTLE_S", 1.0)
     monkeypatch.setattr(live, "SECONDS", 1.5)
     document = measure(tmp_path, lambda _: None)
-    names = ("ros",) if prefix else ("io", "query")
+    names = (prefix,) if prefix else ("io", "query")
     assert set(document) >= {row.key for row in rows.ROWS if row.key.startswith(names)}
     assert document[f"{prefix}io_cpu_percent"] > 0.0
     assert document[f"{prefix}io_resident_mb"] > document[f"{prefix}io_proportional_mb"] > 0.0

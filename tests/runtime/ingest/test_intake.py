@@ -264,7 +264,7 @@ def test_each_stream_has_room_of_its_own(record_property: Callable[[str, object]
         for sensor in vehicle.intake.sensors
         for cause, count in sensor.losses.snapshot().items()
     }
-    record_property("figure", f"{lost}")
+    record_property("figure", f"{sum(lost.values())} of 500 samples of the flood, none of others")
     assert lost == {("camera/0", CAMERA, "overrun"): 500 - FRAMES_WAITING}
     assert len(vehicle.looks["1-0"].pairs) == 9
 
@@ -294,6 +294,28 @@ def test_frames_of_all_pairs_are_bounded_together_and_each_counts_once(
     before = lidar.losses.snapshot()
     vehicle.drive(range(110, 120), 4, 1)
     assert lidar.losses.snapshot() == before, "there is room again"
+
+
+@pytest.mark.fault("checks pile up before a worker that does not answer", "pairs wait no more; no frame is refused")
+def test_pairs_wait_no_more_before_frames_are_refused(record_property: Callable[[str, object], None]) -> None:
+    vehicle = Vehicle(rig_of(2, 2, max_held_bytes=MB))
+    vehicle.looks["1-1"].waits, vehicle.looks["1-1"].keeps = True, False
+    points = 2048  # 24 kB
+    for number in range(120):
+        for index in range(2):
+            vehicle.put(f"lidar/{index}", sweep(number, points))
+            vehicle.put(f"camera/{index}", image(number, index))
+        vehicle.settle()
+        kept = vehicle.looks["0-0"].pairs
+        del kept[: max(len(kept) - 45, 0)], vehicle.looks["0-1"].pairs[:], vehicle.looks["1-0"].pairs[:]
+    held = vehicle.streams["1-1"].report.held
+    record_property("figure", f"{held} pairs wait instead of 42, none refused")
+    assert 0 < held < 20
+    assert all(
+        (kind, "memory_full") not in sensor.losses.snapshot()
+        for sensor in vehicle.intake.sensors
+        for kind in (CAMERA, LIDAR)
+    )
 
 
 @pytest.mark.fault("one camera of a vehicle falls silent", "its slice ends by the clock although all others go on")

@@ -25,7 +25,7 @@ def test_bytes_are_those_of_images_and_points() -> None:
 
 
 def test_the_oldest_goes_first_and_waits_for_so_many_seconds_and_bytes() -> None:
-    held = PairBuffer(WaitingFrames(3 * bytes_of(pair(0))), max_wait_s=10.0)
+    held = PairBuffer(WaitingFrames(3 * bytes_of(pair(0)), lambda: False), max_wait_s=10.0)
     for stamp_ns in (1, 2, 3):
         held.add(pair(stamp_ns))
     assert not held.has_waited(100.0)
@@ -42,7 +42,7 @@ def test_the_oldest_goes_first_and_waits_for_so_many_seconds_and_bytes() -> None
 def test_a_frame_of_several_pairs_counts_once() -> None:
     first, second = pair(1), pair(1)
     shared = FramePair(second.camera, first.lidar)
-    frames = WaitingFrames(bytes_of(first) + frame_bytes(second.camera))
+    frames = WaitingFrames(bytes_of(first) + frame_bytes(second.camera), lambda: False)
     one, other = PairBuffer(frames, 10.0), PairBuffer(frames, 10.0)
     one.add(first)
     other.add(shared)
@@ -56,7 +56,7 @@ def test_a_frame_of_several_pairs_counts_once() -> None:
 
 
 def test_who_waits_for_long_pushes_nobody_else_on() -> None:
-    frames = WaitingFrames(3 * bytes_of(pair(0)))
+    frames = WaitingFrames(3 * bytes_of(pair(0)), lambda: False)
     late, prompt = PairBuffer(frames, 10.0), PairBuffer(frames, 10.0)
     for stamp_ns in (1, 2, 3):
         late.add(pair(stamp_ns))

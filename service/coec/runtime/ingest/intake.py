@@ -25,6 +25,10 @@ ALL_FRAMES = 1.5
 """Bytes of all frames that a vehicle may have in memory, in those that may be held: the others wait for their partner,
 the disk or the worker, 25 pairs of 2.5 MB."""
 
+TIGHT = 1.3
+"""The same, above which pairs wait for no answer any more: better looked at too early than that no frame is let in.
+What is left is half a second of eight cameras and three LiDARs; below it, 75 MB of one pair's checks are no matter."""
+
 TICK_S = 0.1
 """Between two looks at the clocks while samples come; whoever reads the reports looks once a second."""
 
@@ -66,8 +70,9 @@ class Intake:
         self._unheard: list[SensorStream] = []
         self.inbox = Inbox({}, limits.max_waiting_bytes, self._overrun)
         self.thread = ServiceThread("ingest", self._run)
-        self.waiting_frames = WaitingFrames(limits.max_held_bytes)
-        self._budget = FrameBudget(round(ALL_FRAMES * limits.max_held_bytes))
+        budget = self._budget = FrameBudget(round(ALL_FRAMES * limits.max_held_bytes))
+        tight = round(TIGHT * limits.max_held_bytes)
+        self.waiting_frames = WaitingFrames(limits.max_held_bytes, lambda: budget.bytes > tight)
         self._pairs: list[Takes] = []
         self._ticked_s = 0.0
 

@@ -4,6 +4,7 @@ vehicle, and in time."""
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable
 
 from coec.calibration.types import CameraFrame, FramePair, LidarFrame
 from coec.runtime.ingest.frame_budget import frame_bytes
@@ -12,8 +13,10 @@ from coec.runtime.ingest.frame_budget import frame_bytes
 class WaitingFrames:
     """The frames of all buffers of a vehicle, each counted once however many pairs it is of; one thread uses it."""
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(self, max_bytes: int, is_tight: Callable[[], bool]) -> None:
+        """`is_tight()` says whether frames, wherever they are held, leave little room for the next."""
         self._max_bytes = max_bytes
+        self._is_tight = is_tight
         self._holders: Counter[int] = Counter()
         self._bytes = 0
         self._buffers: list[PairBuffer] = []
@@ -36,9 +39,10 @@ class WaitingFrames:
             self._bytes -= frame_bytes(frame)
 
     def has_to_go(self, buffer: PairBuffer) -> bool:
-        """Whether a buffer must let go: there are too many, and none holds more pairs. Who waits for long pushes nobody
-        else on."""
-        return self._bytes > self._max_bytes and len(buffer) == max(map(len, self._buffers))
+        """Whether a buffer must let go: there are too many, or others hold so many that the next ones would be refused;
+        and none holds more pairs. Who waits for long pushes nobody else on."""
+        too_many = self._bytes > self._max_bytes or self._is_tight()
+        return too_many and len(buffer) == max(map(len, self._buffers))
 
 
 class PairBuffer:
