@@ -77,3 +77,46 @@ def test_failure_leaves_nothing_behind(coec: Coec, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     assert coec("sim", "drive", "--output", tmp_path / "file" / "drive.mcap", *SHORT).status == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+RIG = ("--rig", "four-fisheyes", "--camera", "fisheye64", "--camera-hz", 2, "--lidar-hz", 2)
+
+
+def test_a_rig_is_one_bag_whose_pairs_read_back_with_their_masks(coec: Coec, tmp_path: Path) -> None:
+    folder = tmp_path / "rig"
+    outcome = coec(
+        "sim", "drive", "--output", folder, *RIG, "--seed", 4, "--seconds", 0.5, "--fault", "roof:step:0:rz=2", "--json"
+    )
+    assert outcome.status == 0
+    assert outcome.document["frames"] == 7
+    assert len(outcome.document["sources"]) == 12
+    words = "rig=four-fisheyes&seed=4&seconds=0.5&camera=fisheye64&camera_hz=2&lidar_hz=2&faults=roof:step:0:rz=2"
+    for name in ("rear-roof", "right-near_right"):
+        back, drive = open_source(outcome.document["sources"][name]), open_source(f"sim:{words}&pair={name}")
+        np.testing.assert_allclose(back.rig.T_camera_lidar_nominal, drive.rig.T_camera_lidar_nominal, atol=1e-9)
+        np.testing.assert_allclose(back.rig.T_lidar_ego, drive.rig.T_lidar_ego, atol=1e-9)
+        assert back.rig.mask is not None
+        assert drive.rig.mask is not None
+        np.testing.assert_array_equal(back.rig.mask, drive.rig.mask)
+        assert back.rig.camera == drive.rig.camera
+        for ours, theirs in zip(drive.messages(), back.messages(), strict=True):
+            assert (type(ours), ours.stamp_ns, ours.frame_id) == (type(theirs), theirs.stamp_ns, theirs.frame_id)
+            if isinstance(ours, CameraFrame) and isinstance(theirs, CameraFrame):
+                assert ours.image == theirs.image
+            if isinstance(ours, LidarFrame) and isinstance(theirs, LidarFrame):
+                np.testing.assert_array_equal(ours.xyz_m, theirs.xyz_m)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--output", "rig.mcap", *RIG), "name a folder"),
+        (("--output", "rig", *RIG, "--lidar", "16"), "--lidar of a rig"),
+        (("--output", "rig", "--rig", "five"), "choose one of four-fisheyes"),
+        (("--output", "rig", *RIG, "--fault", "step:1:rx=1"), "of which sensor"),
+    ],
+)
+def test_what_a_rig_does_not_take_is_refused(coec: Coec, arguments: tuple[str, ...], said: str) -> None:
+    outcome = coec("sim", "drive", *arguments)
+    assert outcome.status == 2
+    assert said in outcome.err

@@ -103,6 +103,8 @@ def open_rig(query: dict[str, str]) -> RigDrive:
         values["faults"] = tuple(parse_sensor_fault(text, cameras, lidars) for text in query["faults"].split(";"))
     if "workshop" in query:
         parts = [part.partition(":") for part in query["workshop"].split(";")]
+        if not all(colon for _, colon, _ in parts):
+            raise UsageError(f"workshop={query['workshop']} of a rig: of which sensor? Write roof:0,0,1;front:0,1,0")
         values["workshop"] = tuple((sensor, _six(numbers)) for sensor, _, numbers in parts)
     return RigDrive(RigConfig(layout, **values))  # type: ignore[arg-type]  # checked key by key above
 

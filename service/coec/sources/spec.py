@@ -69,6 +69,11 @@ def is_bag(spec: SourceSpec) -> bool:
     return spec.layout is None and by_name
 
 
+def is_rig(spec: SourceSpec) -> bool:
+    """Whether it is a whole simulated rig, and not one pair of it."""
+    return spec.layout == "sim" and "rig" in spec.query and "pair" not in spec.query
+
+
 def _parse_query(query: str, text: str) -> dict[str, str]:
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
