@@ -926,6 +926,25 @@ def _check(source: Source, depth: Depth = None, as_json: Json = False) -> None:
     raise typer.Exit(command.run(source, depth=depth, as_json=as_json))
 
 
+@app.command("lidars")
+def _lidars(
+    source: Annotated[
+        str,
+        typer.Argument(help="A ROS 2 bag, or sim:rig=four-fisheyes&seconds=60.", metavar="SOURCE", show_default=False),
+    ],
+    a: Annotated[
+        str, typer.Argument(help="Topic (of a rig, name) of the denser LiDAR.", metavar="A", show_default=False)
+    ],
+    b: Annotated[str, typer.Argument(help="Of the one whose pose in A is told.", metavar="B", show_default=False)],
+    pairs: Annotated[int, typer.Option(help="Pairs of sweeps, evenly over the recording.", min=1, max=200)] = 12,
+    as_json: Json = False,
+) -> None:
+    """Where one LiDAR of a vehicle sits from another, of the surfaces that both see: exit 1 if those are too few."""
+    from coec.cli import lidars as command
+
+    raise typer.Exit(command.run(command.Options(source, a, b, pairs, as_json)))
+
+
 @app.command("export")
 def _export(
     source: Annotated[
