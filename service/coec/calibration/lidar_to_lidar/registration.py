@@ -150,7 +150,7 @@ def _meet(indexed: Sequence[tuple[Cloud, Neighbourhood]], T_a_b: Matrix4, bias: 
     parts = []
     tried = 0
     for number, (cloud, a) in enumerate(indexed):
-        tried += len(cloud.b_m)
+        tried += len(cloud.raw_b_m)
         parts.append(_meet_one(number, cloud, a, T_a_b, bias, reach_m))
     if not parts:
         return Met(np.empty(0), np.empty((0, 8)), np.empty((0, 2, 6)), np.empty(0, np.int64), np.empty((0, 3)), tried)
@@ -161,8 +161,9 @@ def _meet(indexed: Sequence[tuple[Cloud, Neighbourhood]], T_a_b: Matrix4, bias: 
 def _meet_one(
     number: int, cloud: Cloud, a: Neighbourhood, T_a_b: Matrix4, bias: Doubles, reach_m: float
 ) -> tuple[Doubles, Doubles, Doubles, NDArray[np.int64], Doubles]:
-    ray_b = np.einsum("ij,nj->ni", T_a_b[:3, :3], cloud.b_m / lengths(cloud.b_m)[:, None])
-    point = np.einsum("ij,nj->ni", T_a_b[:3, :3], cloud.b_m) + T_a_b[:3, 3] - bias[1] * ray_b
+    b_m = cloud.b_m(T_a_b)
+    ray_b = np.einsum("ij,nj->ni", T_a_b[:3, :3], b_m / lengths(b_m)[:, None])
+    point = np.einsum("ij,nj->ni", T_a_b[:3, :3], b_m) + T_a_b[:3, 3] - bias[1] * ray_b
     neighbours, squared = a.nearest(point, NEIGHBOURS)
     plane = planes_through(cloud.a_m, neighbours, squared, max(reach_m, SURFACE_REACH_M))
     thickness, narrow, wide = plane.spread.T

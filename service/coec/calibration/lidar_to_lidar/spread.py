@@ -9,7 +9,8 @@ exact.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from math import radians
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,9 @@ AZIMUTHS, ELEVATIONS = 8, 2
 """Sectors of the surroundings of a: by azimuth, and above or below its horizon."""
 CLOCK_S = 0.001
 """By how much the clocks of two LiDARs that are synchronised (PTP, or a pulse per second) may differ."""
+GRAIN_RAD, GRAIN_M = radians(0.01), 0.002
+"""What all points of a LiDAR may have in common of their angles and places: the steps in which packets of common
+sensors tell azimuth and range (VLP-16, HDL-64E: 0.01° and 2 mm)."""
 LEANING = 2.0
 """So much of what leaning normals pretend to tell is taken off: their own estimate is as uncertain as that of a
 variance of a dozen neighbours."""
@@ -53,24 +57,28 @@ def covariance_of(met: Met, weight: Doubles, prior: Doubles, noise_m: float, clo
     # What the clocks do is a shift and a turn along the way, alike in all pairs.
     moved = np.zeros(8)
     moved[:6] = CLOCK_S * np.mean([cloud.twist for cloud in clouds], axis=0)
-    widest = np.diag(prior**2)
-    return _no_wider(covariance, widest) + np.outer(moved, moved)
+    grain = np.diag(2.0 * np.array([GRAIN_RAD] * 3 + [GRAIN_M] * 3 + [0.0] * 2) ** 2)  # of either LiDAR
+    return _no_wider(covariance, prior) + np.outer(moved, moved) + grain
 
 
 def _held(information: Doubles, prior: Doubles) -> Doubles:
     """The matrix without its negative part, each unknown in the unit of what is known of it before."""
     unit = prior[:, None] * prior
-    positive = np.zeros((8, 8))
-    for value, vector in eigen((information * unit).tolist()):
-        if value > 0.0:
-            positive += value * np.outer(vector, vector)
-    return positive / unit
+    return _reshaped(information * unit, lambda value: max(value, 0.0)) / unit
 
 
-def _no_wider(covariance: Doubles, widest: Doubles) -> Doubles:
-    """A scatter without points to hold it may claim more than was known before: along each axis at most that."""
-    scale = np.sqrt(np.minimum(1.0, widest.diagonal() / covariance.diagonal()))
-    return np.asarray(covariance * scale[:, None] * scale)
+def _no_wider(covariance: Doubles, prior: Doubles) -> Doubles:
+    """A scatter without points to hold it may claim more than was known before: both together."""
+    unit = prior[:, None] * prior
+    return _reshaped(covariance / unit, lambda value: max(value, 0.0) / (1.0 + max(value, 0.0))) * unit
+
+
+def _reshaped(symmetric: Doubles, of: Callable[[float], float]) -> Doubles:
+    """The matrix (8, 8) with a function of its eigenvalues for them."""
+    result = np.zeros((8, 8))
+    for value, vector in eigen(symmetric.tolist()):
+        result += of(value) * np.outer(vector, vector)
+    return result
 
 
 def _cells(met: Met, score: Doubles) -> Doubles:
