@@ -102,14 +102,8 @@ def rig_from_above(sensors: Sequence[SensorSeen], edges: Sequence[EdgeSeen], tit
         _draw_view(axes, sensor)
     for edge in sorted(edges, key=lambda edge: edge.sigmas):  # what is sure of a movement lies on top
         (x, y), (x2, y2) = places[edge.a], places[edge.b]
-        axes.plot(
-            [x, x2],
-            [y, y2],
-            color=colormaps[EDGES](float(colours(edge.sigmas))),
-            linewidth=2.6,
-            zorder=3,
-            solid_capstyle="round",
-        )
+        colour = colormaps[EDGES](float(colours(edge.sigmas)))
+        axes.plot([x, x2], [y, y2], color=colour, linewidth=2.6, zorder=3, solid_capstyle="round")
     for sensor in sensors:
         _draw_sensor(axes, sensor)
     _draw_labels(axes, sensors, list(places.values()))
