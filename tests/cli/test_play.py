@@ -209,6 +209,29 @@ def test_other_recordings_are_played_below_the_name_of_their_pair(coec: Coec, li
     assert joint.transforms[0].child_frame_id == "lidar"
 
 
+RIG = "sim:rig=four-fisheyes&seconds=0.5&camera=fisheye32&camera_hz=2&lidar_hz=2&ego_hz=4"
+SENSORS = ("front", "left", "rear", "right", "roof", "near_left", "near_right")
+
+
+def test_all_sensors_of_a_rig_are_played_on_a_key_each(coec: Coec, listener: Listener) -> None:
+    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    outcome = coec("play", RIG, "--connect", listener.endpoint, "--rate", 0, "--json")
+    assert outcome.status == 0
+    assert outcome.document["frames"] == dict.fromkeys(SENSORS, 1) | {"ego": 2}
+    wait_until(lambda: listener.count() == 9, "all frames", SECONDS)
+    assert set(listener.samples) == {f"sensors/{sensor}" for sensor in (*SENSORS, "ego")}
+
+
+def test_all_sensors_of_a_rig_are_played_on_topics_of_their_own(coec: Coec, listener: Listener) -> None:
+    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    outcome = coec("play", RIG, "--connect", listener.endpoint, "--rate", 0, "--middleware", "ros2dds", "--json")
+    assert outcome.status == 0
+    cameras, lidars = SENSORS[:4], SENSORS[4:]
+    topics = {f"{camera}/image/compressed" for camera in cameras} | {f"{camera}/camera_info" for camera in cameras}
+    topics |= {f"{lidar}/points" for lidar in lidars} | {"odometry", "tf_static"}
+    wait_until(lambda: set(listener.samples) == topics, "all topics", SECONDS)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from rosbags.highlevel import AnyReader
 from cli.conftest import Coec
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.sources import open_source
+from coec.sources.lidars import open_lidars
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -77,3 +79,68 @@ def test_failure_leaves_nothing_behind(coec: Coec, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     assert coec("sim", "drive", "--output", tmp_path / "file" / "drive.mcap", *SHORT).status == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+RIG = ("--rig", "four-fisheyes", "--camera", "fisheye64", "--camera-hz", 4, "--lidar-hz", 4, "--scene", "room")
+
+
+def test_a_rig_is_one_bag_whose_pairs_read_back_with_their_masks(coec: Coec, tmp_path: Path) -> None:
+    folder = tmp_path / "rig"
+    outcome = coec(
+        "sim",
+        "drive",
+        "--output",
+        folder,
+        *RIG,
+        "--seed",
+        4,
+        "--seconds",
+        0.25,
+        "--fault",
+        "roof:step:0:rz=2",
+        "--json",
+    )
+    assert outcome.status == 0
+    assert outcome.document["frames"] == 7
+    assert len(outcome.document["sources"]) == 12
+    words = "rig=four-fisheyes&seed=4&seconds=0.25&camera=fisheye64&camera_hz=4&lidar_hz=4&scene=room"
+    words += "&faults=roof:step:0:rz=2"
+    for name in ("rear-roof", "right-near_right"):
+        back, drive = open_source(outcome.document["sources"][name]), open_source(f"sim:{words}&pair={name}")
+        np.testing.assert_allclose(back.rig.T_camera_lidar_nominal, drive.rig.T_camera_lidar_nominal, atol=1e-9)
+        np.testing.assert_allclose(back.rig.T_lidar_ego, drive.rig.T_lidar_ego, atol=1e-9)
+        assert back.rig.mask is not None
+        assert drive.rig.mask is not None
+        np.testing.assert_array_equal(back.rig.mask, drive.rig.mask)
+        assert back.rig.camera == drive.rig.camera
+        for ours, theirs in zip(drive.messages(), back.messages(), strict=True):
+            assert (type(ours), ours.stamp_ns, ours.frame_id) == (type(theirs), theirs.stamp_ns, theirs.frame_id)
+            if isinstance(ours, CameraFrame) and isinstance(theirs, CameraFrame):
+                assert ours.image == theirs.image
+            if isinstance(ours, LidarFrame) and isinstance(theirs, LidarFrame):
+                np.testing.assert_array_equal(ours.xyz_m, theirs.xyz_m)
+    lidars = open_lidars(outcome.document["written"], "/roof/points", "/near_left/points")
+    whole = open_lidars(f"sim:{words}", "roof", "near_left")
+    np.testing.assert_allclose(lidars.rig.T_a_b_nominal, whole.rig.T_a_b_nominal, atol=1e-9)
+    np.testing.assert_allclose(lidars.rig.T_a_ego, whole.rig.T_a_ego, atol=1e-9)
+    (read,), (drawn,) = lidars.pairs(12), whole.pairs(12)
+    for mine, yours in ((read.a, drawn.a), (read.b, drawn.b)):
+        np.testing.assert_array_equal(mine.xyz_m, yours.xyz_m)
+    assert read.motion is not None
+    assert drawn.motion is not None
+    assert read.motion == replace(drawn.motion, sequence=None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--output", "rig.mcap", *RIG), "name a folder"),
+        (("--output", "rig", *RIG, "--lidar", "16"), "--lidar of a rig"),
+        (("--output", "rig", "--rig", "five"), "choose one of four-fisheyes"),
+        (("--output", "rig", *RIG, "--fault", "step:1:rx=1"), "of which sensor"),
+    ],
+)
+def test_what_a_rig_does_not_take_is_refused(coec: Coec, arguments: tuple[str, ...], said: str) -> None:
+    outcome = coec("sim", "drive", *arguments)
+    assert outcome.status == 2
+    assert said in outcome.err

@@ -19,8 +19,10 @@ from coec.geometry import cameras
 from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
 from coec.geometry.se3 import difference, exp
-from coec.simulation.drive import NEAREST_M, START_NS, DriveConfig, SimulatedDrive
+from coec.simulation.aboard import NEAREST_M
+from coec.simulation.drive import DriveConfig, SimulatedDrive
 from coec.simulation.faults import parse_fault
+from coec.simulation.journey import START_NS
 from coec.simulation.parallel import messages_by
 from coec.sources.recording import Message
 
@@ -124,7 +126,7 @@ def test_points_project_onto_their_depth_once_motion_is_compensated(camera: str)
 def test_the_twist_leads_from_one_pose_to_the_next() -> None:
     drive = small()
     step_s = 0.02
-    motion = drive._trip
+    motion = drive._journey.trip
     for time_s in (0.0, 3.3, 17.0):
         linear, angular = motion.twist(time_s)
         before, after = motion.poses(time_s + np.array([-step_s / 2, step_s / 2]))

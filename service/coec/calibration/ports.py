@@ -64,3 +64,20 @@ class Silence:
 
     def step(self, stage: str, done: int, total: int) -> None:
         """Nothing."""
+
+
+class Neighbourhood(Protocol):
+    """Points among which the nearest are looked up."""
+
+    def nearest(self, queries_m: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Indices (N, count) of the nearest points of each query (N, 3), the nearest first, and squared distances
+        (N, count) in m². There are at least `count` points. To the bit the same at each call."""
+        ...
+
+
+class NeighbourSearch(Protocol):
+    """Makes points ready to be looked up."""
+
+    def over(self, points_m: NDArray[np.float64]) -> Neighbourhood:
+        """Of finite points (M, 3)."""
+        ...

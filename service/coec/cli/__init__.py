@@ -739,7 +739,18 @@ Faults = Annotated[
 
 @sim_app.command("drive")
 def _sim_drive(
-    output: Annotated[Path, typer.Option(help="ROS 2 MCAP to write.", metavar="FILE.mcap", show_default=False)],
+    output: Annotated[
+        Path,
+        typer.Option(help="ROS 2 MCAP to write; of a rig, the folder.", metavar="FILE.mcap|DIR", show_default=False),
+    ],
+    rig: Annotated[
+        str | None,
+        typer.Option(
+            help="Several cameras and LiDARs on one vehicle: four-fisheyes. A fault then begins with the sensor's "
+            "name: front:step:40:ry=1, roof:step:40:rz=1, about the sensor's own axes.",
+            metavar="RIG",
+        ),
+    ] = None,
     seed: Seed = 0,
     seconds: Annotated[float, typer.Option(help="Length of the drive.", min=0.1)] = 60.0,
     camera: SimCamera = "fisheye700",
@@ -763,7 +774,10 @@ def _sim_drive(
     fault: Faults = None,
     workshop: Annotated[
         str | None,
-        typer.Option(help="Error of the nominal calibration, degrees and metres.", metavar="RX,RY,RZ[,TX,TY,TZ]"),
+        typer.Option(
+            help="Error of the nominal calibration, degrees and metres; of a rig SENSOR:RX,RY,RZ;...",
+            metavar="RX,RY,RZ[,TX,TY,TZ]",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -787,7 +801,12 @@ def _sim_drive(
         speed_mps=speed_mps,
         rolling_shutter_s=rolling_shutter_s,
         intrinsics_off=intrinsics_off,
+        rig=rig,
     )
+    if rig is not None:
+        from coec.cli import sim_rig
+
+        raise typer.Exit(sim_rig.drive(options, output, as_json=as_json))
     raise typer.Exit(command.drive(options, output, as_json=as_json))
 
 
@@ -905,6 +924,25 @@ def _check(source: Source, depth: Depth = None, as_json: Json = False) -> None:
     from coec.cli import check as command
 
     raise typer.Exit(command.run(source, depth=depth, as_json=as_json))
+
+
+@app.command("lidars")
+def _lidars(
+    source: Annotated[
+        str,
+        typer.Argument(help="A ROS 2 bag, or sim:rig=four-fisheyes&seconds=60.", metavar="SOURCE", show_default=False),
+    ],
+    a: Annotated[
+        str, typer.Argument(help="Topic (of a rig, name) of the denser LiDAR.", metavar="A", show_default=False)
+    ],
+    b: Annotated[str, typer.Argument(help="Of the one whose pose in A is told.", metavar="B", show_default=False)],
+    pairs: Annotated[int, typer.Option(help="Pairs of sweeps, evenly over the recording.", min=1, max=200)] = 12,
+    as_json: Json = False,
+) -> None:
+    """Where one LiDAR of a vehicle sits from another, of the surfaces that both see: exit 1 if those are too few."""
+    from coec.cli import lidars as command
+
+    raise typer.Exit(command.run(command.Options(source, a, b, pairs, as_json)))
 
 
 @app.command("export")

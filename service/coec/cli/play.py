@@ -20,6 +20,7 @@ from coec.config import Config, OpenPairConfig, RosConfig, ZenohConfig, load_con
 from coec.errors import SourceError, UsageError
 from coec.reports import console
 from coec.sources import Recording, open_source
+from coec.sources.spec import is_rig, parse_spec
 
 CONNECT_S = 10.0
 LISTENER_S = 5.0
@@ -77,6 +78,10 @@ def run(options: Options) -> int:
 def _frames(options: Options, target: Target) -> int:
     if options.topics or options.domain is not None:
         raise UsageError("--topics and --domain are of ROS 2: add --middleware rmw_zenoh or ros2dds")
+    if is_rig(spec := parse_spec(options.source)):
+        from coec.cli.play_rig import frames as frames_of_rig
+
+        return frames_of_rig(options, target, spec)
     recording = open_source(options.source)
     pair = target.pair
     streams = Streams.default(options.pair or recording.rig.pair) if pair is None else Streams.of_pair(pair)

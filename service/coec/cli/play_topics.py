@@ -30,7 +30,7 @@ from coec.errors import DecodeError, SourceError, UsageError
 from coec.reports import console
 from coec.schemas.ros_names import TF_STATIC
 from coec.sources import open_source
-from coec.sources.spec import SourceSpec, is_bag, parse_spec
+from coec.sources.spec import SourceSpec, is_bag, is_rig, parse_spec
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ def topics(options: Options, target: Target, middleware: Middleware) -> int:
     if options.encoding != "msgpack":
         raise UsageError("--encoding is of frames on the keys of a pair: topics of ROS 2 carry CDR")
     spec = parse_spec(options.source)
-    programme = _bag(spec) if is_bag(spec) else _frames(options, target.pair)
+    programme = _programme(spec, options, target)
     chosen = _chosen(programme, options.topics, middleware)
     first = next(programme.messages(chosen), None)
     if first is None:
@@ -83,6 +83,16 @@ def topics(options: Options, target: Target, middleware: Middleware) -> int:
         elapsed_s = time.monotonic() - started_s
     report(options, played, elapsed_s, deaf, "messages")
     return 0
+
+
+def _programme(spec: SourceSpec, options: Options, target: Target) -> Programme:
+    if is_bag(spec):
+        return _bag(spec)
+    if is_rig(spec):
+        from coec.cli.play_rig import programme_of
+
+        return programme_of(spec)
+    return _frames(options, target.pair)
 
 
 def _bag(spec: SourceSpec) -> Programme:

@@ -15,10 +15,11 @@ from coec.adapters.ros.topics import Frame
 from coec.calibration.types import CameraFrame
 from coec.errors import UsageError
 from coec.reports import console
-from coec.simulation.source import open_sim
+from coec.simulation.source import open_rig, open_sim
 
 if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
+    from coec.simulation.rig_drive import RigDrive
 
 MOST_PROCESSES = 4
 """Each keeps its own street in memory."""
@@ -42,17 +43,25 @@ class Options:
     lidar_hz: float = 10.0
     faults: tuple[str, ...] = ()
     workshop: str | None = None
+    rig: str | None = None
 
     def open(self) -> SimulatedDrive:
         """The drive. Raises UsageError, SourceError: see `open_sim`."""
-        names = (
-            *("seed", "seconds", "camera", "lidar", "camera_hz", "lidar_hz", "scene", "speed_mps"),
-            *("rolling_shutter_s", "intrinsics_off", "workshop"),
-        )
+        return open_sim(self._query(("lidar", "rolling_shutter_s", "intrinsics_off")))
+
+    def open_rig(self) -> RigDrive:
+        """The drive of the rig. Raises UsageError, SourceError: see `open_rig`."""
+        own = (("--lidar", self.lidar != "64"), ("--rolling-shutter", self.rolling_shutter_s != 0.0))
+        if not_its := [name for name, given in (*own, ("--intrinsics-off", self.intrinsics_off is not None)) if given]:
+            raise UsageError(f"{', '.join(not_its)} of a rig: its sensors are what they are; leave it out")
+        return open_rig(self._query(("rig",)))
+
+    def _query(self, more: tuple[str, ...]) -> dict[str, str]:
+        names = ("seed", "seconds", "camera", "camera_hz", "lidar_hz", "scene", "speed_mps", "workshop", *more)
         query = {name: str(getattr(self, name)) for name in names if getattr(self, name) is not None}
         if self.faults:
             query["faults"] = ";".join(self.faults)
-        return open_sim(query)
+        return query
 
 
 def drive(options: Options, output: Path, *, as_json: bool) -> int:

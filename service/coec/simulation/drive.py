@@ -8,55 +8,31 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeVar
+from typing import Protocol
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from coec.adapters.images.codec import encode_depth_png, encode_jpeg
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
+from coec.calibration.types import Matrix4, Rig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera, build, intrinsics_of, name_of
 from coec.geometry.se3 import inverse, perturb
-from coec.simulation import faults as wrong
-from coec.simulation.exposure import Lens, against_the_sun, at_night, dirt_cover, expose
-from coec.simulation.faults import Fault, late_s, shifted
-from coec.simulation.lamps import around, headlights, night_sky
-from coec.simulation.lidar import LIDARS, LidarModel, sweep
-from coec.simulation.mesh import Floats
-from coec.simulation.passages import passages
-from coec.simulation.render import Exposure, pixel_rays, render_rows
-from coec.simulation.scene import Scene, Solid, Town
-from coec.simulation.sky import Sky
-from coec.simulation.surroundings import SCENES, Surroundings
-from coec.simulation.vehicle import T_ego_lidar, Trip, body, build_pace, build_trip, workshop_T_camera_lidar
-from coec.simulation.weather import CLEAR, SHOWER_S, Air, low_sun_sky, rained_lens, rainy_air, rainy_sky
+from coec.simulation.aboard import Aboard, CameraAboard, LidarAboard, OdometerAboard, Optics, Wire, product
+from coec.simulation.exposure import Lens
+from coec.simulation.faults import Fault, shifted
+from coec.simulation.journey import Journey
+from coec.simulation.lidar import LIDARS, LidarModel
+from coec.simulation.scene import Solid
+from coec.simulation.schedule import Arrival, arrivals, seconds_of
+from coec.simulation.vehicle import T_ego_lidar, body, workshop_T_camera_lidar
 from coec.sources.recording import MOTION_REACH_NS, Message, chosen_indices
 
-Doubles = NDArray[np.float64]
-F = TypeVar("F", bound=Fault)
-
-START_NS = 1_600_000_000_000_000_000
-ROW_PARTS = 24
-"""Parts in which a rolling shutter takes its rows: at 10 m/s and 30 ms the camera moves 1.3 cm from one to the next,
-less than a pixel of anything beyond 3 m."""
 XI, ALPHA = -0.2, 0.6
 """Of the double sphere fisheye: near those of common lenses."""
-BODY = np.float32(0.05)
-"""Share of the light of the horizon that the black body of the vehicle sends back."""
-DAYLIGHT = np.empty((0, 4, 3))
-"""No headlights."""
 WIDE_DEG, PINHOLE_DEG = 90, (10, 120)
 """Width of a pinhole camera unless told otherwise, and the least and greatest."""
-NEAREST_M = 1.0
-"""Range whose inverse has the largest depth code, 65535."""
-SPEED_SCALE_SIGMA, SPEED_SIGMA_MPS = 0.004, 0.02
-TURN_BIAS_SIGMA_RADPS, TURN_SIGMA_RADPS = 0.0005, 0.002
-"""Errors of odometry and gyroscope, as of series sensors: constant over a drive, and of each sample."""
 _EGO, _LIDAR, _CAMERA = 0, 1, 2
 """Streams in the order of messages with equal stamps."""
 
@@ -105,6 +81,10 @@ class DriveConfig:
     depth: bool = False
     lens: Lens = field(default_factory=Lens)
 
+    def drive(self) -> SimulatedDrive:
+        """Which it describes."""
+        return SimulatedDrive(self)
+
 
 class SimulatedDrive:
     """The drive of a configuration.
@@ -123,33 +103,35 @@ class SimulatedDrive:
     configuration = None
 
     def __init__(self, config: DriveConfig) -> None:
-        for name in ("seconds", "camera_hz", "lidar_hz", "ego_hz"):
-            if not 0 < getattr(config, name) < 1e6:
-                raise UsageError(f"{name} of a simulated drive must be above 0, not {getattr(config, name)}")
+        check_rates(config)
         self.config = config
-        self.camera = _camera(config.camera, config.half_view_deg)
-        self.lidar = _lidar(config.lidar)
-        surroundings = _surroundings(config)
-        speed_mps = surroundings.speed_mps if config.speed_mps is None else config.speed_mps
-        pace = build_pace(config.seed, config.start_m, speed_mps)
-        poor = passages(config.faults, pace, config.seconds)
-        reach_m = config.start_m + pace.fastest_mps * config.seconds
-        town = Town(config.seed, reach_m, poor, surroundings, traffic=config.traffic)
-        self._town = town
-        self._trip: Trip = build_trip(config.seed, town.road, town.lane_left_m(), pace)
+        self.camera = camera_of(config.camera, config.half_view_deg)
+        lidar = lidar_of(config.lidar)
+        self._journey = Journey(
+            config.seed, config.scene, config.seconds,
+            speed_mps=config.speed_mps, start_m=config.start_m, traffic=config.traffic, faults=config.faults,
+        )  # fmt: skip
         self._true = workshop_T_camera_lidar()
-        self._body = Solid(body())
-        self._rays = pixel_rays(self.camera, math.radians(config.half_view_deg))
-        seen = np.zeros(self.camera.height * self.camera.width, bool)
-        seen[self._rays.pixel] = True
-        self._seen = seen.reshape(self.camera.height, self.camera.width)
-        self._hidden: tuple[bytes, NDArray[np.bool_]] | None = None
-        self._dirt: dict[float, Floats] = {}
-        self._repeated: tuple[int, CameraFrame] | None = None
+        optics = Optics(
+            self.camera,
+            config.half_view_deg,
+            config.camera_delay_s,
+            config.rolling_shutter_s,
+            config.depth,
+            config.lens,
+        )
+        eye = CameraAboard(
+            self._journey, Wire("camera", config.camera_hz, _CAMERA, faults=config.faults), optics,
+            self._T_ego_camera, Solid(body()),
+        )  # fmt: skip
+        turning = LidarAboard(
+            self._journey, Wire("lidar", config.lidar_hz, _LIDAR, faults=config.faults), lidar, lambda _: T_ego_lidar()
+        )
+        odometer = OdometerAboard(self._journey, Wire("ego", config.ego_hz, _EGO, faults=config.faults))
+        self._streams: tuple[Aboard, ...] = (odometer, turning, eye)
         xi = np.array([*np.deg2rad(config.workshop[:3]), *config.workshop[3:]])
-        usable = self._seen & ~self._own_body(self._true)
-        mask = cv2.erode(np.pad(usable.astype(np.uint8), 2), np.ones((5, 5), np.uint8))[2:-2, 2:-2] > 0
         told = _told(self.camera, config.intrinsics_off)
+        mask = eye.mask_at(product(T_ego_lidar(), inverse(self._true)))
         self.rig = Rig("sim", told, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask)
 
     @property
@@ -165,236 +147,112 @@ class SimulatedDrive:
     @cached_property
     def camera_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the camera frames that arrive, ascending."""
-        return tuple(stamp for stamp, stream, _ in self._plan if stream == _CAMERA)
+        return stamps_of(self._plan, _CAMERA)
 
     @cached_property
     def sweep_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the sweeps that arrive, ascending."""
-        return tuple(stamp for stamp, stream, _ in self._plan if stream == _LIDAR)
+        return stamps_of(self._plan, _LIDAR)
 
     @cached_property
     def motion_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the ego-motion that arrives, ascending."""
-        return tuple(stamp for stamp, stream, _ in self._plan if stream == _EGO)
+        return stamps_of(self._plan, _EGO)
 
     def truth(self, stamp_ns: int) -> Matrix4:
         """True T_camera_lidar (4, 4) at a time."""
-        return shifted(self._true, self.config.faults, (stamp_ns - START_NS) / 1e9)
+        return shifted(self._true, self.config.faults, seconds_of(stamp_ns))
 
     def true_pose(self, stamp_ns: int) -> Matrix4:
         """True T_world_ego (4, 4) at a time."""
-        pose: Matrix4 = self._trip.poses(np.array([(stamp_ns - START_NS) / 1e9]))[0]
-        return pose
+        return self._journey.pose(seconds_of(stamp_ns))
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
         """See `Recording.messages`."""
-        for entry in self._chosen(cameras):
-            yield self._message(*entry)
+        for entry in self._plan if cameras is None else needed(self._plan, cameras, _CAMERA, _LIDAR, _EGO):
+            yield self._message(entry)
 
     def part(self, begin: int, end: int) -> list[Message]:
         """Messages `begin` to `end` (excluded) of all, by their place in `messages()`: for several processes."""
-        return [self._message(*entry) for entry in self._plan[begin:end]]
+        return [self._message(entry) for entry in self._plan[begin:end]]
 
     @property
     def message_count(self) -> int:
         """How many `messages()` there are."""
         return len(self._plan)
 
-    def _message(self, stamp_ns: int, stream: int, index: int) -> Message:
-        if stream == _CAMERA:
-            return self._expose(index, stamp_ns)
-        return self._sweep(index, stamp_ns) if stream == _LIDAR else self._motion(index, stamp_ns)
-
-    # --- when -------------------------------------------------------------------------------------------------
-
     @cached_property
-    def _plan(self) -> list[tuple[int, int, int]]:
-        """(stamp_ns, stream, number) of everything that arrives, in the order of the stamps."""
-        config = self.config
-        plan = []
-        for stream, rate_hz in ((_EGO, config.ego_hz), (_LIDAR, config.lidar_hz), (_CAMERA, config.camera_hz)):
-            for index in range(math.ceil(config.seconds * rate_hz)):
-                time_s = self._time_s(stream, index)
-                if not self._lost(stream, index, time_s):
-                    late = late_s(config.faults, time_s) if stream == _CAMERA else 0.0
-                    plan.append((START_NS + round((time_s + late) * 1e9), stream, index))
-        return sorted(plan)
+    def _plan(self) -> list[Arrival]:
+        return arrivals(self._streams, self.config.seconds)
 
-    def _time_s(self, stream: int, index: int) -> float:
-        """True time of a frame: of an exposure, or of the middle of a sweep."""
-        config = self.config
-        if stream == _CAMERA:
-            return index / config.camera_hz + config.camera_delay_s
-        return index / (config.lidar_hz if stream == _LIDAR else config.ego_hz)
+    def _message(self, entry: Arrival) -> Message:
+        return self._streams[entry.stream].frame(entry.number, entry.stamp_ns)
 
-    def _lost(self, stream: int, index: int, time_s: float) -> bool:
-        if stream == _EGO and any(self._now(wrong.NoEgo, time_s)):
-            return True
-        shares = [fault.share for fault in self._now(wrong.Loss, time_s)]
-        return bool(shares) and self._rng(130, stream, index).random() < max(shares)
-
-    def _now(self, kind: type[F], time_s: float) -> Iterator[F]:
-        return (fault for fault in self.config.faults if isinstance(fault, kind) and fault.active(time_s))
-
-    def _chosen(self, cameras: Collection[int] | None) -> Iterator[tuple[int, int, int]]:
-        """The part of the plan that the chosen camera frames need: the sweep nearest to each, motion around it."""
-        if cameras is None:
-            yield from self._plan
-            return
-        exposures = [entry for entry in self._plan if entry[1] == _CAMERA]
-        picked = [exposures[index] for index in chosen_indices(cameras, len(exposures))]
-        stamps = np.array([entry[0] for entry in picked], dtype=np.int64)
-        sweeps = [entry for entry in self._plan if entry[1] == _LIDAR]
-        times = np.array([entry[0] for entry in sweeps], dtype=np.int64)
-        near = {int(np.abs(times - stamp).argmin()) for stamp in stamps} if len(times) else set()
-        wanted = {*picked, *(sweeps[index] for index in near)}
-        for entry in self._plan:
-            around = entry[1] == _EGO and len(stamps) and np.abs(stamps - entry[0]).min() <= MOTION_REACH_NS
-            if entry in wanted or around:
-                yield entry
-
-    # --- what -------------------------------------------------------------------------------------------------
-
-    def _rng(self, *key: int) -> np.random.Generator:
-        return np.random.default_rng([self.config.seed, *key])
-
-    def _scene(self, time_s: float) -> Scene:
-        at_m = float(self._trip.pace.progress(np.array([time_s]))[0])
-        scene = self._town.scene(at_m, time_s, self._trip.pace.progress)
-        night = any(self._now(wrong.Night, time_s))
-        sky = self._weather(time_s)
-        scene.sky = night_sky(sky) if night else sky
-        scene.headlights = headlights(self._trip.poses(np.array([time_s]))[0]) if night else DAYLIGHT
-        return scene
-
-    def _weather(self, time_s: float) -> Sky:
-        sky = self._town.sky
-        for sunny in self._now(wrong.LowSun, time_s):
-            ahead = self._trip.poses(np.array([sunny.begin_s]))[0]
-            sky = low_sun_sky(sky, math.atan2(ahead[1, 0], ahead[0, 0]))
-        rain = self._rain(time_s)
-        return rainy_sky(sky, rain) if rain else sky
-
-    def _rain(self, time_s: float) -> float:
-        """Millimetres an hour."""
-        return max((fault.mmph for fault in self._now(wrong.Rain, time_s)), default=0.0)
-
-    def _expose(self, index: int, stamp_ns: int) -> CameraFrame:
-        time_s = self._time_s(_CAMERA, index)
-        frozen = next(self._now(wrong.Frozen, time_s), None)
-        if frozen is None:
-            return self._picture(index, stamp_ns)
-        last = max(math.ceil((frozen.begin_s - self.config.camera_delay_s) * self.config.camera_hz) - 1, 0)
-        if self._repeated is None or self._repeated[0] != last:
-            self._repeated = (last, self._picture(last, stamp_ns))
-        before = self._repeated[1]
-        return CameraFrame(stamp_ns, before.frame_id, before.image, sequence=index, depth=before.depth)
-
-    def _picture(self, index: int, stamp_ns: int) -> CameraFrame:
-        time_s = self._time_s(_CAMERA, index)
-        T_camera_lidar = shifted(self._true, self.config.faults, time_s)
-        exposures = self._rows(time_s, _times(T_ego_lidar(), inverse(T_camera_lidar)))
-        view = math.radians(self.config.half_view_deg)
-        scene = self._scene(time_s)
-        radiance = render_rows(scene, self.camera, exposures, half_view_rad=view)
-        hidden = self._own_body(T_camera_lidar)
-        share, lamps = around(scene, exposures[len(exposures) // 2].T_world_camera[:3, 3])
-        radiance.linear[hidden] = BODY * (np.float32(share) * np.array(scene.sky.horizon, np.float32) + lamps)
-        light = math.prod(fault.light for fault in self._now(wrong.Dark, time_s))
-        lens = at_night(self.config.lens) if any(self._now(wrong.Night, time_s)) else self.config.lens
-        lens = against_the_sun(lens) if any(self._now(wrong.LowSun, time_s)) else lens
-        cover = self._cover(time_s)
-        pixels = expose(radiance.linear, self._seen, lens, self._rng(131, index), light=light, dirt=cover)
-        size = (self.camera.width, self.camera.height)
-        image = EncodedImage(ImageFormat.JPEG, *size, encode_jpeg(pixels, self.config.lens.jpeg_quality))
-        depth = None
-        if self.config.depth:
-            code = np.clip(65535 * NEAREST_M / radiance.range_m, 1, 65535)
-            code[np.isnan(code)] = 1  # the sky is far, not unknown
-            code[hidden | ~self._seen] = 0
-            depth = EncodedImage(ImageFormat.PNG, *size, encode_depth_png(code.astype(np.uint16)))
-        return CameraFrame(stamp_ns, "camera", image, sequence=index, depth=depth)
-
-    def _rows(self, time_s: float, T_ego_camera: Matrix4) -> list[Exposure]:
-        """Where the camera is while it takes its rows."""
-        height, readout_s = self.camera.height, self.config.rolling_shutter_s
-        bounds = np.linspace(0, height, (min(ROW_PARTS, height) if readout_s else 1) + 1).round().astype(int)
-        times = time_s + readout_s * ((bounds[:-1] + bounds[1:]) / 2 / height - 0.5)
-        poses = self._trip.poses(times)
-        return [
-            Exposure(int(first), int(last), _times(pose, T_ego_camera), float(at_s))
-            for first, last, pose, at_s in zip(bounds[:-1], bounds[1:], poses, times, strict=True)
-        ]
-
-    def _cover(self, time_s: float) -> Floats | None:
-        """Dirt and drops on the lens, whichever hides more."""
-        covers = []
-        if share := max((fault.share for fault in self._now(wrong.Dirt, time_s)), default=0.0):
-            if share not in self._dirt:
-                self._dirt[share] = dirt_cover(self._seen.shape, share, self.config.seed)
-            covers.append(self._dirt[share])
-        if rain := self._rain(time_s):
-            covers.append(rained_lens(self._seen.shape, rain, self.config.seed, int(time_s / SHOWER_S)))
-        return np.maximum.reduce(covers) if covers else None
-
-    def _own_body(self, T_camera_lidar: Matrix4) -> NDArray[np.bool_]:
-        """(h, w): pixels that show the vehicle itself; depends on how the camera is mounted."""
-        key = T_camera_lidar.tobytes()
-        if self._hidden is None or self._hidden[0] != key:
-            T_ego_camera = _times(T_ego_lidar(), inverse(T_camera_lidar))
-            rays = np.einsum("ij,nj->ni", T_ego_camera[:3, :3], self._rays.directions).astype(np.float32)
-            origins = np.empty_like(rays)
-            origins[:] = T_ego_camera[:3, 3]
-            hidden = np.zeros(self._seen.size, bool)
-            hidden[self._rays.pixel] = self._body.blocked(origins, rays)
-            self._hidden = (key, hidden.reshape(self._seen.shape))
-        return self._hidden[1]
-
-    def _sweep(self, index: int, stamp_ns: int) -> LidarFrame:
-        time_s = self._time_s(_LIDAR, index)
-        share = max((fault.share for fault in self._now(wrong.Beams, time_s)), default=0.0)
-        dead = self._rng(132).random(self.lidar.pattern.beams) < share if share else None
-        rain = self._rain(time_s)
-        air: Air = rainy_air(rain) if rain else CLEAR
-        found = sweep(self._scene(time_s), self.lidar, self._lidar_poses, time_s, self._rng(133, index), dead, air)
-        return LidarFrame(
-            stamp_ns, "lidar", found.xyz_m, found.intensity, found.ring, found.time_offset_s, sequence=index
-        )  # fmt: skip
-
-    def _lidar_poses(self, time_s: Doubles) -> Doubles:
-        poses: Doubles = np.einsum("nij,jk->nik", self._trip.poses(time_s), T_ego_lidar())
-        return poses
-
-    def _motion(self, index: int, stamp_ns: int) -> EgoMotion:
-        linear, angular = self._trip.twist(self._time_s(_EGO, index))
-        constant, sample = self._rng(134), self._rng(135, index)
-        linear = linear * (1 + constant.normal(0, SPEED_SCALE_SIGMA)) + sample.normal(0, SPEED_SIGMA_MPS, 3)
-        bias = constant.normal(0, TURN_BIAS_SIGMA_RADPS, 3)
-        angular = angular + bias + sample.normal(0, TURN_SIGMA_RADPS, 3)
-        vx, vy, vz = (float(value) for value in linear)
-        wx, wy, wz = (float(value) for value in angular)
-        return EgoMotion(stamp_ns, "ego", (vx, vy, vz), (wx, wy, wz), sequence=index)
+    def _T_ego_camera(self, time_s: float) -> Matrix4:
+        return product(T_ego_lidar(), inverse(shifted(self._true, self.config.faults, time_s)))
 
 
-def _times(a: Matrix4, b: Matrix4) -> Matrix4:
-    # Not `@`: the same bits whatever BLAS does.
-    product: Matrix4 = np.einsum("ij,jk->ik", a, b)
-    return product
+class Rated(Protocol):
+    """A configuration with a length and rates."""
+
+    @property
+    def seconds(self) -> float:
+        """Of the drive."""
+        ...
+
+    @property
+    def camera_hz(self) -> float:
+        """Pictures a second."""
+        ...
+
+    @property
+    def lidar_hz(self) -> float:
+        """Sweeps a second."""
+        ...
+
+    @property
+    def ego_hz(self) -> float:
+        """Samples of ego-motion a second."""
+        ...
 
 
-def _surroundings(config: DriveConfig) -> Surroundings:
-    if config.scene not in SCENES:
-        raise UsageError(f"there is no scene {config.scene!r}; choose one of {', '.join(SCENES)}")
-    made = SCENES[config.scene](config.seed)
-    stretches = [fault for fault in config.faults if isinstance(fault, wrong.Tunnel | wrong.OpenRoad)]
-    if stretches and not made.poor:
-        raise UsageError(f"a tunnel or an open road is a stretch of a street, not of a {config.scene}")
-    if config.speed_mps == 0 and any(isinstance(fault, wrong.Tunnel) for fault in stretches):
-        raise UsageError("a standing vehicle comes into no tunnel: give it a speed")
-    return made
+def check_rates(config: Rated) -> None:
+    """Raises UsageError where the length of a drive or a rate is none."""
+    for name in ("seconds", "camera_hz", "lidar_hz", "ego_hz"):
+        if not 0 < getattr(config, name) < 1e6:
+            raise UsageError(f"{name} of a simulated drive must be above 0, not {getattr(config, name)}")
 
 
-def _lidar(choice: str | LidarModel) -> LidarModel:
+def stamps_of(plan: Iterable[Arrival], stream: int) -> tuple[int, ...]:
+    """Of one stream, ascending."""
+    return tuple(entry.stamp_ns for entry in plan if entry.stream == stream)
+
+
+def needed(plan: list[Arrival], cameras: Collection[int], camera: int, lidar: int, ego: int) -> Iterator[Arrival]:
+    """The part of a plan that the chosen frames of a camera need: the sweep nearest to each, motion around it.
+
+    Args:
+        cameras: indices into the arrivals of the stream `camera`.
+        camera, lidar, ego: streams.
+
+    Raises:
+        UsageError: an index out of range.
+    """
+    exposures = [entry for entry in plan if entry.stream == camera]
+    picked = [exposures[index] for index in chosen_indices(cameras, len(exposures))]
+    stamps = np.array([entry.stamp_ns for entry in picked], dtype=np.int64)
+    sweeps = [entry for entry in plan if entry.stream == lidar]
+    times = np.array([entry.stamp_ns for entry in sweeps], dtype=np.int64)
+    near = {int(np.abs(times - stamp).argmin()) for stamp in stamps} if len(times) else set()
+    wanted = {*picked, *(sweeps[index] for index in near)}
+    for entry in plan:
+        around = entry.stream == ego and len(stamps) and np.abs(stamps - entry.stamp_ns).min() <= MOTION_REACH_NS
+        if entry in wanted or around:
+            yield entry
+
+
+def lidar_of(choice: str | LidarModel) -> LidarModel:
+    """The model of a name. Raises UsageError, which names those that there are."""
     if isinstance(choice, LidarModel):
         return choice
     if choice not in LIDARS:
@@ -402,7 +260,8 @@ def _lidar(choice: str | LidarModel) -> LidarModel:
     return LIDARS[choice]
 
 
-def _camera(choice: str | Camera, half_view_deg: float) -> Camera:
+def camera_of(choice: str | Camera, half_view_deg: float) -> Camera:
+    """The camera of a name, see `DriveConfig`. Raises UsageError, which says what may be written."""
     if not isinstance(choice, str):
         return choice
     if found := re.fullmatch(r"fisheye(\d{2,4})", choice):

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,9 @@ class Fault:
     def active(self, time_s: float) -> bool:
         """Whether it is so at this time."""
         return self.begin_s <= time_s < self.end_s
+
+
+F = TypeVar("F", bound=Fault)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +203,45 @@ def parse_fault(text: str) -> Fault:
     return KINDS[kind](begin_s, end_s, **values)
 
 
+@dataclass(frozen=True, slots=True)
+class SensorFault:
+    """A fault of one sensor of a rig; `sensor` None: of the surroundings, or of all sensors alike."""
+
+    sensor: str | None
+    fault: Fault
+
+
+OF_ALL: tuple[type[Fault], ...] = (NoEgo, Loss, Tunnel, OpenRoad, Night, Rain, LowSun)
+"""Faults that need no sensor."""
+OF_CAMERAS: tuple[type[Fault], ...] = (Step, Drift, Dirt, Dark, Frozen, Offset, OffsetDrift, Loss)
+OF_LIDARS: tuple[type[Fault], ...] = (Step, Drift, Beams, Loss)
+
+
+def parse_sensor_fault(text: str, cameras: Collection[str], lidars: Collection[str]) -> SensorFault:
+    """`[SENSOR:]KIND:BEGIN...`. A step of a sensor turns it about, and shifts it along, its own axes.
+
+    Raises:
+        UsageError: says what does not fit, and what to write.
+    """
+    first, _, rest = text.partition(":")
+    if first in cameras or first in lidars:
+        fault = parse_fault(rest)
+        if not isinstance(fault, OF_CAMERAS if first in cameras else OF_LIDARS):
+            kind = "camera" if first in cameras else "LiDAR"
+            raise UsageError(f"fault {text!r}: {rest.partition(':')[0]} is no fault of a {kind}")
+        return SensorFault(first, fault)
+    sensors = ", ".join((*cameras, *lidars))
+    if first not in KINDS:
+        raise UsageError(
+            f"fault {text!r}: there is no sensor and no fault {first!r}; write SENSOR:FAULT, for example "
+            f"{next(iter(cameras))}:step:40:ry=1, with one of the sensors {sensors} and the faults {FORMS}"
+        )
+    fault = parse_fault(text)
+    if not isinstance(fault, OF_ALL):
+        raise UsageError(f"fault {text!r}: of which sensor? Write SENSOR:{text} with one of {sensors}")
+    return SensorFault(None, fault)
+
+
 def _number(text: str, name: str, value: str) -> float:
     try:
         number = float(value)
@@ -206,6 +250,11 @@ def _number(text: str, name: str, value: str) -> float:
     if not math.isfinite(number):
         raise UsageError(f"fault {text!r}: {name} must be a number, not {value!r}; write for example {FORMS}")
     return number
+
+
+def now(faults: Iterable[Fault], kind: type[F], time_s: float) -> Iterator[F]:
+    """The faults of a kind that are so at a time."""
+    return (fault for fault in faults if isinstance(fault, kind) and fault.active(time_s))
 
 
 def shifted(T_camera_lidar: NDArray[np.float64], faults: tuple[Fault, ...], time_s: float) -> NDArray[np.float64]:

@@ -7,22 +7,48 @@ import os
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from typing import Protocol
 
-from coec.simulation.drive import DriveConfig, SimulatedDrive
 from coec.sources.recording import Message
 
 PART = 128
 """Messages per piece of work: about 2 s of a drive at the usual rates, some 45 MB of sweeps on their way."""
 
-_drive: SimulatedDrive | None = None
+
+class Drive(Protocol):
+    """What can be made in parts."""
+
+    @property
+    def message_count(self) -> int:
+        """How many `messages()` there are."""
+        ...
+
+    def messages(self) -> Iterator[Message]:
+        """In the order of their stamps."""
+        ...
+
+    def part(self, begin: int, end: int) -> list[Message]:
+        """Messages `begin` to `end` (excluded) of all."""
+        ...
 
 
-def messages_by(config: DriveConfig, processes: int) -> Iterator[Message]:
-    """The messages of the drive, the same to the byte and in the same order as from `SimulatedDrive.messages`.
+class Driven(Protocol):
+    """A configuration, which travels to other processes."""
+
+    def drive(self) -> Drive:
+        """Which it describes."""
+        ...
+
+
+_drive: Drive | None = None
+
+
+def messages_by(config: Driven, processes: int) -> Iterator[Message]:
+    """The messages of the drive, the same to the byte and in the same order as from its own `messages`.
 
     At most two pieces of work per process are under way or wait, whatever the length of the drive.
     """
-    whole = SimulatedDrive(config)
+    whole = config.drive()
     count = whole.message_count
     if processes == 1 or count <= PART:
         yield from whole.messages()
@@ -50,9 +76,9 @@ def messages_by(config: DriveConfig, processes: int) -> Iterator[Message]:
             os.environ["NUMBA_NUM_THREADS"] = before
 
 
-def _open(config: DriveConfig) -> None:
+def _open(config: Driven) -> None:
     global _drive  # one drive per process, as the pool's initializer gives it
-    _drive = SimulatedDrive(config)
+    _drive = config.drive()
 
 
 def _part(begin: int) -> list[Message]:

@@ -7,10 +7,11 @@ import math
 from typing import TYPE_CHECKING
 
 from coec.errors import SourceError, UsageError
-from coec.simulation.faults import parse_fault
+from coec.simulation.faults import parse_fault, parse_sensor_fault
 
 if TYPE_CHECKING:
     from coec.simulation.drive import SimulatedDrive
+    from coec.simulation.rig_drive import RigDrive, RigPair
 
 NUMBERS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**31 - 1),
@@ -52,20 +53,13 @@ def open_sim(query: dict[str, str]) -> SimulatedDrive:
     known = (*NUMBERS, *WORDS)
     if unknown := sorted(set(query) - set(known)):
         raise UsageError(f"unknown query key {', '.join(unknown)} of a simulated drive; known: {', '.join(known)}")
-    values: dict[str, object] = {key: _number(key, query[key]) for key in NUMBERS if key in query}
-    values |= {key: int(query[key]) for key in WHOLE if key in query}
-    values |= {key: query[key] for key in NAMES if key in query}
+    values = _values(query)
     if "faults" in query:
         values["faults"] = tuple(parse_fault(text) for text in query["faults"].split(";"))
     if "workshop" in query:
         values["workshop"] = _six(query["workshop"])
     if "intrinsics_off" in query:
         values["intrinsics_off"] = _three(query["intrinsics_off"])
-    for key in SWITCHES:
-        if key in query:
-            if query[key] not in ("yes", "no"):
-                raise UsageError(f"{key}={query[key]} of a simulated drive: write yes or no")
-            values[key] = query[key] == "yes"
     return SimulatedDrive(DriveConfig(**values))  # type: ignore[arg-type]  # checked key by key above
 
 
@@ -73,6 +67,77 @@ def require_extra() -> None:
     """Raises SourceError, which says what to install, where ray casting is not installed."""
     if importlib.util.find_spec("embreex") is None:
         raise SourceError("a simulated drive needs the optional extra `sim`: pip install 'coec[sim]'")
+
+
+RIG_KEYS = (
+    *("seed", "seconds", "camera_hz", "lidar_hz", "ego_hz", "start_m", "speed_mps"),
+    *("rig", "pair", "scene", "camera", "depth", "traffic", "faults", "workshop"),
+)
+"""Query keys of a rig; numbers as above."""
+
+
+def open_rig(query: dict[str, str]) -> RigDrive:
+    """The drive of `sim:rig=four-fisheyes&KEY=VALUE&...`; every other key may be left out, `pair` is not looked at.
+
+    `faults` are separated by `;`, those of a sensor begin with its name (see `faults.parse_sensor_fault`); `workshop`
+    is SENSOR:rx,ry,rz[,tx,ty,tz] in degrees and metres about the sensor's axes, separated by `;`.
+
+    Raises:
+        UsageError: an unknown key, or a value that does not fit; names the key.
+        SourceError: the optional extra is not installed.
+    """
+    require_extra()
+    from coec.simulation.rig_drive import RigConfig, RigDrive
+    from coec.simulation.rigs import RIGS
+
+    if unknown := sorted(set(query) - set(RIG_KEYS)):
+        raise UsageError(f"unknown query key {', '.join(unknown)} of a simulated rig; known: {', '.join(RIG_KEYS)}")
+    if query["rig"] not in RIGS:
+        raise UsageError(f"there is no rig {query['rig']!r}; choose one of {', '.join(RIGS)}")
+    layout = RIGS[query["rig"]]
+    values = _values({key: value for key, value in query.items() if key not in ("rig", "pair", "lidar")})
+    if not query.get("camera", "fisheye").startswith("fisheye"):
+        raise UsageError(f"camera={query['camera']}: this rig has fisheyes; write fisheye700 (any width)")
+    if "faults" in query:
+        cameras, lidars = ([sensor.name for sensor in kind] for kind in (layout.cameras, layout.lidars))
+        values["faults"] = tuple(parse_sensor_fault(text, cameras, lidars) for text in query["faults"].split(";"))
+    if "workshop" in query:
+        parts = [part.partition(":") for part in query["workshop"].split(";")]
+        if not all(colon for _, colon, _ in parts):
+            raise UsageError(f"workshop={query['workshop']} of a rig: of which sensor? Write roof:0,0,1;front:0,1,0")
+        values["workshop"] = tuple((sensor, _six(numbers)) for sensor, _, numbers in parts)
+    return RigDrive(RigConfig(layout, **values))  # type: ignore[arg-type]  # checked key by key above
+
+
+def open_pair_of_rig(query: dict[str, str]) -> RigPair:
+    """The recording of `sim:rig=...&pair=CAMERA-LIDAR&...`.
+
+    Raises:
+        UsageError, SourceError: as `open_rig`, and where the pair is not named or there is no such pair.
+    """
+    drive = open_rig(query)
+    pairs = [f"{camera}-{lidar}" for camera, lidar in drive.config.layout.pairs]
+    if query.get("pair") not in pairs:
+        raise UsageError(f"one pair of the rig is a recording: write pair=... with one of {', '.join(pairs)}")
+    camera, _, lidar = query["pair"].partition("-")
+    return drive.pair(camera, lidar)
+
+
+def _values(query: dict[str, str]) -> dict[str, object]:
+    """Numbers, names and switches of a query.
+
+    Raises:
+        UsageError: a value that does not fit; names the key.
+    """
+    values: dict[str, object] = {key: _number(key, query[key]) for key in NUMBERS if key in query}
+    values |= {key: int(query[key]) for key in WHOLE if key in query}
+    values |= {key: query[key] for key in NAMES if key in query}
+    for key in SWITCHES:
+        if key in query:
+            if query[key] not in ("yes", "no"):
+                raise UsageError(f"{key}={query[key]} of a simulated drive: write yes or no")
+            values[key] = query[key] == "yes"
+    return values
 
 
 def _number(key: str, text: str) -> float:

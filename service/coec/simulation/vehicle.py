@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,6 +163,32 @@ def body() -> Mesh:
         mirror = [[2.2, s * 0.9, 1.0], [2.2, s * 1.12, 1.0], [2.2, s * 1.12, 1.18], [2.2, s * 0.9, 1.18]]
         parts.append(quads([mirror], dark, Material.LACQUER))
     return join(parts)
+
+
+@lru_cache(maxsize=1)
+def whole_body() -> Mesh:
+    """The body from bumper to bumper in the ego frame, closed on all sides: what sensors all around have of their own
+    car."""
+    dark = (0.035, 0.03, 0.03)
+    # Along the middle: (x, half width, height) of the bonnet's nose, its end, the roof's front, its rear, the tail.
+    rails = [(3.5, 0.78, 0.72), (2.45, 0.86, 0.98), (1.75, 0.62, 1.5), (-0.3, 0.62, 1.5), (-0.85, 0.8, 0.95)]
+    belt = [(x, 0.9 if x < 3.0 else 0.8, min(z, 0.98)) for x, _, z in rails]
+    sill_m = 0.3
+    top = [[[x, -w, z], [x, w, z], [x2, w2, z2], [x2, -w2, z2]] for (x, w, z), (x2, w2, z2) in pairwise(rails)]
+    flanks = []
+    for s in (-1.0, 1.0):
+        for (upper, upper2), (lower, lower2) in zip(pairwise(rails), pairwise(belt), strict=True):
+            corners = [[x, s * w, z] for x, w, z in (upper, upper2, lower2, lower)]
+            sills = [[x, s * w, z] for x, w, z in (lower, lower2)]
+            flanks += [corners, [*sills, *([x, s * w, sill_m] for x, w, _ in (lower2, lower))]]
+    ends = [
+        [[x, -w, sill_m], [x, w, sill_m], [x, w2, z], [x, -w2, z]]
+        for x, w, w2, z in ((3.5, 0.8, 0.8, 0.72), (-0.85, 0.9, 0.9, 0.95))
+    ]
+    mirrors = [
+        [[2.2, s * 0.9, 1.0], [2.2, s * 1.1, 1.0], [2.2, s * 1.1, 1.16], [2.2, s * 0.9, 1.16]] for s in (-1.0, 1.0)
+    ]
+    return quads([*top, *flanks, *ends, *mirrors], dark, Material.LACQUER)
 
 
 def _swing(time_s: Doubles, size: float, hertz: tuple[float, float], phases: Doubles) -> Doubles:

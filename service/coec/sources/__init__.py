@@ -29,9 +29,9 @@ def open_source(spec: str) -> Recording:
 
             return open_kitti_raw(parsed)
         case "sim":
-            from coec.simulation.source import open_sim
+            from coec.simulation.source import open_pair_of_rig, open_sim
 
-            return open_sim(parsed.query)
+            return open_pair_of_rig(parsed.query) if "rig" in parsed.query else open_sim(parsed.query)
     return _open_path(parsed)
 
 

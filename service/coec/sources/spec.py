@@ -17,7 +17,8 @@ FORMS = """accepted forms of a source:
   kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
   kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
   FOLDER or dataset.yaml                        images and clouds listed in a manifest
-  sim:seed=1&seconds=60&camera=fisheye700&...   a seeded drive through a town that does not exist (extra `sim`)"""
+  sim:seed=1&seconds=60&camera=fisheye700&...   a seeded drive through a town that does not exist (extra `sim`)
+  sim:rig=four-fisheyes&pair=front-roof&...     one pair of a simulated rig"""
 
 LAYOUTS = ("kitti360", "kitti-raw", "sim")
 
@@ -66,6 +67,11 @@ def is_bag(spec: SourceSpec) -> bool:
     """Whether it is a bag of ROS 2, a recorded window among them: by the name of the file, or what the folder holds."""
     by_name = spec.path.suffix in (".mcap", ".db3") or (spec.path / "metadata.yaml").is_file()
     return spec.layout is None and by_name
+
+
+def is_rig(spec: SourceSpec) -> bool:
+    """Whether it is a whole simulated rig, and not one pair of it."""
+    return spec.layout == "sim" and "rig" in spec.query and "pair" not in spec.query
 
 
 def _parse_query(query: str, text: str) -> dict[str, str]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
 from coec import __version__
 from coec.adapters.ros import messages
-from coec.adapters.ros.topics import Frame, FrameTopics, PairTopics
+from coec.adapters.ros.topics import Frame, FrameTopics, PairTopics, TopicMessage
 from coec.calibration.types import Matrix4, Rig
 
 
@@ -36,17 +36,30 @@ def write_bag(
     Raises:
         OSError: the file cannot be written.
     """
+    told = FrameTopics(rig, T_camera_lidar, PairTopics.default(rig.pair))
+
+    def messages_of() -> Iterator[TopicMessage]:
+        for frame in frames:
+            yield from told.of(frame)
+            for topic, type_name, data in beside(frame):
+                yield TopicMessage(frame.stamp_ns, topic, type_name, data)
+            heard(frame)
+
+    write_messages(path, messages_of())
+
+
+def write_messages(path: Path, items: Iterable[TopicMessage]) -> None:
+    """Writes messages in their order.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.NONE, enable_data_crcs=True)
         writer.start(profile="ros2", library=f"coec/{__version__}")
         topics = _Topics(writer)
-        told = FrameTopics(rig, T_camera_lidar, PairTopics.default(rig.pair))
-        for frame in frames:
-            for message in told.of(frame):
-                topics.write(message.topic, message.type_name, message.stamp_ns, message.data)
-            for topic, type_name, data in beside(frame):
-                topics.write(topic, type_name, frame.stamp_ns, data)
-            heard(frame)
+        for message in items:
+            topics.write(message.topic, message.type_name, message.stamp_ns, message.data)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves the result open
 
 

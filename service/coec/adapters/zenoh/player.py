@@ -49,18 +49,43 @@ class Streams:
         """`sensors/<pair>/camera`, `lidar` and `ego`."""
         return cls(f"sensors/{pair}/camera", f"sensors/{pair}/lidar", f"sensors/{pair}/ego")
 
+    def keys(self) -> dict[str, str]:
+        """Keys by stream."""
+        named = {CAMERA: self.camera, LIDAR: self.lidar, EGO: self.ego}
+        return {stream: key for stream, key in named.items() if key is not None}
+
+    def stream_of(self, frame: Frame) -> str:
+        """By the kind of the frame."""
+        return stream_of(frame)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorKeys:
+    """A key for each sensor of a vehicle, by the frame of coordinates in which it speaks."""
+
+    sensors: tuple[str, ...]
+
+    def keys(self) -> dict[str, str]:
+        """`sensors/<sensor>`."""
+        return {sensor: f"sensors/{sensor}" for sensor in self.sensors}
+
+    def stream_of(self, frame: Frame) -> str:
+        """By the sensor."""
+        return frame.frame_id
+
 
 class Player:
-    """Publishes the frames of a pair. Senders wait rather than drop: what is lost is then lost by the receiver, which
-    counts it."""
+    """Publishes the frames of a pair, or of all sensors. Senders wait rather than drop: what is lost is then lost by
+    the receiver, which counts it."""
 
-    def __init__(self, session: zenoh.Session, streams: Streams, encoding: Literal["msgpack", "cdr"]) -> None:
+    def __init__(
+        self, session: zenoh.Session, streams: Streams | SensorKeys, encoding: Literal["msgpack", "cdr"]
+    ) -> None:
         self._encoding = encoding
-        keys = {CAMERA: streams.camera, LIDAR: streams.lidar, EGO: streams.ego}
+        self._stream_of = streams.stream_of
         self._publishers = {
             stream: session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
-            for stream, key in keys.items()
-            if key is not None
+            for stream, key in streams.keys().items()
         }
         self._sequence: Counter[str] = Counter()
         self.played = Played(Counter())
@@ -88,7 +113,7 @@ class Player:
         heard: Callable[[Frame, Played], None],
     ) -> Played:
         """Publishes every frame when it is due, see `paced`; the frames of a stream that has no key are left out."""
-        ours = (frame for frame in frames if stream_of(frame) in self._publishers)
+        ours = (frame for frame in frames if self._stream_of(frame) in self._publishers)
         return paced(ours, rate, stop, self._send, heard, self.played)
 
     def close(self) -> None:
@@ -97,7 +122,7 @@ class Player:
             publisher.undeclare()
 
     def _send(self, frame: Frame) -> tuple[str, int]:
-        stream = stream_of(frame)
+        stream = self._stream_of(frame)
         payload, encoding = self._encoded(stream, frame)
         self._publishers[stream].put(payload, encoding=encoding)
         return stream, len(payload)

@@ -1,0 +1,1 @@
+"""Libraries that search in clouds of points."""

@@ -1,0 +1,43 @@
+"""The nearest points of a cloud, by the k-d tree of small_gicp (Koide 2024, MIT): one thread, so that every call gives
+the same bits."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.errors import SourceError
+
+
+class Tree:
+    """A `calibration.ports.Neighbourhood`."""
+
+    def __init__(self, points_m: NDArray[np.float64]) -> None:
+        import small_gicp
+
+        self._tree = small_gicp.KdTree(points_m, num_threads=1)
+
+    def nearest(self, queries_m: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """See `Neighbourhood`."""
+        if not len(queries_m):
+            return np.empty((0, count), np.int64), np.empty((0, count))
+        found, squared = self._tree.batch_knn_search(queries_m, count, num_threads=1)
+        return np.asarray(found).astype(np.int64), np.asarray(squared, np.float64)
+
+
+class Trees:
+    """A `calibration.ports.NeighbourSearch`.
+
+    Raises:
+        SourceError: the optional extra is not installed; says what to install.
+    """
+
+    def __init__(self) -> None:
+        if importlib.util.find_spec("small_gicp") is None:
+            raise SourceError("LiDARs are registered with the optional extra `lidars`: pip install 'coec[lidars]'")
+
+    def over(self, points_m: NDArray[np.float64]) -> Tree:
+        """See `NeighbourSearch`."""
+        return Tree(points_m)

@@ -1,0 +1,82 @@
+"""Two sweeps as they would have been measured at one instant, that of the first one's stamp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.motion_compensation import sensor_twist
+from coec.calibration.lidar_to_lidar.types import LidarRig, SweepPair
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
+from coec.geometry import se3
+from coec.geometry.deskew import deskew
+from coec.geometry.vectors import lengths
+
+Doubles = NDArray[np.float64]
+
+THINNED_M = 0.3
+"""One point of b in every cube of this size: what is near would else count for everything."""
+NEAREST_M, FURTHEST_M = 0.5, 60.0
+"""Points of b that are used; further ones have no surfaces of a about them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points of both.
+
+    Attributes:
+        a_m: (N, 3) in the frame of a, at the instant.
+        raw_b_m: (M, 3) float32 in the frame of b, each at its own instant; thinned.
+        after_s: (M,) by how much that is later.
+        motion: of the vehicle at the instant; None where it is not known.
+        T_a_ego: (4, 4).
+    """
+
+    a_m: Doubles
+    raw_b_m: NDArray[np.float32]
+    after_s: Doubles
+    motion: EgoMotion | None
+    T_a_ego: Matrix4
+
+    def b_m(self, T_a_b: Matrix4) -> Doubles:
+        """(M, 3) in the frame of b at the instant, if b sits there: a LiDAR that is turned goes another way through
+        its own frame, 1.4 cm aside in 90 ms at 8 m/s and 1°."""
+        return _at(self.raw_b_m, self.after_s, self.motion, se3.inverse(T_a_b) @ self.T_a_ego)
+
+    @property
+    def twist(self) -> Doubles:
+        """(6,) of a in its own frame, rad/s and m/s; zero where it is not known."""
+        if self.motion is None:
+            return np.zeros(6)
+        return np.concatenate(sensor_twist(self.motion, self.T_a_ego))
+
+
+def clouds_of(rig: LidarRig, pair: SweepPair) -> Cloud:
+    """Motion-compensated by the time of each point; a sweep without such times, or without ego-motion, as it is."""
+    a, b = pair.a, pair.b
+    a_m = _at(np.ascontiguousarray(a.xyz_m), _offsets_s(a), pair.motion, rig.T_a_ego)
+    range_m = lengths(b.xyz_m)
+    used = np.flatnonzero((range_m > NEAREST_M) & (range_m < FURTHEST_M))
+    chosen = used[_first_of_each_cube(b.xyz_m[used])]
+    after_s = _offsets_s(b)[chosen] + (b.stamp_ns - a.stamp_ns) * 1e-9
+    return Cloud(a_m, np.ascontiguousarray(b.xyz_m[chosen]), after_s, pair.motion, rig.T_a_ego)
+
+
+def _offsets_s(sweep: LidarFrame) -> Doubles:
+    return np.zeros(len(sweep.xyz_m)) if sweep.time_offset_s is None else sweep.time_offset_s.astype(np.float64)
+
+
+def _at(xyz_m: NDArray[np.float32], after_s: Doubles, motion: EgoMotion | None, T_lidar_ego: Matrix4) -> Doubles:
+    if motion is None:
+        return xyz_m.astype(np.float64)
+    angular, linear = sensor_twist(motion, T_lidar_ego)
+    return deskew(xyz_m, after_s, angular, linear).astype(np.float64)
+
+
+def _first_of_each_cube(points_m: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Indices, ascending."""
+    cubes = np.floor(points_m / THINNED_M).astype(np.int64)
+    _, first = np.unique(cubes, axis=0, return_index=True)
+    return np.sort(first)

@@ -1,0 +1,86 @@
+"""What the registration of two LiDARs is given, and what it tells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarRig:
+    """Two LiDARs of one vehicle as they were mounted.
+
+    Attributes:
+        a, b: names; b is brought to a. The denser one should be a: its points make the surfaces.
+        T_a_b_nominal: (4, 4) maps coordinates of b to those of a.
+        T_a_ego: (4, 4) maps ego coordinates to those of a; carries ego-motion to both.
+    """
+
+    a: str
+    b: str
+    T_a_b_nominal: Matrix4
+    T_a_ego: Matrix4
+
+
+@dataclass(frozen=True, slots=True)
+class SweepPair:
+    """A sweep of each, near each other in time, and the ego-motion then; None where none is known."""
+
+    a: LidarFrame
+    b: LidarFrame
+    motion: EgoMotion | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeBias:
+    """By how much b measures longer than a, metres, with its standard deviation."""
+
+    longer_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarEdge:
+    """The pose of b in a.
+
+    Attributes:
+        rig: whose.
+        T_a_b: (4, 4).
+        correction: (6,) ξ with T_a_b = perturb(T_a_b_nominal, ξ): about the axes of a, rad and m.
+        covariance: (6, 6) of ξ; axes that the surroundings do not tell have the width of what is known before.
+        range_bias: a nuisance that is estimated along.
+        rms_m: distance of the points of b from the surfaces of a, of those that met one.
+        points: of b that met a surface of a, over all pairs.
+        share: of the points of b that were tried.
+        pairs: of sweeps.
+        reasons: why the result is not to be used; empty if it is.
+    """
+
+    rig: LidarRig
+    T_a_b: Matrix4
+    correction: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    range_bias: RangeBias
+    rms_m: float
+    points: int
+    share: float
+    pairs: int
+    reasons: tuple[Reason, ...]
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """(6,) standard deviations of the correction."""
+        return np.sqrt(self.covariance.diagonal())
+
+    @property
+    def chi2(self) -> float:
+        """Squared length of the correction in its standard deviations, 6 degrees of freedom: whether one of the two
+        has moved. NaN where the covariance is none."""
+        try:
+            return float(self.correction @ np.linalg.solve(self.covariance, self.correction))
+        except np.linalg.LinAlgError:
+            return float("nan")

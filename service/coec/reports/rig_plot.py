@@ -1,0 +1,218 @@
+"""A rig from above, as PNG bytes: where its sensors sit and look, what the pairs of them say, and who has moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import atan2, cos, degrees, hypot, isfinite, sin
+from types import MappingProxyType
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, FancyBboxPatch, Wedge
+
+from coec.calibration.types import Matrix4
+from coec.reports.plots import png
+
+STATE_COLOURS: Mapping[str, str] = MappingProxyType(
+    {
+        "calibrated": "tab:green",
+        "camera_moved": "tab:red",
+        "lidar_moved": "tab:red",
+        "undecided": "orange",
+        "unknown": "silver",
+    }
+)
+"""Health of a sensor; any other state is drawn as `unknown`."""
+MOVED = ("camera_moved", "lidar_moved")
+
+CERTAIN_SIGMAS = 6.0
+"""Colours of edges end here: a pair that far from its nominal, in its own standard deviations, has moved."""
+EDGES = "coolwarm"
+LENGTH_M, WIDTH_M, BEHIND_M = 4.6, 1.9, 0.95
+"""Of the outline of the vehicle, and how far it reaches behind the rear axle, where its frame is."""
+MARGIN_M = 1.3
+FAN_M = {"camera": 1.1, "lidar": 0.75}
+"""Radius of the fan of a field of view: it shows the direction, not the reach."""
+LABEL_M, LABEL_APART_M, LINE_M = 0.42, 0.62, 0.26
+"""How far from its sensor a name stands, how far names keep from each other, and the height of a line of text."""
+TRIES = 16
+"""Directions in which a name is tried, around its sensor."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorSeen:
+    """A sensor of the picture.
+
+    Attributes:
+        kind: `camera` or `lidar`.
+        T_ego_sensor: (4, 4) pose in the vehicle (x forward, y left); a camera looks along its z, a LiDAR along its x.
+        view_deg: width of its field of view, 360 of a LiDAR that turns.
+        state: of its health, see `STATE_COLOURS`.
+        probability: that it has moved; None where nobody can tell.
+        moved_deg: by how much, if it has.
+    """
+
+    name: str
+    kind: str
+    T_ego_sensor: Matrix4
+    view_deg: float
+    state: str
+    probability: float | None = None
+    moved_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeSeen:
+    """What a pair of sensors says: it is `deg` from where it was, give or take `sigma_deg`."""
+
+    a: str
+    b: str
+    deg: float
+    sigma_deg: float
+
+    @property
+    def sigmas(self) -> float:
+        """The evidence that something has moved; 0 where the pair cannot tell."""
+        told = isfinite(self.deg) and isfinite(self.sigma_deg) and self.sigma_deg > 0.0
+        return abs(self.deg) / self.sigma_deg if told else 0.0
+
+
+def rig_from_above(sensors: Sequence[SensorSeen], edges: Sequence[EdgeSeen], title: str) -> bytes:
+    """Ahead is up. An edge is the redder the surer its pair is that something has moved; the sensor that did is marked.
+
+    Raises:
+        ValueError: an edge to a sensor that is not there; names it.
+    """
+    places = {sensor.name: _place(sensor) for sensor in sensors}
+    if unknown := sorted({name for edge in edges for name in (edge.a, edge.b)} - set(places)):
+        raise ValueError(f"edges of sensors that the picture does not have: {', '.join(unknown)}")
+    figure = Figure(figsize=(8.4, 9.2), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots()
+    _frame(axes, list(places.values()))
+    colours = Normalize(0.0, CERTAIN_SIGMAS, clip=True)
+    scale = ScalarMappable(colours, EDGES)
+    for sensor in sensors:
+        _draw_view(axes, sensor)
+    for edge in sorted(edges, key=lambda edge: edge.sigmas):  # what is sure of a movement lies on top
+        (x, y), (x2, y2) = places[edge.a], places[edge.b]
+        colour = colormaps[EDGES](float(colours(edge.sigmas)))
+        axes.plot([x, x2], [y, y2], color=colour, linewidth=2.6, zorder=3, solid_capstyle="round")
+    for sensor in sensors:
+        _draw_sensor(axes, sensor)
+    _draw_labels(axes, sensors, list(places.values()))
+    figure.colorbar(scale, ax=axes, shrink=0.55, label="a pair's offset from its nominal, in its standard deviations")
+    seen = [state for state in STATE_COLOURS if any(_state(sensor) == state for sensor in sensors)]
+    handles = [_dot("o", STATE_COLOURS[state], state.replace("_", " ")) for state in seen]
+    handles += [_dot("^", "white", "camera"), _dot("o", "white", "LiDAR")]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    return png(figure)
+
+
+def words_of(sensor: SensorSeen) -> str:
+    """What stands beside a sensor."""
+    lines = [sensor.name]
+    if sensor.state in MOVED:
+        by = "" if sensor.moved_deg is None else f" by {sensor.moved_deg:.2g}°"
+        lines.append(f"moved{by}")
+    elif sensor.state != "calibrated":
+        lines.append(sensor.state.replace("_", " "))
+    if sensor.probability is not None and (sensor.state != "calibrated" or sensor.probability >= 0.005):
+        lines.append(_percent(sensor.probability))
+    return "\n".join(lines)
+
+
+def _percent(probability: float) -> str:
+    """Never 100 % or 0 % of what is not certain."""
+    if probability > 0.99:
+        return "> 99 %"
+    return "< 1 %" if probability < 0.01 else f"{100.0 * probability:.0f} %"
+
+
+def _place(sensor: SensorSeen) -> tuple[float, float]:
+    """On the page: ahead (x of the vehicle) is up, left (y) is left."""
+    return -float(sensor.T_ego_sensor[1, 3]), float(sensor.T_ego_sensor[0, 3])
+
+
+def _heading_rad(sensor: SensorSeen) -> float:
+    """On the page, from its right."""
+    ahead = sensor.T_ego_sensor[:3, 2 if sensor.kind == "camera" else 0]
+    return atan2(float(ahead[0]), -float(ahead[1]))
+
+
+def _state(sensor: SensorSeen) -> str:
+    return sensor.state if sensor.state in STATE_COLOURS else "unknown"
+
+
+def _frame(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
+    """The outline of the vehicle, and room for all."""
+    outline = FancyBboxPatch(
+        (-WIDTH_M / 2 + 0.3, -BEHIND_M + 0.3), WIDTH_M - 0.6, LENGTH_M - 0.6, boxstyle="round,pad=0.3",
+        facecolor="whitesmoke", edgecolor="grey", linewidth=1.2, zorder=0,
+    )  # fmt: skip
+    axes.add_patch(outline)
+    axes.annotate(
+        "", (0.0, LENGTH_M - BEHIND_M + 0.75), (0.0, LENGTH_M - BEHIND_M + 0.15),
+        arrowprops={"arrowstyle": "->", "color": "grey", "linewidth": 1.5},
+    )  # fmt: skip
+    x, y = ([place[axis] for place in places] for axis in (0, 1))
+    axes.set_xlim(min([-WIDTH_M / 2, *x]) - MARGIN_M, max([WIDTH_M / 2, *x]) + MARGIN_M)
+    axes.set_ylim(min([-BEHIND_M, *y]) - 0.7, max([LENGTH_M - BEHIND_M, *y]) + 0.9)
+    axes.set_aspect("equal")
+    axes.set_xlabel("to the right, m")
+    axes.set_ylabel("ahead of the rear axle, m")
+
+
+def _draw_view(axes: Axes, sensor: SensorSeen) -> None:
+    heading_deg, half_deg = degrees(_heading_rad(sensor)), min(sensor.view_deg, 360.0) / 2
+    fan = Wedge(
+        _place(sensor), FAN_M.get(sensor.kind, 0.75), heading_deg - half_deg, heading_deg + half_deg,
+        facecolor=STATE_COLOURS[_state(sensor)], alpha=0.13, linewidth=0, zorder=1,
+    )  # fmt: skip
+    axes.add_patch(fan)
+
+
+def _draw_sensor(axes: Axes, sensor: SensorSeen) -> None:
+    x, y = _place(sensor)
+    if sensor.state in MOVED:
+        axes.add_patch(Circle((x, y), 0.21, fill=False, edgecolor=STATE_COLOURS[sensor.state], linewidth=2.5, zorder=5))
+    # A triangle that points to where the camera looks; `None` leaves it to matplotlib to turn it.
+    marker = (3, 0, degrees(_heading_rad(sensor)) - 90.0) if sensor.kind == "camera" else "o"
+    axes.plot(
+        [x], [y], marker=marker, markersize=13.0, color=STATE_COLOURS[_state(sensor)], markeredgecolor="black", zorder=6
+    )
+
+
+def _draw_labels(axes: Axes, sensors: Sequence[SensorSeen], places: Sequence[tuple[float, float]]) -> None:
+    """Names beside their sensors, where nothing else stands; those that have most to say choose first."""
+    taken = list(places)
+    for number in sorted(range(len(sensors)), key=lambda number: -words_of(sensors[number]).count("\n")):
+        words = words_of(sensors[number])
+        at = _free(places[number], words, taken)
+        taken.append(at)
+        bold = "bold" if sensors[number].state in MOVED else "normal"
+        axes.text(*at, words, ha="center", va="center", fontsize=10, fontweight=bold, zorder=7)
+
+
+def _free(place: tuple[float, float], words: str, taken: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """The direction around a sensor in which its words are furthest from all others', outwards if it is all one."""
+    distance = LABEL_M + LINE_M * words.count("\n") / 2
+    best, room = place, -1.0
+    outwards = atan2(place[1] - (LENGTH_M / 2 - BEHIND_M), place[0]) if place[0] else 0.0
+    for step in range(TRIES):
+        angle = outwards + 2 * np.pi * step / TRIES
+        at = (place[0] + 1.3 * distance * cos(angle), place[1] + distance * sin(angle))
+        apart = min(hypot(at[0] - x, at[1] - y) for x, y in taken)
+        if apart > room + 1e-9 and room < LABEL_APART_M:
+            best, room = at, apart
+    return best
+
+
+def _dot(marker: str, colour: str, label: str) -> Line2D:
+    return Line2D([], [], linestyle="", marker=marker, color=colour, markeredgecolor="black", markersize=9, label=label)

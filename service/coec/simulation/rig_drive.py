@@ -1,0 +1,249 @@
+"""A drive of a vehicle with several cameras and LiDARs: one way through one scene, each sensor at its own stamps.
+
+Every frame follows from the seed, its sensor and its number alone. A pair of the rig is a recording as any other; the
+frames of all sensors together are made once, whatever number of pairs they serve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import Matrix4, Rig
+from coec.errors import UsageError
+from coec.geometry.cameras import Camera
+from coec.geometry.se3 import inverse, perturb
+from coec.simulation.aboard import Aboard, CameraAboard, LidarAboard, Mount, OdometerAboard, Optics, Wire, product
+from coec.simulation.drive import camera_of, check_rates, needed, stamps_of
+from coec.simulation.exposure import Lens
+from coec.simulation.faults import Fault, SensorFault, shifted
+from coec.simulation.journey import Journey
+from coec.simulation.rigs import FOUR_FISHEYES, RigLayout
+from coec.simulation.scene import Solid
+from coec.simulation.schedule import Arrival, arrivals, seconds_of
+from coec.simulation.vehicle import whole_body
+from coec.sources.recording import Message
+
+EGO = "ego"
+"""Name of the odometer's stream, and of the vehicle's frame."""
+
+Vector6 = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class RigConfig:
+    """What to drive: as `drive.DriveConfig`, for a rig.
+
+    Attributes:
+        camera: of every camera of the rig, `fisheyeW`.
+        faults: of a sensor, its own; a step or drift turns it about its own axes: T_sensor_ego becomes
+            exp(ξ)·T_sensor_ego.
+        workshop: by sensor, (6,) ξ, degrees and metres about its own axes, by which its nominal pose is wrong.
+    """
+
+    layout: RigLayout = FOUR_FISHEYES
+    seed: int = 0
+    scene: str = "street"
+    seconds: float = 60.0
+    camera: str = "fisheye700"
+    camera_hz: float = 10.0
+    lidar_hz: float = 10.0
+    ego_hz: float = 50.0
+    speed_mps: float | None = None
+    traffic: bool = True
+    start_m: float = 0.0
+    faults: tuple[SensorFault, ...] = ()
+    workshop: tuple[tuple[str, Vector6], ...] = ()
+    depth: bool = False
+    lens: Lens = field(default_factory=Lens)
+
+    def drive(self) -> RigDrive:
+        """Which it describes."""
+        return RigDrive(self)
+
+
+class RigDrive:
+    """The drive of a configuration.
+
+    Attributes:
+        config: as given.
+        cameras, lidars: names of the sensors.
+        camera: every camera's intrinsics.
+
+    Raises:
+        UsageError: a camera or a sensor that is not known, or figures out of range; names them.
+    """
+
+    def __init__(self, config: RigConfig) -> None:
+        check_rates(config)
+        layout = config.layout
+        self.config = config
+        self.cameras = tuple(sensor.name for sensor in layout.cameras)
+        self.lidars = tuple(sensor.name for sensor in layout.lidars)
+        self.camera: Camera = camera_of(config.camera, layout.half_view_deg)
+        named = {*(fault.sensor for fault in config.faults if fault.sensor is not None), *dict(config.workshop)}
+        if unknown := sorted(named - set(layout.names)):
+            raise UsageError(f"the rig has no sensor {', '.join(unknown)}; it has {', '.join(layout.names)}")
+        self._mounted = {sensor.name: inverse(sensor.T_ego_camera) for sensor in layout.cameras} | {
+            sensor.name: inverse(sensor.T_ego_lidar) for sensor in layout.lidars
+        }
+        common = tuple(fault.fault for fault in config.faults if fault.sensor is None)
+        self._faults = {
+            name: (*common, *(fault.fault for fault in config.faults if fault.sensor == name)) for name in layout.names
+        }
+        self._journey = Journey(
+            config.seed, config.scene, config.seconds,
+            speed_mps=config.speed_mps, start_m=config.start_m, traffic=config.traffic, faults=common,
+        )  # fmt: skip
+        self._body = Solid(whole_body())
+        self._order = (EGO, *self.lidars, *self.cameras)
+        self._eyes: dict[str, CameraAboard] = {}
+        self._streams: dict[str, Aboard] = {EGO: OdometerAboard(self._journey, Wire(EGO, config.ego_hz, 0, (), common))}
+        for lidar in layout.lidars:
+            self._streams[lidar.name] = LidarAboard(
+                self._journey, self._wire(lidar.name, config.lidar_hz), lidar.model, self._mount(lidar.name),
+                delay_s=lidar.phase / config.lidar_hz, own_body=self._body,
+            )  # fmt: skip
+        for camera in layout.cameras:
+            optics = Optics(
+                self.camera, layout.half_view_deg, camera.phase / config.camera_hz, depth=config.depth, lens=config.lens
+            )
+            self._eyes[camera.name] = CameraAboard(
+                self._journey, self._wire(camera.name, config.camera_hz), optics, self._mount(camera.name), self._body
+            )
+        self._streams |= self._eyes
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"simulated drive of a rig, seed {self.config.seed}"
+
+    @property
+    def message_count(self) -> int:
+        """How many `messages()` there are."""
+        return len(self.plan)
+
+    @cached_property
+    def plan(self) -> list[Arrival]:
+        """Everything that arrives, in the order of the stamps; streams: ego, LiDARs, cameras."""
+        return arrivals([self._streams[name] for name in self._order], self.config.seconds)
+
+    def messages(self) -> Iterator[Message]:
+        """All frames of all sensors in the order of their stamps; `frame_id` is the name of the sensor."""
+        for entry in self.plan:
+            yield self.message(entry)
+
+    def part(self, begin: int, end: int) -> list[Message]:
+        """Messages `begin` to `end` (excluded) of all, by their place in `messages()`: for several processes."""
+        return [self.message(entry) for entry in self.plan[begin:end]]
+
+    def message(self, entry: Arrival) -> Message:
+        """One of the plan."""
+        return self._streams[self._order[entry.stream]].frame(entry.number, entry.stamp_ns)
+
+    def stream(self, sensor: str) -> int:
+        """Of a sensor, or of `EGO`, in the plan."""
+        return self._order.index(sensor)
+
+    def T_sensor_ego(self, sensor: str, stamp_ns: int) -> Matrix4:
+        """(4, 4) truth at a time."""
+        return shifted(self._mounted[sensor], self._faults[sensor], seconds_of(stamp_ns))
+
+    def T_sensor_ego_nominal(self, sensor: str) -> Matrix4:
+        """(4, 4) as the workshop has it."""
+        xi = dict(self.config.workshop).get(sensor, (0.0,) * 6)
+        return perturb(self._mounted[sensor], np.array([*np.deg2rad(xi[:3]), *xi[3:]]))
+
+    def true_pose(self, stamp_ns: int) -> Matrix4:
+        """True T_world_ego (4, 4) at a time."""
+        return self._journey.pose(seconds_of(stamp_ns))
+
+    def mask(self, camera: str) -> NDArray[np.bool_]:
+        """(height, width): what a camera sees of the world where it was mounted."""
+        return self._eyes[camera].mask_at(inverse(self._mounted[camera]))
+
+    def pair(self, camera: str, lidar: str) -> RigPair:
+        """A camera and a LiDAR of the rig.
+
+        Raises:
+            UsageError: there is no such sensor.
+        """
+        for sensor, known, kind in ((camera, self.cameras, "camera"), (lidar, self.lidars, "LiDAR")):
+            if sensor not in known:
+                raise UsageError(f"the rig has no {kind} {sensor!r}; it has {', '.join(known)}")
+        return RigPair(self, camera, lidar)
+
+    def _wire(self, name: str, hz: float) -> Wire:
+        number = self._order.index(name)
+        return Wire(name, hz, number, (number,), self._faults[name])
+
+    def _mount(self, name: str) -> Mount:
+        faults: tuple[Fault, ...] = self._faults[name]
+        return lambda time_s: inverse(shifted(self._mounted[name], faults, time_s))
+
+
+class RigPair:
+    """A camera and a LiDAR of a rig: a `sources.recording.Recording`, whose truth is known.
+
+    Attributes:
+        rig: with the workshop's poses as nominal, and a mask of lens and body.
+        configuration: None, as for every recording that is not a window.
+    """
+
+    configuration = None
+
+    def __init__(self, drive: RigDrive, camera: str, lidar: str) -> None:
+        self._drive = drive
+        self._camera, self._lidar = camera, lidar
+        T_lidar_ego = drive.T_sensor_ego_nominal(lidar)
+        nominal = product(drive.T_sensor_ego_nominal(camera), inverse(T_lidar_ego))
+        pair = f"{camera}-{lidar}"
+        self.rig = Rig(pair, drive.camera, camera, lidar, nominal, T_lidar_ego, mask=drive.mask(camera))
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self._drive.name}, {self.rig.pair}"
+
+    @property
+    def T_camera_lidar_start(self) -> Matrix4:
+        """(4, 4) the workshop's."""
+        return self.rig.T_camera_lidar_nominal
+
+    @property
+    def camera_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the camera frames that arrive, ascending."""
+        return stamps_of(self._plan, self._drive.stream(self._camera))
+
+    @property
+    def sweep_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the sweeps that arrive, ascending."""
+        return stamps_of(self._plan, self._drive.stream(self._lidar))
+
+    @property
+    def motion_stamps_ns(self) -> tuple[int, ...]:
+        """Stamps of the ego-motion that arrives, ascending."""
+        return stamps_of(self._plan, self._drive.stream(EGO))
+
+    def truth(self, stamp_ns: int) -> Matrix4:
+        """True T_camera_lidar (4, 4) at a time."""
+        T_lidar_ego = self._drive.T_sensor_ego(self._lidar, stamp_ns)
+        return product(self._drive.T_sensor_ego(self._camera, stamp_ns), inverse(T_lidar_ego))
+
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Message]:
+        """See `Recording.messages`."""
+        of = self._drive.stream
+        chosen = self._plan
+        if cameras is not None:
+            chosen = list(needed(chosen, cameras, of(self._camera), of(self._lidar), of(EGO)))
+        for entry in chosen:
+            yield self._drive.message(entry)
+
+    @cached_property
+    def _plan(self) -> list[Arrival]:
+        ours = {self._drive.stream(name) for name in (self._camera, self._lidar, EGO)}
+        return [entry for entry in self._drive.plan if entry.stream in ours]

@@ -1,0 +1,216 @@
+"""The pose of one LiDAR in another: found, with a covariance that is honest where the surroundings do not tell it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.calibration.lidar_to_lidar.registration import register
+from coec.calibration.lidar_to_lidar.types import LidarEdge, LidarRig, SweepPair
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
+from coec.geometry import se3
+
+Doubles = NDArray[np.float64]
+
+T_A_EGO = se3.perturbation(np.array([0.02, -0.01, 0.3, -1.0, 0.2, -1.8]))
+T_A_B = se3.perturbation(np.array([0.05, -0.03, 1.4, 0.1, 0.9, -0.8]))
+NOISE_M = 0.02
+
+
+class BruteForce:
+    """Every distance, as slow as it is plain."""
+
+    def __init__(self, points_m: Doubles) -> None:
+        self._points_m = points_m
+
+    def nearest(self, queries_m: Doubles, count: int) -> tuple[NDArray[np.int64], Doubles]:
+        points = self._points_m
+        apart = (queries_m**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * queries_m @ points.T
+        found = np.argpartition(apart, count - 1, axis=1)[:, :count]
+        squared = np.take_along_axis(apart, found, axis=1)
+        order = np.argsort(squared, axis=1, kind="stable")
+        return np.take_along_axis(found, order, axis=1), np.take_along_axis(squared, order, axis=1)
+
+
+class Search:
+    """A `NeighbourSearch`."""
+
+    def over(self, points_m: Doubles) -> BruteForce:
+        return BruteForce(points_m)
+
+
+Shape = Callable[[np.random.Generator, int], Doubles]
+
+
+def room(rng: np.random.Generator, count: int) -> Doubles:
+    """Points on floor, two walls along x and one across, about the vehicle; world is the ego frame at the instant."""
+    part = rng.integers(0, 4, count)
+    x, y, z = rng.uniform(-4, 4, count), rng.uniform(-3, 3, count), rng.uniform(0, 2.5, count)
+    floor = np.column_stack([x, y, np.zeros(count)])
+    left = np.column_stack([x, np.full(count, 3.0), z])
+    right = np.column_stack([x, np.full(count, -3.0), z])
+    end = np.column_stack([np.full(count, 4.0), y, z])
+    return np.choose(part[:, None], [floor, left, right, end])
+
+
+def corridor(rng: np.random.Generator, count: int) -> Doubles:
+    """The same without the wall across: nothing tells how far along it anybody is."""
+    points = room(rng, count)
+    across = points[:, 0] == 4.0
+    points[across] = np.column_stack(
+        [rng.uniform(-4, 4, across.sum()), np.full(across.sum(), 3.0), rng.uniform(0, 2.5, across.sum())]
+    )
+    return points
+
+
+def sweep(
+    points_m: Doubles, T_lidar_ego: Matrix4, name: str, rng: np.random.Generator, *, longer_m: float = 0.0,
+    after_s: Doubles | None = None, motion: EgoMotion | None = None, stamp_ns: int = 0,
+) -> LidarFrame:  # fmt: skip
+    """Points (N, 3) of the ego frame at the instant 0, as a LiDAR measures them, each `after_s` later."""
+    local = points_m @ T_lidar_ego[:3, :3].T + T_lidar_ego[:3, 3]
+    if after_s is not None and motion is not None:
+        assert motion.linear_mps is not None
+        twist = np.array([*motion.angular_radps, *motion.linear_mps])
+        for i, seconds in enumerate(after_s):
+            ego = se3.inverse(se3.exp(twist * seconds))
+            local[i] = (T_lidar_ego @ ego @ np.array([*points_m[i], 1.0]))[:3]
+    range_m = np.linalg.norm(local, axis=1, keepdims=True)
+    local *= (range_m + longer_m + rng.normal(0, NOISE_M, range_m.shape)) / range_m
+    offsets = None if after_s is None else (after_s - stamp_ns * 1e-9).astype(np.float32)
+    return LidarFrame(stamp_ns, name, local.astype(np.float32), time_offset_s=offsets)
+
+
+def drive(shape: Shape, seed: int, *, pairs: int = 3, longer_m: float = 0.0, count: int = 2200) -> list[SweepPair]:
+    result = []
+    for number in range(pairs):
+        rng = np.random.default_rng([seed, number])
+        a = sweep(shape(rng, count), T_A_EGO, "a", rng)
+        b = sweep(shape(rng, count // 3), se3.inverse(T_A_B) @ T_A_EGO, "b", rng, longer_m=longer_m)
+        result.append(SweepPair(a, b, None))
+    return result
+
+
+def edge(pairs: list[SweepPair], off: Doubles) -> LidarEdge:
+    """Registered from a nominal pose that is wrong by ξ `off` (6,)."""
+    return register(LidarRig("a", "b", se3.perturb(T_A_B, off), T_A_EGO), pairs, Search())
+
+
+def error(found: LidarEdge) -> Doubles:
+    return se3.difference(found.T_a_b, T_A_B)
+
+
+KNOCK = np.array([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.0, 0.0])
+FAR = np.array([0.03, -0.02, 0.04, 0.1, -0.08, 0.06])
+
+
+@lru_cache(maxsize=1)
+def in_a_room() -> LidarEdge:
+    return edge(drive(room, 1), FAR)
+
+
+def test_the_pose_is_found_from_two_degrees_and_ten_centimetres_away() -> None:
+    found = in_a_room()
+    assert not found.reasons
+    assert np.rad2deg(np.abs(error(found)[:3])).max() < 0.06
+    assert np.abs(error(found)[3:]).max() < 0.01
+    assert np.abs(error(found) / found.sigma).max() < 3.5
+    assert found.rms_m == pytest.approx(NOISE_M, rel=0.3)
+    np.testing.assert_allclose(found.correction, se3.difference(found.T_a_b, found.rig.T_a_b_nominal))
+
+
+def test_a_knock_of_one_degree_is_the_correction_and_its_absence_is_none() -> None:
+    pairs = drive(room, 2, pairs=2)
+    knocked, calm = edge(pairs, KNOCK), edge(pairs, np.zeros(6))
+    assert np.rad2deg(knocked.correction[2]) == pytest.approx(-1.0, abs=0.1)
+    assert knocked.chi2 > 200.0
+    assert calm.chi2 < 30.0
+
+
+def test_moving_b_by_s_moves_its_pose_by_the_inverse() -> None:
+    shift = se3.perturbation(np.array([0.2, -0.1, 0.4, 0.5, -0.3, 0.2]))
+    pairs = drive(room, 3, pairs=1)
+    moved = [
+        SweepPair(
+            p.a, LidarFrame(p.b.stamp_ns, "b", (p.b.xyz_m @ shift[:3, :3].T + shift[:3, 3]).astype(np.float32)), None
+        )
+        for p in pairs
+    ]
+    before = register(LidarRig("a", "b", T_A_B, T_A_EGO), pairs, Search())
+    after = register(LidarRig("a", "b", T_A_B @ se3.inverse(shift), T_A_EGO), moved, Search())
+    # Another choice of points, one in every cube, is another draw of the noise.
+    apart = se3.difference(after.T_a_b @ shift, before.T_a_b)
+    assert np.rad2deg(np.abs(apart[:3])).max() < 0.1
+    assert np.abs(apart[3:]).max() < 0.015
+
+
+def test_along_a_corridor_nothing_is_claimed() -> None:
+    """Normals that scatter must not pass for a wall across."""
+    along, up = T_A_EGO[:3, 0], T_A_EGO[:3, 2]
+    found = edge(drive(corridor, 4), np.concatenate([np.zeros(3), 0.2 * along]))
+    sigma_m = float(np.sqrt(along @ found.covariance[3:, 3:] @ along))
+    assert sigma_m > 0.1
+    assert abs(error(found)[3:] @ along) < 3.0 * sigma_m
+    for axis in (np.cross(along, up), up):
+        assert float(np.sqrt(axis @ found.covariance[3:, 3:] @ axis)) < 0.03
+    held = in_a_room()
+    assert float(np.sqrt(along @ held.covariance[3:, 3:] @ along)) < 0.03
+
+
+def test_a_range_bias_is_told_and_does_not_bend_the_pose() -> None:
+    found = edge(drive(room, 5, longer_m=0.05), np.zeros(6))
+    assert found.range_bias.longer_m == pytest.approx(0.05, abs=3.5 * found.range_bias.sigma_m)
+    assert found.range_bias.sigma_m < 0.015
+    assert np.abs(error(found)[3:]).max() < 0.02
+
+
+def test_the_same_view_again_is_no_further_evidence() -> None:
+    once = drive(room, 6, pairs=1)
+    again, alone = edge(once * 6, np.zeros(6)), edge(once, np.zeros(6))
+    assert (again.sigma / alone.sigma).min() > 0.7
+
+
+def test_sweeps_are_brought_to_one_instant_through_the_mount_that_is_found() -> None:
+    """b is 40 ms later and turned by 2° from where it was mounted: taken through its nominal mount, its points would
+    lie 2 cm aside."""
+    motion = EgoMotion(0, "ego", (15.0, 0.0, 0.0), (0.0, 0.0, 0.3))
+    pairs = []
+    for number in range(2):
+        rng = np.random.default_rng([7, number])
+        late = 0.04 + rng.uniform(-0.05, 0.05, 900)
+        a = sweep(room(rng, 2500), T_A_EGO, "a", rng)
+        b = sweep(
+            room(rng, 900), se3.inverse(T_A_B) @ T_A_EGO, "b", rng, after_s=late, motion=motion, stamp_ns=40_000_000
+        )
+        pairs.append(SweepPair(a, b, motion))
+    found = edge(pairs, 2.0 * KNOCK)
+    assert np.rad2deg(np.abs(error(found)[:3])).max() < 0.12
+    assert np.abs(error(found)[3:]).max() < 0.012
+
+
+def test_what_sees_nothing_in_common_is_refused_in_words() -> None:
+    far = [SweepPair(p.a, LidarFrame(0, "b", p.b.xyz_m + np.float32(100.0)), None) for p in drive(room, 8, pairs=1)]
+    found = edge(far, np.zeros(6))
+    assert [reason.code for reason in found.reasons] == ["lidar_overlap"]
+    assert "too little in view in common" in found.reasons[0].text
+    assert found.sigma[0] > np.deg2rad(5.0)
+    with pytest.raises(ValueError, match="no sweep"):
+        edge([], np.zeros(6))
+
+
+def test_points_that_lie_anywhere_do_not_pull() -> None:
+    """A third of b is of things that a does not see."""
+    pairs = []
+    for number, pair in enumerate(drive(room, 9, pairs=2)):
+        rng = np.random.default_rng([10, number])
+        xyz = pair.b.xyz_m.copy()
+        wrong = rng.random(len(xyz)) < 0.33
+        xyz[wrong] *= rng.uniform(0.5, 0.95, (wrong.sum(), 1)).astype(np.float32)
+        pairs.append(SweepPair(pair.a, LidarFrame(0, "b", xyz), None))
+    found = edge(pairs, FAR)
+    assert np.rad2deg(np.abs(error(found)[:3])).max() < 0.15
+    assert np.abs(error(found)[3:]).max() < 0.02
