@@ -35,9 +35,10 @@ from coec.calibration.types import (
     Uncertainty,
     Verdict,
 )
-from coec.config import AuthorityConfig, CalibrationConfig, Config, LimitsConfig
+from coec.config import AuthorityConfig, BudgetConfig, CalibrationConfig, Config, LimitsConfig
 from coec.geometry import se3
 from coec.runtime import pair as runtime_pair
+from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.inbox import Call
@@ -283,9 +284,12 @@ class Bench:
         worker: type[KnowingWorker] = KnowingWorker,
         vehicle: str = "test",
         authority: AuthorityConfig | None = None,
+        cores: float = 0.5,
     ) -> None:
         config = configuration(folder, apply, vehicle)
-        self.config = config.model_copy(update={"authority": authority or config.authority})
+        self.config = config.model_copy(
+            update={"authority": authority or config.authority, "budget": BudgetConfig(cores=cores)}
+        )
         self.kind = worker
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
@@ -293,6 +297,7 @@ class Bench:
 
     def restart(self) -> None:
         windows = WindowStore(self.folder / "windows", self.config.state)
+        self.budget = Budget(self.config.budget, lambda: 0.0)
         self.worker = self.kind()
         store = StateStore(self.folder, self.config.vehicle)
         self.published: list[str] = []
@@ -303,6 +308,7 @@ class Bench:
             InstantScribe(self.folder),
             windows,
             cast("Worker", self.worker),
+            self.budget,
             lambda key, _: self.published.append(key),
             lambda: (),
             lambda pair, _drawn, _pose: self.shown.append(pair.name),

@@ -308,12 +308,16 @@ class PairingConfig(Stage):
     )
 
 
+MAX_SLICE_S = 3600.0
+"""Longest slice, s: within an hour, light and weather are those of one drive."""
+
+
 class WindowConfig(Stage):
     """How a window is chosen from the stream (the paper: 25 pairs over three minutes)."""
 
     pairs: int = Field(default=25, ge=1, le=400)
     min_pairs: int = Field(default=10, ge=1, le=400, description="a slice that ends with fewer makes no window")
-    slice_s: float = Field(default=180.0, gt=0, le=3600)
+    slice_s: float = Field(default=180.0, gt=0, le=MAX_SLICE_S)
     require_motion: bool = Field(default=True, description="skip pairs taken while the vehicle is known to stand")
     min_speed_mps: float = Field(default=0.5, ge=0, description="slower counts as standing")
     min_sharpness: float = Field(
@@ -598,6 +602,19 @@ class StateConfig(Stage):
     evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
 
 
+class BudgetConfig(Stage):
+    """What the pairs may spend of the processor between them. Where it does not suffice for every check and every
+    window, their periods stretch evenly, and `status` says by how much."""
+
+    cores: float = Field(
+        default=0.5,
+        gt=0,
+        le=64,
+        description="processor time of the worker in a second of driving, s: a replay at ten times the pace of the "
+        "drive spends ten times as much, and is checked as often",
+    )
+
+
 class WorkerConfig(Stage):
     """The process that infers and solves."""
 
@@ -764,6 +781,7 @@ class Config(Stage):
     authority: AuthorityConfig = AuthorityConfig()
     state: StateConfig = StateConfig()
     worker: WorkerConfig = WorkerConfig()
+    budget: BudgetConfig = BudgetConfig()
     limits: LimitsConfig = LimitsConfig()
     stale_after_s: float = Field(
         default=600.0, gt=0, description="age of the last completed check at which a pair is called stale, s"

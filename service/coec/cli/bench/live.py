@@ -4,13 +4,9 @@ worker solves. Real processes: the daemon (which is the router, too), the sensor
 
 from __future__ import annotations
 
-import json
-import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,8 +15,8 @@ import numpy as np
 import zenoh
 
 from coec.adapters.files.rig import intrinsics_config
-from coec.adapters.zenoh.client import ConnectionFailedError, ask_one, connected
-from coec.cli.bench import load, scene
+from coec.adapters.zenoh.client import ask_one, connected
+from coec.cli.bench import daemons, load, scene
 from coec.cli.bench.process import ProcessReading
 from coec.config import (
     CalibrationConfig,
@@ -35,8 +31,6 @@ from coec.config import (
     WindowConfig,
     ZenohConfig,
 )
-from coec.errors import NotFoundError
-from coec.runtime.worker.child import PACKAGE_ROOT
 from coec.schemas.keys import Keys
 
 VEHICLE, PAIR = "bench", "front"
@@ -47,12 +41,7 @@ SETTLE_S, SECONDS = 10.0, 25.0
 SLICE_S = 20.0
 """25 pairs in so much time, nine times the default: the recorder, too, is at work all the while."""
 
-SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(*sys.argv[1:]))"
-
 QUERY_PERIOD_S, COMMAND_PERIOD_S = 0.05, 0.5
-POLL_S, TIMEOUT_S = 0.1, 60.0
-"""Between two questions whether the daemon runs: before it does, it can tell nobody."""
-
 BUSY_SHARE = 0.5
 """Of a period between two queries: the worker is solving when it used more processor time."""
 
@@ -94,18 +83,18 @@ def _loaded(
 ) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
     """A daemon that has been under load for a while, as `form` of `load.SENDERS` sends it, and who may ask it."""
     heard(f"the daemon starts, {form}")
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{daemons.free_port()}"
     configuration = folder / f"{form}.yaml"
     # JSON is YAML.
     config = _configuration(endpoint, folder / form, form, window)
     configuration.write_text(config.model_dump_json(exclude_none=True))
     with (
-        _running("-m", "coec", "run", "--config", str(configuration)) as daemon,
-        connected([endpoint], TIMEOUT_S) as session,
-        _running("-c", SENSORS, endpoint, form),
+        daemons.running("-m", "coec", "run", "--config", str(configuration)) as daemon,
+        connected([endpoint], daemons.TIMEOUT_S) as session,
+        daemons.running("-c", daemons.SENSORS, endpoint, form),
     ):
         heard(f"the daemon under load, {form}")
-        _await_running(session, KEYS)
+        daemons.await_running(session, KEYS)
         process = ProcessReading(daemon.pid)
         _ask(session, KEYS, process, SETTLE_S, at_work=False)
         yield session, process
@@ -147,7 +136,7 @@ def _ask(session: zenoh.Session, keys: Keys, process: ProcessReading, seconds: f
     while (now_s := time.monotonic()) < end_s:
         worker_s = worker.cpu_s
         begin_s = time.perf_counter()
-        ask_one(session, keys.extrinsic(PAIR), TIMEOUT_S)
+        ask_one(session, keys.extrinsic(PAIR), daemons.TIMEOUT_S)
         elapsed_s = time.perf_counter() - begin_s
         # The pace of the questions is part of what is measured.
         time.sleep(max(QUERY_PERIOD_S - (time.monotonic() - now_s), 0.0))
@@ -159,19 +148,9 @@ def _ask(session: zenoh.Session, keys: Keys, process: ProcessReading, seconds: f
     return seen
 
 
-def _await_running(session: zenoh.Session, keys: Keys) -> None:
-    end_s = time.monotonic() + TIMEOUT_S
-    while time.monotonic() < end_s:
-        with suppress(NotFoundError):  # the router is there before the service
-            if _status(session, keys)["state"] == "running":
-                return
-        time.sleep(POLL_S)
-    raise ConnectionFailedError(f"the daemon of the benchmark did not become ready within {TIMEOUT_S:g} s")
-
-
 def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
     """What came and what became of it, since the start."""
-    pair = _status(session, keys)["pairs"][0]
+    pair = daemons.status(session, keys)["pairs"][0]
     streams = {f"{name}s": pair[name]["accepted"] for name in ("camera", "lidar")}
     return {
         **streams,
@@ -180,11 +159,6 @@ def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
         "solved": pair["solved"],
         "checks": pair["checks"],
     }
-
-
-def _status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(ask_one(session, keys.status + "?format=json", TIMEOUT_S).payload)
-    return document
 
 
 def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig) -> Config:
@@ -208,23 +182,3 @@ def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig) 
         log=LogConfig(level="error"),
         pairs=(pair,),
     )
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-@contextmanager
-def _running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A Python process of ours, asked to end at the end."""
-    process = subprocess.Popen(
-        [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=PACKAGE_ROOT
-    )
-    try:
-        yield process
-    finally:
-        process.terminate()
-        process.communicate(timeout=TIMEOUT_S)

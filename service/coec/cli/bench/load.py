@@ -8,8 +8,8 @@ import itertools
 import select
 import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import zenoh
 
@@ -25,7 +25,10 @@ from coec.cli.bench import scene
 Frame = CameraFrame | LidarFrame | EgoMotion
 
 CAMERA_HZ, SWEEP_EVERY = 30.0, 3
-"""Images a second, and of how many images each has a sweep: 10 sweeps a second."""
+"""Images a second of one camera, and of how many images each has a sweep: 10 sweeps a second."""
+
+RIG = ("front", "left", "rear", "right")
+"""Cameras of a vehicle that sees all around: each as often as there are sweeps, all at a time."""
 
 ROOMS = 7
 """Different frames that are sent in turn: a camera that sends one and the same would look frozen."""
@@ -37,32 +40,60 @@ TOPICS = {"camera": "/bench/camera/compressed", "lidar": "/bench/points", "ego":
 KEYS = {"camera": "bench/camera", "lidar": "bench/lidar", "ego": "bench/ego"}
 
 
-def main(endpoint: str, form: str) -> int:
-    """Publishes until standard input ends; always 0. `form` is one of `SENDERS`."""
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """A set of sensors: what sends a frame of theirs, how often there are images, of how many each has a sweep."""
+
+    sender: Callable[[zenoh.Session], Callable[[Frame], None]]
+    camera_hz: float
+    sweep_every: int
+
+
+def main(endpoint: str, form: str, pace: str = "1") -> int:
+    """Publishes until standard input ends; always 0. `form` is one of `FORMS`; `pace`: seconds of driving in a second,
+    by which stamps and frames come."""
+    sensors = FORMS[form]
     pairs = [scene.pair(scene.CAMERAS[CAMERA], seed, 0) for seed in range(ROOMS)]
     with connected([endpoint], CONNECT_S) as session:
-        send = SENDERS[form](session)
-        begin_s = time.monotonic()
+        send = sensors.sender(session)
+        begin_s, begin_ns = time.monotonic(), time.time_ns()
         for count in itertools.count():
-            if _ended(begin_s + count / CAMERA_HZ - time.monotonic()):
+            drive_s = count / sensors.camera_hz
+            if _ended(begin_s + drive_s / float(pace) - time.monotonic()):
                 return 0
-            room, stamp_ns = pairs[count % ROOMS], time.time_ns()
+            room, stamp_ns = pairs[count % ROOMS], begin_ns + round(1e9 * drive_s)
             send(EgoMotion(stamp_ns, "ego", (SPEED_MPS, 0.0, 0.0), (0.0, 0.0, 0.0), count))
             send(replace(room.camera, stamp_ns=stamp_ns, sequence=count))
-            if count % SWEEP_EVERY == 0:
-                send(replace(room.lidar, stamp_ns=stamp_ns, sequence=count // SWEEP_EVERY))
+            if count % sensors.sweep_every == 0:
+                send(replace(room.lidar, stamp_ns=stamp_ns, sequence=count // sensors.sweep_every))
     return 0
+
+
+def camera_key(name: str) -> str:
+    """Of a camera of `RIG`."""
+    return f"{KEYS['camera']}/{name}"
 
 
 def _native(session: zenoh.Session) -> Callable[[Frame], None]:
     """Native frames on `KEYS`."""
+    return _on_keys(session, (KEYS["camera"],))
+
+
+def _rig(session: zenoh.Session) -> Callable[[Frame], None]:
+    """The same with the images on the key of every camera of `RIG`."""
+    return _on_keys(session, [camera_key(name) for name in RIG])
+
+
+def _on_keys(session: zenoh.Session, cameras: Sequence[str]) -> Callable[[Frame], None]:
     encoding = zenoh.Encoding("application/msgpack")
-    streams = {name: session.declare_publisher(key, encoding=encoding) for name, key in KEYS.items()}
+    streams = {name: session.declare_publisher(KEYS[name], encoding=encoding) for name in ("lidar", "ego")}
+    images = [session.declare_publisher(key, encoding=encoding) for key in cameras]
 
     def send(frame: Frame) -> None:
         match frame:
             case CameraFrame():
-                streams["camera"].put(encode_camera(frame))
+                for stream in images:
+                    stream.put(encode_camera(frame))
             case LidarFrame():
                 streams["lidar"].put(encode_lidar(frame))
             case EgoMotion():
@@ -90,8 +121,12 @@ def _ros(session: zenoh.Session) -> Callable[[Frame], None]:
     return send
 
 
-SENDERS: Mapping[str, Callable[[zenoh.Session], Callable[[Frame], None]]] = {"native": _native, "ros": _ros}
-"""By the form in which frames are sent."""
+FORMS: Mapping[str, Sensors] = {
+    "native": Sensors(_native, CAMERA_HZ, SWEEP_EVERY),
+    "ros": Sensors(_ros, CAMERA_HZ, SWEEP_EVERY),
+    "rig": Sensors(_rig, CAMERA_HZ / SWEEP_EVERY, 1),
+}
+"""Sensors of one pair that send native frames or are nodes of ROS, and those of a rig."""
 
 
 def _ended(wait_s: float) -> bool:
