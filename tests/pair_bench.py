@@ -46,6 +46,7 @@ from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import RecordingPlan
 from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.worker.costs import Cost, cost_of
 from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutcome, Kind, Solved
 from coec.runtime.worker.messages import unpack_pairs
 from coec.runtime.worker.supervisor import Worker
@@ -119,7 +120,8 @@ RIG = rig_of(configuration(Path("state")).pairs[0])
 
 @dataclass
 class KnowingWorker:
-    """Answers at once, and rightly."""
+    """Answers at once, and rightly. `cost_s`: processor time that work of a kind takes, for which `pay` is told;
+    `checked` are the stamps of the pairs of each check."""
 
     cause: str | None = None
     baseline_not_used: str | None = None
@@ -127,8 +129,13 @@ class KnowingWorker:
     window_fault: Reason | None = None
     bias: Matrix4 = field(default_factory=lambda: np.eye(4))
     estimates: dict[str, Estimate] = field(default_factory=dict)
+    cost_s: dict[Kind, float] = field(default_factory=dict)
+    pay: Callable[[Cost], None] = lambda _: None
+    checked: list[tuple[int, ...]] = field(default_factory=list)
 
     def ask(self, job: Job) -> None:
+        if job.kind in self.cost_s:
+            self.pay(cost_of(job, self.cost_s[job.kind]))
         ways: dict[Kind, Callable[[Job], Answer]] = {
             Kind.CHECK: self._check,
             Kind.SOLVE: self._solve,
@@ -146,6 +153,7 @@ class KnowingWorker:
 
     def _check(self, job: Job) -> Checked:
         pairs = unpack_pairs(job.body["frames"], LimitsConfig())
+        self.checked.append(tuple(pair.stamp_ns for pair in pairs))
         wrong = [se3.difference(np.array(job.body["pose"]), truth(pair.stamp_ns)) for pair in pairs]
         offset = np.mean(wrong, axis=0)
         observation = Observation(
@@ -299,6 +307,7 @@ class Bench:
         windows = WindowStore(self.folder / "windows", self.config.state)
         self.budget = Budget(self.config.budget, lambda: 0.0)
         self.worker = self.kind()
+        self.worker.pay = self.budget.pay
         store = StateStore(self.folder, self.config.vehicle)
         self.published: list[str] = []
         self.shown: list[str] = []

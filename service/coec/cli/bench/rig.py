@@ -31,6 +31,7 @@ from coec.config import (
     WindowConfig,
     ZenohConfig,
 )
+from coec.runtime.worker import jobs
 from coec.schemas.keys import Keys
 
 VEHICLE = "bench-rig"
@@ -44,6 +45,9 @@ SECONDS = WindowConfig().slice_s
 
 LOOK_S = 1.0
 """Of driving, between two looks at how old the latest check of each pair is."""
+
+KINDS = (jobs.Kind.CHECK.value, jobs.Kind.SOLVE.value, jobs.PREFETCH)
+"""What the worker does for the stream."""
 
 PACE = 1.0
 """Seconds of driving in a second. Every figure is by the second of driving: a machine that is busy with something else
@@ -90,11 +94,18 @@ def _figures(session: zenoh.Session, service: ProcessReading) -> dict[str, Any]:
         "rig_cpu_percent": io_percent + worker_percent,
         "rig_io_cpu_percent": io_percent,
         "rig_worker_cpu_percent": worker_percent,
+        "rig_worker_s": {kind: 60.0 * (_spent_s(after, kind) - _spent_s(before, kind)) / elapsed_s for kind in KINDS},
         "rig_unseen_s": max(unseen_s.values()),
         "rig_done": {name: _done(after, name) - _done(before, name) for name in ("checks", "solved")},
         "rig_resident_mb": service.resident_mb,
         "rig_health": {name: daemons.answered(session, KEYS.health(name))["state"] for name in load.RIG},
     }
+
+
+def _spent_s(status: dict[str, Any], kind: str) -> float:
+    """What the worker has taken for work of a kind, s."""
+    taken_s: float = status["budget"]["spent_s"].get(kind, 0.0)
+    return taken_s
 
 
 def _done(status: dict[str, Any], what: str) -> int:
