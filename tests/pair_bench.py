@@ -35,9 +35,10 @@ from coec.calibration.types import (
     Uncertainty,
     Verdict,
 )
-from coec.config import AuthorityConfig, CalibrationConfig, Config, LimitsConfig
+from coec.config import AuthorityConfig, BudgetConfig, CalibrationConfig, Config, LimitsConfig
 from coec.geometry import se3
 from coec.runtime import pair as runtime_pair
+from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.inbox import Call
@@ -46,6 +47,7 @@ from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import RecordingPlan
 from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.worker.costs import Cost, cost_of
 from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutcome, Kind, Solved
 from coec.runtime.worker.messages import unpack_pairs
 from coec.runtime.worker.supervisor import Worker
@@ -119,7 +121,8 @@ RIG = rig_of(configuration(Path("state")).pairs[0])
 
 @dataclass
 class KnowingWorker:
-    """Answers at once, and rightly."""
+    """Answers at once, and rightly. `cost_s`: processor time that work of a kind takes, for which `pay` is told;
+    `checked` are the stamps of the pairs of each check."""
 
     cause: str | None = None
     baseline_not_used: str | None = None
@@ -127,8 +130,13 @@ class KnowingWorker:
     window_fault: Reason | None = None
     bias: Matrix4 = field(default_factory=lambda: np.eye(4))
     estimates: dict[str, Estimate] = field(default_factory=dict)
+    cost_s: dict[Kind, float] = field(default_factory=dict)
+    pay: Callable[[Cost], None] = lambda _: None
+    checked: list[tuple[int, ...]] = field(default_factory=list)
 
     def ask(self, job: Job) -> None:
+        if job.kind in self.cost_s:
+            self.pay(cost_of(job, self.cost_s[job.kind]))
         ways: dict[Kind, Callable[[Job], Answer]] = {
             Kind.CHECK: self._check,
             Kind.SOLVE: self._solve,
@@ -146,6 +154,7 @@ class KnowingWorker:
 
     def _check(self, job: Job) -> Checked:
         pairs = unpack_pairs(job.body["frames"], LimitsConfig())
+        self.checked.append(tuple(pair.stamp_ns for pair in pairs))
         wrong = [se3.difference(np.array(job.body["pose"]), truth(pair.stamp_ns)) for pair in pairs]
         offset = np.mean(wrong, axis=0)
         observation = Observation(
@@ -284,9 +293,12 @@ class Bench:
         worker: type[KnowingWorker] = KnowingWorker,
         vehicle: str = "test",
         authority: AuthorityConfig | None = None,
+        cores: float = 0.5,
     ) -> None:
         config = configuration(folder, apply, vehicle)
-        self.config = config.model_copy(update={"authority": authority or config.authority})
+        self.config = config.model_copy(
+            update={"authority": authority or config.authority, "budget": BudgetConfig(cores=cores)}
+        )
         self.kind = worker
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
@@ -294,7 +306,9 @@ class Bench:
 
     def restart(self) -> None:
         windows = WindowStore(self.folder / "windows", self.config.state)
+        self.budget = Budget(self.config.budget, lambda: 0.0)
         self.worker = self.kind()
+        self.worker.pay = self.budget.pay
         store = StateStore(self.folder, self.config.vehicle)
         self.intake = Intake(self.config.limits)
         self.published: list[str] = []
@@ -306,6 +320,7 @@ class Bench:
             InstantScribe(self.folder),
             windows,
             cast("Worker", self.worker),
+            self.budget,
             lambda key, _: self.published.append(key),
             lambda: (),
             lambda pair, _drawn, _pose: self.shown.append(pair.name),

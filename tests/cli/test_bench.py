@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from rich.progress import Progress
 from cli.conftest import SMALL, Coec
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.cli import bench
-from coec.cli.bench import live, rows, scene, worker
+from coec.cli.bench import live, rig, rows, scene, worker
 from coec.cli.bench.process import ProcessReading
 from coec.geometry import se3
 
@@ -44,6 +43,7 @@ def no_processes(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     document = {**figures, "io_per_second": {"pairs": 10.0}}
     monkeypatch.setattr(worker, "measure", lambda *_: {})
     monkeypatch.setattr(live, "measure", lambda *_: dict(document))
+    monkeypatch.setattr(rig, "measure", lambda *_: {})
     return document
 
 
@@ -88,7 +88,7 @@ def test_a_worker_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     [
         pytest.param(live.native, "", marks=pytest.mark.slow),
         (live.ros, "ros_"),
-        pytest.param(partial(live.rig, name="rig"), "rig_", marks=pytest.mark.slow),
+        pytest.param(live.large_rig, "large_rig_", marks=pytest.mark.slow),
     ],
 )
 def test_a_daemon_is_measured_under_load(
@@ -103,6 +103,19 @@ def test_a_daemon_is_measured_under_load(
     assert document[f"{prefix}io_resident_mb"] > document[f"{prefix}io_proportional_mb"] > 0.0
     per_second = document[f"{prefix}io_per_second"]
     assert per_second["cameras"] > per_second["lidars"] > 0.0
+
+
+@pytest.mark.slow
+def test_the_cameras_of_a_vehicle_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A minute of it says nothing of the figures, but each is there, and every pair was looked at."""
+    monkeypatch.setattr(rig, "SETTLE_S", 1.0)
+    monkeypatch.setattr(rig, "SECONDS", 20.0)
+    monkeypatch.setattr(rig, "PACE", 0.5)
+    document = rig.measure(tmp_path, lambda _: None)
+    assert set(document) >= {row.key for row in rows.ROWS if row.key.startswith("rig_")}
+    assert document["rig_cpu_percent"] > document["rig_io_cpu_percent"] > 0.0
+    assert document["rig_worker_s"]["check"] > 0.0
+    assert document["rig_done"]["checks"] > 0
 
 
 def test_the_table_says_what_is_not_as_required(capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,6 +21,7 @@ OF_A_JOB = {"busy", "deadline_passed", "not_recorded", "stopping", "superseded",
 """Why one question to the worker came to nothing: counted, and no reason of health by itself."""
 
 COMPOSED = {
+    "overdue_budget",
     "overdue_worker",
     "overdue_depth",
     "overdue_pairing",

@@ -27,7 +27,7 @@ from coec.adapters.zenoh.cadence import Played
 from coec.adapters.zenoh.client import ask_one, connected
 from coec.adapters.zenoh.player import CAMERA, Frame, Player, Streams, stream_of
 from coec.cli.convert import configuration_for
-from coec.config import Config, LimitsConfig, StateConfig, ZenohConfig, load_config
+from coec.config import BudgetConfig, Config, LimitsConfig, StateConfig, ZenohConfig, load_config
 from coec.errors import NotFoundError
 from coec.geometry.se3 import Array, perturb
 from coec.reports.commented_yaml import commented_yaml
@@ -125,6 +125,8 @@ def write_configuration(
     nominal = perturb(rig.T_camera_lidar_nominal, np.zeros(6) if perturbation is None else perturbation)
     pair = configuration_for(recording, nominal, mask).model_copy(update=of_pair)
     config = Config(
+        # Windows are shorter than the default budget is for, and what is compared must not hang on what they cost.
+        budget=BudgetConfig(cores=64.0),
         zenoh=ZenohConfig(connect=(endpoint,), listen=(endpoint,)),
         state=StateConfig(directory=Path("state"), min_free_bytes=0),
         pairs=(pair,),

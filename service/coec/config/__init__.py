@@ -13,8 +13,9 @@ from coec.config.metrics import MetricsConfig, is_loopback
 from coec.config.pair import OpenPairConfig, PairConfig
 from coec.config.reading import config_of, load_config
 from coec.config.ros import RosConfig, RosOutput
-from coec.config.service import LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
+from coec.config.service import BudgetConfig, LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
 from coec.config.stages import (
+    MAX_SLICE_S,
     CalibrationConfig,
     DepthConfig,
     ObjectiveConfig,
@@ -49,9 +50,11 @@ from coec.config.yaml_text import MAX_YAML_BYTES, load_yaml, parse_yaml
 
 __all__ = [
     "IDENTITY",
+    "MAX_SLICE_S",
     "MAX_YAML_BYTES",
     "AnyStreamConfig",
     "AuthorityConfig",
+    "BudgetConfig",
     "CalibrationConfig",
     "CameraConfig",
     "CameraIntrinsics",

@@ -42,6 +42,19 @@ class StateConfig(Stage):
     evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
 
 
+class BudgetConfig(Stage):
+    """What the pairs may spend of the processor between them. Where it does not suffice for every check and every
+    window, their periods stretch evenly, and `status` says by how much."""
+
+    cores: float = Field(
+        default=0.5,
+        gt=0,
+        le=64,
+        description="processor time of the worker in a second of driving, s: a replay at ten times the pace of the "
+        "drive spends ten times as much, and is checked as often",
+    )
+
+
 class WorkerConfig(Stage):
     """The process that infers and solves."""
 

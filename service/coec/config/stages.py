@@ -24,12 +24,16 @@ class PairingConfig(Stage):
     )
 
 
+MAX_SLICE_S = 3600.0
+"""Longest slice, s: within an hour, light and weather are those of one drive."""
+
+
 class WindowConfig(Stage):
     """How a window is chosen from the stream (the paper: 25 pairs over three minutes)."""
 
     pairs: int = Field(default=25, ge=1, le=400)
     min_pairs: int = Field(default=10, ge=1, le=400, description="a slice that ends with fewer makes no window")
-    slice_s: float = Field(default=180.0, gt=0, le=3600)
+    slice_s: float = Field(default=180.0, gt=0, le=MAX_SLICE_S)
     require_motion: bool = Field(default=True, description="skip pairs taken while the vehicle is known to stand")
     min_speed_mps: float = Field(default=0.5, ge=0, description="slower counts as standing")
     min_sharpness: float = Field(

@@ -15,7 +15,7 @@ from coec.config.metrics import MetricsConfig
 from coec.config.pair import OpenPairConfig, PairConfig
 from coec.config.rig import MAX_LINKS, MAX_SENSORS
 from coec.config.ros import RosConfig
-from coec.config.service import LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
+from coec.config.service import BudgetConfig, LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
 from coec.schemas.ros_names import ros_name
 
 MAX_PAIRS = 32
@@ -34,6 +34,7 @@ class Config(Stage):
     authority: AuthorityConfig = AuthorityConfig()
     state: StateConfig = StateConfig()
     worker: WorkerConfig = WorkerConfig()
+    budget: BudgetConfig = BudgetConfig()
     limits: LimitsConfig = LimitsConfig()
     stale_after_s: float = Field(
         default=600.0, gt=0, description="age of the last completed check at which a pair is called stale, s"

@@ -44,7 +44,8 @@ from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.router_watch import RouterWatch
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
-from coec.runtime.api.status import worker_status_of
+from coec.runtime.api.status import budget_status_of, worker_status_of
+from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.intake import Intake
@@ -103,7 +104,8 @@ class Daemon:
         self._fault: Reason | None = None
         self._keys = Keys(config.prefix, config.vehicle)
         self._folder = WindowStore(config.state.directory / "windows", config.state)
-        self._worker = Worker(config.worker, config.model_dump_json())
+        self._budget = Budget(config.budget)
+        self._worker = Worker(config.worker, config.model_dump_json(), pay=self._budget.pay)
         settings = settings_of(config.zenoh, config.limits)
         self._insecure = _insecure(unguarded(settings))
         self._reach = Reach(settings)
@@ -120,7 +122,7 @@ class Daemon:
         self._ros_outputs = RosOutputs(publishers, config, self._worker)
         store = StateStore(config.state.directory, config.vehicle)
         self._scribe = Scribe(config.state.directory)
-        own = (self._worker, self._publish, self._troubles, self._ros_outputs.show)
+        own = (self._worker, self._budget, self._publish, self._troubles, self._ros_outputs.show)
         of_ros = (self._ros_side.topics, self._room.nominal)
         self._intake = Intake(config.limits)
         self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *own, *of_ros)
@@ -357,6 +359,7 @@ class Daemon:
             return
         logs.configure(config.log.level, config.log.format)
         self._folder.use(config.state)
+        self._budget.use(config.budget)
         self._shown = self._shown_now()
         for old, new in zip(before.pairs, config.pairs, strict=True):
             if old == new and before.stale_after_s == config.stale_after_s:
@@ -414,6 +417,7 @@ class Daemon:
             configuration=self._configuration,
             pairs=tuple(answers.status() for answers in self._answering()),
             worker=worker_status_of(self._worker),
+            budget=budget_status_of(self._budget.report()),
             storage=replies.StorageStatus(
                 bytes_used=usage.used,
                 bytes_free=usage.free,

@@ -162,6 +162,8 @@ def status(payload: bytes) -> None:
         f"worker {worker.state}, process {worker.pid or '-'}, {worker.restarts} restarts, {worker.queued} waiting; "
         f"windows {storage.bytes_used / 1e6:.0f} MB, free {storage.bytes_free / 1e9:.1f} GB"
     )
+    if reply.budget is not None:
+        _budget(reply.budget)
     table = console.table("pair", "camera", "lidar", "ego", "pairs", "chosen", "windows", "solved", right=range(1, 8))
     for pair in reply.pairs:
         streams = [f"{s.accepted}/{s.received}" if s else "-" for s in (pair.camera, pair.lidar, pair.ego)]
@@ -208,6 +210,17 @@ def _axes(axes: replies.Axes) -> None:
             title, console.figure(axis.correction, sign=True), console.figure(axis.sigma), axis.unit, axis.status
         )
     console.out.print(table)
+
+
+def _budget(budget: replies.BudgetStatus) -> None:
+    console.show(f"budget {budget.cores:g} of a core; {budget.spent:.2f} spent, {budget.wanted:.2f} wanted")
+    if budget.stretched_by > 1.0:
+        waiting = ", ".join(name for name, share in budget.pairs.items() if share.waiting) or "none"
+        console.show(
+            f"  it does not suffice: checks and windows are {budget.stretched_by:g} times as far apart as configured; "
+            f"waiting: {waiting}",
+            "yellow",
+        )
 
 
 def _losses(losses: Mapping[str, Mapping[str, int]]) -> None:

@@ -10,6 +10,7 @@ from coec.adapters.zenoh.bus import Answer
 from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.types import FramePair, Matrix4, Reason
 from coec.config import PairConfig
+from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.intake import Intake
 from coec.runtime.nominal.watch import Nominal
@@ -41,6 +42,7 @@ class Outside:
     scribe: Scribe
     folder: WindowStore
     worker: Worker
+    budget: Budget
     publish: Callable[[str, Answer], None]
     vehicle_troubles: Callable[[], tuple[Reason, ...]]
     show: Callable[[PairConfig, FramePair, Matrix4], None]

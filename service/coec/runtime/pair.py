@@ -45,13 +45,16 @@ class Pair:
         rig, folder = rig_of(pair), outside.folder
         losses = LossCounter(_log, pair.name)
         mailbox, queue = Mailbox(), DecisionQueue()
-        questions = Questions(pair, queue, outside.worker, mailbox, folder, outside.show)
+        questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, outside.show)
         store = PairStore(rig, config.vehicle, config.state, outside.store, outside.scribe, folder, losses)
         baseline = RigBaseline(pair, rig, config.state.directory)
         self._rig, self._vehicle = rig, config.vehicle
         plan = self._plan(pair, baseline.calibration)
         self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost)
-        chooser = Chooser(pair, config.limits, rig, store.served, questions, self.recorder, losses, store.kept)
+        first_slice_s = outside.budget.join(pair.name, pair.monitor, pair.window)
+        chooser = Chooser(
+            pair, config.limits, rig, store.served, questions, self.recorder, losses, first_slice_s, store.kept
+        )
         self.stream = PairStream(pair, config, outside.intake, chooser, lambda: self.recorder.has_room, losses)
         self.answers = PairAnswers(
             pair, config, rig, store, folder, self.recorder, self.stream, outside, lambda: self.commands.counts

@@ -437,6 +437,39 @@ class WorkerStatus(Part):
     faults: Counts = Field(default_factory=dict, description="worker processes that were replaced, by cause")
 
 
+class BudgetShare(Part):
+    """What one pair takes of the budget."""
+
+    look_s: float | None = Field(ge=0, description="what a check costs, s of processor time; null before the first")
+    window_s: float | None = Field(
+        ge=0,
+        description="what a window costs, with depth of its images, s of processor time; null before the first",
+    )
+    unseen_s: float | None = Field(ge=0, description="since the worker last looked, s; null before the first look")
+    suspected: bool = Field(description="there is a suspicion: its checks come first, and may borrow")
+    waiting: bool = Field(description="a check waits for its turn")
+    active: bool = Field(description="its streams bring pairs for checks")
+
+
+class BudgetStatus(Part):
+    """What the pairs spend of the processor between them, in cores: s of processor time a second."""
+
+    cores: float = Field(description="what may be spent for checks and windows, by the clock of the sensors")
+    spent: float = Field(
+        ge=0, description="what the worker took in the last three minutes, whatever for, by the steady clock"
+    )
+    wanted: float = Field(ge=0, description="what every check and every window of all active pairs would take")
+    stretched_by: float = Field(
+        ge=1, description="periods of checks and slices of windows are so many times as long as configured"
+    )
+    in_store_s: float = Field(description="s of processor time that are not spent; below 0: borrowed for a suspicion")
+    spent_s: dict[str, float] = Field(
+        description="processor time of the worker since the start by what it was for, s: check, solve, prefetch "
+        "(depth for a window), start, idle, backlog, overlay, picture, commission"
+    )
+    pairs: dict[str, BudgetShare]
+
+
 class StorageStatus(Part):
     """The state directory."""
 
@@ -470,6 +503,7 @@ class StatusReply(Message):
     configuration: ConfigurationStatus | None = Field(default=None, description="null from an older service")
     pairs: tuple[PairStatus, ...]
     worker: WorkerStatus
+    budget: BudgetStatus | None = Field(default=None, description="null from an older service")
     storage: StorageStatus
     queries_waiting: Counts = Field(default_factory=dict, description="queries that wait for an answer, by queue")
 

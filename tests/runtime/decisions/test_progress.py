@@ -16,9 +16,12 @@ S = 1_000_000_000
 PERIOD_S = 5.0
 
 
-def report(camera: int = 0, lidar: int = 0, refused: int = 0, pairs: int = 0, checks: int = 0) -> StreamStatistics:
+def report(
+    camera: int = 0, lidar: int = 0, refused: int = 0, pairs: int = 0, checks: int = 0, not_afforded: int = 0
+) -> StreamStatistics:
     streams = {CAMERA: StreamCounts(camera, camera - refused), LIDAR: StreamCounts(lidar, lidar)}
-    return StreamStatistics(streams=streams, pairs=pairs, chosen=Chosen(checks=checks, last_ns=1000 * S), pace=1.0)
+    chosen = Chosen(checks=checks, not_afforded=not_afforded, last_ns=1000 * S)
+    return StreamStatistics(streams=streams, pairs=pairs, chosen=chosen, pace=1.0)
 
 
 BEGIN = report()
@@ -68,6 +71,7 @@ def test_a_replay_slower_than_the_drive_has_as_much_longer() -> None:
         (report(camera=100, refused=100, lidar=100), "data", "every camera frame is refused"),
         (report(camera=100, lidar=100), "pairing", "none belong together"),
         (report(camera=100, lidar=100, pairs=2), "data", "too few pairs"),
+        (report(camera=100, lidar=100, pairs=100, not_afforded=3), "budget", "`budget.cores` does not suffice"),
         (ALL, "worker", "has not answered"),
     ],
 )

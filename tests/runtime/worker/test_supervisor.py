@@ -22,6 +22,7 @@ from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFo
 from coec.config import CalibrationConfig, WorkerConfig
 from coec.runtime.worker import jobs, link
 from coec.runtime.worker.child import Child, ChildError, Fault
+from coec.runtime.worker.costs import Cost
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Fate, Job, JobOutcome, Kind, Solved
 from coec.runtime.worker.supervisor import Worker, WorkerState
 from coec.schemas.base import to_msgpack
@@ -141,6 +142,35 @@ def test_a_worker_that_takes_the_place_of_another_has_the_latest_configuration(t
         assert it.answer() == ("a", "a")
         assert (tmp_path / SETTINGS).read_text().splitlines()[-1].endswith(" another")
         assert it.worker.status().starts == 2
+
+
+# --- what it costs ----------------------------------------------------------------------------------------------------
+
+
+def test_all_processor_time_is_told_by_what_it_was_for(tmp_path: Path) -> None:
+    """Of a process that is new, of each job before its outcome, and of one that dies with its job."""
+    (tmp_path / RESULT).write_bytes(to_msgpack(result_of(estimate(1), RIG, "test")))
+    costs: list[Cost] = []
+    command = fake_worker_command("crash-once", tmp_path)
+    it = Bench(Worker(LIMITS, "{}", command, costs.append), tmp_path)
+    it.check("c")
+    it.worker.start()
+    assert it.answer()[0] == "c"
+    assert [cost.kind for cost in costs] == ["start", "idle", "check"]
+    assert costs[0].cpu_s > 0.01, "an interpreter has started"
+    assert costs[-1].pair == "front"
+    it.solve("a")
+    assert it.answer() == ("a", "a")
+    it.solve("old", live=False)
+    assert it.answer() == ("old", "old")
+    it.worker.prefetch("rear", b"image")
+    wait_until(lambda: costs[-1].kind == "prefetch", "an image")
+    it.finish()
+    assert costs[-1].pair == "rear"
+    assert [cost.kind for cost in costs if cost.kind != "idle"] == [
+        "start", "check", "solve", "start", "solve", "backlog", "prefetch",
+    ]  # fmt: skip
+    assert all(cost.cpu_s >= 0.0 for cost in costs)
 
 
 # --- jobs come back ---------------------------------------------------------------------------------------------------

@@ -4,13 +4,9 @@ worker solves. Real processes: the daemon (which is the router, too), the sensor
 
 from __future__ import annotations
 
-import json
-import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,10 +15,11 @@ import numpy as np
 import zenoh
 
 from coec.adapters.files.rig import intrinsics_config
-from coec.adapters.zenoh.client import ConnectionFailedError, ask_one, connected
-from coec.cli.bench import load, scene
+from coec.adapters.zenoh.client import ask_one, connected
+from coec.cli.bench import daemons, load, scene
 from coec.cli.bench.process import ProcessReading
 from coec.config import (
+    BudgetConfig,
     CalibrationConfig,
     Config,
     LogConfig,
@@ -32,8 +29,6 @@ from coec.config import (
     WindowConfig,
     ZenohConfig,
 )
-from coec.errors import NotFoundError
-from coec.runtime.worker.child import PACKAGE_ROOT
 from coec.schemas.keys import Keys
 
 VEHICLE, PAIR = "bench", "0-0"
@@ -44,12 +39,10 @@ SETTLE_S, SECONDS = 10.0, 25.0
 SLICE_S = 20.0
 """25 pairs in so much time, nine times the default: the recorder, too, is at work all the while."""
 
-SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(*sys.argv[1:]))"
+ENOUGH_CORES = 64.0
+"""Budget: windows come nine times as often as the default is for."""
 
 QUERY_PERIOD_S, COMMAND_PERIOD_S = 0.05, 0.5
-POLL_S, TIMEOUT_S = 0.1, 60.0
-"""Between two questions whether the daemon runs: before it does, it can tell nobody."""
-
 BUSY_SHARE = 0.5
 """Of a period between two queries: the worker is solving when it used more processor time."""
 
@@ -68,7 +61,7 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     Raises:
         ConnectionFailedError: the daemon did not become ready.
     """
-    return native(folder, heard) | ros(folder, heard) | rig(folder, heard, "rig") | rig(folder, heard, "large_rig")
+    return native(folder, heard) | ros(folder, heard) | large_rig(folder, heard)
 
 
 def native(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
@@ -85,10 +78,10 @@ def ros(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
         return {f"ros_{name}": figure for name, figure in _resources(session, process, heard).items()}
 
 
-def rig(folder: Path, heard: Callable[[str], None], name: str) -> dict[str, Any]:
-    """By several cameras below LiDARs that they share, with windows as long as they are by default."""
-    with _loaded(folder, name, WindowConfig(), heard) as (session, process):
-        return {f"{name}_{figure}": value for figure, value in _resources(session, process, heard).items()}
+def large_rig(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
+    """By eight cameras below three LiDARs that they share, with windows as long as they are by default."""
+    with _loaded(folder, "large_rig", WindowConfig(), heard) as (session, process):
+        return {f"large_rig_{figure}": value for figure, value in _resources(session, process, heard).items()}
 
 
 @contextmanager
@@ -97,18 +90,18 @@ def _loaded(
 ) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
     """A daemon that has been under load for a while, `form` of `load.LOADS`, and who may ask it."""
     heard(f"the daemon starts, {form}")
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    configuration = folder / f"{form}.yaml"
+    endpoint = f"tcp/127.0.0.1:{daemons.free_port()}"
+    written = folder / f"{form}.yaml"
     # JSON is YAML.
-    config = _configuration(endpoint, folder / form, form, window)
-    configuration.write_text(config.model_dump_json(exclude_none=True))
+    config = configuration(endpoint, folder / form, form, window, BudgetConfig(cores=ENOUGH_CORES))
+    written.write_text(config.model_dump_json(exclude_none=True))
     with (
-        _running("-m", "coec", "run", "--config", str(configuration)) as daemon,
-        connected([endpoint], TIMEOUT_S) as session,
-        _running("-c", SENSORS, endpoint, form),
+        daemons.running("-m", "coec", "run", "--config", str(written)) as daemon,
+        connected([endpoint], daemons.TIMEOUT_S) as session,
+        daemons.running("-c", daemons.SENSORS, endpoint, form),
     ):
         heard(f"the daemon under load, {form}")
-        _await_running(session, KEYS)
+        daemons.await_running(session, KEYS)
         process = ProcessReading(daemon.pid)
         _ask(session, KEYS, process, SETTLE_S, at_work=False)
         yield session, process
@@ -150,7 +143,7 @@ def _ask(session: zenoh.Session, keys: Keys, process: ProcessReading, seconds: f
     while (now_s := time.monotonic()) < end_s:
         worker_s = worker.cpu_s
         begin_s = time.perf_counter()
-        ask_one(session, keys.extrinsic(PAIR), TIMEOUT_S)
+        ask_one(session, keys.extrinsic(PAIR), daemons.TIMEOUT_S)
         elapsed_s = time.perf_counter() - begin_s
         # The pace of the questions is part of what is measured.
         time.sleep(max(QUERY_PERIOD_S - (time.monotonic() - now_s), 0.0))
@@ -162,19 +155,9 @@ def _ask(session: zenoh.Session, keys: Keys, process: ProcessReading, seconds: f
     return seen
 
 
-def _await_running(session: zenoh.Session, keys: Keys) -> None:
-    end_s = time.monotonic() + TIMEOUT_S
-    while time.monotonic() < end_s:
-        with suppress(NotFoundError):  # the router is there before the service
-            if _status(session, keys)["state"] == "running":
-                return
-        time.sleep(POLL_S)
-    raise ConnectionFailedError(f"the daemon of the benchmark did not become ready within {TIMEOUT_S:g} s")
-
-
 def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
     """What came and what became of it, since the start; a stream of several pairs counts once."""
-    pairs = _status(session, keys)["pairs"]
+    pairs = daemons.status(session, keys)["pairs"]
     streams = {
         f"{kind}s": sum({pair["name"].split("-")[index]: pair[kind]["accepted"] for pair in pairs}.values())
         for index, kind in ((0, "camera"), (-1, "lidar"))
@@ -184,12 +167,7 @@ def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
     return {**streams, **counted, "lost": lost}
 
 
-def _status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(ask_one(session, keys.status + "?format=json", TIMEOUT_S).payload)
-    return document
-
-
-def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig) -> Config:
+def configuration(endpoint: str, state: Path, form: str, window: WindowConfig, budget: BudgetConfig) -> Config:
     """Every camera with every LiDAR, as if all were at one place: what is found there does not matter."""
     what = load.LOADS[form]
     many = {"camera": range(what.cameras), "lidar": range(what.lidars)}
@@ -209,6 +187,7 @@ def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig) 
         for lidar in many["lidar"]
     ]
     return Config(
+        budget=budget,
         vehicle=VEHICLE,
         zenoh=ZenohConfig(embedded_router=True, listen=(endpoint,), connect=()),
         middleware="rmw_zenoh" if what.is_ros else "native",
@@ -223,23 +202,3 @@ _INTRINSICS = intrinsics_config(scene.CAMERAS[load.CAMERA])
 
 def _place(what: load.Load, kind: str, index: int) -> dict[str, str]:
     return {"topic": load.TOPICS[kind]} if what.is_ros else {"key": load.key(kind, index)}
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-@contextmanager
-def _running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A Python process of ours, asked to end at the end."""
-    process = subprocess.Popen(
-        [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=PACKAGE_ROOT
-    )
-    try:
-        yield process
-    finally:
-        process.terminate()
-        process.communicate(timeout=TIMEOUT_S)

@@ -49,7 +49,7 @@ LOADS: Mapping[str, Load] = {
     "rig": Load(cameras=4, camera_hz=10.0, sweep_every=1),
     "large_rig": Load(cameras=8, lidars=3, camera_hz=10.0, sweep_every=1),
 }
-"""By name. A rig is that of issue 17: four fisheyes and a LiDAR; and eight with three."""
+"""By name. A rig is of four fisheyes and a LiDAR; a large one of eight with three."""
 
 ROOMS = 7
 """Different frames that are sent in turn: a camera that sends one and the same would look frozen."""
@@ -66,17 +66,19 @@ def key(kind: str, index: int = 0) -> str:
     return f"bench/{kind}-{index}"
 
 
-def main(endpoint: str, name: str) -> int:
-    """Publishes until standard input ends; always 0. `name` is one of `LOADS`."""
+def main(endpoint: str, name: str, pace: str = "1") -> int:
+    """Publishes until standard input ends; always 0. `name` is one of `LOADS`; `pace`: seconds of driving in a second,
+    by which stamps and frames come."""
     load = LOADS[name]
     pairs = [scene.pair(scene.CAMERAS[CAMERA], seed, 0) for seed in range(ROOMS)]
     with connected([endpoint], CONNECT_S) as session:
         send = (_ros if load.is_ros else _native)(session, load)
-        begin_s = time.monotonic()
+        begin_s, begin_ns = time.monotonic(), time.time_ns()
         for count in itertools.count():
-            if _ended(begin_s + count / load.camera_hz - time.monotonic()):
+            drive_s = count / load.camera_hz
+            if _ended(begin_s + drive_s / float(pace) - time.monotonic()):
                 return 0
-            stamp_ns = time.time_ns()
+            stamp_ns = begin_ns + round(1e9 * drive_s)
             send(EgoMotion(stamp_ns, "ego", (SPEED_MPS, 0.0, 0.0), (0.0, 0.0, 0.0), count), 0)
             for index in range(load.cameras):
                 room = pairs[(count + index) % ROOMS]

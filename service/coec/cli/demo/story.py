@@ -9,6 +9,7 @@ from coec.adapters.files.rig import intrinsics_config, matrix_rows
 from coec.adapters.zenoh.player import Streams
 from coec.calibration.types import Rig
 from coec.config import (
+    BudgetConfig,
     CameraConfig,
     Config,
     EgoConfig,
@@ -47,6 +48,9 @@ PAIR_HZ, EGO_HZ = 1.0, 50.0
 WINDOW = WindowConfig(pairs=12, min_pairs=8, slice_s=24.0)
 MONITOR = MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0)
 """Shorter than on a vehicle, where a window takes three minutes: nobody wants to watch that."""
+
+STORY_CORES = 64.0
+"""Budget: the story has a window in seconds, oftener than the default is for."""
 
 MAX_ERROR_DEG = 0.25
 """What the repair must be within of the truth (geodesic angle)."""
@@ -96,6 +100,7 @@ def service_config(rig: Rig, mask: Path, endpoint: str) -> Config:
         monitor=MONITOR,
     )
     return Config(
+        budget=BudgetConfig(cores=STORY_CORES),
         zenoh=ZenohConfig(connect=(endpoint,), listen=(endpoint,)),
         state=StateConfig(directory=Path("state"), min_free_bytes=MIN_FREE_BYTES),
         # On a vehicle the cameras do not compete with the solver for the processor; here they are drawn on it.

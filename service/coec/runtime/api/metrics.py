@@ -15,7 +15,7 @@ from typing import Literal
 from coec.calibration.lifecycle import HealthState
 from coec.runtime.api.extrinsic import AXES, UNITS
 from coec.runtime.timings import Histogram
-from coec.schemas.replies import CheckReply, HealthReply, Maybe6, PairStatus, StatusReply, StreamStatus
+from coec.schemas.replies import BudgetStatus, CheckReply, HealthReply, Maybe6, PairStatus, StatusReply, StreamStatus
 
 ENCODING = "application/openmetrics-text"
 
@@ -119,6 +119,18 @@ def _counts(counts: Callable[[PairStatus], Mapping[str, int]]) -> Callable[[View
 
 def _of_worker(counts: Callable[[View], Mapping[str, int]]) -> Callable[[View], Iterable[Sample]]:
     return lambda view: (((name,), float(count)) for name, count in counts(view).items())
+
+
+def _of_budget(
+    figures: Callable[[BudgetStatus], Mapping[tuple[str, ...], float | None]],
+) -> Callable[[View], Iterable[Sample]]:
+    def samples(view: View) -> Iterable[Sample]:
+        if view.status.budget is not None:
+            for labels, told in figures(view.status.budget).items():
+                if told is not None:
+                    yield labels, float(told)
+
+    return samples
 
 
 def _streams(value: Callable[[StreamStatus], float | None]) -> Callable[[View], Iterable[Sample]]:
@@ -351,6 +363,49 @@ FAMILIES: tuple[Family, ...] = (
     ),
     Family("coec_worker_job_age_seconds", "gauge", "Of what is with the worker.", ("kind",), _job_age),
     Family("coec_worker_restarts", "counter", "Workers replaced.", (), _one(lambda view: view.status.worker.restarts)),
+    Family(
+        "coec_worker_processor_seconds",
+        "counter",
+        "Processor time of the worker, by what for: check, solve, ...",
+        ("kind",),
+        _of_budget(lambda budget: {(kind,): cpu_s for kind, cpu_s in budget.spent_s.items()}),
+    ),
+    Family("coec_budget_cores", "gauge", "What may be spent.", (), _of_budget(lambda budget: {(): budget.cores})),
+    Family(
+        "coec_budget_spent_cores",
+        "gauge",
+        "What the worker took in the last three minutes.",
+        (),
+        _of_budget(lambda budget: {(): budget.spent}),
+    ),
+    Family(
+        "coec_budget_wanted_cores",
+        "gauge",
+        "What every check and every window would take.",
+        (),
+        _of_budget(lambda budget: {(): budget.wanted}),
+    ),
+    Family(
+        "coec_budget_stretch",
+        "gauge",
+        "Periods and slices are so many times as long as configured.",
+        (),
+        _of_budget(lambda budget: {(): budget.stretched_by}),
+    ),
+    Family(
+        "coec_budget_store_seconds",
+        "gauge",
+        "Processor time in store; below 0: borrowed.",
+        (),
+        _of_budget(lambda budget: {(): budget.in_store_s}),
+    ),
+    Family(
+        "coec_unseen_seconds",
+        "gauge",
+        "Since the worker last looked at a pair.",
+        _PAIR,
+        _of_budget(lambda budget: {(name,): share.unseen_s for name, share in budget.pairs.items()}),
+    ),
     Family(
         "coec_worker_memory_bytes",
         "gauge",

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 from coec.runtime.api.health import drops_of
+from coec.runtime.budget.budget import BudgetReport
 from coec.runtime.decisions.decider import Known
 from coec.runtime.ingest.decoder import CAMERA, EGO, LIDAR, StreamCounts
 from coec.runtime.ingest.inbox import Arrivals
@@ -82,4 +83,28 @@ def worker_status_of(worker: Worker) -> replies.WorkerStatus:
         outcomes={fate.value: status.outcomes.get(fate, 0) for fate in Fate},
         losses=dict(status.losses),
         faults={fault.value: count for fault, count in status.faults.items()},
+    )
+
+
+def budget_status_of(report: BudgetReport) -> replies.BudgetStatus:
+    """The budget as `status` tells it."""
+    kinds = sorted({kind for kind, _ in report.totals_s})
+    return replies.BudgetStatus(
+        cores=report.cores,
+        spent=report.spent,
+        wanted=report.wanted,
+        stretched_by=report.stretched_by,
+        in_store_s=report.in_store_s,
+        spent_s={kind: sum(cpu_s for (each, _), cpu_s in report.totals_s.items() if each == kind) for kind in kinds},
+        pairs={
+            name: replies.BudgetShare(
+                look_s=share.look_s,
+                window_s=share.window_s,
+                unseen_s=report.unseen_s.get(name),
+                suspected=share.suspected,
+                waiting=share.waiting,
+                active=share.active,
+            )
+            for name, share in report.pairs.items()
+        },
     )

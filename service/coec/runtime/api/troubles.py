@@ -110,6 +110,11 @@ TROUBLES: Mapping[str, Trouble] = {
         "No check has been completed for three periods: frames do not come, are refused, or are too few.",
         "See to the sensors, their keys and the router's rules: `coec doctor` listens.",
     ),
+    "overdue_budget": Trouble(
+        "No check has been completed for three periods: the budget of the processor does not suffice.",
+        "Raise `budget.cores` to what `status` says under `budget.wanted`, or lengthen `monitor.period_s` and "
+        "`window.slice_s`.",
+    ),
     "service_stuck": Trouble(
         "What is known of the pair is not renewed: a disk or a thread is stuck.",
         "The service manager restarts the service if it stays so; see to the disk.",

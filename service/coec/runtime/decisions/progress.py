@@ -123,6 +123,8 @@ class Progress:
             return "pairing", "camera and LiDAR frames come, but none belong together in time."
         if self._failure is not None:
             return self._kind_of(self._failure), self._failure.text
+        if now.chosen.checks == then.chosen.checks and now.chosen.not_afforded > then.chosen.not_afforded:
+            return "budget", "`budget.cores` does not suffice; `budget` of status says for what."
         if now.chosen.checks == then.chosen.checks:
             return "data", "too few pairs come, or they are too far apart, for a check."
         return "worker", "the worker has not answered."

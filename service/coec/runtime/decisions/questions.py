@@ -12,6 +12,7 @@ from typing import Protocol
 from coec.calibration.frames.sampling import stands
 from coec.calibration.types import FramePair, Matrix4
 from coec.config import PairConfig
+from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.mailbox import Mailbox
 from coec.runtime.decisions.queue import DecisionQueue, Question
 from coec.runtime.ingest.chooser import Served
@@ -56,6 +57,7 @@ class Questions:
         pair: PairConfig,
         queue: DecisionQueue,
         worker: Worker,
+        budget: Budget,
         mailbox: Mailbox,
         windows: WindowStore,
         show: Callable[[PairConfig, FramePair, Matrix4], None],
@@ -66,6 +68,7 @@ class Questions:
         self._windows = windows
         self._queue = queue
         self._worker = worker
+        self._budget = budget
         self._mailbox = mailbox
         self._period_ns = round(pair.monitor.period_s * NS_PER_S)
         self._decides: Decides
@@ -81,13 +84,28 @@ class Questions:
 
     # --- for the stream ---------------------------------------------------------------------------------------------
 
+    def affords(self, stamp_ns: int, *, suspected: bool) -> bool:
+        """Whether a check may be asked for at a sensor time; it has to be asked for then. What is `suspected` comes
+        before what is not."""
+        return self._budget.affords(self._pair.name, stamp_ns, suspected=suspected)
+
+    @property
+    def stretch(self) -> float:
+        """By how much slices are to be longer than configured, at least 1."""
+        return self._budget.stretch
+
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
-        """Is `served` right, by these pairs? Asked at a sensor time."""
+        """Is `served` right, by these pairs? Asked at a sensor time, once it is known to be afforded."""
         standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
         question = self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.CHECK))
-        ended = partial(self._decides.checked, question, served.epoch, standing)
+        post = self._post(partial(self._decides.checked, question, served.epoch, standing))
         pair = self._pair
-        self._worker.ask(jobs.check(pair.name, pair.calibration, served.T_camera_lidar, pairs, self._post(ended)))
+
+        def done(outcome: JobOutcome) -> None:
+            self._budget.ended(pair.name)
+            post(outcome)
+
+        self._worker.ask(jobs.check(pair.name, pair.calibration, served.T_camera_lidar, pairs, done))
         self._show(pair, pairs[-1], served.T_camera_lidar)
 
     def window(self, window_id: str, stamp_ns: int) -> int:

@@ -19,7 +19,7 @@ from coec.calibration.frames.sampling import CheckSampler
 from coec.calibration.frames.window import KeptPairs, PairSelected, SliceEnded, WindowCutter
 from coec.calibration.monitor.urgency import Urgency
 from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
-from coec.config import LimitsConfig, PairConfig, WindowConfig
+from coec.config import MAX_SLICE_S, LimitsConfig, PairConfig, WindowConfig
 from coec.runtime.ingest.sensor_clock import SensorClock
 
 _log = logging.getLogger(__name__)
@@ -40,8 +40,16 @@ class Served:
 class Asks(Protocol):
     """What the chooser wants to know of others; see `runtime.decisions.questions`."""
 
+    @property
+    def stretch(self) -> float:
+        """By how much slices are to be longer than configured, at least 1."""
+
+    def affords(self, stamp_ns: int, *, suspected: bool) -> bool:
+        """Whether a check may be asked for at a sensor time; it has to be asked for then. What is `suspected` comes
+        before what is not."""
+
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
-        """Is `served` right, by these pairs? Asked at a sensor time."""
+        """Is `served` right, by these pairs? Asked at a sensor time, once it is known to be afforded."""
 
     def window(self, window_id: str, stamp_ns: int) -> int:
         """What does a window say that ends at a sensor time? From when on its answer counts, sensor time."""
@@ -82,6 +90,7 @@ class Chosen:
         quality: of the image looked at last; None before the first.
         frozen: whether images have repeated since the last that was chosen.
         checks: checks that were asked for.
+        not_afforded: checks that never got their turn.
         last_ns: stamp of the pair looked at last; None before the first.
         steps_back: how often sensor time has stepped back.
     """
@@ -91,6 +100,7 @@ class Chosen:
     quality: ImageQuality | None = None
     frozen: bool = False
     checks: int = 0
+    not_afforded: int = 0
     last_ns: int | None = None
     steps_back: int = 0
 
@@ -107,6 +117,7 @@ class Chooser:
         asks: Asks,
         recorder: Writes,
         losses: LossCounter,
+        first_slice_s: float,
         kept: KeptPairs | None = None,
     ) -> None:
         """`served` is the extrinsic at which pairs are looked at until another is adopted; `kept` are pairs of an
@@ -116,7 +127,10 @@ class Chooser:
         self._losses = losses
         self._served = served
         self._infers = pair.calibration.depth.model != STEREO
+        self._window, self._stretch = pair.window, 1.0
         self._cutter = WindowCutter(pair.window, rig, Inspector(limits))
+        if first_slice_s < pair.window.slice_s:
+            self._cutter.hurry(first_slice_s)
         if kept is not None:
             self._cutter.keep(kept)
         self._sampler = CheckSampler(pair.monitor)
@@ -126,7 +140,10 @@ class Chooser:
         self._unasked: deque[tuple[FramePair, ...]] = deque(maxlen=CHECKS_WAITING)
         self._window_due_ns = 0
         self._frozen = False
+        self._suspected = False
         self._checks = 0
+        self._not_afforded = 0
+        self._waits_its_turn = False
         self._steps_back = 0
 
     @property
@@ -138,6 +155,7 @@ class Chooser:
             self._cutter.last_quality,
             self._frozen,
             self._checks,
+            self._not_afforded,
             self._last_ns,
             self._steps_back,
         )
@@ -167,6 +185,7 @@ class Chooser:
         self._last_ns = pair.stamp_ns
         # The steady clock plays no part: this one only tells at which rate pairs come.
         self._pace.observe(pair.stamp_ns, 0.0)
+        self._follow_stretch()
         for ended in self._urgency.heed(self._cutter, self._pace.rate_hz):
             self._end(ended, pair.stamp_ns)
         frozen_before = self._cutter.rejections["frozen"]
@@ -184,9 +203,7 @@ class Chooser:
         self._frozen |= self._cutter.rejections["frozen"] > frozen_before
         check = self._sampler.offer(pair)
         if check is not None:
-            if len(self._unasked) == CHECKS_WAITING:
-                self._losses.add("monitor", "check_superseded")
-            self._unasked.append(check)
+            self._await_turn(check)
         if pair.stamp_ns >= self._window_due_ns:
             self._ask_checks(pair.stamp_ns)
 
@@ -204,6 +221,7 @@ class Chooser:
 
     def use(self, window: WindowConfig) -> None:
         """The next slice is to be cut by this."""
+        self._window, self._stretch = window, 1.0
         self._cutter.use(window)
 
     # --- effects of answers -----------------------------------------------------------------------------------------
@@ -215,6 +233,7 @@ class Chooser:
 
     def alarm(self, since_ns: int) -> None:
         """A window is wanted soon, of pairs since this sensor time."""
+        self._suspected = True
         self._urgency.alarm(since_ns)
 
     def keep(self, kept: KeptPairs) -> None:
@@ -223,6 +242,7 @@ class Chooser:
 
     def calm(self) -> None:
         """There is no suspicion any more."""
+        self._suspected = False
         self._urgency.calm()
 
     # --- inside -----------------------------------------------------------------------------------------------------
@@ -230,17 +250,39 @@ class Chooser:
     def _begin_new_time(self, stamp_ns: int) -> None:
         self._steps_back += 1
         self._losses.add("monitor", "time_stepped_back", detail="the clock of the sensors stepped back")
-        self._urgency.calm()
+        self.calm()
         self._window_due_ns = stamp_ns
         self._asks.time_stepped_back(stamp_ns)
 
     def _has_stepped_back(self, stamp_ns: int) -> bool:
         return self._last_ns is not None and stamp_ns < self._last_ns
 
+    def _follow_stretch(self) -> None:
+        """Slices are longer where the budget does not suffice for all windows, as the periods of checks are."""
+        stretch = self._asks.stretch
+        if stretch != self._stretch:
+            self._stretch = stretch
+            slice_s = min(stretch * self._window.slice_s, MAX_SLICE_S)
+            self._cutter.use(self._window.model_copy(update={"slice_s": slice_s}))
+
+    def _await_turn(self, check: tuple[FramePair, ...]) -> None:
+        """There are pairs for a check. Those of a period before that still wait for their turn are too old then."""
+        if self._waits_its_turn:
+            self._not_afforded += len(self._unasked)
+            self._losses.add("monitor", "check_not_afforded", len(self._unasked))
+            self._unasked.clear()
+        if len(self._unasked) == CHECKS_WAITING:
+            self._losses.add("monitor", "check_superseded")
+        self._unasked.append(check)
+
     def _ask_checks(self, stamp_ns: int) -> None:
-        """Have the latest pairs checked at what is served. While a window is about to change that, they wait: they
-        would be judged at what is no longer served."""
+        """Have the latest pairs checked at what is served, when it is their turn. While a window is about to change
+        that, they wait: they would be judged at what is no longer served."""
+        self._waits_its_turn = False
         while self._unasked:
+            if not self._asks.affords(stamp_ns, suspected=self._suspected):
+                self._waits_its_turn = True
+                return
             self._checks += 1
             self._asks.check(self._unasked.popleft(), self._served, stamp_ns)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.adapters.system.memory import resident_bytes
+from coec.adapters.system.processor import processor_s
 from coec.config import WorkerConfig
 from coec.runtime.worker.link import Link, NoMessageError
 
@@ -75,6 +77,7 @@ class Child:
             except (OSError, subprocess.SubprocessError) as error:
                 self._link.close()
                 raise ChildError(Fault.NOT_STARTED, f"could not be started ({error})") from error
+        self._cpu_s = self._told_cpu_s = 0.0
 
     @property
     def pid(self) -> int:
@@ -89,11 +92,18 @@ class Child:
         """
         if (exit_text := self._exit_text()) is not None:
             raise ChildError(Fault.DIED, exit_text)
+        self._look_at_processor()
         resident, allowed = self._resident_bytes(), self._config.max_memory_bytes
         if resident > allowed:
             text = f"used {resident >> 20} MiB of memory; worker.max_memory_bytes allows {allowed >> 20} MiB"
             raise ChildError(Fault.TOO_LARGE, text)
         return resident
+
+    def taken_s(self) -> float:
+        """Processor time that it has taken since the last call, s; of one that has ended, as far as it was watched."""
+        self._look_at_processor()
+        taken_s, self._told_cpu_s = self._cpu_s - self._told_cpu_s, self._cpu_s
+        return taken_s
 
     def send(self, message: dict[str, Any]) -> None:
         """Give it a message.
@@ -135,6 +145,10 @@ class Child:
         except subprocess.TimeoutExpired:
             _log.error("a killed worker does not end and is left behind", extra={"fields": {"pid": self.pid}})
         self._link.close()
+
+    def _look_at_processor(self) -> None:
+        with contextlib.suppress(OSError):
+            self._cpu_s = processor_s(self.pid)
 
     def _broken(self, error: Exception) -> ChildError:
         """Its exit tells more than the broken pipe that it left."""

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
@@ -25,6 +25,7 @@ from coec.config import WorkerConfig
 from coec.runtime.timings import LONG_S, Histogram
 from coec.runtime.worker.answers import MalformedAnswerError, number_of, read_answer
 from coec.runtime.worker.child import Child, ChildError, Fault
+from coec.runtime.worker.costs import IDLE, START, Cost, cost_of
 from coec.runtime.worker.jobs import PREFETCH, Answer, Fate, Job, Kind, Prefetch
 from coec.runtime.worker.queue import WORKER_FAILED, InProgress, JobQueue, Ticket
 
@@ -100,13 +101,16 @@ class Worker:
         config: WorkerConfig,
         settings: str,
         command: Sequence[str] = (sys.executable, "-m", "coec.runtime.worker.process"),
+        pay: Callable[[Cost], None] = lambda _: None,
     ) -> None:
         """`settings` is the JSON of the `Config`, handed to every process; `command` starts one, given two more
-        arguments: the descriptor of its socket and the id of this process."""
+        arguments: the descriptor of its socket and the id of this process. `pay` is told of all processor time that
+        the process takes, on the supervisor's thread, of a job before its outcome is."""
         self._config = config
         self._settings = settings
         self._told = ""
         self._command = tuple(command)
+        self._pay = pay
         self._condition = threading.Condition()
         # Under the condition: the queue is everybody's.
         self._queue = JobQueue(config.attempts)
@@ -229,7 +233,10 @@ class Worker:
         reached = _Reached.NOTHING
         self._pid = child.pid
         try:
-            self._await_ready(child)
+            try:
+                self._await_ready(child)
+            finally:
+                self._pay(Cost(START, "", child.taken_s()))
             reached = _Reached.READY
             while not self.thread.stopping:
                 if self._take_turn(child):
@@ -273,9 +280,13 @@ class Worker:
             return False
         kind = ticket.work.kind if isinstance(ticket.work, Job) else None
         timeout_s = ticket.work.timeout_s if isinstance(ticket.work, Job) else None
-        self._send(child, ticket)
-        sent_s = time.monotonic()
-        message = self._next_message(child, timeout_s or self._config.timeout_s)
+        self._pay(Cost(IDLE, "", child.taken_s()))
+        try:
+            self._send(child, ticket)
+            sent_s = time.monotonic()
+            message = self._next_message(child, timeout_s or self._config.timeout_s)
+        finally:
+            self._pay(cost_of(ticket.work, child.taken_s()))
         if message is None:
             return False
         self.work_took.add(time.monotonic() - sent_s, PREFETCH if kind is None else kind.value)

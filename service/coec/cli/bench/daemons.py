@@ -1,0 +1,76 @@
+"""A daemon of the benchmark, beside it in a process of its own: started, asked, ended."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import zenoh
+
+from coec.adapters.zenoh.client import ConnectionFailedError, ask_one
+from coec.errors import NotFoundError
+from coec.runtime.worker.child import PACKAGE_ROOT
+from coec.schemas.keys import Keys
+
+TIMEOUT_S = 60.0
+"""Of an answer, and of an end."""
+
+POLL_S, READY_S = 0.1, 300.0
+"""Between two questions whether the daemon runs: before it does, it can tell nobody. A first start compiles every
+kernel, for a minute and a half on two busy cores."""
+
+SENSORS = "import sys; from coec.cli.bench import load; sys.exit(load.main(*sys.argv[1:]))"
+"""Program of the process that sends frames; its arguments are those of `load.main`."""
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A Python process of ours, asked to end at the end."""
+    process = subprocess.Popen(
+        [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=PACKAGE_ROOT
+    )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.communicate(timeout=TIMEOUT_S)
+
+
+def await_running(session: zenoh.Session, keys: Keys) -> None:
+    """Wait until the service says that it runs.
+
+    Raises:
+        ConnectionFailedError: it does not.
+    """
+    end_s = time.monotonic() + READY_S
+    while time.monotonic() < end_s:
+        with suppress(NotFoundError):  # the router is there before the service
+            if status(session, keys)["state"] == "running":
+                return
+        time.sleep(POLL_S)
+    raise ConnectionFailedError(f"the daemon of the benchmark did not become ready within {READY_S:g} s")
+
+
+def status(session: zenoh.Session, keys: Keys) -> dict[str, Any]:
+    """Of the daemon."""
+    return answered(session, keys.status)
+
+
+def answered(session: zenoh.Session, key: str) -> dict[str, Any]:
+    """The document that is served on a key."""
+    document: dict[str, Any] = json.loads(ask_one(session, f"{key}?format=json", TIMEOUT_S).payload)
+    return document
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,33 @@
+"""What a piece of work costs: measured as it is done, smoothed, bounded."""
+
+from __future__ import annotations
+
+from collections import deque
+
+KEPT = 9
+"""Measurements of which the middle one is the price: what else the machine does, a process that is new and a hard scene
+move none of the middle ones as long as they are fewer than half."""
+
+MOST_S = 600.0
+"""Of processor time that one measurement may say: five times the longest that a job may take by default."""
+
+
+class Price:
+    """Processor time of one kind of work, s."""
+
+    def __init__(self) -> None:
+        self._seen: deque[float] = deque(maxlen=KEPT)
+
+    def add(self, cpu_s: float) -> None:
+        """It took so much."""
+        self._seen.append(min(max(cpu_s, 0.0), MOST_S))
+
+    @property
+    def known(self) -> bool:
+        """Whether it was measured at all."""
+        return bool(self._seen)
+
+    @property
+    def cpu_s(self) -> float:
+        """The middle one of the last measurements, of two the lower; 0 before the first."""
+        return sorted(self._seen)[(len(self._seen) - 1) // 2] if self._seen else 0.0
