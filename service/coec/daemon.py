@@ -210,7 +210,7 @@ class Daemon:
         self._door.use(self._config.metrics)
         for pair in self._config.pairs:
             self._run(pair)
-        self._room.listen(self._bus, self._ros_side.input_of)
+        self._room.listen(self._bus, self._ros_side)
         for name in (each.name for each in self._config.every_pair):
             self._bus.declare_alive(self._keys.alive(name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
