@@ -100,7 +100,7 @@ def _is_one_scan(header: Header, data: bytes) -> bool:
 
 
 def _count_scans(data: bytes) -> int:
-    """Occurrences of the marker of a scan, as `data.count`, at a tenth of its time: words that begin at even places, and
+    """Occurrences of the marker of a scan, as `data.count` at a tenth of its time: words that begin at even places, and
     those that begin at odd ones."""
     marker = np.frombuffer(_JPEG_SCAN, np.uint16)
     words = (np.frombuffer(data, np.uint16, (len(data) - odd) // 2, odd) for odd in (0, 1))
