@@ -135,11 +135,9 @@ def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, said: PointTi
     that the configuration says. Arguments as of `offsets_s`."""
     values = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
     begin, end = _range(values if keep is None else values[keep])
-    if said is not None:
-        units, since_s = ((said.unit,) if said.base == "clock" else ()), 0
-    else:
-        units, since_s = tuple(_TICKS), SINCE_S
-    for unit in units:
+    clocked = [unit for unit in _TICKS if said is None or (said.unit, said.base) == (unit, "clock")]
+    since_s = SINCE_S if said is None else 0
+    for unit in clocked:
         ticks = _TICKS[unit]
         finest = 1.0 if values.dtype.kind != "f" else float(np.spacing(values.dtype.type(begin)))
         if since_s < begin / ticks and end / ticks < UNTIL_S and finest / ticks <= FINEST_S:
