@@ -6,7 +6,6 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -63,6 +62,10 @@ def configured(folder: Path, endpoint: str, more: str = "") -> Path:
     return path
 
 
+BLOCK = zenoh.CongestionControl.BLOCK
+"""Whoever sends waits for the network: by default Zenoh drops after a millisecond, which a busy machine often takes."""
+
+
 class Vehicle:
     """Publishes on a session of its own. Latched messages wait for whoever comes later."""
 
@@ -80,7 +83,9 @@ class Vehicle:
 
     def put(self, topic: str, payload: bytes) -> None:
         """A message of a topic that keeps nothing."""
-        self._session.put(f"0{topic}/{TYPES[topic]}", payload, attachment=self._attachment(topic))
+        self._session.put(
+            f"0{topic}/{TYPES[topic]}", payload, congestion_control=BLOCK, attachment=self._attachment(topic)
+        )
 
     def latch(self, topic: str, payload: bytes) -> None:
         """A message that is kept for whoever comes later."""
@@ -88,10 +93,9 @@ class Vehicle:
             self._latched[topic] = latched(self._session, f"0{topic}/{TYPES[topic]}")
         self._latched[topic].put(payload, attachment=self._attachment(topic))
 
-    def send(self, frames: Sequence[Frame]) -> None:
-        """Frames as drivers send them: without depth, numbered by their attachments."""
-        for frame in frames:
-            self.put(*message_of(frame))
+    def send(self, frame: Frame) -> None:
+        """A frame as drivers send it: without depth, numbered by its attachment."""
+        self.put(*message_of(frame))
 
     def close(self) -> None:
         """Be gone, with what was kept."""

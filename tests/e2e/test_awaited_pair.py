@@ -17,6 +17,7 @@ from coec.geometry import se3
 from e2e.drives import Drive, rendered
 from e2e.processes import PATIENCE_S, Router, Service, service
 from e2e.ros_vehicle import (
+    BLOCK,
     CAMERA,
     EGO,
     INFO,
@@ -97,7 +98,8 @@ def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, dr
         assert f"No CameraInfo on {INFO} yet." in acknowledged["text"]
 
         vehicle.put(INFO, camera_info(rig.camera, rig.camera_frame))
-        vehicle.send(drive.frames[:20])
+        for frame in drive.frames[:20]:
+            vehicle.send(frame)
         running.until(running.counters, lambda pair: not pair["awaits"], "the pair is complete")
         nominal = running.extrinsic()
         expected = se3.perturb(rig.T_camera_lidar_nominal, OFF)
@@ -116,7 +118,7 @@ def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, dr
         np.testing.assert_allclose(T_lidar_ego, se3.inverse(T_BASE_LIDAR), atol=1e-9)
         complete_hash = running.status()["config_hash"]
 
-        vehicle.send(drive.frames)
+        running.send_by(vehicle.send, drive.frames)
         running.until(running.counters, lambda pair: pair["windows"] > 0 or pair["selected"] >= PAIRS - 1, "the pairs")
         acknowledged = running.command("calibrate")
         assert acknowledged["accepted"], acknowledged
@@ -173,10 +175,10 @@ def test_rubbish_and_a_flood_keep_a_pair_waiting_and_no_other(
         flood = 2000
         for number in range(flood):
             turned = se3.exp(np.array([0.0, 0.0, 1e-3 * number, 0.0, 0.0, 0.0]))
-            driver.put(TF[1:], transforms(("base_link", rig.lidar_frame, turned)))
+            driver.put(TF[1:], transforms(("base_link", rig.lidar_frame, turned)), congestion_control=BLOCK)
             if number % 10 == 0:
                 for topic in (TF, INFO, CAMERA, POINTS, EGO):
-                    driver.put(topic[1:], bytes(number))
+                    driver.put(topic[1:], bytes(number), congestion_control=BLOCK)
         front = partial(running.ask, keys.health("front"))
         health = running.until(front, lambda told: "camera_info_refused" in codes(told), "what is refused")
         assert (health["state"], health["level"]) == ("unknown", 3)
@@ -188,8 +190,8 @@ def test_rubbish_and_a_flood_keep_a_pair_waiting_and_no_other(
             of_stream = {"camera": CameraFrame, "lidar": LidarFrame, "ego": EgoMotion}[name]
             frame = next(frame for frame in frames if isinstance(frame, of_stream))
             topic, payload = message_of(frame)
-            driver.put(topic[1:], payload)
-        driver.put(INFO[1:], camera_info(rig.camera, rig.camera_frame))
+            driver.put(topic[1:], payload, congestion_control=BLOCK)
+        driver.put(INFO[1:], camera_info(rig.camera, rig.camera_frame), congestion_control=BLOCK)
         latched(driver, TF[1:]).put(said(drive))
         status = running.until(running.status, lambda told: awaits(told, "front") == [], "the pair is complete")
         losses = next(pair for pair in status["pairs"] if pair["name"] == "front")["losses"]

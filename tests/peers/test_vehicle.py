@@ -3,6 +3,7 @@ calibrated frame out, and a knock that a subscriber of rclpy sees."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -90,15 +91,20 @@ class Drivers:
         """In portions that the service's inbox holds, of each the motion first: a drive in seconds overtakes what comes
         on another topic by more than any vehicle does."""
         for portion in portions(frames):
-            motions = [frame for frame in portion if isinstance(frame, EgoMotion)]
-            self._publish_counted(running, "ego", motions)
-            self._publish_counted(running, "camera", [frame for frame in portion if not isinstance(frame, EgoMotion)])
+            self._publish_counted(running, [frame for frame in portion if isinstance(frame, EgoMotion)])
+            self._publish_counted(running, [frame for frame in portion if not isinstance(frame, EgoMotion)])
         running.rest()
 
-    def _publish_counted(self, running: Service, stream: str, frames: Sequence[Frame]) -> None:
-        due = running.counters()[stream]["received"] + sum(stream_of(frame) == stream for frame in frames)
+    def _publish_counted(self, running: Service, frames: Sequence[Frame]) -> None:
+        sent = Counter(stream_of(frame) for frame in frames)
+        before = running.counters()
+        due = {stream: before[stream]["received"] + count for stream, count in sent.items()}
         self.publish(frames)
-        running.until(running.counters, lambda pair: pair[stream]["received"] >= due, f"what was sent of {stream}")
+        running.until(
+            running.counters,
+            lambda pair: all(pair[stream]["received"] >= count for stream, count in due.items()),
+            f"what was sent: {dict(sent)}",
+        )
 
 
 def levels(inbox: Inbox) -> list[int]:

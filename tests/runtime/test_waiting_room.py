@@ -1,41 +1,167 @@
-"""Pairs that wait for what the bus tells: what they share is listened to once."""
+"""Pairs that are awaited: what is listened to, when they are handed over, and what a restart knows of them."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import pytest
 
 from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import Input, Sample, input_of
-from coec.config import AnyStreamConfig, config_of
+from coec.adapters.zenoh.inputs import Input, Sample
+from coec.adapters.zenoh.ros_side import RosSide
+from coec.calibration.types import Reason
+from coec.config import AnyStreamConfig, Config, PairConfig, config_of
+from coec.errors import ConfigError
 from coec.runtime.nominal.findings import Found
 from coec.runtime.nominal.watch import NominalWatch
 from coec.runtime.waiting_room import WaitingRoom
+from fakes import wait_until
 from pair_bench import Bench
+from runtime.waiting import CAMERA, INFO, POINTS, SAMPLES, T_CAMERA_LIDAR, TF_STATIC, World, configured
 
 
-@dataclass
-class Ears:
-    """In place of the bus."""
+class Line:
+    """A bus and its vehicle: who listens to a topic hears what is put there."""
 
-    heard: Counter[str] = field(default_factory=Counter)
-    takers: dict[str, Callable[[Sample], None]] = field(default_factory=dict)
-    ended: list[str] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.heard: dict[str, Callable[[Sample], None]] = {}
+        self.latched: list[str] = []
+        self.subscribed: list[str] = []
+        self.ended: list[str] = []
 
-    def subscribe(self, stream: Input, take: Callable[[Sample], None]) -> Callable[[], None]:
-        (key,) = stream.expressions
-        self.subscribe_latched(stream, take)
-        return lambda: self.ended.append(key)
+    def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
+        (topic,) = stream.expressions
+        self.heard[topic] = on_sample
+        self.subscribed.append(topic)
 
-    def subscribe_latched(self, stream: Input, take: Callable[[Sample], None]) -> None:
-        (key,) = stream.expressions
-        self.heard[key] += 1
-        self.takers[key] = take
+        def end() -> None:
+            self.ended.append(topic)
+            del self.heard[topic]
+
+        return end
+
+    def subscribe_latched(self, stream: Input, on_sample: Callable[[Sample], None]) -> None:
+        self.subscribe(stream, on_sample)
+        self.latched += stream.expressions
+
+    def input_of(self, stream: AnyStreamConfig) -> Input:
+        return self.input_of_info(stream.place)
+
+    def input_of_info(self, topic: str) -> Input:
+        return Input((topic,), lambda _: Sample(b"", ""))
+
+    def input_of_static_transforms(self) -> Input:
+        return self.input_of_info(TF_STATIC)
+
+    def put(self, *topics: str) -> None:
+        for topic in topics:
+            if topic in self.heard:
+                self.heard[topic](SAMPLES[topic])
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+def opened(stack: ExitStack, config: Config, folder: Path) -> tuple[WaitingRoom, Line, World]:
+    room, line = WaitingRoom(config, folder), Line()
+    world = World(folder, room.nominal)
+    room.open(room.complete(config), world.outside)
+    room.listen(cast("Bus", line), cast("RosSide", line))
+    for thread in room.threads:
+        stack.callback(thread.join, 20.0)
+        stack.callback(thread.request_stop)
+    return room, line, world
+
+
+def found(room: WaitingRoom) -> dict[str, PairConfig]:
+    """Of the first hand-over."""
+    handed: list[dict[str, PairConfig]] = []
+
+    def comes() -> bool:
+        handed.append(room.found())
+        return bool(handed[-1])
+
+    wait_until(comes, "the pair is found")
+    return handed[-1]
+
+
+def test_where_nobody_is_awaited_nothing_is_listened_to(stack: ExitStack, tmp_path: Path) -> None:
+    intrinsics = {"model": "pinhole", "width": 8, "height": 6, "fx": 4, "fy": 4, "cx": 4, "cy": 3}
+    camera = {"topic": CAMERA, "intrinsics": intrinsics, "frame_id": "camera"}
+    lidar = {"topic": POINTS, "frame_id": "lidar"}
+    given = {"T_camera_lidar": T_CAMERA_LIDAR.tolist(), "camera": camera, "lidar": lidar}
+    document = configured(tmp_path).model_dump(include={"middleware", "state"})
+    config = Config.model_validate({**document, "pairs": [{"name": "front", **given}]})
+    room, line, _ = opened(stack, config, tmp_path)
+    assert (room.threads, room.answers, line.heard, room.found()) == ((), {}, {}, {})
+    assert room.complete(config) == config
+
+
+def test_a_pair_is_handed_over_once_everything_is_heard(stack: ExitStack, tmp_path: Path) -> None:
+    config = configured(tmp_path)
+    room, line, world = opened(stack, config, tmp_path)
+    assert set(line.heard) == {CAMERA, POINTS, INFO, TF_STATIC}
+    assert set(line.latched) == {INFO, TF_STATIC}, "what was said before counts, too"
+    line.put(INFO, TF_STATIC, POINTS)
+    wait_until(lambda: [one.code for one in room.nominal("front").awaits] == ["no_image"], "what is missing is told")
+    assert room.found() == {}
+    room.renew()
+    assert b"no_image" in world.published[-1][1].payload
+
+    line.put(CAMERA)
+    pair = found(room)["front"]
+    np.testing.assert_allclose(pair.T_camera_lidar, T_CAMERA_LIDAR, atol=1e-12)
+    assert room.answers == {}, "whoever is handed over is answered for elsewhere"
+    assert set(line.heard) == {INFO, TF_STATIC}, "changes are told for as long as the service runs"
+    line.put(INFO, TF_STATIC)
+    assert room.found() == {}, "once"
+
+
+@pytest.mark.fault("a restart of a vehicle whose pairs were found on the bus", "they are served at once, as found")
+def test_a_restart_has_what_was_found(stack: ExitStack, tmp_path: Path) -> None:
+    config = configured(tmp_path)
+    room, line, _ = opened(stack, config, tmp_path)
+    line.put(*SAMPLES)
+    pair = found(room)["front"]
+
+    again = WaitingRoom(config, tmp_path)
+    complete = again.complete(config)
+    assert (complete.pairs, complete.awaited) == ((pair,), ())
+    assert "kept since" in again.origins()["front"]["T_camera_lidar"]
+    elsewhere = configured(tmp_path, points="/rear/points")
+    assert WaitingRoom(elsewhere, tmp_path).complete(elsewhere).pairs == (), "of other topics nothing is known"
+
+
+@pytest.mark.fault("what was found of a pair cannot be used", "it is awaited until something else is heard")
+def test_a_pair_that_cannot_be_built_is_awaited_again(stack: ExitStack, tmp_path: Path) -> None:
+    room, line, world = opened(stack, configured(tmp_path), tmp_path)
+    line.put(*SAMPLES)
+    wait_until(lambda: [one.code for one in room.nominal("front").awaits] == ["being_built"], "it is found")
+    room.refuse("front", "the mask is too small")
+    wait_until(lambda: [one.code for one in room.nominal("front").awaits] == ["cannot_be_built"], "it is refused")
+    room.renew()
+    assert b"the mask is too small" in world.published[-1][1].payload
+    assert list(room.answers) == ["front"]
+
+
+def test_the_end_of_the_service_is_told_for_those_who_wait(stack: ExitStack, tmp_path: Path) -> None:
+    room, _, world = opened(stack, configured(tmp_path), tmp_path)
+    room.fail(Reason("thread_died", "The thread look-out died."))
+    assert b"thread_died" in world.published[-1][1].payload
+
+
+def test_what_is_given_and_cannot_be_used_is_told_at_once(tmp_path: Path) -> None:
+    config = configured(tmp_path, T_camera_lidar=np.eye(4).tolist(), camera={"topic": CAMERA, "mask": "absent.png"})
+    with pytest.raises(ConfigError, match="absent"):
+        WaitingRoom(config, tmp_path)
 
 
 def test_what_several_pairs_wait_for_is_listened_to_once_until_the_last_is_found(
@@ -46,24 +172,21 @@ def test_what_several_pairs_wait_for_is_listened_to_once_until_the_last_is_found
     config = config_of({"middleware": "ros2dds", "cameras": cameras, "lidars": lidars, "pairs": "all"})
     told: list[tuple[str, str]] = []
     monkeypatch.setattr(NominalWatch, "take_frame", lambda _, pair, kind, __: told.append((pair, kind)))
-    room, ears = WaitingRoom(config, tmp_path), Ears()
+    room, ears = WaitingRoom(config, tmp_path), Line()
     monkeypatch.setattr(room._watch.thread, "start", lambda: None)
     room.open(config, Bench(tmp_path / "bench").outside)
 
-    def input_of_stream(stream: AnyStreamConfig) -> Input:
-        return input_of(stream, config)
-
-    room.listen(cast("Bus", ears), input_of_stream)
-    topics = {f"{name}/image_raw" for name in ("front", "rear")} | {f"{name}/points" for name in ("roof", "left")}
-    infos = {"front/camera_info", "rear/camera_info"}
-    assert ears.heard == Counter(topics | infos | {"tf_static"})
-    ears.takers["roof/points"](Sample(b"", ""))
+    room.listen(cast("Bus", ears), cast("RosSide", ears))
+    topics = {f"/{name}/image_raw" for name in ("front", "rear")} | {f"/{name}/points" for name in ("roof", "left")}
+    infos = {"/front/camera_info", "/rear/camera_info"}
+    assert Counter(ears.subscribed) == Counter(topics | infos | {TF_STATIC})
+    ears.heard["/roof/points"](Sample(b"", ""))
     assert told == [("front-roof", "lidar"), ("rear-roof", "lidar")]
     (pair,) = Bench(tmp_path / "other").config.pairs
     ready = iter([{"front-roof": Found(pair, {})}, {"front-left": Found(pair, {})}])
     monkeypatch.setattr(room._watch, "ready", lambda: next(ready))
     assert [*room.found(), *room.found()] == ["front-roof", "front-left"]
-    assert ears.ended == ["front/image_raw"]
+    assert ears.ended == ["/front/image_raw"]
     told.clear()
-    ears.takers["roof/points"](Sample(b"", ""))
+    ears.heard["/roof/points"](Sample(b"", ""))
     assert told == [("rear-roof", "lidar")]

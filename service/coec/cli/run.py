@@ -30,7 +30,7 @@ def run(path: Path, *, embedded_router: bool, state_dir: Path | None) -> int:
     from coec.adapters.system import allocator
 
     allocator.share_arenas()
-    allocator.return_large()
+    allocator.reuse_frames()
     return daemon.run(config, read)
 
 

@@ -77,6 +77,11 @@ CERTIFICATE = "authority.certificate"
 """Place of what is read from files, which change while the configuration does not."""
 
 TICK_S = 1.0
+
+GIVE_BACK_S = 5.0
+"""Between two times at which memory that nobody uses goes back: what frames come to use again meanwhile need not be
+cleared by the system first."""
+
 STALLED_S = 20.0
 """A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed."""
 
@@ -100,6 +105,7 @@ class Daemon:
         config = self._config = self._room.complete(config)
         self._notifier = notifier
         self._started_s, self._started_ns = time.monotonic(), time.time_ns()
+        self._given_back_s = self._started_s
         self._state: Literal["starting", "running", "stopping", "failing"] = "starting"
         self._fault: Reason | None = None
         self._keys = Keys(config.prefix, config.vehicle)
@@ -179,7 +185,7 @@ class Daemon:
         self._answers.declare(self._bus)
         self._door.use(self._config.metrics)
         self._run(self._pairs.values())
-        self._room.listen(self._bus, self._ros_side.input_of)
+        self._room.listen(self._bus, self._ros_side)
         for name in (each.name for each in self._config.every_pair):
             self._bus.declare_alive(self._keys.alive(name))
         fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
@@ -224,7 +230,9 @@ class Daemon:
     def _tick(self) -> int:
         """Once a second: look at every thread, renew what is served, keep no memory that nobody uses. Returns an exit
         status, 0 to go on."""
-        allocator.give_back()
+        if time.monotonic() - self._given_back_s >= GIVE_BACK_S:
+            allocator.give_back()
+            self._given_back_s = time.monotonic()
         threads = self._threads()
         dead = [thread for thread in threads if thread.dead]
         if dead:

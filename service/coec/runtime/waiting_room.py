@@ -14,16 +14,16 @@ from pathlib import Path
 from coec.adapters.files.rig import check_given, rig_of
 from coec.adapters.system.threads import ServiceThread
 from coec.adapters.zenoh.bus import Bus
-from coec.adapters.zenoh.inputs import Input, Sample, input_of
+from coec.adapters.zenoh.inputs import Sample
+from coec.adapters.zenoh.ros_side import RosSide
 from coec.calibration.types import Reason
-from coec.config import AnyStreamConfig, Config, PairConfig, StreamConfig
+from coec.config import Config, PairConfig
 from coec.errors import ConfigError
 from coec.runtime.api.awaited import AwaitedAnswers
 from coec.runtime.nominal.findings import CANNOT_BE_BUILT, Found, info_topic_of, needs_transforms
 from coec.runtime.nominal.kept import KeptNominals, completed
 from coec.runtime.nominal.watch import Nominal, NominalWatch
 from coec.runtime.outside import Outside
-from coec.schemas.ros_names import TF_STATIC
 
 _log = logging.getLogger(__name__)
 
@@ -107,14 +107,13 @@ class WaitingRoom:
         self.answers = {pair.name: AwaitedAnswers(pair, config.vehicle, outside) for pair in config.awaited}
         return self.answers
 
-    def listen(self, bus: Bus, input_of_stream: Callable[[AnyStreamConfig], Input]) -> None:
-        """Listen for what is left out; to `/tf_static` and `CameraInfo` for as long as the service runs.
-        `input_of_stream` tells how to listen to the streams of a pair."""
+    def listen(self, bus: Bus, side: RosSide) -> None:
+        """Listen for what is left out; to `/tf_static` and `CameraInfo` for as long as the service runs. `side` tells
+        how."""
         for thread in self.threads:
             thread.start()
         if any(needs_transforms(pair) for pair in self._asked.values()):
-            stream = StreamConfig(topic=TF_STATIC)
-            bus.subscribe_latched(input_of(stream, self._read), self._watch.take_transforms)
+            bus.subscribe_latched(side.input_of_static_transforms(), self._watch.take_transforms)
         infos: dict[str, _Shared] = {}
         for name, pair in self._asked.items():
             topic = info_topic_of(pair)
@@ -122,12 +121,12 @@ class WaitingRoom:
                 shared = infos.setdefault(topic, _Shared())
                 shared.join(name, partial(self._watch.take_info, name))
                 if shared.is_new:
-                    bus.subscribe_latched(input_of(StreamConfig(topic=topic), self._read), shared.take)
+                    bus.subscribe_latched(side.input_of_info(topic), shared.take)
             for kind, stream in pair.streams.items() if name in self.answers else ():
                 shared = self._streams.setdefault(stream.place, _Shared())
                 shared.join(name, partial(self._watch.take_frame, name, kind))
                 if shared.is_new:
-                    shared.end = bus.subscribe(input_of_stream(stream), shared.take)
+                    shared.end = bus.subscribe(side.input_of(stream), shared.take)
 
     def found(self) -> dict[str, PairConfig]:
         """Pairs of which everything is known by now, and that can be built; each once."""

@@ -137,10 +137,28 @@ def test_a_jpeg_that_claims_a_huge_size_is_refused() -> None:
 @pytest.mark.fault(
     "a small JPEG of thousands of scans that keeps a decoder busy for hours", "it is refused before it is decoded"
 )
-def test_a_jpeg_of_many_scans_is_refused() -> None:
+@pytest.mark.parametrize("components", [2, 3])
+def test_a_jpeg_of_many_scans_is_refused(components: int) -> None:
+    """A progressive one, and one whose first scan does not hold all components."""
+    data = with_many_scans(progressive=components == 3, components=components)
+
+    assert reason_of(data) == "image_corrupt"
+
+
+@pytest.mark.parametrize("appended", [b"", b"\xff\xda\x00\x02" * 200])
+def test_of_a_jpeg_of_one_scan_no_other_is_read(appended: bytes) -> None:
     data = encode_jpeg(scene())
 
-    assert reason_of(data[:-2] + b"\xff\xda\x00\x02" * 200 + data[-2:]) == "image_corrupt"
+    image = probe(data[:-2] + appended + data[-2:], LIMITS)
+    assert np.array_equal(decode_bgr(image, LIMITS), decode_bgr(probe(data, LIMITS), LIMITS))
+
+
+def with_many_scans(*, progressive: bool, components: int) -> bytes:
+    """A JPEG of three components, of which the first scan says that it holds so many."""
+    parameters = [cv2.IMWRITE_JPEG_PROGRESSIVE, int(progressive)]
+    data = bytearray(cv2.imencode(".jpg", scene(), parameters)[1].tobytes())
+    data[data.index(b"\xff\xda") + 4] = components
+    return bytes(data[:-2] + b"\xff\xda\x00\x02" * 200 + data[-2:])
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,21 @@ def test_points_that_carry_a_clocks_time_move_with_their_stamp(unit_s: float) ->
     np.testing.assert_allclose(frame.time_offset_s, [0.01, 0.05], atol=1e-5)
 
 
+@pytest.mark.parametrize("unit_s", [1.0, 1e-9])
+def test_points_whose_cloud_has_no_stamp_move_alone(unit_s: float) -> None:
+    times = [(STAMP * 1e-9) / unit_s, (STAMP * 1e-9 + 0.04) / unit_s]
+    data = later(POINT_CLOUD, packed([*XYZ, ("timestamp", "<f8", times)], sec=0, nsec=0))
+    assert data[4:12] == bytes(8)
+    frame = decode(POINT_CLOUD, data, LimitsConfig())
+    assert isinstance(frame, LidarFrame)
+    assert frame.stamp_ns == pytest.approx(STAMP + LATER_NS, abs=1000)
+
+
+def test_a_header_without_a_stamp_stays_without() -> None:
+    data = b"\x00\x01\x00\x00" + bytes(8) + b"rest"
+    assert later(COMPRESSED_IMAGE, data) == data
+
+
 def test_times_since_the_stamp_stay() -> None:
     data = packed([*XYZ, ("time", "<f8", [0.0, 0.1])])
     assert later(POINT_CLOUD, data)[12:] == data[12:]

@@ -191,3 +191,57 @@ def test_no_usual_sweep_is_read_in_another_way_than_it_was_written(
     frame = sweep(cloud_timed("timestamp", "<f8", values, stamp_ns=seconds * 10**9))
 
     assert offsets_s(frame) == pytest.approx([begin_s, begin_s + lasts_s], abs=2e-6)
+
+
+BEGIN_S = SEC + NSEC * 1e-9
+
+
+@pytest.mark.fault("a cloud without a stamp whose points carry the time of day", "the first point's is taken, and said")
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+@pytest.mark.parametrize("name", ["timestamp", "t"])
+def test_without_a_stamp_the_first_point_tells_it(unit: str, name: str) -> None:
+    frame = sweep(cloud_timed(name, "<f8", ((SWEEP_S + BEGIN_S) * TICKS[unit]).tolist(), stamp_ns=0))
+
+    assert frame.stamp_ns == pytest.approx(STAMP, abs=1000)  # neighbouring doubles are 0.2 us apart
+    assert offsets_s(frame) == pytest.approx(SWEEP_S, abs=2e-6)
+    assert frame.timed_by.endswith("stamped at its begin; without a stamp, that of the first point is taken")
+
+
+def test_points_that_are_none_do_not_stamp_a_cloud() -> None:
+    columns: Columns = [(axis, "<f4", [math.nan, 1.0, 2.0]) for axis in "xyz"]
+    times: Columns = [("timestamp", "<f8", [0.0, BEGIN_S, BEGIN_S + 0.1])]
+    assert sweep(packed([*columns, *times], sec=0, nsec=0)).stamp_ns == pytest.approx(STAMP, abs=1000)
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "values"),
+    [
+        ("t", "<u4", [0.0, 99_900_000.0]),
+        ("time", "<f4", [-0.1, 0.0]),
+        ("timestamp", "<f8", [0.0, 0.1]),
+    ],
+)
+def test_without_a_stamp_a_time_since_the_stamp_leaves_it_open(name: str, form: str, values: list[float]) -> None:
+    assert sweep(cloud_timed(name, form, values, stamp_ns=0)).stamp_ns == 0
+
+
+@pytest.mark.fault("a cloud without a stamp whose points tell no time of day", "the sweep is refused with its reason")
+@pytest.mark.parametrize(
+    ("form", "values"),
+    [
+        ("<f4", [BEGIN_S, BEGIN_S]),  # two minutes between neighbouring values
+        ("<u4", [float(SEC), float(SEC)]),  # whole seconds
+        ("<f8", [345e9, 345.1e9]),  # since the sensor was switched on
+        ("<f8", [2.0**31, 2.0**31 + 0.1]),
+    ],
+)
+def test_without_a_stamp_nothing_is_guessed(form: str, values: list[float]) -> None:
+    assert refused(cloud_timed("timestamp", form, values, stamp_ns=0)).reason == "cloud_time"
+
+
+def test_without_a_stamp_a_clock_that_is_named_is_believed() -> None:
+    said = PointTimeConfig(field="timestamp", unit="s", base="clock")
+    frame = sweep(cloud_timed("timestamp", "<f8", [345.0, 345.1], stamp_ns=0), said)
+
+    assert frame.stamp_ns == 345 * 10**9
+    assert offsets_s(frame) == pytest.approx([0.0, 0.1])

@@ -88,6 +88,22 @@ def test_the_service_shows_itself_as_a_node_that_subscribes(session: zenoh.Sessi
     assert seen(session, "@ros2_lv/**") == set()
 
 
+def test_the_service_shows_that_it_listens_to_transforms_and_camera_info(session: zenoh.Session, side: RosSide) -> None:
+    bus, own = Bus(session), str(session.info.zid())
+    for stream in (side.input_of_static_transforms(), side.input_of_info("/front/camera_info")):
+        bus.subscribe_latched(stream, lambda _: None)
+    tf = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+    info = "RIHS01_b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275"
+    shown = f"@ros2_lv/0/{own}/0"
+    assert seen(session, "@ros2_lv/*/*/*/*/MS/**") == {
+        f"{shown}/1/MS/%/%vehicle/coec/%tf_static/tf2_msgs::msg::dds_::TFMessage_/{tf}/:1:,100:,:,:,,/backends:cpu:",
+        f"{shown}/2/MS/%/%vehicle/coec/%front%camera_info/sensor_msgs::msg::dds_::CameraInfo_/{info}/2::,5:,:,:,,"
+        "/backends:cpu:",
+    }
+    bus.undeclare_inputs()
+    assert seen(session, "@ros2_lv/*/*/*/*/MS/**") == set()
+
+
 @pytest.mark.parametrize("middleware", ["native", "ros2dds"])
 def test_elsewhere_subscribing_is_enough(session: zenoh.Session, stack: ExitStack, middleware: str) -> None:
     config = configured("ros2dds")

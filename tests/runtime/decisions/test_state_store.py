@@ -181,3 +181,18 @@ def test_numbers_and_shapes_that_nobody_wrote_are_an_error_of_ours(tmp_path: Pat
     file.save(body)
     with pytest.raises(StateError):
         StateStore(tmp_path, "test").recall(RIG)
+
+
+@pytest.mark.fault("a forged state with corrections beyond all measure", "an error of ours, and nominal is served")
+@pytest.mark.parametrize("name", ["correction_rad_m", "noise", "systematic"])
+def test_a_result_that_could_not_be_told_again_is_an_error_of_ours(tmp_path: Path, name: str) -> None:
+    saved(StateStore(tmp_path, "test"), RIG, after_estimate(initial_state(RIG), estimate(1), 0, RULES), {})
+    file = StateFile(tmp_path / "state.json")
+    body = file.load().body
+    assert body is not None
+    huge = [1e308] * 6
+    beyond = {"correction_rad_m": huge, "noise": [huge] * 6, "systematic": {"stamps": huge}}
+    body["pairs"][RIG.pair]["latest"][name] = beyond[name]
+    file.save(body)
+    with pytest.raises(StateError):
+        StateStore(tmp_path, "test").recall(RIG)

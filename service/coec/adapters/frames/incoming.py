@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 
 import numpy as np
@@ -65,10 +66,11 @@ def finite_rows(
     xyz_m: NDArray[np.float32], time_offset_s: NDArray[np.float32] | None = None
 ) -> NDArray[np.bool_] | None:
     """(N,) mask of the points whose place and time are finite, or None when all are (the usual case)."""
+    # First as a whole, and by a sum, which anything that is not finite would spoil: ten times as fast as by column.
+    with np.errstate(over="ignore", invalid="ignore"):
+        if all(math.isfinite(column.sum()) for column in (xyz_m, time_offset_s) if column is not None):
+            return None
     finite: NDArray[np.bool_] = np.isfinite(xyz_m)
-    # First as a whole: seven times as fast as by column.
-    if finite.all() and (time_offset_s is None or bool(np.isfinite(time_offset_s).all())):
-        return None
     keep: NDArray[np.bool_] = finite[:, 0] & finite[:, 1] & finite[:, 2]
     if time_offset_s is not None:
         keep &= np.isfinite(time_offset_s)

@@ -18,6 +18,8 @@ _JPEG_END = b"\xff\xd9"
 _JPEG_SCAN = b"\xff\xda"
 # Markers of ITU-T T.81, table B.1.
 _SOF = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; Huffman
+_PROGRESSIVE = 0xC2
+_TABLES = (0xC4, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE)  # DHT, DQT, DRI, APPn, COM: what may lie before a scan
 _OTHER_SOF = (0xC3, *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0))  # lossless, differential, arithmetic
 _STANDALONE = (0x01, *range(0xD0, 0xD9))  # TEM, RST0-7, SOI: markers without a length
 
@@ -35,12 +37,17 @@ _MAX_CHUNKS = 16_384
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Format and size in pixels; `body` is the offset of the first byte behind the header."""
+    """Format and size in pixels; `body` is the offset of the first byte behind the header.
+
+    Attributes:
+        components: of a JPEG that is not progressive; 0 of all others.
+    """
 
     format: ImageFormat
     width: int
     height: int
     body: int
+    components: int = 0
 
 
 def read_header(data: bytes) -> Header:
@@ -69,16 +76,32 @@ def check_body(header: Header, data: bytes) -> None:
     if header.format is ImageFormat.PNG:
         _check_png_chunks(data, header.body)
         return
-    if _count_scans(data) > _MAX_SCANS:
+    if not _is_one_scan(header, data) and _count_scans(data) > _MAX_SCANS:
         raise DecodeError(Refusal.IMAGE_CORRUPT, f"the JPEG has more than {_MAX_SCANS} scans")
     # Entropy-coded data cannot hold the end marker, and a thumbnail's stands before the frame header.
     if data.rfind(_JPEG_END, header.body) < 0:
         raise DecodeError(Refusal.IMAGE_TRUNCATED, "the JPEG has no end marker: it was cut off")
 
 
+def _is_one_scan(header: Header, data: bytes) -> bool:
+    """Whether the first scan of a JPEG holds all there is: a decoder then reads no other (libjpeg, jdinput.c). So it is
+    of nearly every camera, and these need not be gone through."""
+    at = header.body
+    for _ in range(_MAX_SEGMENTS if header.components else 0):
+        if at + 5 > len(data) or data[at] != 0xFF:
+            return False
+        if data[at + 1] == _JPEG_SCAN[1]:
+            return data[at + 4] == header.components
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[at + 1] not in _TABLES or length < 2:
+            return False
+        at += 2 + length
+    return False
+
+
 def _count_scans(data: bytes) -> int:
-    """Occurrences of the marker of a scan. As `data.count`, at a tenth of its time: every image that comes is looked
-    at. Words that begin at even places, and those that begin at odd ones."""
+    """Occurrences of the marker of a scan, as `data.count` at a tenth of its time: words that begin at even places, and
+    those that begin at odd ones."""
     marker = np.frombuffer(_JPEG_SCAN, np.uint16)
     words = (np.frombuffer(data, np.uint16, (len(data) - odd) // 2, odd) for odd in (0, 1))
     return sum(int(np.count_nonzero(half == marker)) for half in words)
@@ -127,10 +150,11 @@ def _jpeg_header(data: bytes) -> Header:
             continue
         (length,) = struct.unpack_from(">H", data, at + 2)
         if marker in _SOF:
-            if at + 9 > len(data):
+            if at + 10 > len(data):
                 raise DecodeError(Refusal.IMAGE_TRUNCATED, "the JPEG ends within its frame header")
             height, width = struct.unpack_from(">HH", data, at + 5)
-            return Header(ImageFormat.JPEG, width, height, at + 2 + length)
+            components = 0 if marker == _PROGRESSIVE else data[at + 9]
+            return Header(ImageFormat.JPEG, width, height, at + 2 + length, components)
         if marker in _OTHER_SOF:
             raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, "of JPEGs, only baseline and progressive ones are read")
         if length < 2 or marker in (0x00, 0xD9, 0xDA):  # end of image or a scan without a frame

@@ -42,6 +42,10 @@ _TAIL_BYTES = _PREFIX.size + _FOOTER.size + len(MAGIC)
 class McapDamaged(CoecError):  # noqa: N818 - caught by name where it becomes a SourceError or a WindowError
     """The file is not MCAP, is cut off, or a CRC does not agree; the message begins with the byte."""
 
+    def of(self, path: Path) -> str:
+        """What it says of a recording, whoever recorded it, and what helps."""
+        return f"{path} is damaged: {self}. `mcap recover` saves what is whole"
+
 
 @dataclass(frozen=True, slots=True)
 class Schema:

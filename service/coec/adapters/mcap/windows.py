@@ -47,7 +47,7 @@ from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
-from coec.errors import ConfigError, DecodeError, RecordingError, WindowError
+from coec.errors import ConfigError, DecodeError, RecordingError, SourceError, WindowError
 from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import CalibrationResult
 from coec.schemas.ros_names import DIAGNOSTICS, TF_STATIC
@@ -404,9 +404,14 @@ def is_window(path: Path) -> bool:
     """Whether a sound MCAP file is a window of ours. Does not read the frames.
 
     Raises:
-        WindowError: unreadable, cut off or damaged.
+        SourceError: unreadable, cut off or damaged, so that nobody can tell.
     """
-    return _attachment(path, RIG) is not None
+    try:
+        return read_attachment(path, RIG) is not None
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror}") from error
+    except McapDamaged as error:
+        raise SourceError(error.of(path)) from error
 
 
 @dataclass(slots=True)
@@ -593,7 +598,7 @@ def _attachment(path: Path, name: str) -> bytes | None:
 
 
 def _damage(path: Path, error: McapDamaged) -> str:
-    return f"{path} is damaged: {error}. `mcap recover` saves what is whole; the daemon does so for its own at start"
+    return f"{error.of(path)}; the daemon does so for its own at start"
 
 
 def _size(path: Path) -> int:

@@ -11,6 +11,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.ros import messages
+from coec.adapters.ros.point_time import SINCE_S, UNTIL_S
 from coec.adapters.ros.topics import TopicMessage
 from coec.errors import DecodeError
 
@@ -31,8 +32,8 @@ _NEAR_S: Final = 60.0
 
 
 def shifted(message: TopicMessage, shift_ns: int) -> TopicMessage:
-    """The message so much later: the stamp of its header, those of transforms, and points' times of a clock. A type
-    without a header, or one that is not known here, keeps its bytes.
+    """The message so much later: the stamp of its header, those of transforms, and points' times of a clock. A header
+    without a stamp (0) stays without, and a type without a header, or one that is not known here, keeps its bytes.
 
     Raises:
         DecodeError: it is not what its type says, or a stamp would leave what ROS can say.
@@ -55,6 +56,8 @@ def _header(data: bytes, shift_ns: int) -> bytes:
     if layout is None:
         raise DecodeError(Refusal.MESSAGE_MALFORMED, "the message ends within its header")
     seconds, nanoseconds = layout.unpack_from(data, 4)
+    if seconds == nanoseconds == 0:
+        return data
     return data[:4] + layout.pack(*_later(seconds, nanoseconds, shift_ns)) + data[12:]
 
 
@@ -87,7 +90,8 @@ def _cloud(data: bytes, shift_ns: int) -> bytes:
         with np.errstate(invalid="ignore", over="ignore"):
             middle = float(np.median(times[np.isfinite(times)])) if np.isfinite(times).any() else 0.0
             for unit_s in _UNITS_S:
-                if abs(middle * unit_s - stamp_s) < _NEAR_S < stamp_s:
+                near = abs(middle * unit_s - stamp_s) < _NEAR_S < stamp_s
+                if near or (stamp_s == 0.0 and SINCE_S < middle * unit_s < UNTIL_S):
                     times += shift_ns * 1e-9 / unit_s
                     break
     return _header(messages.serialized(replace(message, data=points), messages.POINT_CLOUD), shift_ns)

@@ -160,10 +160,11 @@ def sayable(camera: Camera) -> tuple[Camera, float]:
     try:
         fit = fit_kannala_brandt(camera)
     except ValueError as error:
-        raise UnsayableCameraError(f"not as equidistant: {error}") from error
+        raise UnsayableCameraError(f"ROS has no model {name_of(camera)}, and not as equidistant: {error}") from error
     if fit.residual_max_px > MAX_RESIDUAL_PX:
         raise UnsayableCameraError(
-            f"not as equidistant: it would be {fit.residual_max_px:.2g} px off, more than {MAX_RESIDUAL_PX:g} px"
+            f"ROS has no model {name_of(camera)}, and as equidistant it would be {fit.residual_max_px:.2g} px off, "
+            f"more than {MAX_RESIDUAL_PX:g} px: nodes need the intrinsics from where this configuration has them"
         )
     return fit.camera, fit.residual_max_px
 

@@ -4,6 +4,7 @@ column."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +16,7 @@ from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 
 from coec.adapters.frames.incoming import Refusal, finite_rows, lidar_frame
 from coec.adapters.ros.point_time import FIELDS as TIME_FIELDS
-from coec.adapters.ros.point_time import offsets_s
+from coec.adapters.ros.point_time import offsets_s, stamp_in
 from coec.adapters.ros.source_field import of_source
 from coec.calibration.types import LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig
@@ -48,7 +49,8 @@ def frame_of(
 
     `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned
     integer; time one of `TIME_FIELDS`, any number, as recognised there or as `point_time` says. Optional
-    fields of other types are left out, as are fields with several values a point. `source`: see `of_source`.
+    fields of other types are left out, as are fields with several values a point. A `stamp_ns` of 0 is none: then the
+    first point tells it, if it tells a time of day. `source`: see `of_source`.
 
     Raises:
         DecodeError: `cloud_shape`, `cloud_fields`, `cloud_too_large`, `cloud_empty`, `cloud_time`,
@@ -63,15 +65,15 @@ def frame_of(
         ring = _column(message, next((by_name[n] for n in ("ring", "channel", "line") if n in by_name), None), "u")
         if ring is not None and ring.itemsize > 2 and int(ring.max()) > 0xFFFF:
             raise DecodeError(Refusal.CLOUD_FIELDS, "a ring number exceeds 65535")
-        times_s, timed_by = _times(message, by_name, finite_rows(xyz_m), stamp_ns, point_time)
+        times = _times(message, by_name, finite_rows(xyz_m), stamp_ns, point_time)
         return lidar_frame(
-            stamp_ns,
+            times.stamp_ns,
             message.header.frame_id,
             xyz_m,
             None if intensity is None else intensity.astype(np.float32),
             None if ring is None else ring.astype(np.uint16),
-            times_s,
-            timed_by=timed_by,
+            times.offset_s,
+            timed_by=times.told,
         )
 
 
@@ -158,20 +160,39 @@ def _together(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArra
     return places.view(">f4" if message.is_bigendian else "<f4").reshape(-1, 3).astype(np.float32, copy=False)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Times:
+    """The stamp of a sweep, when its points were measured, and how that was read.
+
+    Attributes:
+        stamp_ns: that of the header, or where it has none, of the first point that tells a time of day.
+        offset_s: (N,) seconds after the stamp; None where no field tells.
+        told: see `LidarFrame.timed_by`.
+    """
+
+    stamp_ns: int
+    offset_s: NDArray[np.float32] | None
+    told: str
+
+
 def _times(
     message: PointCloud2,
     by_name: Mapping[str, PointField],
     keep: NDArray[np.bool_] | None,
     stamp_ns: int,
     said: PointTimeConfig | None,
-) -> tuple[NDArray[np.float32] | None, str]:
-    """(N,) seconds after the stamp and how they were read, or None where no field tells; `keep` as in `offsets_s`."""
+) -> _Times:
+    """`keep` as in `offsets_s`."""
     names = TIME_FIELDS if said is None else (said.field,)
     name = next((name for name in names if name in by_name), None)
     column = None if name is None else _column(message, by_name[name], "fiu")
     if name is None or column is None:
-        return None, ""
-    return offsets_s(name, column, keep, stamp_ns, said)
+        return _Times(stamp_ns, None, "")
+    first_ns = None if stamp_ns else stamp_in(column, keep, said)
+    offset_s, told = offsets_s(name, column, keep, first_ns or stamp_ns, said)
+    if first_ns is None:
+        return _Times(stamp_ns, offset_s, told)
+    return _Times(first_ns, offset_s, f"{told}; without a stamp, that of the first point is taken")
 
 
 def _column(message: PointCloud2, field: PointField | None, kinds: str) -> NDArray[Any] | None:

@@ -6,6 +6,8 @@ takes `SHORTEST_S` to `LONGEST_S`, and lies within `NEAR_S` of its stamp. Of uni
 makes a usual sweep of a column. Where more than one reading is left, none is taken: `lidar.time` of the configuration
 says which it is.
 
+Some drivers leave the stamp out where they write times of day: then the first point tells it.
+
 Every cloud is judged for itself, so that it reads the same alone and in a stream, live and in a bag.
 """
 
@@ -46,6 +48,15 @@ LONGEST_S: Final = 10.0
 
 NEAR_S: Final = 1.0
 """Between a sweep and its stamp: drivers stamp its begin, middle or end, or the instant of sending it."""
+
+SINCE_S: Final = 946_684_800
+"""Begin of 2000, seconds since 1970: no time of day is earlier."""
+
+UNTIL_S: Final = 2**31
+"""2038, the end of what ROS can say. Units are a factor of 1000 apart: in one of them at most a value lies between."""
+
+FINEST_S: Final = 1e-3
+"""Between two neighbouring values of a time of day that tells when a sweep was taken: not so of float32."""
 
 NS_PER_S: Final = 1_000_000_000
 
@@ -117,6 +128,22 @@ def offsets_s(
         reading = recognised(name, values.dtype, begin, end, stamp_ns)
     line = f"{name}: {values.dtype.name}, {reading.sentence}{reading.stamped}"
     return _after_stamp_s(values, reading, stamp_ns), line
+
+
+def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, said: PointTimeConfig | None) -> int | None:
+    """Nanoseconds of the first point, for a cloud without a stamp; None where its points tell no time of day, or none
+    that the configuration says. Arguments as of `offsets_s`."""
+    values = np.ascontiguousarray(column, column.dtype.newbyteorder("="))
+    begin, end = _range(values if keep is None else values[keep])
+    clocked = [unit for unit in _TICKS if said is None or (said.unit, said.base) == (unit, "clock")]
+    since_s = SINCE_S if said is None else 0
+    for unit in clocked:
+        ticks = _TICKS[unit]
+        finest = 1.0 if values.dtype.kind != "f" else float(np.spacing(values.dtype.type(begin)))
+        if since_s < begin / ticks and end / ticks < UNTIL_S and finest / ticks <= FINEST_S:
+            seconds, rest = divmod(begin, ticks)
+            return int(seconds) * NS_PER_S + round(rest * (NS_PER_S / ticks))
+    return None
 
 
 def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_ns: int) -> Reading:

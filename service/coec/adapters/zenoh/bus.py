@@ -146,8 +146,7 @@ class Bus:
     def subscribe(self, stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[], None]:
         """Call `on_sample` for every put on the stream, on Zenoh's thread. Returns what ends it."""
         receive = self._receiver(stream, on_sample)
-        token = None if stream.token is None else self._session.liveliness().declare_token(stream.token)
-        self._tokens += [] if token is None else [token]
+        token = self._shown(stream)
         declared = [self._session.declare_subscriber(each, _direct(receive)) for each in stream.expressions]
         self._subscribers += declared
 
@@ -165,6 +164,7 @@ class Bus:
         """As `subscribe`, and for what was put before, where its publisher keeps it for whoever comes later (ROS calls
         that transient local). What this session puts itself is not heard."""
         receive = self._receiver(stream, on_sample)
+        self._shown(stream)
         for expression in stream.expressions:
             subscriber = declare_advanced_subscriber(
                 self._session,
@@ -176,6 +176,14 @@ class Bus:
                 subscriber_detection=True,
             )
             self._subscribers.append(subscriber)
+
+    def _shown(self, stream: Input) -> zenoh.LivelinessToken | None:
+        """The token by which others see that somebody listens, while it is held; None where nobody wants to know."""
+        if stream.token is None:
+            return None
+        token = self._session.liveliness().declare_token(stream.token)
+        self._tokens.append(token)
+        return token
 
     @staticmethod
     def _receiver(stream: Input, on_sample: Callable[[Sample], None]) -> Callable[[zenoh.Sample], None]:

@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import zenoh
 
+from coec.adapters.ros import messages
 from coec.adapters.ros.dialects import dialect_of
-from coec.adapters.ros.wire.qos import SENSOR_DATA
+from coec.adapters.ros.wire.qos import SENSOR_DATA, STATIC_LISTENER, Qos
 from coec.adapters.zenoh.inputs import Input, input_of
 from coec.adapters.zenoh.ros_publisher import RosNode
 from coec.adapters.zenoh.ros_topics import RosTopics, Topics
-from coec.config import AnyStreamConfig, Config
+from coec.config import AnyStreamConfig, Config, StreamConfig
+from coec.schemas.ros_names import TF_STATIC
 
 
 class RosSide:
@@ -30,12 +32,23 @@ class RosSide:
 
     def input_of(self, stream: AnyStreamConfig) -> Input:
         """How to listen to a stream, with the token by which nodes and tools of ROS see who listens."""
-        plain = input_of(stream, self._config)
-        if self.node is None or stream.topic is None:
+        return self._announced(input_of(stream, self._config), stream.topic, stream.assumed_type, SENSOR_DATA)
+
+    def input_of_info(self, topic: str) -> Input:
+        """The same of a `CameraInfo`."""
+        return self._announced(self._of_topic(topic), topic, messages.CAMERA_INFO, SENSOR_DATA)
+
+    def input_of_static_transforms(self) -> Input:
+        """The same of `/tf_static`."""
+        return self._announced(self._of_topic(TF_STATIC), TF_STATIC, messages.TF, STATIC_LISTENER)
+
+    def _of_topic(self, topic: str) -> Input:
+        return input_of(StreamConfig(topic=topic), self._config)
+
+    def _announced(self, plain: Input, topic: str | None, type_name: str, qos: Qos) -> Input:
+        if self.node is None or topic is None:
             return plain
-        number = self.node.number()
-        token = self.node.dialect.subscriber_token(number, stream.topic, stream.assumed_type, SENSOR_DATA)
-        return replace(plain, token=token)
+        return replace(plain, token=self.node.dialect.subscriber_token(self.node.number(), topic, type_name, qos))
 
     def topics(self) -> Topics:
         """What is published now. Any thread."""

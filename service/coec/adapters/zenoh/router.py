@@ -8,6 +8,7 @@ import zenoh
 
 from coec.adapters.zenoh.endpoints import without_secrets
 from coec.adapters.zenoh.settings import mode_of, unguarded
+from coec.adapters.zenoh.settings_file import read_settings
 from coec.errors import ConfigError, UnavailableError
 
 ROUTER = "router"
@@ -21,10 +22,7 @@ def open_router(file: Path) -> zenoh.Session:
         UnavailableError: a port is taken, an address is not there, or a certificate cannot be used.
     """
     zenoh.init_log_from_env_or("error")
-    try:
-        settings = zenoh.Config.from_file(file)
-    except (zenoh.ZError, OSError, ValueError) as error:
-        raise ConfigError(f"{file}: {without_secrets(str(error), ())}") from None
+    settings = read_settings(file)
     if mode_of(settings) != ROUTER:
         raise ConfigError(f'{file}: its mode is {mode_of(settings)}: a router says `mode: "router"`')
     doors = unguarded(settings)

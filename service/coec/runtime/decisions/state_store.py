@@ -32,6 +32,10 @@ _log = logging.getLogger(__name__)
 
 STATE_FILE = "state.json"
 
+LARGEST = 1e9
+"""Radians or metres, of a correction and of the standard deviations beside it. No window says more; what follows from
+less, in degrees and squared, is finite."""
+
 Rows = tuple[replies.Row4, replies.Row4, replies.Row4, replies.Row4]
 
 WallNs = Annotated[int, Field(ge=0, lt=2**63)]
@@ -253,6 +257,9 @@ def _estimate(stored: CalibrationResult) -> Estimate:
     estimate = estimate_of(stored)
     if (estimate.uncertainty.noise.diagonal() < 0.0).any():
         raise ValueError("a variance is negative")
+    shifts = np.abs([estimate.correction, *estimate.uncertainty.systematic.values()])
+    if (shifts > LARGEST).any() or (np.abs(estimate.uncertainty.noise) > LARGEST**2).any():
+        raise ValueError("a correction or its uncertainty is larger than any that is estimated")
     return estimate
 
 

@@ -1,6 +1,6 @@
 """What is in a bag: one pass that verifies it, and notes where each frame lies and what its header's stamp is.
 
-The header stamp is the sensor's time; the recorder's is not looked at.
+The header stamp is the sensor's time, of a cloud without one its first point's; the recorder's is not looked at.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
 from coec.calibration.types import Matrix4
 from coec.errors import DecodeError, SourceError
 from coec.schemas.ros_names import TF_STATIC
+from coec.sources.bag.cloud_reading import Clouds
 from coec.sources.bag.storage import Entry, Storage
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
@@ -56,6 +57,7 @@ class Index:
     """One pass over a bag.
 
     Attributes:
+        clouds: how clouds are read.
         streams: frames by topic.
         infos: the first camera info of each topic.
         transforms: all static transforms.
@@ -63,6 +65,7 @@ class Index:
     """
 
     path: Path
+    clouds: Clouds
     streams: dict[str, Stream] = field(default_factory=dict)
     infos: dict[str, Info] = field(default_factory=dict)
     transforms: StaticTransforms = field(default_factory=StaticTransforms)
@@ -113,6 +116,8 @@ class Index:
             stamp_ns = _header_stamp_ns(entry.data)
             if stamp_ns is None:
                 raise SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
+            if stamp_ns == 0 and name in CLOUD_TYPES:
+                stamp_ns = self._stamp_of_points(entry)
             stream.places.append(Place(stamp_ns, entry.place, name))
         elif name == messages.CAMERA_INFO and entry.topic not in self.infos:
             self.infos[entry.topic] = self._decoded(entry, decode_info)
@@ -121,6 +126,13 @@ class Index:
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
 
+    def _stamp_of_points(self, entry: Entry) -> int:
+        """Of a cloud without a stamp; 0 where its points tell none. One that is refused is told of where it is used."""
+        try:
+            return self.clouds.decoded(entry.type_name, entry.data).stamp_ns
+        except DecodeError:
+            return 0
+
     def _decoded(self, entry: Entry, decode: Callable[[bytes], T]) -> T:
         try:
             return decode(entry.data)
@@ -128,13 +140,13 @@ class Index:
             raise SourceError(f"{self.path}: a {entry.type_name} on {entry.topic} is refused: {error}") from error
 
 
-def index_of(storage: Storage) -> Index:
-    """The index of a bag.
+def index_of(storage: Storage, clouds: Clouds) -> Index:
+    """The index of a bag whose clouds are read like this.
 
     Raises:
         SourceError: a file is absent, cut off or damaged, or a message is not what its topic says.
     """
-    index = Index(storage.path)
+    index = Index(storage.path, clouds)
     for entry in storage.entries():
         index.take(entry)
     return index

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from coec.adapters.ros import incoming
 from coec.adapters.ros.transforms import bare
 from coec.calibration.lidar_to_lidar.types import LidarRig
 from coec.calibration.types import EgoMotion, LidarFrame
-from coec.config import LimitsConfig
 from coec.errors import DecodeError, SourceError
+from coec.sources.bag.cloud_reading import Clouds
 from coec.sources.bag.index import CLOUD_TYPES, VELOCITY_TYPES, Place, index_of
 from coec.sources.bag.storage import Storage, open_storage
 from coec.sources.lidars import Frames, LidarRecording
 from coec.sources.spec import SourceSpec
+
+AS_THEY_ARE = Clouds()
 
 
 def lidars_of_bag(spec: SourceSpec, a: str, b: str) -> LidarRecording:
@@ -25,7 +26,7 @@ def lidars_of_bag(spec: SourceSpec, a: str, b: str) -> LidarRecording:
     """
     query = spec.only("odometry")
     storage = open_storage(spec.path)
-    index = index_of(storage)
+    index = index_of(storage, AS_THEY_ARE)
     places = {topic: index.streams[index.topic(CLOUD_TYPES, topic, "points")].ordered() for topic in (a, b)}
     first = {topic: _load(storage, places[topic][0]) for topic in (a, b)}
     odometry = index.optional_topic(VELOCITY_TYPES, query.get("odometry"), "odometry")
@@ -50,7 +51,7 @@ def _load(storage: Storage, place: Place) -> LidarFrame | EgoMotion:
     with storage.open() as reader:
         data = reader.read(place.at)
     try:
-        frame = incoming.decode(place.type_name, data, LimitsConfig())
+        frame = AS_THEY_ARE.decoded(place.type_name, data)
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error
     if not isinstance(frame, LidarFrame | EgoMotion):

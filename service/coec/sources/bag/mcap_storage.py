@@ -50,7 +50,7 @@ class McapStorage:
         except OSError as error:
             raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
         except McapDamaged as error:
-            raise SourceError(f"{self.path} is damaged: {error}. `mcap recover` saves what is whole") from error
+            raise SourceError(error.of(self.path)) from error
 
     @contextmanager
     def open(self) -> Iterator[Reader]:

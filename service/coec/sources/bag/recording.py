@@ -9,15 +9,13 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from coec.adapters.mcap.windows import is_window, read_window
-from coec.adapters.ros import incoming
 from coec.calibration.frames.concatenation import SeveralOrigins
 from coec.calibration.frames.origin import ApparentOrigin
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
-from coec.config import CalibrationConfig, LimitsConfig, PointTimeConfig, describe
+from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
+from coec.sources.bag.cloud_reading import Clouds
 from coec.sources.bag.index import CLOUD_TYPES, IMAGE_TYPES, Index, Place, index_of
 from coec.sources.bag.motion import VEHICLE, motion_topic, moved_on
 from coec.sources.bag.rig import rig_of_bag
@@ -68,7 +66,7 @@ def open_bag(spec: SourceSpec) -> Recording:
         return _window_recording(spec.path)
     clouds, frames = Clouds.asked(query.get("time"), query.get("lidar_source")), _frames(query.get("moving"))
     storage = open_storage(spec.path)
-    index = index_of(storage)
+    index = index_of(storage, clouds)
     camera_topic = index.topic(IMAGE_TYPES, query.get("camera"), "camera")
     lidar_topic = index.topic(CLOUD_TYPES, query.get("points"), "points")
     with storage.open() as reader:
@@ -102,37 +100,6 @@ def _window_recording(path: Path) -> FramewiseRecording:
         tuple(pair.motion for pair in window.pairs if pair.motion is not None),
         configuration,
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Clouds:
-    """How the clouds of a bag are read.
-
-    Attributes:
-        point_time: how points are timed, where that was said.
-        source: number of the LiDAR, of clouds of several.
-    """
-
-    point_time: PointTimeConfig | None = None
-    source: int | None = None
-
-    @classmethod
-    def asked(cls, time: str | None, source: str | None) -> Clouds:
-        """As a query asks for it: `FIELD,UNIT[,BASE]`, and a number.
-
-        Raises:
-            UsageError: it does not.
-        """
-        names = ("field", "unit", "base")
-        try:
-            timed = None if time is None else dict(zip(names, time.split(",", 2), strict=False))
-            point_time = None if timed is None else PointTimeConfig.model_validate(timed)
-        except ValidationError as error:
-            raise UsageError(f"time={time}: {describe(error)}; for example time=timestamp,s,clock") from error
-        try:
-            return cls(point_time, None if source is None else int(source))
-        except ValueError:
-            raise UsageError(f"lidar_source={source}: it is a whole number, as in the points' field") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,8 +206,6 @@ def _frames(text: str | None) -> tuple[str, str]:
 def _load(storage: Storage, reader: Reader, place: Place, clouds: Clouds) -> Message:
     data = reader.read(place.at)
     try:
-        return incoming.decode(
-            place.type_name, data, LimitsConfig(), point_time=clouds.point_time, source=clouds.source
-        )
+        return clouds.decoded(place.type_name, data)
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error

@@ -33,3 +33,6 @@ SENSOR_DATA = Qos(reliable=False, depth=5)
 
 STATIC = Qos(transient_local=True, depth=1)
 """Of `/tf_static`: whoever comes later gets the last one (tf2_ros/qos.hpp, StaticBroadcasterQoS)."""
+
+STATIC_LISTENER = Qos(transient_local=True, depth=100)
+"""Of who listens to `/tf_static`: the last one of each of so many publishers (tf2_ros/qos.hpp, StaticListenerQoS)."""
