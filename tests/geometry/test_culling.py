@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coec.geometry import se3
 from coec.geometry.cameras import build, in_image
-from coec.geometry.culling import BUNDLE, azimuth_order, bundle
+from coec.geometry.culling import BUNDLE, azimuth_order, bundle, half_field_of_view_rad, within_cone
 from coec.geometry.mutual_information import BinnedFrames, joint_histograms
 from coec.geometry.projection import project
 
@@ -94,3 +94,21 @@ def test_the_order_is_stable_and_complete(scale_m: float) -> None:
     assert sorted(order) == list(range(500))
     azimuth = np.arctan2(xyz[order, 1], xyz[order, 0])
     assert (np.diff(azimuth) > -0.1).all()
+
+
+def test_no_point_that_a_pose_of_a_reach_brings_into_the_image_is_outside_of_the_cone() -> None:
+    xyz, start, rng = sweeps(6), se3.perturbation(np.array([0.4, -1.1, 0.3, 0.2, -0.5, 0.4])), np.random.default_rng(8)
+    half_view_rad = half_field_of_view_rad(CAMERA, np.ones((CAMERA.height, CAMERA.width), np.bool_))
+    kept = within_cone(xyz, start, half_view_rad + 0.3, 0.5)
+    assert 0.05 < kept.mean() < 0.8
+    for _ in range(30):
+        turn, shift = rng.normal(size=(2, 3))
+        xi = np.concatenate([0.3 * turn / np.linalg.norm(turn), 0.5 * shift / np.linalg.norm(shift)])
+        pose = se3.perturb(start, xi)
+        uv_px, valid = project(CAMERA, xyz.T.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
+        assert kept[valid & in_image(CAMERA, uv_px)].all()
+
+
+def test_what_is_no_number_is_never_left_out() -> None:
+    xyz = np.full((3, 2), np.nan, np.float32)
+    assert within_cone(xyz, np.eye(4), 0.1, 0.0).all()

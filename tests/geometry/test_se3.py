@@ -93,7 +93,7 @@ def test_angle_of_a_rotation_and_of_a_transform() -> None:
 def test_difference_is_the_perturbation_on_the_left(a: Array, b: Array) -> None:
     nominal = se3.exp(a)
     moved = se3.perturb(nominal, b)
-    np.testing.assert_allclose(moved, se3.perturbation(b) @ nominal, rtol=0, atol=0)
+    np.testing.assert_allclose(moved, se3.perturbation(b) @ nominal, rtol=0, atol=1e-11)
     found = se3.difference(moved, nominal)
     np.testing.assert_allclose(se3.perturb(nominal, found), moved, rtol=0, atol=1e-11)
 

@@ -25,7 +25,7 @@ from coec.calibration.objective.mutual_information import (
     distance_and_depth,
 )
 from coec.calibration.ports import DepthModel, ImageReader, Progress
-from coec.calibration.search.global_search import at_rim, find_basins
+from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins
 from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
 from coec.calibration.search.mount_prior import log_prior
 from coec.calibration.types import DepthMap, Matrix4, Metric, StopReason, Window
@@ -45,16 +45,26 @@ POLISHED_ALIKE = 3
 differs by 0.1 % at most on eight windows of nine, half of them simulated), and with two another basin won on the
 ninth."""
 
+PLAUSIBLE = 0.5
+"""Share of the best one's rank from which a basin, or what lies next to the start, is polished: a polish adds a tenth
+to a rank, a quarter at most, and what is half as high would have to double."""
+
+NEIGHBOURHOOD_RAD = radians(5.0)
+"""How far from the start what lies next to it may be."""
+
 SETTLED_POSES = 2
 """Poses of the best basin that are settled: with six degrees of freedom, blurred edges can lead one of them astray (to
 0.5° and 8 cm in one window of 24 of a simulated fisheye of 700 px)."""
 
-DEPTH_POINTS = 300_000
+DEPTH_POINTS = 150_000
 """Points of the window's clouds, seen or not, that carry the depth witness of a fusion: its hill is degrees wide, the
 edges settle the rest."""
 
 SAME_BASIN_RAD = radians(1.5)
 """Poses nearer than this are one basin, not rivals."""
+
+BETWEEN = (0.5, 0.75, 0.25)
+"""Shares of the way from the pose to another summit at which a valley between them is looked for."""
 
 MAX_GREY_WIDTH_PX = 800
 """Images are halved to at most this width before grey values are compared: about the spacing of a sweep's points."""
@@ -177,9 +187,16 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     fusion = Fusion(edges, depth, start, reach)
     ranked = sorted(((fusion.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
     to_rank = near(config.search, fusion.ranking[-1])
-    # The neighbourhood of the start, whatever the charts say of it.
-    ends = [polish_in_turn(fusion.ranking, start, to_rank, progress)]
-    for _, basin in ranked[:POLISHED_BASINS]:
+    of_start = basin_next_to(edges, start, SearchBox(NEIGHBOURHOOD_RAD, reach.translation_m))
+    least = PLAUSIBLE * max((rank for rank, _ in ranked), default=0.0)
+    plausible = [basin for rank, basin in ranked[:POLISHED_BASINS] if rank >= least]
+    ends, others = [], [basin for _, basin in ranked[len(plausible) :]]
+    if fusion.rank(of_start) >= least:
+        # The neighbourhood of the start, whatever place the charts give it.
+        ends.append(polish_in_turn(fusion.ranking, start, to_rank, progress))
+    else:
+        others.append(of_start)
+    for basin in plausible:
         there = sum(not _differ(end.T_camera_lidar, basin) for end in ends)
         if there < POLISHED_ALIKE:
             # The coarser bands led the first one of a basin: they would lead the others to the same end.
@@ -196,14 +213,13 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
 
     _, pose = max(polished, key=preferred)
     contrast = fusion.edge_contrast(pose)
-    rivals = [
-        fusion.edge_contrast(other) for _, other in (*polished, *ranked[POLISHED_BASINS:]) if _differ(other, pose)
-    ]
+    others += [end for _, end in polished]
+    rival = _best_rival(fusion, [other for other in others if _differ(other, pose)], pose)
     limits = config.verdict
     metrics = (
         Metric("range_edges", len(edges.sharp.weight), least_range_edges(config), at_least=True),
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
-        Metric("runner_up", runner_up(contrast, rivals), limits.max_runner_up, at_least=False),
+        Metric("runner_up", runner_up(contrast, rival), limits.max_runner_up, at_least=False),
     )
     alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
     settled = [polish_in_turn(fusion.settling, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
@@ -221,6 +237,20 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
         Rivals(fusion.ranking[-1], alike[0][1], tuple(end for _, end in alike[1:])),
     )
     return Found(finest, found, metrics, summits, edges)
+
+
+def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> list[float]:
+    """The largest edge contrast among those of `others` (4, 4) that are summits beside `pose` (4, 4), in a list; an
+    empty one where there is none.
+
+    A climb may also end on the shoulder of the hill that `pose` is the top of, where turns and shifts make up for each
+    other: from there the way to the top leads down nowhere.
+    """
+    for contrast, other in sorted(((fusion.edge_contrast(o), o) for o in others), key=lambda item: -item[0]):
+        apart = se3.difference(other, pose)
+        if any(fusion.edge_contrast(se3.perturb(pose, share * apart)) < contrast for share in BETWEEN):
+            return [contrast]
+    return []
 
 
 def least_range_edges(config: CalibrationConfig) -> float:

@@ -1,4 +1,4 @@
-"""Bundles of neighbouring points of a sweep, so that a pose can leave out a bundle as a whole.
+"""Points that cannot be in view: left out once for a whole search, or in bundles of neighbours at each pose.
 
 A bundle is a run of `BUNDLE` points of one frame. Seen from the LiDAR its points lie within an angle of its axis; seen
 from the camera, within that angle and their parallax. Where this cone and the field of view do not meet, none of them
@@ -14,6 +14,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.geometry.cameras import Camera, domain_angle_rad
+from coec.geometry.projection import unproject
+
+FIELD_OF_VIEW_PX = 8
+"""Side of the squares of pixels over which the field of view is measured: a few thousand rays instead of a million."""
+
 BUNDLE = 512
 """Points per bundle: their coordinates and pixels (8 kB) stay in the first-level cache while they are dealt with."""
 
@@ -22,6 +28,40 @@ SECTORS = 64
 
 MARGIN_RAD = 1e-6
 """Added to every angle, for rounding."""
+
+
+def half_field_of_view_rad(camera: Camera, lit: NDArray[np.bool_]) -> float:
+    """Largest angle from the optical axis at which the image has a pixel that counts (`lit`, (height, width)).
+
+    Over squares of pixels that hold one: their corners, where all of those have a ray, else the end of the model's
+    domain (the image circle of a fisheye lies inside the image).
+    """
+    rows, columns = (np.append(np.arange(0, size, FIELD_OF_VIEW_PX), size) for size in lit.shape)
+    corners = np.stack(np.meshgrid(columns - 0.5, rows - 0.5), axis=-1)
+    rays, valid = unproject(camera, corners.reshape(-1, 2))
+    cosine = np.where(valid, rays[:, 2], -2.0).reshape(corners.shape[:2])
+    least = np.minimum.reduce([cosine[:-1, :-1], cosine[:-1, 1:], cosine[1:, :-1], cosine[1:, 1:]])
+    counts = np.logical_or.reduceat(np.logical_or.reduceat(lit, rows[:-1], axis=0), columns[:-1], axis=1)
+    lowest = float(least[counts].min(initial=1.0))
+    angle_rad = domain_angle_rad(camera) if lowest < -1.0 else math.acos(lowest)
+    # One pixel more, for rounding and for the tangential distortion within a square.
+    return angle_rad + 1.0 / min(camera.fx, camera.fy)
+
+
+def within_cone(
+    xyz_m: NDArray[np.float32], T_camera_lidar: NDArray[np.float64], angle_rad: float, shift_m: float
+) -> NDArray[np.bool_]:
+    """(N,) whether points (3, N) may lie within an angle of the optical axis of a camera at a pose (4, 4), or at one
+    that is shifted from there by up to `shift_m`. What is no number does."""
+    x, y, z = xyz_m
+    T = T_camera_lidar.astype(np.float32)
+    a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    b = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    distance_m = np.maximum(np.sqrt(a * a + b * b + c * c), np.float32(1e-6))
+    parallax_rad = np.arcsin(np.minimum(np.float32(shift_m) / distance_m, np.float32(1.0)))
+    outside: NDArray[np.bool_] = np.arccos(np.clip(c / distance_m, -1.0, 1.0)) > angle_rad + parallax_rad
+    return ~outside
 
 
 @dataclass(frozen=True, slots=True, eq=False)

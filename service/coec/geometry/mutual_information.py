@@ -10,6 +10,7 @@ never interpolated. So the inner loop is: transform, project, one 8-bit look-up,
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -208,40 +209,49 @@ def _count_exactly(
         counts[np.uint64(depth_bin[np.uint64(pixel)]) * columns + np.uint64(range_bin)] += np.int32(1)
 
 
+_TIMES_LOG = np.array([0.0, *(count * math.log(count) for count in range(1, 4096))])
+"""c·log c of the counts that nearly all cells have, nats: the logarithms were half of what a frame of some thousand
+points costs after it is counted."""
+
+
+@njit(cache=True, inline="always")
+def _times_log(count: np.int64) -> float:
+    return _TIMES_LOG[count] if count < _TIMES_LOG.shape[0] else count * math.log(count)
+
+
 @njit(cache=True)
 def _information(
     counts: NDArray[np.int32], first_task: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """MI in nats and number of points of each frame, with H = log n - (1/n) Σ c·log c over the counts c.
 
-    On one thread: 2 µs a frame, for 25 frames less than it takes to wake another thread.
+    On one thread: a microsecond a frame, for 25 frames less than it takes to wake another thread.
     """
     frames, depth_bins, range_bins = len(first_task) - 1, counts.shape[1] - 1, counts.shape[2]
     mi = np.zeros(frames)
     points = np.zeros(frames, np.int64)
+    joint = np.empty((depth_bins, range_bins), np.int64)
+    of_depth, of_range = np.empty(depth_bins, np.int64), np.empty(range_bins, np.int64)
     for f in range(frames):
-        joint = np.zeros((depth_bins, range_bins), np.int64)
+        joint[:] = 0
+        of_depth[:] = 0
+        of_range[:] = 0
         for task in range(first_task[f], first_task[f + 1]):
             joint += counts[task, :depth_bins]
-        of_depth = np.zeros(depth_bins)
-        of_range = np.zeros(range_bins)
         cells = 0.0
         for d in range(depth_bins):
             for r in range(range_bins):
-                count = float(joint[d, r])
-                if count > 0.0:
-                    of_depth[d] += count
-                    of_range[r] += count
-                    cells += count * np.log(count)
+                count = joint[d, r]
+                of_depth[d] += count
+                of_range[r] += count
+                cells += _times_log(count)
         n = of_depth.sum()
-        if n > 0.0:
+        if n > 0:
             margins = 0.0
             for count in of_depth:
-                if count > 0.0:
-                    margins += count * np.log(count)
+                margins += _times_log(count)
             for count in of_range:
-                if count > 0.0:
-                    margins += count * np.log(count)
-            mi[f] = np.log(n) + (cells - margins) / n
-            points[f] = np.int64(n)
+                margins += _times_log(count)
+            mi[f] = math.log(n) + (cells - margins) / n
+            points[f] = n
     return mi, points

@@ -169,8 +169,21 @@ def perturbation_log(transform: Array) -> Array:
 
 def perturb(transform: Array, xi: Array) -> Array:
     """T(xi) = perturbation(xi) · T: for T_camera_lidar a turn about and a shift along the camera's axes."""
-    moved: Array = perturbation(xi) @ transform
-    return moved
+    a, b, c, *shift = _vector("xi", xi, 6).tolist()
+    by_axis, by_square, _ = _coefficients(math.sqrt(a * a + b * b + c * c))
+    # Rodrigues, entry by entry: a search does this thousands of times, and arrays of nine numbers are mostly overhead.
+    square = a * a + b * b + c * c
+    rows = (
+        (1.0 + by_square * (a * a - square), by_square * a * b - by_axis * c, by_square * a * c + by_axis * b),
+        (by_square * a * b + by_axis * c, 1.0 + by_square * (b * b - square), by_square * b * c - by_axis * a),
+        (by_square * a * c - by_axis * b, by_square * b * c + by_axis * a, 1.0 + by_square * (c * c - square)),
+    )
+    x, y, z, last = transform.tolist()
+    moved = [
+        [p * x[j] + q * y[j] + r * z[j] + t * last[j] for j in range(4)]
+        for (p, q, r), t in zip(rows, shift, strict=True)
+    ]
+    return np.array([*moved, last])
 
 
 def difference(transform_a: Array, transform_b: Array) -> Array:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from calibration.conftest import window_of
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.objective.edges import EdgeWitness, build_edges
+from coec.calibration.objective.edges import EdgeWitness, build_edges, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
-from coec.calibration.search.global_search import AT_RIM, FINE, ROUNDS, at_rim, find_basins, sample_reach
+from coec.calibration.search.global_search import AT_RIM, FINE, ROUNDS, at_rim, basin_next_to, find_basins, sample_reach
 from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import se3
@@ -148,3 +148,23 @@ def test_same_input_same_basins_to_the_bit(sharp_street: Window, sharp_edges: Ed
     first, second = (find_basins(sharp_edges, start, BOTH) for _ in range(2))
     assert [b.T_camera_lidar.tobytes() for b in first] == [b.T_camera_lidar.tobytes() for b in second]
     assert [b.significance for b in first] == [b.significance for b in second]
+
+
+def test_what_lies_next_to_a_pose_is_the_true_basin_from_a_degree_away(
+    sharp_street: Window, sharp_edges: EdgeWitness
+) -> None:
+    truth = sharp_street.rig.T_camera_lidar_nominal
+    near = SearchBox(np.radians(5.0), 0.0)
+    end = basin_next_to(sharp_edges, away_from(truth, 1.0, 5), near)
+    assert angle_deg(end, truth) < 1.5 * np.degrees(sharp_edges.band_blur_rad[1])
+    far = away_from(truth, 20.0, 5)
+    assert angle_deg(basin_next_to(sharp_edges, far, near), far) <= 5.0
+
+
+def test_edges_out_of_reach_are_nothing_to_the_bit(sharp_street: Window, sharp_edges: EdgeWitness) -> None:
+    start = away_from(sharp_street.rig.T_camera_lidar_nominal, 9.0, 1)
+    charts = sharp_edges.charts[FINE]
+    kept = in_reach(charts, sharp_edges.half_view_rad, start, BOTH)
+    assert kept.xyz_m.shape[1] < charts.xyz_m.shape[1]
+    poses = sample_reach(start, BOTH, 200)
+    assert charted_significances(kept, poses).tolist() == charted_significances(charts, poses).tolist()

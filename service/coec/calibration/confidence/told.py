@@ -11,12 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import sensor_twist
+from coec.calibration.objective.edges import in_reach
+from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
+from coec.geometry.culling import half_field_of_view_rad
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
+from coec.geometry.edges.image_edges import VOID
 from coec.geometry.projection import project
 from coec.geometry.thinning import thinned
+from coec.geometry.vectors import lengths
 
 TURNS, SHIFTS, CLOCKS, LENS = range(3), range(3, 6), range(6, 9), range(9, 12)
 """Places in a deviation (12,): the perturbation ξ of the pose, rad and m; by how much the camera was exposed later than
@@ -31,13 +36,17 @@ REACH = np.array([radians(3.0)] * 3 + [0.4] * 3 + [0.08, 0.08, 0.06] + [0.04, 0.
 shutters; a lens: beyond what a focus ring or another unit of the same type does. A mount: as far as the edges of the
 coarsest band lead back."""
 
-STEPS = np.array([1e-3] * 3 + [7e-3] * 3 + [5e-3] * 3 + [2e-3] * 3)
-"""Difference steps: each moves what lies 7 m away by about a pixel or less."""
+STEP_RAD = 1e-3
+"""Difference step, a shift by so much of the range: about a pixel or less."""
 
 LEADING_POINTS, SETTLING_POINTS = 4_000, 20_000
 """Range edges that are asked, at most, on a level that leads to the next and on the sharpest: some four hundred
 evaluations of them cost as much as ten of the search's. With half as many, what the sharpest can tell of a principal
 point four pixels beside through a fisheye is a third less certain."""
+
+SEEN = SearchBox(radians(15.0), 4.0)
+"""How far from the pose that was told range edges are asked: twice the reach of its turns about three axes at once, and
+what passes at 40 m/s while the clocks are off by theirs. The edge of the coarsest map is known to some degrees."""
 
 SLOWEST_MPS = 1.0
 """Below that an offset of a clock of a tenth of a second moves nothing by more than 10 cm, and all is alike."""
@@ -70,6 +79,13 @@ class Told:
             frames = replace(frames, camera=_through(frames.camera, deviation[LENS]))
         return frames, se3.perturb(self.pose, deviation[: SHIFTS.stop])
 
+    def thinned(self, at_most: int) -> Told:
+        """Of about so many of the range edges."""
+        kept = thinned(len(self.frames.weight), at_most)
+        return replace(
+            self, frames=self.frames.of_points(kept), passing=self.passing[:, kept], share=self.share[:, kept]
+        )
+
     def significance(self, deviation: NDArray[np.float64]) -> float:
         """Of the alignment at a deviation (12,)."""
         return frame_alignment(*self.otherwise(deviation)).significance
@@ -83,31 +99,56 @@ class Told:
     def moved(
         self, deviation: NDArray[np.float64], places: tuple[int, ...]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """(E, 2, n) how far each of n places of a deviation moves the range edges about one (12,), pixels per unit; and
-        (E,) which of them."""
-        uv_px, seen = self.pixels(deviation)
+        """(n, E, 2) how far each of n places of a deviation moves the range edges about one (12,), pixels per unit; and
+        (E,) which of them.
+
+        By how the pixel follows the point, in differences, and how the point follows a place.
+        """
+        frames, T = self.otherwise(deviation)
+        p_camera = np.einsum("ij,jn->ni", T[:3, :3], frames.xyz_m.astype(np.float64)) + T[:3, 3]
+        uv_px, seen = project(frames.camera, p_camera)
         height, width = self.frames.maps.shape[1:]
         seen = seen & (uv_px >= 0.0).all(axis=1) & (uv_px <= [width - 1.0, height - 1.0]).all(axis=1)
-        columns = np.empty((len(uv_px), 2, len(places)))
-        for column, place in enumerate(places):
-            step = np.zeros(SIZE)
-            step[place] = STEPS[place]
-            (ahead, seen_ahead), (behind, seen_behind) = self.pixels(deviation + step), self.pixels(deviation - step)
-            columns[:, :, column] = (ahead - behind) / (2.0 * STEPS[place])
+        # A deviation turns about the camera as it was told, and then shifts.
+        turned_m = p_camera - deviation[SHIFTS]
+        step_m = STEP_RAD * lengths(p_camera)
+        follows = np.empty((len(uv_px), 2, 3))
+        for axis, unit in enumerate(np.eye(3)):
+            (ahead, seen_ahead), (behind, seen_behind) = (
+                project(frames.camera, p_camera + sign * step_m[:, None] * unit) for sign in (1.0, -1.0)
+            )
+            follows[:, :, axis] = (ahead - behind) / np.maximum(2.0 * step_m, 1e-9)[:, None]
             seen = seen & seen_ahead & seen_behind
+        columns = np.empty((len(places), len(uv_px), 2))
+        for column, place in zip(columns, places, strict=True):
+            if place in LENS:
+                column[:] = _moved_by_lens(self.frames.camera, frames.camera, uv_px, place)
+            else:
+                column[:] = np.sum(follows * self._moved_by(place, turned_m, T)[:, None, :], axis=2)
         return columns, seen
+
+    def _moved_by(self, place: int, turned_m: NDArray[np.float64], T: Matrix4) -> NDArray[np.float64]:
+        """(E, 3) how points move with one place of a deviation, per unit: (E, 3) they are in the camera, turned and not
+        yet shifted, at a pose (4, 4)."""
+        if place in TURNS:
+            return np.cross(np.eye(3)[place], turned_m)
+        if place in SHIFTS:
+            return np.broadcast_to(np.eye(3)[place - SHIFTS.start], turned_m.shape)
+        passing_m = (self.passing * self.share[place - CLOCKS.start]).astype(np.float64)
+        return np.asarray(np.einsum("ij,jn->ni", T[:3, :3], passing_m))
 
 
 def levels_told(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> list[Told]:
-    """Of a window, which is at `pose` (4, 4): `edges` from a level that leads there to the sharpest one."""
+    """Of a window, which is at `pose` (4, 4): `edges` from a level that leads there to the sharpest one. Those that no
+    deviation brings into view are left out."""
     counts = [*([LEADING_POINTS] * (len(edges) - 1)), SETTLING_POINTS]
-    return [_told(level, window, pose, count) for level, count in zip(edges, counts, strict=True)]
+    half_view_rad = half_field_of_view_rad(edges[0].camera, edges[0].maps[0] != VOID)
+    levels = [level.of_points(thinned(len(level.weight), count)) for level, count in zip(edges, counts, strict=True)]
+    return [_told(in_reach(level, half_view_rad, pose, SEEN), window, pose) for level in levels]
 
 
-def _told(frames: EdgeFrames, window: Window, pose: Matrix4, at_most: int) -> Told:
-    """About `at_most` range edges of a window, which is at `pose` (4, 4)."""
-    chosen = thinned(len(frames.weight), at_most)
-    frames = frames.of_points(chosen)
+def _told(frames: EdgeFrames, window: Window, pose: Matrix4) -> Told:
+    """The range edges of a window, which is at `pose` (4, 4)."""
     counts, pairs = np.diff(frames.first_point), window.pairs
     frame = np.repeat(np.arange(len(pairs)), counts)
     velocity, turn, moves = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3)), np.zeros(len(pairs))
@@ -129,6 +170,19 @@ def _told(frames: EdgeFrames, window: Window, pose: Matrix4, at_most: int) -> To
 def moves(window: Window) -> bool:
     """Whether the vehicle moves enough for a clock to show."""
     return any(pair.motion is not None and pair.motion.reaches(SLOWEST_MPS) for pair in window.pairs)
+
+
+def _moved_by_lens(told: Camera, camera: Camera, uv_px: NDArray[np.float64], place: int) -> NDArray[np.float64]:
+    """(E, 2) how pixels (E, 2) of a camera move with one place of the lens, per unit of what was told of it."""
+    moved = np.zeros_like(uv_px)
+    if place == LENS.start:
+        moved[:, 0] = told.fx
+    elif place == LENS.start + 1:
+        moved[:, 1] = told.fy
+    else:
+        moved[:, 0] = (uv_px[:, 0] - camera.cx) * told.fx / camera.fx
+        moved[:, 1] = (uv_px[:, 1] - camera.cy) * told.fy / camera.fy
+    return moved
 
 
 def _through(camera: Camera, lens: NDArray[np.float64]) -> Camera:

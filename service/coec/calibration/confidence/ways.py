@@ -23,6 +23,9 @@ LEADING, SETTLING = 0.1, 0.03
 """Shares of its first step within which a climb ends, on a level that leads to the next and on the sharpest. An offset
 of the clocks and a shift along the way differ by little: its hill is a ridge."""
 
+POINTS = 5_000
+"""Range edges from which the directions are taken, at most: a least squares over twelve unknowns needs no more."""
+
 MAX_EVALUATIONS = 200
 """Bound on one climb; it takes 20 to 80."""
 
@@ -54,13 +57,17 @@ class Ways:
             ValueError: the edges in view do not determine what moves already.
         """
         places, count = (*base, *free), len(base)
-        columns, seen = sharp.moved(at, places)
-        weight = np.where(seen, sharp.frames.weight, 0.0)[:, None]
+        some = sharp.thinned(POINTS)
+        columns, seen = some.moved(at, places)
+        weight = np.where(seen, some.frames.weight, 0.0)[:, None]
         whole = max(float(weight.sum()), LEAST_SQUARE)
         n = range(len(places))
-        weighted = columns * weight[:, :, None]
-        # Sums without a BLAS product: to the bit the same in every process.
-        normal = [[float(np.sum(weighted[:, :, i] * columns[:, :, j])) / whole for j in n] for i in n]
+        normal = [[0.0] * len(places) for _ in n]
+        for i in n:
+            weighted = columns[i] * weight
+            for j in range(i + 1):
+                # A sum without a BLAS product: to the bit the same in every process.
+                normal[i][j] = normal[j][i] = float(np.sum(weighted * columns[j])) / whole
         own = [row[:count] for row in normal[:count]]
         directions = np.zeros((SIZE, len(places)))
         directions[places, n] = 1.0

@@ -6,14 +6,16 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import radians
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.mutual_information import Evaluation
+from coec.calibration.objective.mutual_information import Evaluation, SearchBox
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, pixel_rad, scaled
+from coec.geometry.culling import half_field_of_view_rad, within_cone
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
@@ -39,6 +41,9 @@ THINNED_POINTS = 3_000
 """Range edges of the window that the cover visits; significance falls with the square root of their number only."""
 
 
+Edges = TypeVar("Edges", EdgeFrames, EdgeCharts)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeWitness:
     """One witness in four forms.
@@ -51,6 +56,7 @@ class EdgeWitness:
         bands: from fine to coarse, `RANKED_POINTS` of the range edges on one band each, through the model of the
             lens: ranks basins.
         band_blur_rad: the blur of each, an angle likewise.
+        half_view_rad: largest angle from the optical axis at which the images have a pixel that counts.
         charts: the coarsest and the next finer band with the same range edges: fast.
         thinned: the charts with `THINNED_POINTS` of those range edges: faster.
     """
@@ -60,6 +66,7 @@ class EdgeWitness:
     blur_rad: float
     bands: tuple[EdgeFrames, ...]
     band_blur_rad: tuple[float, ...]
+    half_view_rad: float
     charts: tuple[EdgeCharts, EdgeCharts]
     thinned: tuple[EdgeCharts, EdgeCharts]
 
@@ -67,6 +74,17 @@ class EdgeWitness:
     def to_the_sharpest(self) -> tuple[EdgeFrames, EdgeFrames, EdgeFrames]:
         """Levels by which a climb from some pixels beside gets to the sharpest edges: two bands, and these."""
         return self.bands[1], self.bands[0], self.sharp
+
+
+ROUNDING_RAD = radians(0.1)
+"""Added to an angle within which edges may come into view: many times what single precision loses."""
+
+
+def in_reach(edges: Edges, half_view_rad: float, pose: Matrix4, reach: SearchBox) -> Edges:
+    """With the range edges only that may come into view at some pose within a reach of `pose` (4, 4): to the
+    significance at any of those poses the others are nothing, to the last bit."""
+    angle_rad = half_view_rad + reach.rotation_rad + ROUNDING_RAD
+    return edges.of_points(np.flatnonzero(within_cone(edges.xyz_m, pose, angle_rad, reach.translation_m)))
 
 
 class EdgesAlone:
@@ -140,6 +158,7 @@ def build_edges(
         blur_rad=_blur_rad(rig.camera, finest),
         bands=bands,
         band_blur_rad=blur_rad,
+        half_view_rad=half_field_of_view_rad(rig.camera, _lit(rig)),
         charts=(coarse, fine),
         thinned=(coarse.of_points(kept), fine.of_points(kept)),
     )
@@ -153,9 +172,8 @@ def _maps(
     An image at a time: none is in memory twice, nor longer than its turn where `greys` are decoded as they are asked
     for. What a pyramid is made in, as much as five maps, is gone before the charts are made.
     """
-    lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
     # The third column of a rotation is where it takes the third axis.
-    scales = EdgeScales(lit, finest, coarsest, upright=rig.T_camera_lidar_nominal[:2, 2])
+    scales = EdgeScales(_lit(rig), finest, coarsest, upright=rig.T_camera_lidar_nominal[:2, 2])
     stacks: list[NDArray[np.int8]] = []
     for frame, grey in enumerate(greys):
         if grey.shape != scales.shape:
@@ -167,6 +185,11 @@ def _maps(
         for stack, level in zip(stacks, maps, strict=True):
             stack[frame] = level
     return stacks
+
+
+def _lit(rig: Rig) -> NDArray[np.bool_]:
+    """(height, width) the pixels that count."""
+    return rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
 
 
 def _finest_level(camera: Camera) -> int:

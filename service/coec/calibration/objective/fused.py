@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective.cells import COLUMNS, ROWS, Cells, SightLines, sectors
-from coec.calibration.objective.edges import EdgeWitness
+from coec.calibration.objective.edges import EdgeWitness, in_reach
 from coec.calibration.objective.mutual_information import Evaluation, MutualInformation, SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import in_image
+from coec.geometry.culling import half_field_of_view_rad
 from coec.geometry.edges.alignment import (
     LEAST_SQUARE,
     EdgeFrames,
@@ -26,6 +27,7 @@ from coec.geometry.edges.alignment import (
     significances,
 )
 from coec.geometry.edges.charts import charted_significances
+from coec.geometry.edges.image_edges import VOID
 from coec.geometry.projection import project
 
 OTHER_POSES = 64
@@ -34,6 +36,13 @@ OTHER_POSES = 64
 OTHER_POSES_RAD = radians(28.0)
 """The reach from which those of the edges are taken at least, whatever the search may reach: nearer to the truth, poses
 share too much of the layout of the scene with it to stand for wrong ones."""
+
+NEARBY = SearchBox(radians(10.0), 1.0)
+"""How far from the pose at which they are cut cells are asked: where the hill drops for certain, and other summits of
+the basin. Edges that come into view only farther off are in none of them."""
+
+BEYOND = SearchBox(radians(8.0), 0.5)
+"""How far a polish may end outside of the reach: its box, of four blurs, and that of the next level."""
 
 
 CELL_STEP = 0.25
@@ -87,7 +96,9 @@ class FusedObjective:
 
     def cells(self, T_camera_lidar: Matrix4) -> Cells:
         """The edges by sectors of the image, and depth, which has no parts, as one more."""
-        edges = self._edges
+        every = self._edges
+        half_view_rad = half_field_of_view_rad(every.camera, every.maps[0] != VOID)
+        edges = in_reach(every, half_view_rad, T_camera_lidar, NEARBY)
         p_camera = (
             np.einsum("ij,jn->ni", T_camera_lidar[:3, :3], edges.xyz_m.astype(np.float64)) + T_camera_lidar[:3, 3]
         )
@@ -110,7 +121,8 @@ class FusedObjective:
 
 
 class Fusion:
-    """Both witnesses of a window, with their scales frozen from poses within reach.
+    """Both witnesses of a window, with their scales frozen from poses within reach. Edges that come into view at none
+    of them, nor a little outside, are left out.
 
     Attributes:
         ranking: what a basin is polished on before it is ranked, one after the other; the coarsest band the charts have
@@ -125,7 +137,15 @@ class Fusion:
         self._edges, self._depth = edges, depth
         poses = sample_reach(start, reach, OTHER_POSES)
         self._of_depth = Scale.of(np.array([depth.evaluate(pose).score for pose in poses]))
-        poses = sample_reach(start, replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD)), OTHER_POSES)
+        of_edges = replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD))
+        poses = sample_reach(start, of_edges, OTHER_POSES)
+        seen = SearchBox(of_edges.rotation_rad + BEYOND.rotation_rad, of_edges.translation_m + BEYOND.translation_m)
+        edges = replace(
+            edges,
+            bands=tuple(in_reach(band, edges.half_view_rad, start, seen) for band in edges.bands),
+            whole=in_reach(edges.whole, edges.half_view_rad, start, seen),
+            sharp=in_reach(edges.sharp, edges.half_view_rad, start, seen),
+        )
         self._of_bands = Scale.of(np.mean([charted_significances(chart, poses) for chart in edges.charts], axis=0))
         self.ranking = tuple(
             FusedObjective(band, blur_rad, depth, self._of_bands, self._of_depth)

@@ -25,7 +25,7 @@ from math import inf, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.edges import EdgeWitness
+from coec.calibration.objective.edges import Edges, EdgeWitness, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
@@ -41,6 +41,9 @@ belongs to."""
 POINTS = 30_000
 """Range edges of the window that are asked, at most: half of those that rank basins. Every other costs gain by the root
 of two, and all of them would cost a tenth of a solve."""
+
+SEEN = SearchBox(2.0 * REACH_RAD, 0.0)
+"""From the solved pose to the farthest that a climb comes to: edges that none of them brings into view are left out."""
 
 CHART_POSES = 2_000
 """Of the cover of the reach: half a degree apart, the blur of a chart or less."""
@@ -111,9 +114,12 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     `MIN_FRAMES` pairs. The camera turns about its centre."""
     if len(edges.whole.first_point) - 1 < MIN_FRAMES:
         return None
-    band, blur_rad = _thinned(edges.bands[0]), edges.band_blur_rad[0]
+    band = _asked(edges.bands[0], edges.half_view_rad, pose)
+    sharp = _asked(edges.sharp, edges.half_view_rad, pose)
+    chart = _asked(edges.charts[-1], edges.half_view_rad, pose)
+    blur_rad = edges.band_blur_rad[0]
     near = sample_reach(pose, SearchBox(NEAR_BLURS * blur_rad, 0.0), NEAR_POSES)
-    poses = np.concatenate([pose[None], near, *_put_forward(edges.charts[-1], pose, len(band.first_point) - 1)])
+    poses = np.concatenate([pose[None], near, *_put_forward(chart, pose, len(band.first_point) - 1)])
     early = np.cumsum([_scores(band, at) for at in poses], axis=1).T  # (F, K)
     total = early[-1]
     late = total - early
@@ -122,7 +128,7 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     ends = [poses[int(np.argmax(scores))] for scores in (early[last_early], late[last_early], total)]
     parts = (_part(band, 0, last_early + 1), _part(band, last_early + 1, len(early)), band)
     begun = tuple(_climbed(part, end, blur_rad)[0] for part, end in zip(parts, ends, strict=True))
-    return _settled(_thinned(edges.sharp), last_early + 1, begun, edges.blur_rad)
+    return _settled(sharp, last_early + 1, begun, edges.blur_rad)
 
 
 def _settled(sharp: EdgeFrames, first_late: int, begun: Sequence[Matrix4], blur_rad: float) -> ChangePoint:
@@ -156,7 +162,6 @@ def _settled(sharp: EdgeFrames, first_late: int, begun: Sequence[Matrix4], blur_
 
 def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[np.float64]]:
     """Poses (n, 4, 4) about those at which the frames of one side of a split score most on the chart."""
-    chart = chart.of_points(thinned(len(chart.weight), POINTS))
     cover = sample_reach(pose, SearchBox(REACH_RAD, 0.0), CHART_POSES)
     cover = np.concatenate([pose[None], cover])
     of_frames = chart.frame
@@ -210,17 +215,9 @@ def _climbed(band: EdgeFrames, start: Matrix4, blur_rad: float) -> tuple[Matrix4
     return pose, best
 
 
-def _thinned(frames: EdgeFrames) -> EdgeFrames:
-    return _of_points(frames, thinned(len(frames.weight), POINTS))
-
-
-def _of_points(frames: EdgeFrames, kept: NDArray[np.int64]) -> EdgeFrames:
-    return replace(
-        frames,
-        xyz_m=np.ascontiguousarray(frames.xyz_m[:, kept]),
-        weight=frames.weight[kept],
-        first_point=np.searchsorted(kept, frames.first_point).astype(np.int64),
-    )
+def _asked(edges: Edges, half_view_rad: float, pose: Matrix4) -> Edges:
+    """Of range edges `POINTS` at most, and of those the ones that any pose brings into view."""
+    return in_reach(edges.of_points(thinned(len(edges.weight), POINTS)), half_view_rad, pose, SEEN)
 
 
 def _part(frames: EdgeFrames, begin: int, end: int) -> EdgeFrames:

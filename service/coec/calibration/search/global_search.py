@@ -1,7 +1,8 @@
 """The global stage: every basin of the edge witness within reach of the start, from coarse to fine, in bounded time.
 
-A low-discrepancy cover of the reach is scored on the coarsest level with few edges; the best, kept apart, climb on ever
-finer levels with ever more edges. Nothing is drawn at random: same input, same basins.
+A low-discrepancy cover of the reach is scored on the coarsest level with few edges, the better part of it with more;
+the best, kept apart, climb on ever finer levels with ever more edges. Range edges that no pose of the reach brings into
+view are left out of it all. Nothing is drawn at random: same input, same basins.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ from math import cos, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.edges import EdgeWitness
+from coec.calibration.objective.edges import EdgeWitness, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.steps import of_both
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
 from coec.geometry.cover import moved_by, unit_ball
 from coec.geometry.edges.charts import EdgeCharts, charted_significances, climb, keep_apart
+from coec.geometry.thinning import thinned
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
@@ -29,19 +31,25 @@ MIN_COVER, MAX_COVER = 10_000, 150_000
 BLOCK = 10_000
 """Poses that are made at once: what is needed between is many times as large as they are."""
 
-CANDIDATES = 30_000
-"""Poses of the cover among which those that begin are looked for: most neighbours of a good pose are good, too."""
+SCREENING_POINTS = 400
+"""Range edges by which the whole cover is looked through, at most."""
+
+CANDIDATES = 12_000
+"""Poses of the cover, the best by those, that all thinned edges score, and among which those that begin are looked for:
+most neighbours of a good pose are good, too."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Round:
     """One round of climbing: how many poses begin it, the best on its chart, how far apart (rad); on the coarse or the
-    fine chart, thinned or not; first step (rad) and halvings of it."""
+    fine chart, thinned or not, and with how many of its edges they climb, at most; first step (rad) and halvings of
+    it."""
 
     poses: int
     apart_rad: float
     chart: int
     thinned: bool
+    points: int
     step_rad: float
     halvings: int
 
@@ -50,9 +58,9 @@ COARSE, FINE = 0, 1
 """Places of the charts in `EdgeWitness.charts` and `.thinned`."""
 
 ROUNDS = (
-    _Round(1500, radians(0.9), COARSE, thinned=True, step_rad=radians(0.45), halvings=1),
-    _Round(150, radians(0.7), FINE, thinned=True, step_rad=radians(0.3), halvings=1),
-    _Round(24, radians(0.4), FINE, thinned=False, step_rad=radians(0.15), halvings=1),
+    _Round(1500, radians(0.9), COARSE, thinned=True, points=800, step_rad=radians(0.45), halvings=1),
+    _Round(150, radians(0.7), FINE, thinned=True, points=3_000, step_rad=radians(0.3), halvings=1),
+    _Round(24, radians(0.4), FINE, thinned=False, points=10_000, step_rad=radians(0.15), halvings=1),
 )
 """Each round's steps begin at the width of its blur and end at the next one's. That each chooses by its own chart is
 what finds the true pose: on a coarse one, hundreds of layouts that happen to fit may stand above it (the 855th of the
@@ -90,16 +98,29 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
 
     The reach is a ball: so many radians about any axis, and so many metres in any direction (0: rotation only).
     """
-    poses = _promising(edges.thinned[ROUNDS[0].chart], start, reach)
+    thinned_to = [in_reach(charts, edges.half_view_rad, start, reach) for charts in edges.thinned]
+    finest = in_reach(edges.charts[FINE], edges.half_view_rad, start, reach)
+    poses = _promising(thinned_to[ROUNDS[0].chart], start, reach)
     for number in ROUNDS:
-        charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
+        charts = thinned_to[number.chart] if number.thinned else finest
         poses = poses[_apart(poses, charted_significances(charts, poses), number.poses, number.apart_rad)]
         poses, z = _climbed(charts, poses, number, start, reach)
     if reach.translation_m > 0.0:
         more = _shifted(poses[np.argsort(-z, kind="stable")[:SHIFTED_POSES]])
-        more, z_more = _climbed(edges.charts[FINE], more, ROUNDS[-1], start, reach)
-        poses, z = np.concatenate([poses, more]), np.concatenate([z, z_more])
+        more, _ = _climbed(finest, more, ROUNDS[-1], start, reach)
+        poses = np.concatenate([poses, more])
+    z = charted_significances(finest, poses)
     return [Basin(poses[k], float(z[k])) for k in _apart(poses, z, len(poses), ROUNDS[-1].apart_rad)]
+
+
+def basin_next_to(edges: EdgeWitness, pose: Matrix4, reach: SearchBox) -> Matrix4:
+    """The pose (4, 4) to which the rounds lead from `pose` (4, 4), whatever stands above it elsewhere; within `reach`
+    of it."""
+    end = pose[None]
+    for number in ROUNDS:
+        charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
+        end, _ = _climbed(in_reach(charts, edges.half_view_rad, pose, reach), end, number, pose, reach)
+    return np.asarray(end[0])
 
 
 def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.float64]:
@@ -127,14 +148,15 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     count = int(min(max(volume, MIN_COVER), MAX_COVER))
     cover = _Cover(start, reach, count)
     blocks = np.array_split(np.arange(count), -(-count // BLOCK))
-    z = np.concatenate([charted_significances(charts, cover.poses(block)) for block in blocks])
-    best = np.argsort(-z, kind="stable")[:CANDIDATES]
+    screen = _at_most(charts, SCREENING_POINTS)
+    z = np.concatenate([charted_significances(screen, cover.poses(block)) for block in blocks])
+    best = np.flatnonzero(z >= np.partition(z, -min(CANDIDATES, count))[-min(CANDIDATES, count)])
     # In place: twice all of them is the most that a solve holds.
     poses = np.empty((1 + len(best), 4, 4))
     poses[0] = start
     for begin in range(0, len(best), BLOCK):
         poses[1 + begin : 1 + begin + BLOCK] = cover.poses(best[begin : begin + BLOCK])
-    z = np.concatenate([charted_significances(charts, start[None]), z[best]])
+    z = charted_significances(charts, poses)
     return poses[_apart(poses, z, ROUNDS[0].poses, ROUNDS[0].apart_rad)]
 
 
@@ -152,7 +174,12 @@ def _climbed(
     steps = of_both(number.step_rad)
     if reach.translation_m == 0.0:
         steps[3:] = 0.0
-    return climb(charts, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m]))
+    few = _at_most(charts, number.points)
+    return climb(few, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m]))
+
+
+def _at_most(charts: EdgeCharts, points: int) -> EdgeCharts:
+    return charts.of_points(thinned(len(charts.weight), points))
 
 
 def _apart(poses: NDArray[np.float64], z: NDArray[np.float64], count: int, apart_rad: float) -> NDArray[np.int64]:
