@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -127,7 +128,6 @@ class SimulatedDrive:
             if not 0 < getattr(config, name) < 1e6:
                 raise UsageError(f"{name} of a simulated drive must be above 0, not {getattr(config, name)}")
         self.config = config
-        self.camera = _camera(config.camera, config.half_view_deg)
         self.lidar = _lidar(config.lidar)
         surroundings = _surroundings(config)
         speed_mps = surroundings.speed_mps if config.speed_mps is None else config.speed_mps
@@ -139,6 +139,12 @@ class SimulatedDrive:
         self._trip: Trip = build_trip(config.seed, town.road, town.lane_left_m(), pace)
         self._true = workshop_T_camera_lidar()
         self._body = Solid(body())
+        self._mount()
+
+    def _mount(self) -> None:
+        """The camera of the configuration."""
+        config = self.config
+        self.camera = _camera(config.camera, config.half_view_deg)
         self._rays = pixel_rays(self.camera, math.radians(config.half_view_deg))
         seen = np.zeros(self.camera.height * self.camera.width, bool)
         seen[self._rays.pixel] = True
@@ -151,6 +157,17 @@ class SimulatedDrive:
         mask = cv2.erode(np.pad(usable.astype(np.uint8), 2), np.ones((5, 5), np.uint8))[2:-2, 2:-2] > 0
         told = _told(self.camera, config.intrinsics_off)
         self.rig = Rig("sim", told, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask)
+
+    def through(self, camera: str | Camera, half_view_deg: float) -> SimulatedDrive:
+        """The same drive with another lens: its surroundings are shared, so it is best drawn in step with this one.
+
+        Raises:
+            UsageError: a camera that is not known.
+        """
+        other = copy(self)
+        other.config = replace(self.config, camera=camera, half_view_deg=half_view_deg)
+        other._mount()
+        return other
 
     @property
     def name(self) -> str:

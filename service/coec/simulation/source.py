@@ -10,7 +10,7 @@ from coec.errors import SourceError, UsageError
 from coec.simulation.faults import parse_fault
 
 if TYPE_CHECKING:
-    from coec.simulation.drive import SimulatedDrive
+    from coec.simulation.drive import DriveConfig, SimulatedDrive
 
 NUMBERS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**31 - 1),
@@ -37,7 +37,20 @@ MOST_OFF_PERCENT = 20.0
 
 
 def open_sim(query: dict[str, str]) -> SimulatedDrive:
-    """The drive of `sim:KEY=VALUE&...`; every key may be left out.
+    """The drive of `sim:KEY=VALUE&...`, see `config_of`.
+
+    Raises:
+        UsageError: an unknown key, or a value that does not fit; names the key.
+        SourceError: the optional extra is not installed.
+    """
+    config = config_of(query)
+    from coec.simulation.drive import SimulatedDrive
+
+    return SimulatedDrive(config)
+
+
+def config_of(query: dict[str, str]) -> DriveConfig:
+    """What `sim:KEY=VALUE&...` says; every key may be left out.
 
     `faults` are separated by `;` (see `faults.FORMS`), `workshop` is rx,ry,rz[,tx,ty,tz] in degrees and metres,
     `intrinsics_off` is FOCAL[,CX,CY] in percent, `depth` and `traffic` are `yes` or `no`.
@@ -47,7 +60,7 @@ def open_sim(query: dict[str, str]) -> SimulatedDrive:
         SourceError: the optional extra is not installed.
     """
     require_extra()
-    from coec.simulation.drive import DriveConfig, SimulatedDrive
+    from coec.simulation.drive import DriveConfig
 
     known = (*NUMBERS, *WORDS)
     if unknown := sorted(set(query) - set(known)):
@@ -66,7 +79,7 @@ def open_sim(query: dict[str, str]) -> SimulatedDrive:
             if query[key] not in ("yes", "no"):
                 raise UsageError(f"{key}={query[key]} of a simulated drive: write yes or no")
             values[key] = query[key] == "yes"
-    return SimulatedDrive(DriveConfig(**values))  # type: ignore[arg-type]  # checked key by key above
+    return DriveConfig(**values)  # type: ignore[arg-type]  # checked key by key above
 
 
 def require_extra() -> None:

@@ -7,6 +7,7 @@ between the pose and the local optimum of both witnesses.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import StrEnum
 from math import degrees, inf
 
 import numpy as np
@@ -64,6 +65,16 @@ to 1.9 of 6, and put right mounts 3 to 10 cm beside; 95 % of others are above 2.
 MOVING_MPS = 1.0
 """Faster, a vehicle passes what it sees. While it stands, its checks count as one anyway."""
 
+
+class Faint(StrEnum):
+    """Of what a check whose edges are faint has too little."""
+
+    EDGES_IN_VIEW = "edges_in_view"
+    LOOKS = "looks"
+    SIGNIFICANCE = "significance"
+    CONTRAST = "contrast"
+
+
 UNCOMMISSIONED = MonitorLimits(
     max_distance2_rotation=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0, ROTATION_DOF),
     max_farthest2_pose=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0 / POSE_DOF, 1),
@@ -96,11 +107,10 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
     of_rotation, of_pose = over_limits(seen, rotation, accuracy, limits)
     metrics = _metrics(seen, of_rotation, of_pose, limits)
     flagged = max(of_rotation, of_pose) > 1.0
-    few = seen.edges_in_view < MIN_EDGES_IN_VIEW * seen.pairs or (seen.looks < MIN_LOOKS and _moves(evidence.pairs))
-    weak = few or edges_per_pair(seen) < limits.min_edges_per_pair or seen.contrast < MIN_CONTRAST
+    faint = faintness(evidence.pairs, seen, limits)
     causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
     dirty, textured = ((), 0) if baseline is None or causes else dirty_blocks(evidence.scenes, baseline.scene)
-    if not causes and not few:
+    if not causes and not faint & {Faint.EDGES_IN_VIEW, Faint.LOOKS}:
         # What few edges fit, another clock fits as well as another mount.
         explained = explained_by_motion(
             evidence.pairs,
@@ -122,7 +132,7 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
         place=street_sigma(camera),
         distance2=max(of_rotation, of_pose),
         flagged=flagged,
-        weak=weak,
+        weak=bool(faint),
         flagged_by_paper=None if baseline is None else limits.of_paper.flags(seen),
         causes=causes,
         first_derivative=seen.first_derivative,
@@ -131,6 +141,17 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
         dirty=dirty,
         textured=textured,
     )
+
+
+def faintness(pairs: Sequence[FramePair], seen: Check, limits: MonitorLimits) -> frozenset[Faint]:
+    """Why the edges of a check of some pairs count as faint; nothing where they do not."""
+    short = {
+        Faint.EDGES_IN_VIEW: seen.edges_in_view < MIN_EDGES_IN_VIEW * seen.pairs,
+        Faint.LOOKS: seen.looks < MIN_LOOKS and _moves(pairs),
+        Faint.SIGNIFICANCE: edges_per_pair(seen) < limits.min_edges_per_pair,
+        Faint.CONTRAST: seen.contrast < MIN_CONTRAST,
+    }
+    return frozenset(why for why, is_short in short.items() if is_short)
 
 
 def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> tuple[float, float]:
