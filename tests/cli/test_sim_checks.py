@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -20,10 +21,13 @@ def test_a_drive_that_has_a_result_is_not_checked_again(
 ) -> None:
     checked: list[str] = []
 
-    def run(drive: CheckDrive, baseline: object) -> CheckedDrive:
-        assert baseline is None
-        checked.append(drive.name)
-        return driven(drive.place, drive.seed, (judged(0.0),), (judged(1.0),)).model_copy(update={"name": drive.name})
+    def run(drives: Sequence[CheckDrive], baselines: Mapping[str, object]) -> list[CheckedDrive]:
+        assert not any(baselines.values())
+        checked.extend(drive.name for drive in drives)
+        return [
+            driven(drive.place, drive.seed, (judged(0.0),), (judged(1.0),)).model_copy(update={"name": drive.name})
+            for drive in drives
+        ]
 
     monkeypatch.setattr(check_drives, "PLACES", {"street": "", "highway": "scene=highway"})
     monkeypatch.setattr(check_run, "run", run)
@@ -39,17 +43,18 @@ def test_a_drive_that_has_a_result_is_not_checked_again(
 
 def test_a_right_mount_on_a_highway_is_found_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where guard rails, markings and horizon fit nearly as well most of a degree beside."""
-    monkeypatch.setitem(check_drives.RIGS, "wide", "camera=pinhole640x400&lidar=64")
-    monkeypatch.setattr(check_run, "MOVES", check_run.MOVES[:1])
-    row = check_run.run(CheckDrive("wide", "highway", 700_001), None, checks=1)
+    monkeypatch.setitem(check_drives.RIGS, "wide", "lidar=64&camera=pinhole640x400")
+    monkeypatch.setattr(check_run, "CHECKS", 1)
+    (row,) = check_run.run([CheckDrive("wide", "highway", 700_001)], {})
     assert row.failure is None
-    ((check,),) = [pose.uncommissioned for pose in row.poses]
-    assert (check.flagged, check.weak, check.causes) == (False, True, ())  # one frame says what the other says
+    assert row.poses[0].moved == check_run.RIGHT
+    (check,) = row.poses[0].uncommissioned
+    assert (check.flagged, check.faint, check.causes) == (False, ("looks",), ())  # one frame says what the other says
     assert max(abs(value) for value in check.offset[:3]) < 0.0035
 
 
 def test_a_drive_that_cannot_be_drawn_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(check_drives.RIGS, "box", "camera=box")
-    row = check_run.run(CheckDrive("box", "street", 1), None)
+    (row,) = check_run.run([CheckDrive("box", "street", 1)], {})
     assert row.failure is not None
     assert "unknown camera 'box'" in row.failure

@@ -70,6 +70,17 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others() -> None:
     assert all(a != b for a, b in zip(other, fingerprint(plain()), strict=True))
 
 
+def test_another_lens_sees_the_same_drive_as_one_drawn_for_it_alone() -> None:
+    first, alone = small(seconds=0.5), small(seconds=0.5, camera="pinhole160x120@60", half_view_deg=50.0)
+    through = first.through("pinhole160x120@60", 50.0)
+    drawn = [(message, through.part(number, number + 1)[0]) for number, message in enumerate(first.messages())]
+    seen = [other if isinstance(one, CameraFrame) else one for one, other in drawn]
+    assert fingerprint(seen) == fingerprint(alone.messages())
+    assert first.rig.camera.width == 128
+    assert through.rig.camera == alone.rig.camera
+    np.testing.assert_array_equal(through.rig.mask, alone.rig.mask)
+
+
 def test_several_processes_give_the_same_bytes_in_the_same_order() -> None:
     config = small(camera_hz=2.0, lidar_hz=2.0, ego_hz=200.0).config
     assert fingerprint(messages_by(config, 2)) == fingerprint(SimulatedDrive(config).messages())

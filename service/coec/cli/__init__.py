@@ -887,8 +887,9 @@ def _sim_checks(
 ) -> None:
     """Tell how often the monitor accuses a right mount on rendered drives, and how soon it notices a wrong one.
 
-    A drive is 25 s of one rig in one place and takes a quarter of a minute of one core, a round 40 of them. What is
-    done is kept in DIR: call again, with more rounds, to go on. A DIR holds results of one state of the code.
+    A drive is 25 s of one rig in one place, looked at from the truth and from beside it; it takes a quarter of a minute
+    of one core, a round 40 of them. What no drive met is told by a tail that is fitted to how far off places are. What
+    is done is kept in DIR: call again, with more rounds, to go on. A DIR holds results of one state of the code.
     """
     from coec.cli import sim_checks as command
 

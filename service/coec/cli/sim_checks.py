@@ -35,20 +35,23 @@ def run(options: Options) -> int:
         OutputError: a file cannot be written.
     """
     require_extra()
-    drives = list(check_drives.drives(options.rounds))
+    outings = list(check_drives.drives(options.rounds))
+    drives = [drive for outing in outings for drive in outing]
     rows = {drive.name: row for drive in drives if (row := _kept(options.output, drive)) is not None}
     baselines: dict[str, Baseline | None] = {}
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
-        for drive in drives:
-            if drive.name in rows:
+        for outing in outings:
+            missing = [drive for drive in outing if drive.name not in rows]
+            if not missing:
                 continue
-            if drive.rig not in baselines:
-                baselines[drive.rig] = _commissioned(drive.rig)
-            row = check_run.run(drive, baselines[drive.rig])
-            output.write(_path(options.output, row.name), to_json(row))
-            rows[row.name] = row
-            bars.update(task, advance=1, note=row.name)
+            for drive in missing:
+                if drive.rig not in baselines:
+                    baselines[drive.rig] = _commissioned(drive.rig)
+            for row in check_run.run(missing, baselines):
+                output.write(_path(options.output, row.name), to_json(row))
+                rows[row.name] = row
+                bars.update(task, advance=1, note=row.name)
     report = check_statistics.report([rows[drive.name] for drive in drives], options.hours)
     output.write(options.output / "report.json", to_json(report))
     if options.as_json:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
 
 CHECK_PAIRS, CHECKS, PERIOD_S = 6, 5, 5.0
 """Pairs of a check, checks of a drive, and seconds between two: as the monitor is configured unless told otherwise."""
@@ -11,12 +12,13 @@ CHECK_PAIRS, CHECKS, PERIOD_S = 6, 5, 5.0
 HERTZ = CHECK_PAIRS / PERIOD_S
 
 RIGS = {
-    "fisheye600-32": "camera=fisheye600&lidar=32",
-    "75deg-64": "camera=pinhole560x350@75&lidar=64",
-    "fisheye560-64": "camera=fisheye560&lidar=64",
-    "100deg-32": "camera=pinhole640x320@100&lidar=32",
+    "64-60deg": "lidar=64&camera=pinhole400x240@60",
+    "64-fisheye520": "lidar=64&camera=fisheye520&half_view_deg=70",
+    "32-100deg": "lidar=32&camera=pinhole600x300@100",
+    "32-70deg": "lidar=32&camera=pinhole420x260@70",
 }
-"""By name, the words of a `sim:` SOURCE. None of these lenses is in the matrix, or was learned on."""
+"""By name, the words of a `sim:` SOURCE. None of these lenses is in the matrix, or was learned on. Those that share a
+LiDAR look at the same drives, so a sweep is drawn once for them."""
 
 PLACES = {
     "highway": "scene=highway",
@@ -32,10 +34,10 @@ PLACES = {
 }
 """Likewise."""
 
-FIRST_SEED = 810_001
+FIRST_SEED = 910_001
 """Beyond all seeds that anything was learned on, or is shown with."""
 
-COMMISSIONED_ON = (("street", 820_001), ("garage", 820_002))
+COMMISSIONED_ON = (("street", 920_001), ("garage", 920_002))
 """Places and seeds of the drives that a rig is commissioned on."""
 
 COMMISSIONED_CHECKS = 3
@@ -63,10 +65,10 @@ class CheckDrive:
         return "sim:" + "&".join([*words, "ego_hz=20", RIGS[self.rig], *filter(None, [PLACES[self.place]])])
 
 
-def drives(rounds: int) -> Iterator[CheckDrive]:
-    """Every place with every rig, `rounds` times, each time with a seed of its own: some of a run have seen all."""
+def drives(rounds: int) -> Iterator[tuple[CheckDrive, ...]]:
+    """Every place with every rig, `rounds` times, each time with a seed of its own: some of a run have seen all.
+    Together those that differ in their lens alone."""
     for turn in range(rounds):
         for number, place in enumerate(PLACES):
-            for rig in RIGS:
-                # Rigs share the drive: what differs between them is the rig.
-                yield CheckDrive(rig, place, FIRST_SEED + turn * len(PLACES) + number)
+            for _, rigs in groupby(RIGS, lambda rig: RIGS[rig].partition("&")[0]):
+                yield tuple(CheckDrive(rig, place, FIRST_SEED + turn * len(PLACES) + number) for rig in rigs)

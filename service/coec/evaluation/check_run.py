@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import radians
 from typing import TYPE_CHECKING
@@ -17,12 +17,11 @@ from coec.calibration.commissioning.baseline import Baseline, learned_hash
 from coec.calibration.commissioning.learning import learn_accuracy, learn_limits
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.monitor.change_detector import Observation
-from coec.calibration.monitor.check import NO_BIAS, ROTATION_DOF, check_at, gather
-from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, judge_check
+from coec.calibration.monitor.check import NO_BIAS, ROTATION_DOF, Check, CheckInput, check_at, gather
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, UNCOMMISSIONED, faintness, judge_check
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.ports import DepthModel, ImageReader, Silence
-from coec.calibration.types import FramePair, Matrix4, Rig, Window
+from coec.calibration.types import CameraFrame, FramePair, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, PairingConfig
 from coec.errors import CoecError
 from coec.evaluation.check_drives import CHECK_PAIRS, CHECKS, COMMISSIONED_CHECKS, COMMISSIONED_ON, CheckDrive
@@ -31,7 +30,7 @@ from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 from coec.schemas.checks import CheckedDrive, CheckedPose, Judged
 from coec.schemas.replies import Vector6
-from coec.simulation.source import open_sim
+from coec.simulation.source import config_of, open_sim
 from coec.sources.spec import parse_spec
 
 if TYPE_CHECKING:
@@ -40,9 +39,9 @@ if TYPE_CHECKING:
 RIGHT = "right"
 """Name of no move."""
 
-MOVES = ((RIGHT, 0.0, 0.0), ("0.3 deg", 0.3, 0.0), ("0.5 deg", 0.5, 0.0), ("1 deg", 1.0, 0.0), ("10 cm", 0.0, 0.10))
+MOVES = (("0.5 deg", 0.5, 0.0), ("1 deg", 1.0, 0.0), ("10 cm", 0.0, 0.10))
 """By name: by how much the served pose is turned from the truth, about a random axis (degrees), and shifted from it
-along an axis of the camera that checks know (m)."""
+along an axis of the camera that checks know (m). A drive is looked at from the truth and with one of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +66,7 @@ def commissioned(rig: str) -> Baseline:
     Raises:
         CalibrationError: these drives show nothing.
     """
-    stages = [_draw(CheckDrive(rig, *where).source(COMMISSIONED_CHECKS)) for where in COMMISSIONED_ON]
+    stages = [_draw([CheckDrive(rig, *where).source(COMMISSIONED_CHECKS)])[0] for where in COMMISSIONED_ON]
     pairs = [
         # As if one drive had come after the other: they begin at the same time.
         _later(pair, number * 3_600_000_000_000)
@@ -88,14 +87,29 @@ def commissioned(rig: str) -> Baseline:
     )  # fmt: skip
 
 
-def run(drive: CheckDrive, baseline: Baseline | None, checks: int = CHECKS) -> CheckedDrive:
-    """The row of a drive of so many checks; whatever goes wrong is its `failure`."""
-    source = drive.source(checks)
-    row = CheckedDrive(name=drive.name, rig=drive.rig, place=drive.place, seed=drive.seed, source=source, poses=())
+def run(drives: Sequence[CheckDrive], baselines: Mapping[str, Baseline | None]) -> list[CheckedDrive]:
+    """The rows of drives that differ in their lens alone; whatever goes wrong is their `failure`. `baselines` of the
+    rigs by name."""
+    rows = [
+        CheckedDrive(name=drive.name, rig=drive.rig, place=drive.place, seed=drive.seed, source=source, poses=())
+        for drive in drives
+        for source in [drive.source(CHECKS)]
+    ]
     try:
-        return row.model_copy(update={"poses": _checked(_draw(source), drive, baseline)})
+        stages = _draw([row.source for row in rows])
     except CoecError as error:
-        return row.model_copy(update={"failure": f"{type(error).__name__}: {error}"})
+        return [_failed(row, error) for row in rows]
+    checked = []
+    for row, drive, stage in zip(rows, drives, stages, strict=True):
+        try:
+            checked.append(row.model_copy(update={"poses": _checked(stage, drive, baselines.get(drive.rig))}))
+        except CoecError as error:
+            checked.append(_failed(row, error))
+    return checked
+
+
+def _failed(row: CheckedDrive, error: CoecError) -> CheckedDrive:
+    return row.model_copy(update={"failure": f"{type(error).__name__}: {error}"})
 
 
 def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tuple[CheckedPose, ...]:
@@ -105,16 +119,17 @@ def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tup
     windows = [stage.window(stage.pairs[first : first + CHECK_PAIRS]) for first in starts]
     gathered = [gather(sight_of(window, stage.depth, stage.images, configuration, Silence())) for window in windows]
     rows = []
-    for number, (name, turn_deg, shift_m) in enumerate(MOVES):
-        rng = np.random.default_rng([zlib.crc32(drive.name.encode()), number])
+    drawn = zlib.crc32(drive.name.encode())
+    rng = np.random.default_rng(drawn)
+    for name, turn_deg, shift_m in ((RIGHT, 0.0, 0.0), MOVES[drawn % len(MOVES)]):
         xi = _move(rng, turn_deg, shift_m, baseline)
         if xi is None:
             continue
         pose = se3.perturb(stage.truth, xi)
         seen = [(evidence, check_at(evidence, pose, configuration, bias)) for evidence in gathered]
-        of_any = tuple(_wire(judge_check(evidence, check, pose, None)) for evidence, check in seen)
+        of_any = tuple(_judged(*one, pose, None) for one in seen)
         # The reference moves with what is served: a commissioned rig whose mount has moved.
-        of_rig = () if baseline is None else tuple(_wire(judge_check(*one, pose, baseline)) for one in seen)
+        of_rig = () if baseline is None else tuple(_judged(*one, pose, baseline) for one in seen)
         rows.append(CheckedPose(moved=name, uncommissioned=of_any, commissioned=of_rig))
     return tuple(rows)
 
@@ -134,13 +149,28 @@ def _move(
     return xi
 
 
-def _draw(source: str) -> _Stage:
-    made: SimulatedDrive = open_sim(parse_spec(source).query)
-    pairer = Pairer(PairingConfig(), expects_motion=True)
-    pairs = [pair for message in made.messages() for pair in pairer.push(message)] + pairer.flush()
+def _draw(sources: Sequence[str]) -> list[_Stage]:
+    """Drives that differ in their lens alone."""
+    first: SimulatedDrive = open_sim(parse_spec(sources[0]).query)
+    configs = [config_of(parse_spec(source).query) for source in sources[1:]]
+    drives = [first, *(first.through(config.camera, config.half_view_deg) for config in configs)]
+    pairers = [Pairer(PairingConfig(), expects_motion=True) for _ in drives]
+    pairs: list[list[FramePair]] = [[] for _ in drives]
+    for number, message in enumerate(first.messages()):
+        # What is no picture is the same for all of them.
+        own = isinstance(message, CameraFrame)
+        seen = [message, *(drive.part(number, number + 1)[0] if own else message for drive in drives[1:])]
+        for pairer, one, paired in zip(pairers, seen, pairs, strict=True):
+            paired += pairer.push(one)
+    return [
+        _stage(drive, [*paired, *pairer.flush()]) for drive, pairer, paired in zip(drives, pairers, pairs, strict=True)
+    ]
+
+
+def _stage(drive: SimulatedDrive, pairs: Sequence[FramePair]) -> _Stage:
     depth = CachedDepth(open_depth(_configuration().depth, LimitsConfig()), len(pairs))
     images = CachedGreys(GreyImages(LimitsConfig()), len(pairs))
-    return _Stage(made.rig, made.truth(pairs[0].stamp_ns), tuple(pairs), depth, images)
+    return _Stage(drive.rig, drive.truth(pairs[0].stamp_ns), tuple(pairs), depth, images)
 
 
 def _later(pair: FramePair, by_ns: int) -> FramePair:
@@ -159,10 +189,12 @@ def _configuration() -> CalibrationConfig:
     return CalibrationConfig.model_validate(values)
 
 
-def _wire(seen: Observation) -> Judged:
+def _judged(evidence: CheckInput, check: Check, pose: Matrix4, baseline: Baseline | None) -> Judged:
+    seen = judge_check(evidence, check, pose, baseline)
+    faint = faintness(evidence.pairs, check, UNCOMMISSIONED if baseline is None else baseline.monitor)
     return Judged(
         offset=_six(seen.offset), sigma=_six(seen.sigma), noise=_six(seen.noise), place=_six(seen.place),
-        distance2=seen.distance2, flagged=seen.flagged, weak=seen.weak,
+        distance2=seen.distance2, flagged=seen.flagged, faint=tuple(sorted(faint)),
         causes=tuple(cause.code for cause in seen.causes),
     )  # fmt: skip
 

@@ -2,7 +2,9 @@
 
 A mount is right or wrong for hours, and so is a place poor for its checks: on a highway what one check is off, the next
 one is off as well. So the hours are resampled by whole drives, and of one place for as long as one is there; checks
-that are shuffled would be independent, and the alarms far too few.
+that are shuffled would be independent, and the alarms far too few. What was not met, no resampling meets: a tail is
+fitted to how far off places are (`alarm_bound`), once as if every drive were a place of its own, and once as if a
+vehicle stayed at each for ten minutes.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from coec.calibration.monitor.change_detector import (
 )
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.config import MonitorConfig
-from coec.evaluation.check_drives import CHECK_PAIRS, PERIOD_S
+from coec.evaluation.alarm_bound import Places, bound
+from coec.evaluation.check_drives import CHECK_PAIRS, CHECKS, PERIOD_S
 from coec.evaluation.check_run import MOVES, RIGHT
 from coec.evaluation.detection import CONFIDENCE, interval
 from coec.schemas.checks import (
@@ -34,6 +37,7 @@ from coec.schemas.checks import (
     Judged,
     MovedStatistics,
     RigStatistics,
+    TailStatistics,
 )
 
 PLACE_CHECKS = 120
@@ -72,8 +76,10 @@ def _of_rigs(rows: Sequence[CheckedDrive], commissioned: bool, resampled_h: floa
     if known and resampled_h > 0.0:
         most = round(resampled_h * S_PER_H / PERIOD_S)
         hours.append(_hours("resampled", _at_most(_resampled(known, right), most)))
-    moved = [_moved(name, known, right, commissioned) for name, _, _ in MOVES]
-    return RigStatistics(commissioned=commissioned, moved=tuple(moved), hours=tuple(hours))
+    settled = Places.of([right[row.name] for row in known])
+    tails = [one for stay in (CHECKS, PLACE_CHECKS) if (one := _tail(settled, stay)) is not None]
+    moved = [_moved(name, known, right, commissioned) for name in (RIGHT, *(name for name, _, _ in MOVES))]
+    return RigStatistics(commissioned=commissioned, moved=tuple(moved), hours=tuple(hours), tails=tuple(tails))
 
 
 def _checks(row: CheckedDrive, moved: str, commissioned: bool) -> tuple[Judged, ...]:
@@ -139,6 +145,22 @@ def _hours(how: str, vehicles: Iterable[list[Where]]) -> HoursStatistics:
     )
 
 
+def _tail(places: Places, stay_checks: int) -> TailStatistics | None:
+    """Of a vehicle that is at another place after every `stay_checks`."""
+    levels = alarm_levels(CONFIG)
+
+    def alarms(checks: Sequence[Judged]) -> bool:
+        return any(state.outcome is Finding.CONFIRMED for state in states(checks, levels))
+
+    found = bound(places, stay_checks, S_PER_H / PERIOD_S / stay_checks, alarms)
+    if found is None:
+        return None
+    return TailStatistics(
+        stay_checks=stay_checks, places=len(places.checks), farthest=float(places.displacement.max()),
+        accused_at=found.half, alarms_per_100_h=found.mean, alarms_per_100_h_at_most=found.at_most,
+    )  # fmt: skip
+
+
 def _moved(
     name: str, rows: Sequence[CheckedDrive], right: dict[str, tuple[Judged, ...]], commissioned: bool
 ) -> MovedStatistics:
@@ -158,12 +180,12 @@ def _moved(
         suspected += any(state.evidence >= levels.suspect for state in after)
         confirmed = next((number for number, state in enumerate(after, 1) if state.evidence >= levels.confirmed), None)
         delays += [] if confirmed is None else [confirmed]
-    clear = [check for check in everything if not check.causes and not check.weak]
+    clear = [check for check in everything if not check.causes and not check.faint]
     flagged = sum(check.flagged for check in clear)
     low, high = interval(flagged, len(clear)) if clear else (None, None)
     return MovedStatistics(
         moved=name, drives=drives, checks=len(everything), blind=sum(bool(check.causes) for check in everything),
-        weak=sum(check.weak and not check.causes for check in everything), clear=len(clear), flagged=flagged,
+        weak=sum(bool(check.faint) and not check.causes for check in everything), clear=len(clear), flagged=flagged,
         flagged_low=low, flagged_high=high, suspected=suspected, confirmed=len(delays), delay_checks=tuple(delays),
     )  # fmt: skip
 
@@ -181,6 +203,6 @@ def _observation(check: Judged, number: int) -> Observation:
     return Observation(
         stamp_ns=begin_ns + CHECK_PAIRS - 1, pair_stamps_ns=tuple(begin_ns + pair for pair in range(CHECK_PAIRS)),
         metrics=(), offset=np.array(check.offset), sigma=np.array(check.sigma), noise=np.array(check.noise),
-        place=np.array(check.place), distance2=check.distance2, flagged=check.flagged, weak=check.weak,
+        place=np.array(check.place), distance2=check.distance2, flagged=check.flagged, weak=bool(check.faint),
         flagged_by_paper=None, causes=tuple(CAUSES[code] for code in check.causes),
     )  # fmt: skip

@@ -43,6 +43,20 @@ def _show(rigs: RigStatistics) -> None:
             console.figure(driven.alarms_per_100_h_at_most, 1),
         )
     console.out.print(hours)
+    if rigs.tails:
+        tails = console.table(
+            "places of", "places", "farthest, σ", "accused at, σ", "in 100 h", "at most (95 %)", right=range(1, 6)
+        )
+        for tail in rigs.tails:
+            tails.add_row(
+                f"{tail.stay_checks} checks",
+                str(tail.places),
+                console.figure(tail.farthest, 1),
+                "-" if tail.accused_at is None else console.figure(tail.accused_at, 0),
+                console.figure(tail.alarms_per_100_h, 3),
+                console.figure(tail.alarms_per_100_h_at_most, 3),
+            )
+        console.out.print(tails)
     for driven in rigs.hours:
         if driven.alarmed:
             console.show(f"false alarms, {driven.how}: {', '.join(driven.alarmed)}")

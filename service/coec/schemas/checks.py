@@ -18,7 +18,7 @@ class Judged(Part):
     place: Vector6
     distance2: float
     flagged: bool
-    weak: bool = Field(description="its edges are faint")
+    faint: tuple[str, ...] = Field(description="of what its edges have too little; empty where they are not faint")
     causes: tuple[str, ...] = Field(description="what is wrong with its data, by code")
 
 
@@ -74,12 +74,26 @@ class HoursStatistics(Part):
     alarmed: tuple[str, ...] = Field(description="where: rig and place")
 
 
+class TailStatistics(Part):
+    """How often a right mount would be accused, from how far off places are, beyond those that were met."""
+
+    stay_checks: Count = Field(description="a vehicle is at another place after so many")
+    places: Count = Field(description="drives with a clear check of a right mount")
+    farthest: float = Field(description="displacement of the farthest of them, standard deviations of what places are")
+    accused_at: float | None = Field(
+        description="displacement at which half of drawn places accuse; null where the farthest drawn do not"
+    )
+    alarms_per_100_h: float = Field(description="mean over all tails that fit")
+    alarms_per_100_h_at_most: float = Field(description="of 95 % of the tails that fit, by how well they do")
+
+
 class RigStatistics(Part):
     """Of a rig that was commissioned, or was not."""
 
     commissioned: bool
     moved: tuple[MovedStatistics, ...]
     hours: tuple[HoursStatistics, ...]
+    tails: tuple[TailStatistics, ...] = Field(description="empty with fewer than twenty places")
 
 
 class ChecksReport(Message):

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -105,13 +106,21 @@ class SimulatedDrive:
     def __init__(self, config: DriveConfig) -> None:
         check_rates(config)
         self.config = config
-        self.camera = camera_of(config.camera, config.half_view_deg)
-        lidar = lidar_of(config.lidar)
         self._journey = Journey(
             config.seed, config.scene, config.seconds,
             speed_mps=config.speed_mps, start_m=config.start_m, traffic=config.traffic, faults=config.faults,
         )  # fmt: skip
         self._true = workshop_T_camera_lidar()
+        self._turning = LidarAboard(
+            self._journey, Wire("lidar", config.lidar_hz, _LIDAR, faults=config.faults), lidar_of(config.lidar),
+            lambda _: T_ego_lidar(),
+        )  # fmt: skip
+        self._mount()
+
+    def _mount(self) -> None:
+        """The camera of the configuration, beside the other sensors."""
+        config = self.config
+        self.camera = camera_of(config.camera, config.half_view_deg)
         optics = Optics(
             self.camera,
             config.half_view_deg,
@@ -124,15 +133,23 @@ class SimulatedDrive:
             self._journey, Wire("camera", config.camera_hz, _CAMERA, faults=config.faults), optics,
             self._T_ego_camera, Solid(body()),
         )  # fmt: skip
-        turning = LidarAboard(
-            self._journey, Wire("lidar", config.lidar_hz, _LIDAR, faults=config.faults), lidar, lambda _: T_ego_lidar()
-        )
         odometer = OdometerAboard(self._journey, Wire("ego", config.ego_hz, _EGO, faults=config.faults))
-        self._streams: tuple[Aboard, ...] = (odometer, turning, eye)
+        self._streams: tuple[Aboard, ...] = (odometer, self._turning, eye)
         xi = np.array([*np.deg2rad(config.workshop[:3]), *config.workshop[3:]])
         told = _told(self.camera, config.intrinsics_off)
         mask = eye.mask_at(product(T_ego_lidar(), inverse(self._true)))
         self.rig = Rig("sim", told, "camera", "lidar", perturb(self._true, xi), inverse(T_ego_lidar()), mask=mask)
+
+    def through(self, camera: str | Camera, half_view_deg: float) -> SimulatedDrive:
+        """The same drive with another lens: its surroundings are shared, so it is best drawn in step with this one.
+
+        Raises:
+            UsageError: a camera that is not known.
+        """
+        other = copy(self)
+        other.config = replace(self.config, camera=camera, half_view_deg=half_view_deg)
+        other._mount()
+        return other
 
     @property
     def name(self) -> str:

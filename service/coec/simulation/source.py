@@ -10,7 +10,7 @@ from coec.errors import SourceError, UsageError
 from coec.simulation.faults import parse_fault, parse_sensor_fault
 
 if TYPE_CHECKING:
-    from coec.simulation.drive import SimulatedDrive
+    from coec.simulation.drive import DriveConfig, SimulatedDrive
     from coec.simulation.rig_drive import RigDrive, RigPair
 
 NUMBERS: dict[str, tuple[float, float]] = {
@@ -38,7 +38,20 @@ MOST_OFF_PERCENT = 20.0
 
 
 def open_sim(query: dict[str, str]) -> SimulatedDrive:
-    """The drive of `sim:KEY=VALUE&...`; every key may be left out.
+    """The drive of `sim:KEY=VALUE&...`, see `config_of`.
+
+    Raises:
+        UsageError: an unknown key, or a value that does not fit; names the key.
+        SourceError: the optional extra is not installed.
+    """
+    config = config_of(query)
+    from coec.simulation.drive import SimulatedDrive
+
+    return SimulatedDrive(config)
+
+
+def config_of(query: dict[str, str]) -> DriveConfig:
+    """What `sim:KEY=VALUE&...` says; every key may be left out.
 
     `faults` are separated by `;` (see `faults.FORMS`), `workshop` is rx,ry,rz[,tx,ty,tz] in degrees and metres,
     `intrinsics_off` is FOCAL[,CX,CY] in percent, `depth` and `traffic` are `yes` or `no`.
@@ -48,7 +61,7 @@ def open_sim(query: dict[str, str]) -> SimulatedDrive:
         SourceError: the optional extra is not installed.
     """
     require_extra()
-    from coec.simulation.drive import DriveConfig, SimulatedDrive
+    from coec.simulation.drive import DriveConfig
 
     known = (*NUMBERS, *WORDS)
     if unknown := sorted(set(query) - set(known)):
@@ -60,7 +73,7 @@ def open_sim(query: dict[str, str]) -> SimulatedDrive:
         values["workshop"] = _six(query["workshop"])
     if "intrinsics_off" in query:
         values["intrinsics_off"] = _three(query["intrinsics_off"])
-    return SimulatedDrive(DriveConfig(**values))  # type: ignore[arg-type]  # checked key by key above
+    return DriveConfig(**values)  # type: ignore[arg-type]  # checked key by key above
 
 
 def require_extra() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LENS_FREE, Loosened, loosen
+from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LEAST_PX, LENS_FREE, Loosened, loosen
 from coec.calibration.confidence.told import CLOCKS, LENS, SHIFTS
 from coec.config import VerdictConfig
 from coec.geometry import se3
@@ -116,3 +116,12 @@ def test_the_same_window_gives_the_same_bits(rng: np.random.Generator) -> None:
     for a, b in zip(one, other, strict=True):
         assert (a.certainty, a.moved_px) == (b.certainty, b.moved_px)
         np.testing.assert_array_equal(a.deviation, b.deviation)
+
+
+@pytest.mark.parametrize(("moved_px", "share"), [(0.0, 0.0), (LEAST_PX, 0.5), (10.0 * LEAST_PX, 0.99)])
+def test_a_lens_is_believed_by_what_it_moves_beyond_what_edges_leave(moved_px: float, share: float) -> None:
+    """Beside the turn that answers it: hardly anything of a principal point that a turn makes up for."""
+    lens = Loosened(LENS_FREE, 1.6, moved_px, np.zeros(12), np.zeros(6))
+    assert lens.contradicts
+    assert lens.believed == pytest.approx(share, abs=1e-3)
+    assert Loosened(HELD_FREE, 1.6, moved_px, np.zeros(12), np.zeros(6)).believed == 1.0

@@ -42,7 +42,8 @@ UNSEEN = COLUMNS * ROWS
 LEAST_PX = 0.4
 """Another lens has to move the sharpest edges by so much, root mean square, beside what the pose can do: corners of a
 target are found to a tenth of a pixel, and edges are drawn aside by blur by as much. In 48 windows of twelve simulated
-drives through the lens they were told it was less, or not certain; in all 16 of four through another it was both."""
+drives through the lens they were told it was less, or not certain; in all 16 of four through another it was both. It is
+what edges leave to a lens by themselves: one that moves them by as much is half believed (`Loosened.believed`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +68,15 @@ class Loosened:
     def matters(self) -> bool:
         """Whether it moves the edges by more than calibrations leave."""
         return self.moved_px >= LEAST_PX
+
+    @property
+    def believed(self) -> float:
+        """By what share its shift counts. A lens trades its centre against a turn of the camera, so that what moves the
+        edges by a fifth of a pixel beside the turn turns the camera by half a degree: of what was measured with an
+        error of `LEAST_PX` the part that is not error is believed (Wiener 1949)."""
+        if self.name != LENS_FREE:
+            return 1.0
+        return self.moved_px**2 / (self.moved_px**2 + LEAST_PX**2)
 
     @property
     def contradicts(self) -> bool:

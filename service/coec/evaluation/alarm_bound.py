@@ -1,0 +1,154 @@
+"""How often the monitor would accuse a right mount, from fewer hours than it takes to see one accused.
+
+A single check accuses nobody: what does is a place where all checks are off alike, far enough and for long enough. So
+the question is split in two. How far off are places? As checks of rendered drives say: the largest displacement of each
+drive, in standard deviations of `place`, and a tail beyond those that were seen (peaks over threshold: Pickands 1975;
+Smith 1987), over all tails that they leave likely. And what does the detector do at a place that is so far off? It is
+asked: drawn places of one displacement, with the scatter of checks about their place as it was rendered, one drive's at
+a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import log
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.schemas.checks import Judged
+
+SETTLED_CHECKS = 24
+"""Of a right mount before a place: two minutes at one every five seconds."""
+
+DISPLACEMENTS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0)
+"""Of drawn places, in standard deviations of `place`: from what every other place has to what every check sees."""
+
+DRAWS = 12
+"""Places of each displacement."""
+
+MIN_PLACES = 20
+"""With fewer no tail is fitted: half of them are beyond the threshold."""
+
+SHAPES = np.linspace(-0.5, 0.5, 41)
+"""Of tails that are thought of, all alike likely: from one that ends soon after what was seen to one without a
+variance."""
+
+SCALES = np.geomspace(0.05, 20.0, 121)
+"""Likewise, over the mean excess; every factor alike likely."""
+
+CONFIDENCE = 0.95
+"""Of the bound."""
+
+SEED = 20_230_617
+"""Any number; the first day of CVPR 2023, where the method appeared."""
+
+Alarms = Callable[[Sequence[Judged]], bool]
+"""Whether a detector accuses the mount in a sequence of checks."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """What clear checks of a right mount say of the places they were made at.
+
+    Attributes:
+        checks: of every place, those that can tell.
+        displacement: (n,) of every place: the mean of its checks on the axis that is farthest off, in standard
+            deviations of `place`.
+    """
+
+    checks: tuple[tuple[Judged, ...], ...]
+    displacement: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, drives: Sequence[Sequence[Judged]]) -> Places:
+        """A place a drive; drives without a clear check are none."""
+        clear = [tuple(check for check in drive if not check.causes and not check.faint) for drive in drives]
+        kept = tuple(checks for checks in clear if checks)
+        far = [float(np.max(np.abs(_offsets(checks).mean(axis=0)) / np.array(checks[0].place))) for checks in kept]
+        return cls(kept, np.array(far))
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """Of false alarms in 100 hours, as a tail of displacements says: its mean over all likely tails, and what it is
+    below at `CONFIDENCE`. `half` is the displacement at which half of the places accuse; None if those farthest off
+    do not."""
+
+    mean: float
+    at_most: float
+    half: float | None
+
+
+def bound(places: Places, stay_checks: int, places_per_h: float, alarms: Alarms) -> Bound | None:
+    """Of a vehicle that stays at a place for so many checks, and comes to so many of them an hour; None of fewer than
+    `MIN_PLACES`."""
+    if len(places.checks) < MIN_PLACES:
+        return None
+    accused = [_accused(places, far, stay_checks, alarms) for far in DISPLACEMENTS]
+    # The farther, the likelier: fewer by chance are no fewer.
+    share = np.maximum.accumulate(np.array(accused))
+    weight, beyond = tail(places.displacement, np.array(DISPLACEMENTS))
+    rates = 100.0 * places_per_h * np.sum(np.diff(share, prepend=0.0) * beyond, axis=1)
+    order = np.argsort(rates, kind="stable")
+    place = int(np.searchsorted(np.cumsum(weight[order]), CONFIDENCE))
+    half = next((far for far, part in zip(DISPLACEMENTS, share, strict=True) if part >= 0.5), None)
+    return Bound(float(np.sum(weight * rates)), float(rates[order][min(place, len(rates) - 1)]), half)
+
+
+def tail(seen: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of displacements (n,) that were seen, tails (k,) by how likely they are, and the share of places (k, m) that each
+    has beyond some displacements (m,): generalised Pareto beyond the median."""
+    threshold = float(np.median(seen))
+    excess = seen[seen > threshold] - threshold
+    mean = float(excess.mean())
+    likelihood, shares = [], []
+    for shape in SHAPES.tolist():
+        for scale in (SCALES * mean).tolist():
+            likelihood.append(float(np.sum(_log_density(excess, shape, scale))))
+            shares.append(len(excess) / len(seen) * _survival(np.maximum(at - threshold, 0.0), shape, scale))
+    weight = np.exp(np.array(likelihood) - max(likelihood))
+    return weight / weight.sum(), np.array(shares)
+
+
+def _log_density(excess: NDArray[np.float64], shape: float, scale: float) -> NDArray[np.float64]:
+    if abs(shape) < 1e-9:
+        return np.asarray(-log(scale) - excess / scale)
+    inside = 1.0 + shape * excess / scale
+    with np.errstate(divide="ignore", invalid="ignore"):
+        density = -log(scale) - (1.0 + 1.0 / shape) * np.log(inside)
+    return np.where(inside > 0.0, density, -np.inf)
+
+
+def _survival(excess: NDArray[np.float64], shape: float, scale: float) -> NDArray[np.float64]:
+    if abs(shape) < 1e-9:
+        return np.asarray(np.exp(-excess / scale))
+    return np.asarray(np.maximum(1.0 + shape * excess / scale, 0.0) ** (-1.0 / shape))
+
+
+def _accused(places: Places, displacement: float, stay_checks: int, alarms: Alarms) -> float:
+    """The share of drawn places of one displacement at which the mount is accused."""
+    rng = np.random.default_rng([SEED, round(100.0 * displacement), stay_checks])
+    return float(np.mean([alarms(_stay(places, displacement, stay_checks, rng)) for _ in range(DRAWS)]))
+
+
+def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.Generator) -> list[Judged]:
+    """Checks of a right mount, and then those of a place that is off about or along one axis."""
+    scattered = [checks for checks in places.checks if len(checks) > 1]
+    checks = scattered[int(rng.integers(len(scattered)))]
+    offsets = _offsets(checks)
+    # What so few scatter about their mean is less than what they scatter about their place.
+    about = (offsets - offsets.mean(axis=0)) * np.sqrt(len(checks) / (len(checks) - 1.0))
+    off = np.zeros(6)
+    axis = int(rng.integers(6))
+    off[axis] = displacement * checks[0].place[axis] * float(rng.choice([-1.0, 1.0]))
+    drawn = rng.integers(len(checks), size=SETTLED_CHECKS + stay_checks)
+    return [
+        checks[one].model_copy(update={"offset": tuple((about[one] + off * (number >= SETTLED_CHECKS)).tolist())})
+        for number, one in enumerate(drawn.tolist())
+    ]
+
+
+def _offsets(checks: Sequence[Judged]) -> NDArray[np.float64]:
+    return np.array([check.offset for check in checks])
