@@ -34,8 +34,13 @@ AGES_S = (10.0, 16.0, 26.0, 42.0, 68.0, 110.0)
 """How long ago it is looked for otherwise, in steps that a robust mean bridges; and beyond these, before all looks that
 are kept."""
 
+EVERY_S = 4.0
+"""Between two times that it is asked who moved: it takes 0.03 to 0.1 s of a core, and looks come faster than they
+matter."""
+
 NS_PER_S = 1_000_000_000
 BEFORE_ALL_NS = -(2**62)
+"""A stamp before any other."""
 
 
 class SensorHealth(StrEnum):
@@ -72,11 +77,13 @@ class RigState:
 
     Attributes:
         histories: of every edge, by name.
-        posterior: who moved, as of the last look; None before the first.
+        posterior: who moved, as of when that was last asked; None before the first look.
+        asked_ns: stamp of the look at which it was.
     """
 
     histories: Mapping[str, History]
     posterior: Posterior | None = None
+    asked_ns: int = BEFORE_ALL_NS
 
     @property
     def calm(self) -> bool:
@@ -111,12 +118,13 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
     if look.edge not in state.histories:
         raise ValueError(f"{look.edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
     history = state.histories[look.edge]
-    if not history.looks and not np.isfinite(history.sigma).any():
-        # The first that is known of an edge which nothing vouched for: right, as far as checks of a right rig may be
-        # off.
-        history = History.at(history.origin, look.rig)
+    if not history.looks:
+        # Whoever looks has a bias of its own on this rig, however well the pose is known that is served.
+        history = History.at(history.origin, np.hypot(np.nan_to_num(history.sigma), look.rig))
     histories = {**state.histories, look.edge: history.after(look, state.calm)}
-    return RigState(histories, _posterior(histories, graph))
+    if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
+        return replace(state, histories=histories)
+    return RigState(histories, _posterior(histories, graph), look.stamp_ns)
 
 
 def _posterior(histories: Mapping[str, History], graph: RigGraph) -> Posterior:
@@ -151,7 +159,7 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
         health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
     else:
         health = SensorHealth.CALIBRATED
-        text = f"{len(looked)} of its {len(edges)} pairs were looked at, and fit without a move of it."
+        text = f"What was looked at fits without a move of it: {', '.join(looked)}."
         reasons = (Reason("fits", text),)
     return SensorState(sensor.name, sensor.kind, health, probability, moved, reasons)
 
@@ -161,7 +169,7 @@ def _named(sensor: Sensor, probability: float, moved: Moved | None, looked: list
     far = "" if moved is None else f" by {_size(moved)}"
     others = [name for name in of.sets[0][0] if name != sensor.name]
     beside = f", together with {', '.join(others)}" if others else ""
-    text = f"It moved{far}{beside}: {', '.join(since)} say so, and all others fit ({100.0 * probability:.1f} %)."
+    text = f"It moved{far}{beside}: seen by {', '.join(since)}; all else fits ({100.0 * probability:.1f} %)."
     return Reason("moved", text)
 
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from math import log
+from math import log, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -146,18 +146,19 @@ def who_moved(graph: RigGraph, steps: Mapping[str, Steps]) -> Posterior:
     sets = ones
     log_prior = np.full(len(ones), _log_event() + log(alone / len(ones)))
     log_sets, disturbed = _evidence(ones, rows, pulls)
-    log_nobody = rows.either.sum(axis=1) + np.log1p(-np.exp(_log_event()))
+    log_sets += rows.base[:, None]
+    log_nobody = rows.base + rows.either.sum(axis=1) + np.log1p(-np.exp(_log_event()))
     excess = np.logaddexp.reduce((log_prior + log_sets).ravel()) - np.logaddexp.reduce(log_nobody)
     if twos and excess > ANY_TWO:
         # Of two that moved, one alone says something already.
-        speaks = (log_sets - rows.either.sum(axis=1)[:, None]).max(axis=0) > 0.0
+        speaks = log_sets.max(axis=0) > log_nobody.max()
         twos = [(m, n) for m, n in twos if speaks[m] or speaks[n]]
         if twos:
             count = len(ones) * (len(ones) - 1) // 2
             log_twos, disturbed_twos = _evidence(twos, rows, pulls)
             sets = [*ones, *twos]
             log_prior = np.concatenate([log_prior, np.full(len(twos), _log_event() + log(TWO_SHARE / count))])
-            log_sets = np.concatenate([log_sets, log_twos], axis=1)
+            log_sets = np.concatenate([log_sets, log_twos + rows.base[:, None]], axis=1)
             disturbed = np.concatenate([disturbed, disturbed_twos], axis=1)
     joint = np.concatenate([log_nobody[:, None], log_prior + log_sets], axis=1)
     weight = np.exp(joint - joint.max())
@@ -193,6 +194,8 @@ class _Rows:
     log_disturbed: Array  # (T, E) prior of that
     lasting: Array  # (T, E) share of that prior that is not a transient
     looked_at: NDArray[np.bool_]  # (E,) since any of the times
+    log_still: Array  # (T, E) likelihood of all looks at one place, over that of a step by noise alone
+    base: Array  # (T,) of a step of all edges by noise alone, over that of all at one place
 
     @property
     def undisturbed(self) -> Array:
@@ -206,8 +209,9 @@ class _Rows:
 
     @property
     def either(self) -> Array:
-        """(T, E) of noise or a disturbance."""
-        return np.logaddexp(self.undisturbed, self.bent)
+        """(T, E) of an edge whose sensors stand still: noise, such as another street, or some bad looks; or a
+        disturbance."""
+        return np.logaddexp(self.undisturbed + np.logaddexp(0.0, self.log_still) - log(2.0), self.bent)
 
     @property
     def by_itself(self) -> Array:
@@ -218,18 +222,21 @@ class _Rows:
     @classmethod
     def of(cls, graph: RigGraph, steps: Mapping[str, Steps]) -> _Rows:
         times = len(next(iter(steps.values())).looks) if steps else 1
-        xi, covariance, seen, transient = [], [], [], []
+        xi, covariance, seen, transient, stepped = [], [], [], [], []
         for edge in graph.edges:
             of = steps.get(edge.name)
             xi.append(np.zeros((times, 6)) if of is None else of.xi)
             covariance.append(np.tile(np.eye(6), (times, 1, 1)) if of is None else of.covariance)
             seen.append(np.zeros(times) if of is None else of.looks)
             transient.append(np.zeros(times) if of is None else of.log_transient)
+            stepped.append(np.zeros(times) if of is None else of.log_stepped - of.log_still)
         for link in graph.links:
             xi.append(np.zeros((times, 6)))
             covariance.append(np.tile(np.diag(2.0 * link.sigma**2), (times, 1, 1)))
             seen.append(np.ones(times))
             transient.append(np.full(times, -np.inf))
+            # Nothing was seen of it: noise alone and no step are one.
+            stepped.append(np.full(times, 3.0 * log(2.0 * pi) + 0.5 * float(np.sum(np.log(2.0 * link.sigma**2)))))
         step, cov = np.stack(xi, axis=1), np.stack(covariance, axis=1)
         looked = np.stack(seen, axis=1) >= SEEN
         # A turn is linear in a move to its square, a shift by lever arms of about a metre.
@@ -241,7 +248,10 @@ class _Rows:
         wide = dense.cholesky(cov + np.diag(REACH**2))
         q = dense.squared(information, step)
         q_wide = np.sum(step * dense.solved(wide, step[..., None])[..., 0], axis=-1)
-        spread = dense.log_determinant(wide) - dense.log_determinant(factor)
+        log_volume = dense.log_determinant(factor)
+        spread = dense.log_determinant(wide) - log_volume
+        base = np.stack(stepped, axis=1) - 0.5 * (q + log_volume + 6.0 * log(2.0 * pi))
+        base = np.where(looked, base, 0.0)
         edges = len(graph.edges)
         lasting = np.full(step.shape[:2], log(LINK_BREAKS))
         lasting[:, :edges] = _log_event() + log(EDGE_SHARE / max(edges, 1))
@@ -253,6 +263,8 @@ class _Rows:
             log_disturbed=prior,
             lasting=np.exp(np.minimum(lasting - prior, 0.0)),
             looked_at=np.asarray(looked.any(axis=0)),
+            log_still=-base,
+            base=base.sum(axis=1),
         )
 
 

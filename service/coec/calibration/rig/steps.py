@@ -105,12 +105,16 @@ class Steps:
         covariance: (T, 6, 6).
         looks: (T,) good ones since.
         log_transient: (T,) logarithm of the chance that these are bad ones at one place instead.
+        log_stepped: (T,) log likelihood of all looks, over what a step of ξ leaves of it: N(ξ; xi, covariance).
+        log_still: that of all looks, bad ones among them, at one place.
     """
 
     xi: Array
     covariance: Array
     looks: Array
     log_transient: Array
+    log_stepped: Array
+    log_still: float
 
 
 def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
@@ -118,19 +122,39 @@ def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
     stamps = np.array([look.stamp_ns for look in history.looks], np.int64)
     after = stamps[None, :] >= np.asarray(times_ns, np.int64)[:, None]
     stack = _Stack.of(history.origin, history.looks)
-    m0, v0, _ = stack.mean(~after, history.information, history.moment)
-    m1, v1, good = stack.mean(after, _NOTHING, np.zeros(6))
-    xi = np.zeros_like(m0)
-    for t, (before, since) in enumerate(zip(m0, m1, strict=True)):
-        xi[t] = se3.difference(se3.perturb(history.origin, since), se3.perturb(history.origin, before))
+    before = stack.mean(~after, history.information, history.moment)
+    since = stack.mean(after, _NOTHING, np.zeros(6))
+    still = stack.mean(np.ones((1, len(history.looks)), np.bool_), history.information, history.moment)
+    xi = np.zeros_like(before.offset)
+    for t, (was, is_now) in enumerate(zip(before.offset, since.offset, strict=True)):
+        xi[t] = se3.difference(se3.perturb(history.origin, is_now), se3.perturb(history.origin, was))
     place = np.max(np.array([look.place for look in history.looks]).reshape(-1, 6), axis=0, initial=0.0)
-    covariance = v0 + v1 + np.diag(2.0 * place**2)  # one place before, another one since
+    covariance = before.covariance + since.covariance + np.diag(2.0 * place**2)  # one place before, another one since
+    good = since.good
     looks = good.sum(axis=1)
     again = np.array([look.log_bad_again for look in history.looks])
     first = np.array([look.log_bad for look in history.looks]) - again
     # The first bad one is rarer than the next.
     log_transient = (good * again).sum(axis=1) + np.max(good, axis=1, initial=0.0) * np.max(first, initial=0.0)
-    return Steps(xi, covariance, looks, np.minimum(log_transient, 0.0))
+    return Steps(
+        xi,
+        covariance,
+        looks,
+        np.minimum(log_transient, 0.0),
+        before.log_evidence + since.log_evidence,
+        float(still.log_evidence[0]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Means:
+    """Of some looks, in T ways: offset (T, 6), covariance (T, 6, 6), how far each look is a good one (T, N), and their
+    log evidence (T,): the integral of their likelihood over the offset (Laplace)."""
+
+    offset: Array
+    covariance: Array
+    good: Array
+    log_evidence: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,13 +193,14 @@ class _Stack:
         good = self.share * np.exp(log_good - density)
         return self.share * density, good * np.minimum((FREEDOM + self.axes) / (FREEDOM + q), 1.0), good
 
-    def mean(self, mask: NDArray[np.bool_], information: Array, moment: Array) -> tuple[Array, Array, Array]:
-        """Of the looks in each row of a mask (T, N), with what is known beside them: means (T, 6), their covariances
-        (T, 6, 6), and how far each look is a good one (T, N)."""
+    def mean(self, mask: NDArray[np.bool_], information: Array, moment: Array) -> _Means:
+        """Of the looks in each row of a mask (T, N), with what is known beside them."""
         known = dense.solved(dense.cholesky(information), moment[:, None])[:, 0]
         if not len(self.offset):
             covariance = np.broadcast_to(dense.inverse(information), (len(mask), 6, 6))
-            return np.broadcast_to(known, (len(mask), 6)), covariance, np.zeros((len(mask), 0))
+            return _Means(
+                np.broadcast_to(known, (len(mask), 6)), covariance, np.zeros((len(mask), 0)), _volume(covariance)
+            )
         mean = np.stack([self._starts(row, known) for row in mask])
         for _ in range(TURNS):
             weight = self.weights(mean)[1] * mask[:, None, :]
@@ -186,7 +211,9 @@ class _Stack:
         likely = (density * mask[:, None, :]).sum(axis=-1) - 0.5 * dense.squared(information, apart)
         rows, best = np.arange(len(mask)), np.argmax(likely, axis=1)
         precision, _ = self._sums(weight[rows, best] * mask, information, moment)
-        return mean[rows, best], dense.inverse(precision), good[rows, best] * mask
+        covariance = dense.inverse(precision)
+        log_evidence = likely[rows, best] + _volume(covariance)
+        return _Means(mean[rows, best], covariance, good[rows, best] * mask, log_evidence)
 
     def _starts(self, row: NDArray[np.bool_], known: Array) -> Array:
         """(STARTS + 1, 6) from where the mean of a row is sought: some of its looks, and what is known."""
@@ -205,3 +232,8 @@ class _Stack:
             precision += weight[..., n, None, None] * self.information[n]
             moments += weight[..., n, None] * pulled[n]
         return precision, moments
+
+
+def _volume(covariance: Array) -> Array:
+    """(...) logarithm of the integral of exp(-½·xᵀ·C⁻¹·x)."""
+    return np.asarray(0.5 * dense.log_determinant(dense.cholesky(covariance)) + 3.0 * log(2.0 * pi))
