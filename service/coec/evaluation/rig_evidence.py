@@ -59,14 +59,14 @@ TAILS = 3.0
 STREET_S = 60.0
 """How long a street lasts, on average."""
 
-PERIODS_S = (5.0, 10.0, 20.0)
+PERIODS_S = (5.0, 10.0, 15.0)
 """Between two checks of a pair, one of these per pair and drive."""
 
 LATE_S = 3.0
 """By how much an answer may come late, at most: others overtake it."""
 
-BAD, BAD_LASTS, FAINT, FAINT_BAD, MISSING, BLIND = 0.02, 0.5, 0.1, 0.5, 0.1, 0.05
-"""Shares: of checks that begin a bad run, and that continue one; with faint edges, and those of them that are bad;
+BAD, BAD_LASTS, SAME, FAINT, FAINT_BAD, MISSING, BLIND = 0.02, 0.5, 0.1, 0.1, 0.5, 0.1, 0.05
+"""Shares: of checks that begin a bad run, and that continue one; of these at the very place of the one before; with faint edges, and those of them that are bad;
 without an answer; and of pairs that have none in a whole drive."""
 
 BIASED = 2.0
@@ -169,7 +169,7 @@ def checks(
             faint = bool(rng.random() < FAINT)
             scatter = CHECK * (WEAK_TIMES if faint else 1.0)
             seen = here + bias + street + scatter * rng.standard_t(TAILS, size=6) / np.sqrt(TAILS / (TAILS - 2.0))
-            if not in_run:
+            if not in_run or rng.random() >= SAME:
                 bad = REACH * rng.normal(size=6)
             in_run = bool(rng.random() < (BAD_LASTS if in_run else BAD))
             if in_run or (faint and rng.random() < FAINT_BAD):

@@ -20,7 +20,7 @@ from coec.calibration.rig.steps import History, steps_at
 from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
 from coec.calibration.types import Matrix4, Reason
 
-NAMED_AT = 0.9
+NAMED_AT = 0.95
 """Probability from which a sensor is named, and below whose complement it is called calibrated. Between: undecided."""
 
 CALM_AT = 0.5
@@ -33,6 +33,10 @@ tell already, and others were last looked at before."""
 AGES_S = (10.0, 16.0, 26.0, 42.0, 68.0, 110.0)
 """How long ago it is looked for otherwise, in steps that a robust mean bridges; and beyond these, before all looks that
 are kept."""
+
+BIAS_TIMES = 2.0
+"""Times the bias that looks of a rig usually have, to which the first of them are trusted: that of the next rig may be
+larger than those of the few which are known, and a bias is no move."""
 
 EVERY_S = 4.0
 """Between two times that it is asked who moved: it takes 0.03 to 0.1 s of a core, and looks come faster than they
@@ -120,7 +124,7 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
     history = state.histories[look.edge]
     if not history.looks:
         # Whoever looks has a bias of its own on this rig, however well the pose is known that is served.
-        history = History.at(history.origin, np.hypot(np.nan_to_num(history.sigma), look.rig))
+        history = History.at(history.origin, np.hypot(np.nan_to_num(history.sigma), BIAS_TIMES * look.rig))
     histories = {**state.histories, look.edge: history.after(look, state.calm)}
     if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
         return replace(state, histories=histories)
