@@ -38,9 +38,7 @@ Poses = Mapping[str, Matrix4]
 
 NS_PER_S = 1_000_000_000
 
-CHECK = np.sqrt(
-    np.concatenate([PRIOR_SPREAD_ROTATION[:3], PRIOR_SPREAD_POSE[3:]]) ** 2 / CHECK_PAIRS + FLOOR**2
-)
+CHECK = np.sqrt(np.concatenate([PRIOR_SPREAD_ROTATION[:3], PRIOR_SPREAD_POSE[3:]]) ** 2 / CHECK_PAIRS + FLOOR**2)
 """(6,) scatter of a check (rad, m)."""
 
 WINDOW = np.array([*np.radians([0.04, 0.03, 0.08]), 0.010, 0.015, 0.020])
@@ -60,14 +58,19 @@ STREET_S = 60.0
 """How long a street lasts, on average."""
 
 PERIODS_S = (5.0, 10.0, 15.0)
-"""Between two checks of a pair, one of these per pair and drive."""
+"""Between two checks of a pair, one of these per pair and drive; after one that is flagged the next comes after the
+shortest of them, as who schedules looks puts suspicions first."""
+
+FLAGGED = 4.0
+"""Standard deviations on any axis, beyond which a check is flagged: about one in a hundred is by chance."""
 
 LATE_S = 3.0
 """By how much an answer may come late, at most: others overtake it."""
 
 BAD, BAD_LASTS, SAME, FAINT, FAINT_BAD, MISSING, BLIND = 0.02, 0.5, 0.1, 0.1, 0.5, 0.1, 0.05
-"""Shares: of checks that begin a bad run, and that continue one; of these at the very place of the one before; with faint edges, and those of them that are bad;
-without an answer; and of pairs that have none in a whole drive."""
+"""Shares: of checks that begin a bad run, and that continue one; of these at the very place of the one before; with
+faint edges, and those of them that are bad; without an answer; and of pairs of sensors that stand still, which have
+none in a whole drive."""
 
 BIASED = 2.0
 """Times the bias of the others that one pair of each rig has."""
@@ -157,9 +160,11 @@ def checks(
     biased = int(rng.integers(len(rig.graph.edges)))
     for number, edge in enumerate(rig.graph.edges):
         bias = UNCOMMISSIONED_BIAS * rng.normal(size=6) * (BIASED if number == biased else 1.0)
-        blind = len(rig.graph.edges) > 2 and rng.random() < BLIND
+        still = all(np.array_equal(before[name], after[name]) for name in (edge.a, edge.b))
+        blind = still and rng.random() < BLIND
         period_s = float(rng.choice(PERIODS_S))
         at, street, bad = float(rng.uniform(0.0, period_s)), STREET * rng.normal(size=6), np.zeros(6)
+        right = se3.difference(before[edge.a] @ se3.inverse(before[edge.b]), edge.T_a_b)
         in_run = False
         while at < until_s:
             poses = before if at < at_s else after
@@ -179,7 +184,8 @@ def checks(
                 found.append((at + late_s, _look(edge, at, seen, scatter, faint)))
             if rng.random() < period_s / STREET_S:
                 street = STREET * rng.normal(size=6)
-            at += period_s
+            away = np.abs(seen - right) / np.hypot(CHECK, UNCOMMISSIONED_BIAS)
+            at += PERIODS_S[0] if away.max() > FLAGGED and not faint else period_s
     return [look for _, look in sorted(found, key=lambda one: (one[0], one[1].edge))]
 
 

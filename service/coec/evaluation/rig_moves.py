@@ -60,8 +60,8 @@ FAULTS: tuple[tuple[DrawnRig, Fault], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What was said on one drive: when exactly those that moved were named, seconds after the fault (None: not in time),
-    and whether ever one was that had not."""
+    """What was said on one drive: when exactly those that moved were named, seconds after the fault (None: not in
+    time), and whether ever one was that had not."""
 
     delay_s: float | None
     wrong: bool

@@ -27,7 +27,7 @@ CALM_AT = 0.5
 """Probability of nobody, from which looks that grow old are taken for such of a right rig."""
 
 NEWEST = 6
-"""Looks, the last of each edge, before each of which a step is looked for: of a LiDAR that was just knocked some edges
+"""Looks, the last of each edge, after each of which a step is looked for: of a LiDAR that was just knocked some edges
 tell already, and others were last looked at before."""
 
 AGES_S = (10.0, 16.0, 26.0, 42.0, 68.0, 110.0)
@@ -134,7 +134,8 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
 def _posterior(histories: Mapping[str, History], graph: RigGraph) -> Posterior:
     last_ns = sorted({history.looks[-1].stamp_ns for history in histories.values() if history.looks}, reverse=True)
     aged_ns = [last_ns[0] - round(age_s * NS_PER_S) for age_s in AGES_S]
-    times_ns = sorted({*last_ns[:NEWEST], *aged_ns, BEFORE_ALL_NS}, reverse=True)
+    just_after = (stamp_ns + 1 for stamp_ns in last_ns[1:NEWEST])
+    times_ns = sorted({last_ns[0], *just_after, *aged_ns, BEFORE_ALL_NS}, reverse=True)
     # Levers and axes as they were before: what was built may be far from it.
     edges = [Edge(edge.name, edge.a, edge.b, histories[edge.name].pose) for edge in graph.edges]
     current = RigGraph.of(graph.sensors, edges, graph.links)

@@ -146,7 +146,8 @@ def estimate(graph: RigGraph, windows: Mapping[str, Measurement]) -> JointEstima
     chi2, freedom = solution.chi2, solution.freedom
     chance = chi_square_tail(chi2, freedom) if freedom else 1.0
     left_out: str | None = None
-    widened, loops = 1.0, ()
+    widened = 1.0
+    loops: tuple[Loop, ...] = ()
     if chance < INCONSISTENT_AT:
         loops = _open_loops(graph, system)
         left_out = _alone_at_fault(system, solution, measured)
