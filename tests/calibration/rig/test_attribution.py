@@ -26,9 +26,7 @@ def _named(state: RigState, rig: RigGraph) -> set[str]:
     return {name for name, health in _health(state, rig).items() if health in MOVED}
 
 
-@pytest.mark.fault(
-    "a camera of a rig is knocked by 1°", "it is named, no other sensor is, after five looks of each pair"
-)
+@pytest.mark.fault("sensors of a rig are knocked by 1°", "they are named, no other is, after five looks of each pair")
 @pytest.mark.parametrize("who", [("front",), ("roof",), ("front", "rear")])
 def test_those_that_moved_are_named_and_told_by_how_much(
     who: tuple[str, ...], record_property: Callable[[str, object], None]
