@@ -14,7 +14,6 @@ from coec.evaluation.normalised_errors import (
     Claims,
     carried,
     gathered,
-    jacobian_of,
     normalise,
     of_differences,
     of_outcomes,
@@ -123,16 +122,16 @@ def test_a_perturbation_is_carried_to_another_frame() -> None:
     T_b_a = se3.exp(np.array([0.4, -0.9, 0.2, 0.6, -0.1, 0.3]))
     xi = 1e-6 * np.array([1.0, -2.0, 0.5, 3.0, 1.0, -1.0])
     moved = se3.perturbation_log(T_b_a @ se3.perturbation(xi) @ se3.inverse(T_b_a))
-    np.testing.assert_allclose(jacobian_of(T_b_a) @ xi, moved, atol=1e-11)
+    np.testing.assert_allclose(se3.adjoint(T_b_a) @ xi, moved, atol=1e-11)
 
 
 def test_what_rests_on_an_unclaimed_axis_is_not_claimed() -> None:
     covariance = np.diag([1.0, 1.0, 1.0, np.nan, 1.0, 1.0])
     covariance[3, :] = covariance[:, 3] = np.nan
     quarter = se3.perturbation(np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0]))
-    turned = carried(covariance, jacobian_of(quarter))
+    turned = carried(covariance, se3.adjoint(quarter))
     np.testing.assert_array_equal(np.isfinite(np.diagonal(turned)), [True, True, True, True, False, True])
-    nearly = carried(covariance, jacobian_of(se3.perturbation(np.array([0.0, 0.0, 1e-4, 0.0, 0.0, 0.0]))))
+    nearly = carried(covariance, se3.adjoint(se3.perturbation(np.array([0.0, 0.0, 1e-4, 0.0, 0.0, 0.0]))))
     np.testing.assert_array_equal(np.isfinite(np.diagonal(nearly)), [True, True, True, False, True, True])
 
 

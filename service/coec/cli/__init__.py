@@ -896,6 +896,22 @@ def _sim_checks(
     raise typer.Exit(command.run(command.Options(output, rounds, hours, as_json=as_json)))
 
 
+@sim_app.command("rig-moves")
+def _sim_rig_moves(
+    drives: Annotated[int, typer.Option(help="Drives of each fault.", min=1, max=10_000)] = 30,
+    rigs: Annotated[int, typer.Option(help="Rigs whose windows are combined.", min=1, max=10_000)] = 50,
+    as_json: Json = False,
+) -> None:
+    """Tell how well the sensors of a rig that moved are named, and no others, on drawn evidence of all its pairs.
+
+    Nothing is rendered: checks and windows are drawn with all that is wrong with real ones. A drive takes one to three
+    seconds of a core.
+    """
+    from coec.cli import sim_rig_moves as command
+
+    raise typer.Exit(command.run(drives, rigs, as_json=as_json))
+
+
 @app.command("sbom")
 def _sbom(
     lock: Annotated[

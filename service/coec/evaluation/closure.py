@@ -22,7 +22,6 @@ from coec.evaluation.normalised_errors import (
     carried,
     claimed,
     gathered,
-    jacobian_of,
     normalise,
 )
 from coec.evaluation.statistics import Outcome, Spread
@@ -60,7 +59,7 @@ class Between:
     @property
     def jacobian(self) -> NDArray[np.float64]:
         """(6, 6) how an error of A's calibration shows in what is predicted for B, about the axes of camera B."""
-        return jacobian_of(self.T_b_a) if self.relation is Relation.CAMERAS else np.eye(6)
+        return se3.adjoint(self.T_b_a) if self.relation is Relation.CAMERAS else np.eye(6)
 
     def error(self, a: Outcome, b: Outcome) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """ξ (6,) from what A predicts to what B found, and the covariance (6, 6) that both claim for it; None unless

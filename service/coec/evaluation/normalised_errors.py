@@ -183,16 +183,6 @@ def _histogram(values: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.bincount(np.searchsorted(inner, values, side="right"), minlength=len(inner) + 1)
 
 
-def jacobian_of(T_b_a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6, 6) how a perturbation about the axes of frame a reads about those of frame b, T_b_a (4, 4): rotations turn,
-    and shift the origin of b by their lever."""
-    rotation, lever = T_b_a[:3, :3], T_b_a[:3, 3]
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = jacobian[3:, 3:] = rotation
-    jacobian[3:, :3] = np.cross(lever, rotation.T).T
-    return jacobian
-
-
 UNKNOWN_SHARE = 0.1
 """An axis that takes more than this share of its length from an axis of which nothing is claimed claims nothing, too:
 less is a lever of parallel cameras, whose axes differ by rounding."""

@@ -191,6 +191,16 @@ def difference(transform_a: Array, transform_b: Array) -> Array:
     return perturbation_log(transform_a @ inverse(transform_b))
 
 
+def adjoint(T_b_a: Array) -> Array:
+    """(6, 6) how a small perturbation about the axes of frame a reads about those of frame b, T_b_a (4, 4): rotations
+    turn, and shift the origin of b by their lever."""
+    rotation, lever = T_b_a[:3, :3], T_b_a[:3, 3]
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = jacobian[3:, 3:] = rotation
+    jacobian[3:, :3] = np.cross(lever, rotation.T).T
+    return jacobian
+
+
 def is_rigid(transform: Array, tolerance: float = 1e-6) -> bool:
     """Whether `transform` is (4, 4), finite, with the last row 0 0 0 1 and a proper rotation.
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import checks, commands, doctor, evaluation, frames, matrix, replies
+from coec.schemas import checks, commands, doctor, evaluation, frames, matrix, replies, rig
 from coec.schemas.base import Message
 
 SENT: tuple[type[Message], ...] = (
@@ -41,6 +41,7 @@ MESSAGES: tuple[type[Message], ...] = (
     matrix.MatrixReport,
     checks.CheckedDrive,
     checks.ChecksReport,
+    rig.RigMovesReport,
     doctor.DoctorReport,
 )
 

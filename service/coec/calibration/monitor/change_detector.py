@@ -216,11 +216,11 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     but does not confirm: a full solve has to."""
     most = levels.suspect if observation.weak else levels.most
     turned, shifted, astray2 = state.turned, state.shifted, state.astray2
-    told = _told(observation, slice(0, 3), turned.before)
+    told = told_by(observation, slice(0, 3), turned.before)
     if told is not None:
         turned = after_check(turned, told, ROTATIONS, fresh, most)
         astray2 = learnt_distance2(turned, told.rig)
-    told = _told(observation, slice(3, 6), shifted.before)
+    told = told_by(observation, slice(3, 6), shifted.before)
     if told is not None:
         shifted = after_check(shifted, told, TRANSLATIONS, fresh, most)
     step = fresh * (WEAK_SHARE if observation.weak else 1.0)
@@ -232,8 +232,9 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     return replace(state, turned=turned, shifted=shifted, at_odds=at_odds, astray2=astray2, counted=counted)
 
 
-def _told(observation: Observation, axes: slice, before: Three | None) -> Told | None:
-    """What a check tells of three axes; None where it does not tell all of them."""
+def told_by(observation: Observation, axes: slice, before: Three | None) -> Told | None:
+    """What a check tells of three axes, `before` being the offset of the one before it; None where it does not tell all
+    of them."""
     columns = (observation.offset, observation.sigma, observation.noise, observation.place)
     offset, sigma, noise, place = ([float(value) for value in column[axes]] for column in columns)
     if not all(isfinite(value) for value in (*offset, *sigma, *noise, *place)) or min(noise) <= 0.0:

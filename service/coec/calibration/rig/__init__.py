@@ -1,0 +1,1 @@
+"""Several sensors of one vehicle together: who moved, and where everything is."""

@@ -1,0 +1,200 @@
+"""What several pairs of one vehicle say together of each of its sensors, look after look.
+
+A knocked LiDAR moves the edges to all its cameras alike, a knocked camera its own alone: which sensors moved since the
+rig was last consistent is asked again at every look (`moves`), of steps at some times back (`steps`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from math import degrees
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.rig.evidence import Look
+from coec.calibration.rig.moves import Moved, Posterior, who_moved
+from coec.calibration.rig.steps import History, steps_at
+from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
+from coec.calibration.types import Matrix4, Reason
+
+NAMED_AT = 0.95
+"""Probability from which a sensor is named, and below whose complement it is called calibrated. Between: undecided."""
+
+CALM_AT = 0.5
+"""Probability of nobody, from which looks that grow old are taken for such of a right rig."""
+
+NEWEST = 6
+"""Looks, the last of each edge, after each of which a step is looked for: of a LiDAR that was just knocked some edges
+tell already, and others were last looked at before."""
+
+AGES_S = (10.0, 16.0, 26.0, 42.0, 68.0, 110.0)
+"""How long ago it is looked for otherwise, in steps that a robust mean bridges; and beyond these, before all looks that
+are kept."""
+
+BIAS_TIMES = 2.0
+"""Times the bias that looks of a rig usually have, to which the first of them are trusted: that of the next rig may be
+larger than those of the few which are known, and a bias is no move."""
+
+EVERY_S = 4.0
+"""Between two times that it is asked who moved: it takes 0.03 to 0.1 s of a core, and looks come faster than they
+matter."""
+
+NS_PER_S = 1_000_000_000
+BEFORE_ALL_NS = -(2**62)
+"""A stamp before any other."""
+
+
+class SensorHealth(StrEnum):
+    """Of one sensor. `undecided`: something moved or is disturbed, and this may be it; `unknown`: nothing looked."""
+
+    CALIBRATED = "calibrated"
+    CAMERA_MOVED = "camera_moved"
+    LIDAR_MOVED = "lidar_moved"
+    UNDECIDED = "undecided"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorState:
+    """What is believed of one sensor.
+
+    Attributes:
+        probability: that it moved.
+        moved: by how much, if it is in the likeliest set that moved.
+        reasons: why, in words; the first one says most.
+    """
+
+    name: str
+    kind: Kind
+    health: SensorHealth
+    probability: float
+    moved: Moved | None
+    reasons: tuple[Reason, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigState:
+    """All that is kept between looks.
+
+    Attributes:
+        histories: of every edge, by name.
+        posterior: who moved, as of when that was last asked; None before the first look.
+        asked_ns: stamp of the look at which it was.
+    """
+
+    histories: Mapping[str, History]
+    posterior: Posterior | None = None
+    asked_ns: int = BEFORE_ALL_NS
+
+    @property
+    def calm(self) -> bool:
+        """Whether all looks up to now are those of a right rig."""
+        of = self.posterior
+        return of is None or (of.nobody >= CALM_AT and all(p < CALM_AT for p in of.disturbed.values()))
+
+
+def begun(graph: RigGraph) -> RigState:
+    """Nothing was looked at: every edge is as the vehicle was built, as far as that is known."""
+    return RigState({edge.name: History.at(edge.T_a_b, np.full(6, np.nan)) for edge in graph.edges})
+
+
+def served(state: RigState, edge: str, T_a_b: Matrix4, sigma: NDArray[np.float64]) -> RigState:
+    """A new pose (4, 4) is served for an edge, known to `sigma` (6,): steps of it are counted from there. Looks before
+    are of another mount, and are forgotten.
+
+    Raises:
+        ValueError: there is no such edge.
+    """
+    if edge not in state.histories:
+        raise ValueError(f"{edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
+    return replace(state, histories={**state.histories, edge: History.at(T_a_b, sigma)})
+
+
+def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
+    """The state after one more look.
+
+    Raises:
+        ValueError: it is of no edge of the rig.
+    """
+    if look.edge not in state.histories:
+        raise ValueError(f"{look.edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
+    history = state.histories[look.edge]
+    if not history.looks:
+        # Whoever looks has a bias of its own on this rig, however well the pose is known that is served.
+        history = History.at(history.origin, np.hypot(np.nan_to_num(history.sigma), BIAS_TIMES * look.rig))
+    histories = {**state.histories, look.edge: history.after(look, state.calm)}
+    if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
+        return replace(state, histories=histories)
+    return RigState(histories, _posterior(histories, graph), look.stamp_ns)
+
+
+def _posterior(histories: Mapping[str, History], graph: RigGraph) -> Posterior:
+    last_ns = sorted({history.looks[-1].stamp_ns for history in histories.values() if history.looks}, reverse=True)
+    aged_ns = [last_ns[0] - round(age_s * NS_PER_S) for age_s in AGES_S]
+    just_after = (stamp_ns + 1 for stamp_ns in last_ns[1:NEWEST])
+    times_ns = sorted({last_ns[0], *just_after, *aged_ns, BEFORE_ALL_NS}, reverse=True)
+    # Levers and axes as they were before: what was built may be far from it.
+    edges = [Edge(edge.name, edge.a, edge.b, histories[edge.name].pose) for edge in graph.edges]
+    current = RigGraph.of(graph.sensors, edges, graph.links)
+    return who_moved(current, {name: steps_at(history, times_ns) for name, history in histories.items()})
+
+
+def sensors(state: RigState, graph: RigGraph) -> tuple[SensorState, ...]:
+    """What is believed of every sensor that can move, by name."""
+    return tuple(_state(state, graph, sensor) for sensor in graph.sensors if sensor.kind is not Kind.VEHICLE)
+
+
+def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
+    edges = [edge.name for edge in graph.edges if sensor.name in (edge.a, edge.b)]
+    looked = [name for name in edges if state.histories[name].looks]
+    of = state.posterior
+    if of is None or not looked:
+        text = "No pair of it was looked at yet." if edges else "No pair has it: nothing can tell where it is."
+        return SensorState(sensor.name, sensor.kind, SensorHealth.UNKNOWN, 0.0, None, (Reason("not_looked_at", text),))
+    probability = of.sensors[sensor.name]
+    disturbed = max((of.disturbed[name] for name in edges), default=0.0)
+    moved = of.steps.get(sensor.name) if probability > 1.0 - NAMED_AT else None
+    if probability >= NAMED_AT:
+        health = SensorHealth.CAMERA_MOVED if sensor.kind is Kind.CAMERA else SensorHealth.LIDAR_MOVED
+        reasons: tuple[Reason, ...] = (_named(sensor, probability, moved, looked, of),)
+    elif max(probability, disturbed) > 1.0 - NAMED_AT:
+        health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
+    else:
+        health = SensorHealth.CALIBRATED
+        text = f"What was looked at fits without a move of it: {', '.join(looked)}."
+        reasons = (Reason("fits", text),)
+    return SensorState(sensor.name, sensor.kind, health, probability, moved, reasons)
+
+
+def _named(sensor: Sensor, probability: float, moved: Moved | None, looked: list[str], of: Posterior) -> Reason:
+    since = [name for name in looked if name in of.looked_at]
+    far = "" if moved is None else f" by {_size(moved)}"
+    others = [name for name in of.sets[0][0] if name != sensor.name]
+    beside = f", together with {', '.join(others)}" if others else ""
+    text = f"It moved{far}{beside}: seen by {', '.join(since)}; all else fits ({100.0 * probability:.1f} %)."
+    return Reason("moved", text)
+
+
+def _undecided(
+    sensor: Sensor, probability: float, disturbed: float, edges: list[str], of: Posterior
+) -> tuple[Reason, ...]:
+    reasons = []
+    if probability > 1.0 - NAMED_AT:
+        rivals = [" and ".join(names) for names, _ in of.sets if sensor.name not in names][:3]
+        or_else = f" or {', or '.join(rivals)}" if rivals else ", or nothing did"
+        text = f"It moved{or_else}: the pairs that were looked at cannot tell ({100.0 * probability:.0f} %)."
+        reasons.append(Reason("cannot_tell", text))
+    if disturbed > 1.0 - NAMED_AT:
+        pair = max(edges, key=lambda name: of.disturbed[name])
+        text = f"{pair} is off, and other pairs deny that a sensor moved: {100.0 * disturbed:.0f} %."
+        reasons.append(Reason("pair_disturbed", text))
+    return tuple(reasons)
+
+
+def _size(moved: Moved) -> str:
+    turn = degrees(float(np.sqrt(np.sum(moved.x[:3] ** 2))))
+    shift_cm = 100.0 * float(np.sqrt(np.sum(moved.x[3:] ** 2)))
+    return f"{turn:.2f}° and {shift_cm:.1f} cm"

@@ -1,0 +1,140 @@
+"""What a look at one edge says, whatever looked: a window (strong, minutes apart) or a check (quick, seconds apart)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import log
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.commissioning.baseline import STREET, UNCOMMISSIONED_BIAS
+from coec.calibration.monitor.change_detector import Observation, told_by
+from coec.calibration.monitor.likelihood import (
+    BAD_AFTER_BAD,
+    BAD_SHARE,
+    BAD_SHARE_WEAK,
+    SAME_AGAIN,
+    SAME_AGAIN_WEAK,
+)
+from coec.calibration.tracker import Measurement
+from coec.calibration.types import Matrix4
+from coec.geometry import dense, se3
+
+LEAST_SIGMA, MOST_SIGMA = 1e-6, 10.0
+"""Standard deviations that a look is trusted to at most and at least, rad or m: beyond, its numbers are no evidence but
+a fault of whoever sent them; from the upper one on an axis counts as not told."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """Where one look at an edge puts it.
+
+    Attributes:
+        edge: its name.
+        stamp_ns: sensor time of the last pair of frames.
+        T_a_b: (4, 4).
+        information: (6, 6) inverse of the covariance of what is new at every look, about the axes of a; zero on axes
+            that are not told.
+        place: (6,) standard deviation of what neighbouring looks share and other places do not.
+        rig: (6,) of what no place tells: the bias of whoever looks, as far as it is unknown.
+        share: how far it counts, 0 to 1: by the part of its frames that no look before it held.
+        weak: whether it has little to go by, and may lie anywhere.
+    """
+
+    edge: str
+    stamp_ns: int
+    T_a_b: Matrix4
+    information: NDArray[np.float64]
+    place: NDArray[np.float64]
+    rig: NDArray[np.float64]
+    share: float = 1.0
+    weak: bool = False
+
+    @property
+    def log_bad(self) -> float:
+        """Logarithm of the share of such looks that are bad."""
+        return log(BAD_SHARE_WEAK if self.weak else BAD_SHARE)
+
+    @property
+    def log_bad_again(self) -> float:
+        """That it is bad once more where the one before it was, which was bad."""
+        return log(BAD_SHARE_WEAK * SAME_AGAIN_WEAK if self.weak else BAD_AFTER_BAD * SAME_AGAIN)
+
+
+def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6, 6) inverse of a covariance (6, 6) over the axes that it tells (finite, below `MOST_SIGMA`), zero elsewhere.
+
+    Raises:
+        ValueError: it has another shape or tells no axis; what it tells is not positive definite or absurdly small.
+    """
+    if covariance.shape != (6, 6):
+        raise ValueError(f"a covariance must have the shape (6, 6), got {covariance.shape}")
+    variances = covariance.diagonal()
+    with np.errstate(invalid="ignore"):
+        told = np.flatnonzero(np.isfinite(variances) & (variances < MOST_SIGMA**2))
+    if not len(told):
+        raise ValueError("a covariance tells no axis: every variance is missing or beyond all use")
+    block = covariance[np.ix_(told, told)]
+    if not np.isfinite(block).all() or (variances[told] < LEAST_SIGMA**2).any():
+        raise ValueError("a covariance is not finite, or smaller than anything is known to")
+    if np.abs(block - block.T).max() > 1e-6 * np.abs(block).max():
+        raise ValueError("a covariance is not symmetric")
+    # Scaled to a unit diagonal: radians and metres differ by powers of ten.
+    scale = 1.0 / np.sqrt(variances[told])
+    inner = dense.inverse(0.5 * (block + block.T) * scale[:, None] * scale)
+    information = np.zeros((6, 6))
+    information[np.ix_(told, told)] = inner * scale[:, None] * scale
+    return information
+
+
+def of_check(edge: str, T_served: Matrix4, observation: Observation, share: float = 1.0) -> Look | None:
+    """What a check of the pose `T_served` (4, 4) says; None where it says nothing of the mount: the data were at fault,
+    or it holds no frame that is new.
+
+    Raises:
+        ValueError: the pose is not rigid, or the offset no six numbers.
+    """
+    _rigid(edge, T_served)
+    if observation.causes or not share > 0.0:
+        return None
+    offset, variance = np.zeros(6), np.full(6, np.inf)
+    place, rig = np.zeros(6), np.zeros(6)
+    for axes in (slice(0, 3), slice(3, 6)):
+        told = told_by(observation, axes, None)
+        if told is not None:
+            offset[axes], variance[axes] = told.offset, told.noise
+            place[axes], rig[axes] = np.sqrt(told.place), np.sqrt(told.rig)
+    if not np.isfinite(variance).any():
+        return None
+    return Look(
+        edge=edge,
+        stamp_ns=observation.stamp_ns,
+        T_a_b=se3.perturb(T_served, offset),
+        information=information_of(np.diag(variance)),
+        place=place,
+        rig=rig,
+        share=min(share, 1.0),
+        weak=observation.weak,
+    )
+
+
+def of_window(edge: str, window: Measurement) -> Look | None:
+    """What an accepted window says; None where it tells no axis. Its frames share a street, so what they have in common
+    counts as noise here; the estimator's bias on the rig is that of checks.
+
+    Raises:
+        ValueError: the pose is not rigid, or the covariance no covariance.
+    """
+    _rigid(edge, window.T_camera_lidar)
+    if not window.told_axes():
+        return None
+    noise = window.uncertainty.noise
+    shared = window.uncertainty.covariance - noise
+    covariance = np.where(np.isfinite(noise), noise + np.nan_to_num(shared), np.nan)
+    return Look(edge, window.stamp_ns, window.T_camera_lidar, information_of(covariance), STREET, UNCOMMISSIONED_BIAS)
+
+
+def _rigid(edge: str, pose: Matrix4) -> None:
+    if not se3.is_rigid(pose):
+        raise ValueError(f"{edge}: a pose must be a rigid transform (4, 4) of finite numbers")

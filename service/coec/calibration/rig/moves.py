@@ -1,0 +1,473 @@
+"""Who moved? Every set of one or two sensors, and nobody, against the steps of all edges.
+
+Given a set S that moved by x, an edge stepped by ξ = J·x + noise, those that S does not touch by noise alone; and any
+edge may be disturbed by itself, its step then being anywhere within reach. The marginal likelihood of S is a Gaussian
+integral over x, summed over which edges were disturbed and over how far mounts move:
+
+    BF(S) = Σ over D, k   w_k · Π over e in D (ε_e · p_disturbed(ξ_e) / p(ξ_e)) · |1 + P_k·Λ|^(-1/2)
+                          · exp(½ · ηᵀ·(P_k⁻¹ + Λ)⁻¹·η)        Λ = Σ Jᵀ·W·J, η = Σ Jᵀ·W·ξ over the other edges
+
+against nobody and no edge disturbed. It pays for each axis that a set sets free (Occam's factor: MacKay 2003, chapter
+28), so the fewest moves win that explain all. How far a mount moves is `search.mount_prior`: a Cauchy density in three
+dimensions is a mixture of normal ones whose scales are MOUNT_RAD over the modulus of a standard normal variable; some
+quantiles of that stand for all.
+
+Two sets can leave the very same pattern on all edges that were looked at, as the camera and the LiDAR of a single pair
+do. No evidence tells these apart, and what small lever arms and priors would whisper is not listened to: they share
+their probability evenly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from math import log, pi
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.commissioning.quantiles import normal_quantile
+from coec.calibration.monitor.change_detector import ROTATIONS, TRANSLATIONS
+from coec.calibration.rig.steps import REACH, Steps
+from coec.calibration.rig.types import Kind, Known, RigGraph
+from coec.calibration.search.mount_prior import MOUNT_RAD
+from coec.geometry import dense, se3
+
+Array = NDArray[np.float64]
+
+SCALES = 4
+"""Quantiles that stand for the scales of the mount prior: σ = 0.33, 0.56, 1.0 and 3.2°; 25° are eight of the largest,
+which the next look outweighs."""
+
+M_PER_RAD = TRANSLATIONS.moves[-1][0] / ROTATIONS.moves[-1][0]
+"""How far a knock shifts what it turns by one radian, as the change detector has it: 10 cm at 2°."""
+
+EVENT_HOURS = 1000.0
+"""Hours of driving between two knocks of any kind. Chosen: a fleet's workshop sees a mount bent about once a year."""
+
+LOOK_BACK_HOURS = 120.0 / 3600.0
+"""Within which a step is looked for: as long as looks are kept apart."""
+
+TWO_SHARE, EDGE_SHARE = 0.1, 0.01
+"""Of such events that move two sensors, and that are of one edge alone and last (a clock of one driver, a curtain of
+spray before one pair). Chosen; the rest is of one sensor."""
+
+LINK_BREAKS = 0.01
+"""Of knocks to a bar that bend it. Chosen."""
+
+SEEN = 0.5
+"""Good looks since, from which an edge counts as looked at."""
+
+SAME_SPAN = 1e-6
+"""Of the length of a pattern, by which it may miss the span of others and still lie in it: far above rounding."""
+
+ANY_TWO = log(1e-3)
+"""Log odds of any one sensor against nobody, from which two are looked at: below, neither of two says enough."""
+
+CONTENDER = 0.005
+"""Probability of a set, from which it is compared with others that leave the same pattern."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mover:
+    """What moves as one: a sensor, or all that are on one bar."""
+
+    sensors: tuple[str, ...]
+
+
+Sets = list[tuple[int, ...]]
+"""Movers by their numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moved:
+    """By how much a sensor moved, x (6,) about its own axes (rad, m), and its covariance (6, 6)."""
+
+    x: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """What is believed of who moved.
+
+    Attributes:
+        nobody: probability.
+        sets: the sensors of each set that is worth a word, and its probability; likeliest first.
+        sensors: probability that it moved, by name.
+        disturbed: that something else than a sensor lastingly disturbs an edge, by name.
+        steps: of each sensor in the likeliest set.
+        when: which of the times is the likeliest.
+        looked_at: edges that were looked at since.
+    """
+
+    nobody: float
+    sets: tuple[tuple[tuple[str, ...], float], ...]
+    sensors: Mapping[str, float]
+    disturbed: Mapping[str, float]
+    steps: Mapping[str, Moved]
+    when: int
+    looked_at: tuple[str, ...]
+
+
+def movers(graph: RigGraph) -> tuple[Mover, ...]:
+    """Every sensor that can move by itself, and every bar."""
+    alone = [Mover((sensor.name,)) for sensor in graph.sensors if sensor.kind is not Kind.VEHICLE]
+    groups: list[set[str]] = []
+    for link in graph.links:
+        joined = {link.a, link.b}
+        for group in [group for group in groups if group & joined]:
+            groups.remove(group)
+            joined |= group
+        groups.append(joined)
+    return (*alone, *(Mover(group) for group in sorted(tuple(sorted(group)) for group in groups)))
+
+
+def patterns(graph: RigGraph, of: Sequence[Mover]) -> Array:
+    """(M, E, 6, 6) how each edge and link, in their order, steps as each mover moves about the axes of its first
+    sensor, at the poses of the graph."""
+    poses = dict(zip((sensor.name for sensor in graph.sensors), graph.poses, strict=True))
+    return np.array([[_pattern(known, mover, poses) for known in graph.known] for mover in of])
+
+
+def who_moved(graph: RigGraph, steps: Mapping[str, Steps]) -> Posterior:
+    """The posterior over all sets, from what each edge says of a step at each of the same T times, all as likely."""
+    rows = _Rows.of(graph, steps)
+    moving = movers(graph)
+    design = patterns(graph, moving)
+    pulls = _Pulls.of(design, rows)
+    ones: Sets = [(m,) for m in range(len(moving))]
+    twos: Sets = [
+        (m, n) for m, n in combinations(range(len(moving)), 2) if not set(moving[m].sensors) & set(moving[n].sensors)
+    ]
+    alone = 1.0 - TWO_SHARE - EDGE_SHARE
+    sets = ones
+    log_prior = np.full(len(ones), _log_event() + log(alone / len(ones)))
+    log_sets, disturbed = _evidence(ones, rows, pulls)
+    log_sets += rows.base[:, None]
+    log_nobody = rows.base + rows.either.sum(axis=1) + np.log1p(-np.exp(_log_event()))
+    excess = np.logaddexp.reduce((log_prior + log_sets).ravel()) - np.logaddexp.reduce(log_nobody)
+    if twos and excess > ANY_TWO:
+        # Of two that moved, one alone says something already.
+        speaks = log_sets.max(axis=0) > log_nobody.max()
+        twos = [(m, n) for m, n in twos if speaks[m] or speaks[n]]
+        if twos:
+            count = len(ones) * (len(ones) - 1) // 2
+            log_twos, disturbed_twos = _evidence(twos, rows, pulls)
+            sets = [*ones, *twos]
+            log_prior = np.concatenate([log_prior, np.full(len(twos), _log_event() + log(TWO_SHARE / count))])
+            log_sets = np.concatenate([log_sets, log_twos + rows.base[:, None]], axis=1)
+            disturbed = np.concatenate([disturbed, disturbed_twos], axis=1)
+    joint = np.concatenate([log_nobody[:, None], log_prior + log_sets], axis=1)
+    weight = np.exp(joint - joint.max())
+    weight /= weight.sum()
+    shared = _shared(sets, weight[:, 1:].sum(axis=0), design, rows.looked_at)
+    sensors = {sensor.name: 0.0 for sensor in graph.sensors}
+    for number, p in enumerate(shared.tolist()):
+        for name in _names(moving, sets[number]):
+            sensors[name] += p
+    lasting = (weight[:, 0, None] * rows.by_itself).sum(axis=0) + (weight[:, 1:, None] * disturbed).sum(axis=(0, 1))
+    when = int(np.argmax(weight[:, 1:].sum(axis=1)))
+    order = sorted(range(len(sets)), key=lambda number: (-shared[number], number))
+    return Posterior(
+        nobody=float(weight[:, 0].sum()),
+        sets=tuple(
+            (_names(moving, sets[number]), float(shared[number])) for number in order if shared[number] >= CONTENDER
+        ),
+        sensors={name: min(p, 1.0) for name, p in sensors.items()},
+        disturbed={edge.name: float(p) for edge, p in zip(graph.edges, lasting.tolist(), strict=False)},
+        steps=_steps(rows, when, design, sets[order[0]], moving, graph),
+        when=when,
+        looked_at=tuple(edge.name for edge, seen in zip(graph.edges, rows.looked_at.tolist(), strict=False) if seen),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """Edges and links, E rows, at T times."""
+
+    xi: Array  # (T, E, 6)
+    information: Array  # (T, E, 6, 6) inverse covariance of a step that is noise
+    ratio: Array  # (T, E) log density of the step were it disturbed, over that of noise
+    log_disturbed: Array  # (T, E) prior of that
+    lasting: Array  # (T, E) share of that prior that is not a transient
+    looked_at: NDArray[np.bool_]  # (E,) since any of the times
+    log_still: Array  # (T, E) likelihood of all looks at one place, over that of a step by noise alone
+    base: Array  # (T,) of a step of all edges by noise alone, over that of all at one place
+
+    @property
+    def undisturbed(self) -> Array:
+        """(T, E) log prior of noise alone."""
+        return np.log1p(-np.exp(self.log_disturbed))
+
+    @property
+    def bent(self) -> Array:
+        """(T, E) log likelihood of a disturbance, with its prior, over that of noise."""
+        return self.log_disturbed + self.ratio
+
+    @property
+    def either(self) -> Array:
+        """(T, E) of an edge whose sensors stand still: noise, such as another street, or some bad looks; or a
+        disturbance."""
+        return np.logaddexp(self.undisturbed + np.logaddexp(0.0, self.log_still) - log(2.0), self.bent)
+
+    @property
+    def by_itself(self) -> Array:
+        """(T, E) probability that an edge whose sensors stand still is lastingly disturbed."""
+        seen = np.abs(self.information).max(axis=(2, 3)) > 0.0
+        return np.asarray(np.exp(self.bent - self.either) * self.lasting * seen)
+
+    @classmethod
+    def of(cls, graph: RigGraph, steps: Mapping[str, Steps]) -> _Rows:
+        times = len(next(iter(steps.values())).looks) if steps else 1
+        xi, covariance, seen, transient, stepped = [], [], [], [], []
+        for edge in graph.edges:
+            of = steps.get(edge.name)
+            xi.append(np.zeros((times, 6)) if of is None else of.xi)
+            covariance.append(np.tile(np.eye(6), (times, 1, 1)) if of is None else of.covariance)
+            seen.append(np.zeros(times) if of is None else of.looks)
+            transient.append(np.zeros(times) if of is None else of.log_transient)
+            stepped.append(np.zeros(times) if of is None else of.log_stepped - of.log_still)
+        for link in graph.links:
+            xi.append(np.zeros((times, 6)))
+            covariance.append(np.tile(np.diag(2.0 * link.sigma**2), (times, 1, 1)))
+            seen.append(np.ones(times))
+            transient.append(np.full(times, -np.inf))
+            # Nothing was seen of it: noise alone and no step are one.
+            stepped.append(np.full(times, 3.0 * log(2.0 * pi) + 0.5 * float(np.sum(np.log(2.0 * link.sigma**2)))))
+        step, cov = np.stack(xi, axis=1), np.stack(covariance, axis=1)
+        looked = np.stack(seen, axis=1) >= SEEN
+        # A turn is linear in a move to its square, a shift by lever arms of about a metre.
+        angle2 = np.sum(step[..., :3] ** 2, axis=-1)
+        cov = cov + (0.5 * angle2[..., None] * np.ones(6))[..., None] ** 2 * np.eye(6)
+        factor = dense.cholesky(cov)
+        information = 0.5 * (inverse := dense.solved(factor, np.broadcast_to(np.eye(6), cov.shape)))
+        information = np.where(looked[..., None, None], information + 0.5 * np.swapaxes(inverse, -1, -2), 0.0)
+        wide = dense.cholesky(cov + np.diag(REACH**2))
+        q = dense.squared(information, step)
+        q_wide = np.sum(step * dense.solved(wide, step[..., None])[..., 0], axis=-1)
+        log_volume = dense.log_determinant(factor)
+        spread = dense.log_determinant(wide) - log_volume
+        base = np.stack(stepped, axis=1) - 0.5 * (q + log_volume + 6.0 * log(2.0 * pi))
+        base = np.where(looked, base, 0.0)
+        edges = len(graph.edges)
+        lasting = np.full(step.shape[:2], log(LINK_BREAKS))
+        lasting[:, :edges] = _log_event() + log(EDGE_SHARE / max(edges, 1))
+        prior = np.minimum(np.logaddexp(lasting, np.stack(transient, axis=1)), log(0.999))
+        return cls(
+            xi=step,
+            information=information,
+            ratio=np.where(looked, 0.5 * (q - q_wide - spread), 0.0),
+            log_disturbed=prior,
+            lasting=np.exp(np.minimum(lasting - prior, 0.0)),
+            looked_at=np.asarray(looked.any(axis=0)),
+            log_still=-base,
+            base=base.sum(axis=1),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pulls:
+    """What each edge says of each mover, and of each two together: Jᵀ·W·J and Jᵀ·W·ξ."""
+
+    precision: Array  # (T, M, M, E, 6, 6)
+    moment: Array  # (T, M, E, 6)
+    touched: NDArray[np.bool_]  # (M, E) by a move of it, of edges that were looked at
+
+    @classmethod
+    def of(cls, design: Array, rows: _Rows) -> _Pulls:
+        turned = dense.product(np.swapaxes(design, -1, -2), rows.information[:, None])  # (T, M, E, 6, 6)
+        return cls(
+            precision=dense.product(turned[:, :, None], design[None, None]),
+            moment=dense.applied(turned, rows.xi[:, None]),
+            touched=(np.abs(design).max(axis=(2, 3)) > 0.0) & rows.looked_at,
+        )
+
+    def together(self, sets: Sequence[tuple[int, ...]]) -> tuple[Array, Array]:
+        """Of sets of one size n: (T, S, E, 6n, 6n) and (T, S, E, 6n)."""
+        times, edges, size = self.moment.shape[0], self.moment.shape[2], 6 * len(sets[0])
+        precision = np.zeros((times, len(sets), edges, size, size))
+        moment = np.zeros((times, len(sets), edges, size))
+        for place, one in enumerate(sets):
+            for i, m in enumerate(one):
+                moment[:, place, :, 6 * i : 6 * i + 6] = self.moment[:, m]
+                for j, n in enumerate(one):
+                    precision[:, place, :, 6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = self.precision[:, m, n]
+        return precision, moment
+
+
+def _evidence(sets: Sets, rows: _Rows, pulls: _Pulls) -> tuple[Array, Array]:
+    """Of each set of one size, at each time: log marginal likelihood (T, S) over that of nobody and nothing disturbed,
+    and the probability that each edge is lastingly disturbed (T, S, E).
+
+    Of the edges that a set touches none is disturbed, or one, or with the likeliest one another.
+    """
+    precision, moment = pulls.together(sets)
+    times, edges = rows.ratio.shape
+    touched = np.array([pulls.touched[list(one)].any(axis=0) for one in sets])
+    cases: list[tuple[int, tuple[int, ...]]] = [(place, ()) for place in range(len(sets))]
+    cases += [(place, (e,)) for place in range(len(sets)) for e in np.flatnonzero(touched[place]).tolist()]
+    found: list[list[_Case]] = [[] for _ in sets]
+    for (place, out), log_evidence in zip(cases, _marginal(cases, precision, moment, rows, touched).T, strict=True):
+        found[place].append(_Case(out, log_evidence))
+    cases = []
+    for place, of_set in enumerate(found):
+        if len(of_set) < 4:  # with two of two disturbed nothing speaks for the set
+            continue
+        worst = max(of_set[1:], key=lambda case: float(case.log_evidence.max())).out[0]
+        cases += [(place, (worst, *case.out)) for case in of_set[1:] if case.out[0] != worst]
+    for (place, out), log_evidence in zip(cases, _marginal(cases, precision, moment, rows, touched).T, strict=True):
+        found[place].append(_Case(out, log_evidence))
+    log_sets, disturbed = np.zeros((times, len(sets))), np.zeros((times, len(sets), edges))
+    for place, of_set in enumerate(found):
+        each = np.array([case.log_evidence for case in of_set])  # (C, T)
+        total = np.logaddexp.reduce(each, axis=0)
+        share = np.exp(each - total)
+        log_sets[:, place] = total + rows.either[:, ~touched[place]].sum(axis=1)
+        disturbed[:, place] = np.where(touched[place], 0.0, rows.by_itself)
+        for case, of_case in zip(of_set, share, strict=True):
+            for e in case.out:
+                disturbed[:, place, e] += of_case * rows.lasting[:, e]
+    return log_sets, disturbed
+
+
+class _Case(NamedTuple):
+    """Which of the edges of a set are disturbed, and the log evidence (T,) of that."""
+
+    out: tuple[int, ...]
+    log_evidence: Array
+
+
+def _marginal(
+    cases: Sequence[tuple[int, tuple[int, ...]]],
+    precision: Array,
+    moment: Array,
+    rows: _Rows,
+    touched: NDArray[np.bool_],
+) -> Array:
+    """(T, C) log evidence of each case, a set by its number and the edges that are disturbed, at each time."""
+    if not cases:
+        return np.zeros((len(rows.xi), 0))
+    places = [place for place, _ in cases]
+    total, pull = precision.sum(axis=2)[:, places], moment.sum(axis=2)[:, places]
+    constant = np.stack([rows.undisturbed[:, touched[place]].sum(axis=1) for place in places], axis=1)
+    for row, (place, out) in enumerate(cases):
+        for e in out:
+            total[:, row] -= precision[:, place, e]
+            pull[:, row] -= moment[:, place, e]
+            constant[:, row] += rows.bent[:, e] - rows.undisturbed[:, e]
+    size = total.shape[-1]
+    # Scaled by the prior: 1 + P^½·Λ·P^½ has eigenvalues of 1 or more.
+    root = np.sqrt(np.array([np.tile(variance, size // 6) for variance in _variances()]))[:, None, None]
+    factor = dense.cholesky(np.eye(size) + total * root[..., :, None] * root[..., None, :])
+    scaled = pull * root
+    explained = np.sum(scaled * dense.solved(factor, scaled[..., None])[..., 0], axis=-1)
+    by_scale = 0.5 * (explained - dense.log_determinant(factor))
+    return np.asarray(constant + np.logaddexp.reduce(by_scale, axis=0) - log(SCALES))
+
+
+def _variances() -> list[Array]:
+    """(6,) of a move, for each scale of the mount prior."""
+    scales = [MOUNT_RAD / normal_quantile(0.5 + 0.5 * (k + 0.5) / SCALES) for k in range(SCALES)]
+    return [np.array([s] * 3 + [s * M_PER_RAD] * 3) ** 2 for s in scales]
+
+
+def _log_event() -> float:
+    return log(LOOK_BACK_HOURS / EVENT_HOURS)
+
+
+def _names(moving: Sequence[Mover], one: tuple[int, ...]) -> tuple[str, ...]:
+    return tuple(sorted(name for m in one for name in moving[m].sensors))
+
+
+def _pattern(known: Known, mover: Mover, poses: Mapping[str, Array]) -> Array:
+    origin = se3.inverse(poses[mover.sensors[0]])
+    a_moves, b_moves = known.a in mover.sensors, known.b in mover.sensors
+    if a_moves == b_moves:  # a bar that moves as a whole leaves what lies between its ends
+        return np.zeros((6, 6))
+    if a_moves:
+        return se3.adjoint(poses[known.a] @ origin)
+    return -se3.adjoint(known.T_a_b @ poses[known.b] @ origin)
+
+
+def _shared(sets: Sequence[tuple[int, ...]], probability: Array, design: Array, looked_at: NDArray[np.bool_]) -> Array:
+    """(S,) the probabilities, those of sets that leave one pattern shared evenly between the smallest of them."""
+    contenders = [number for number in range(len(sets)) if probability[number] >= CONTENDER]
+    moves_row = np.abs(design).max(axis=(2, 3)) > 0.0
+    # Sets that leave one pattern touch the same edges: few are left to compare.
+    touched = [tuple((moves_row[list(one)].any(axis=0) & looked_at).tolist()) for one in sets]
+    shared, done = probability.copy(), set[int]()
+    for number in contenders:
+        if number in done:
+            continue
+        span = _span(sets[number], design, looked_at)
+        others = [other for other in range(len(sets)) if touched[other] == touched[number]]
+        alike = [other for other in others if other == number or _same(span, _span(sets[other], design, looked_at))]
+        done.update(alike)
+        fewest = min(len(sets[other]) for other in alike)
+        smallest = [other for other in alike if len(sets[other]) == fewest]
+        shared[alike] = 0.0
+        shared[smallest] = float(probability[alike].sum()) / len(smallest)
+    return shared
+
+
+def _span(one: tuple[int, ...], design: Array, looked_at: NDArray[np.bool_]) -> Array:
+    """(R, n) an orthonormal basis of the patterns that a set leaves on the edges looked at (Gram, Schmidt)."""
+    columns = np.concatenate([design[m][looked_at].reshape(-1, 6) for m in one], axis=1)
+    basis: list[Array] = []
+    for column in columns.T:
+        length = float(np.sqrt(np.sum(column * column)))
+        rest = column.copy()
+        for _ in range(2):  # once more for what rounding left
+            for of in basis:
+                rest = rest - of * np.sum(of * rest)
+        left = float(np.sqrt(np.sum(rest * rest)))
+        if left > SAME_SPAN * max(length, 1.0):
+            basis.append(rest / left)
+    return np.array(basis).reshape(len(basis), -1).T
+
+
+def _same(one: Array, other: Array) -> bool:
+    """Whether two bases of as many vectors span the same."""
+    if one.shape != other.shape:
+        return False
+    missed = other - dense.product(one, dense.product(one.T, other))
+    return bool(np.abs(missed).max() < 100.0 * SAME_SPAN)
+
+
+def _steps(
+    rows: _Rows, t: int, design: Array, one: tuple[int, ...], moving: Sequence[Mover], graph: RigGraph
+) -> dict[str, Moved]:
+    """By how much each sensor of a set moved, had it: edges that do not fit count less, as in a mixture."""
+    size, variance = 6 * len(one), np.tile(_variances()[0], len(one))
+    columns = np.concatenate([design[m] for m in one], axis=2)  # (E, 6, size)
+    weight = np.ones(columns.shape[0])
+    x, covariance = np.zeros(size), np.diag(variance)
+    for _ in range(5):
+        information = np.diag(1.0 / variance)
+        pull = np.zeros(size)
+        for e in range(columns.shape[0]):
+            turned = weight[e] * dense.product(columns[e].T, rows.information[t, e])
+            information = information + dense.product(turned, columns[e])
+            pull = pull + dense.applied(turned, rows.xi[t, e])
+        covariance = dense.inverse(information)
+        x = dense.applied(covariance, pull)
+        away = rows.xi[t] - dense.applied(columns, x)
+        q = dense.squared(rows.information[t], away)
+        whole = dense.squared(rows.information[t], rows.xi[t])
+        # Of noise about the move, against a disturbance by itself.
+        log_odds = rows.log_disturbed[t] + rows.ratio[t] - 0.5 * whole + 0.5 * q
+        weight = 1.0 / (1.0 + np.exp(np.clip(log_odds, -50.0, 50.0)))
+    poses = dict(zip((sensor.name for sensor in graph.sensors), graph.poses, strict=True))
+    moved = {}
+    for i, m in enumerate(one):
+        of = slice(6 * i, 6 * i + 6)
+        first = se3.inverse(poses[moving[m].sensors[0]])
+        for name in moving[m].sensors:
+            carried = se3.adjoint(poses[name] @ first)
+            moved[name] = Moved(
+                dense.applied(carried, x[of]), dense.product(dense.product(carried, covariance[of, of]), carried.T)
+            )
+    return moved

@@ -1,0 +1,239 @@
+"""What the looks at one edge say of a step at some time: where it was before, where it is since, and how well that is
+known.
+
+Either side is a robust mean. A look is a good one, Student-distributed about the place of the edge, or a bad one that
+lies anywhere within reach: the model of `monitor.likelihood`, in all six axes at once. The mean is the mode of that
+mixture (expectation maximisation, from several looks, the likeliest end of all).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import lgamma, log, pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.monitor.change_detector import ROTATIONS, TRANSLATIONS
+from coec.calibration.monitor.likelihood import FREEDOM
+from coec.calibration.rig.evidence import MOST_SIGMA, Look
+from coec.calibration.types import Matrix4
+from coec.geometry import dense, se3
+
+Array = NDArray[np.float64]
+
+MOST_LOOKS = 24
+"""Kept apart, of each edge: two minutes at one every five seconds. Those before are counted together."""
+
+MEMORY_LOOKS = 360.0
+"""Of which those before are a mean, at most: half an hour, so that a mount that creeps is followed."""
+
+REACH = np.array([*ROTATIONS.reach, *TRANSLATIONS.reach])
+"""(6,) standard deviation of what bad looks say (rad, m)."""
+
+STARTS, TURNS = 3, 5
+"""Looks from which a mean is sought, and rounds of it: the means of drawn looks stand still after four."""
+
+_NOTHING = np.eye(6) / MOST_SIGMA**2
+"""Information of a side of which nothing is known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class History:
+    """The looks at one edge since its last state that was consistent.
+
+    Attributes:
+        origin: (4, 4) the pose that offsets are counted from.
+        information, moment: (6, 6) and (6,) what is known of the offset, by what went before the looks that are kept.
+        looks: in the order of their stamps, `MOST_LOOKS` at most.
+    """
+
+    origin: Matrix4
+    information: Array
+    moment: Array
+    looks: tuple[Look, ...] = ()
+
+    @classmethod
+    def at(cls, T_a_b: Matrix4, sigma: Array) -> History:
+        """Without looks: the edge is where it was last said to be (4, 4), to `sigma` (6,); NaN or zero where that is
+        not known."""
+        with np.errstate(invalid="ignore"):
+            known = np.isfinite(sigma) & (sigma > 0.0) & (sigma < MOST_SIGMA)
+        variance = np.where(known, np.where(known, sigma, 1.0) ** 2, MOST_SIGMA**2)
+        return cls(T_a_b, np.diag(1.0 / variance), np.zeros(6))
+
+    def after(self, look: Look, calm: bool) -> History:
+        """With one more look. Where all is `calm`, what goes is counted with those before; else it is forgotten: it may
+        be of after the step that is in question."""
+        looks = sorted((*self.looks, look), key=lambda one: one.stamp_ns)
+        if len(looks) <= MOST_LOOKS:
+            return replace(self, looks=tuple(looks))
+        oldest, kept = looks[0], replace(self, looks=tuple(looks[1:]))
+        if not calm:
+            return kept
+        weight = _Stack.of(self.origin, [oldest]).weights(self.mean[None, None])[1][0, 0, 0]
+        keep = 1.0 - 1.0 / MEMORY_LOOKS
+        offset = se3.difference(oldest.T_a_b, self.origin)
+        information = keep * self.information + weight * oldest.information
+        moment = keep * self.moment + weight * dense.applied(oldest.information, offset)
+        return replace(kept, information=information, moment=moment)
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation of where it was before; NaN where nothing is known."""
+        variance = dense.inverse(self.information).diagonal()
+        return np.sqrt(np.where(variance < 0.99 * MOST_SIGMA**2, variance, np.nan))
+
+    @property
+    def mean(self) -> Array:
+        """(6,) the offset by what went before."""
+        return np.asarray(dense.solved(dense.cholesky(self.information), self.moment[:, None])[:, 0])
+
+    @property
+    def pose(self) -> Matrix4:
+        """(4, 4) where it was before the looks that are kept."""
+        return se3.perturb(self.origin, self.mean)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steps:
+    """Of one edge, for each of T times at which it may have stepped.
+
+    Attributes:
+        xi: (T, 6) from where it was before to where it is since.
+        covariance: (T, 6, 6).
+        looks: (T,) good ones since.
+        log_transient: (T,) logarithm of the chance that these are bad ones at one place instead.
+        log_stepped: (T,) log likelihood of all looks, over what a step of ξ leaves of it: N(ξ; xi, covariance).
+        log_still: that of all looks, bad ones among them, at one place.
+    """
+
+    xi: Array
+    covariance: Array
+    looks: Array
+    log_transient: Array
+    log_stepped: Array
+    log_still: float
+
+
+def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
+    """What the looks say of a step at each of some times: those from that stamp on lie after it."""
+    stamps = np.array([look.stamp_ns for look in history.looks], np.int64)
+    after = stamps[None, :] >= np.asarray(times_ns, np.int64)[:, None]
+    stack = _Stack.of(history.origin, history.looks)
+    before = stack.mean(~after, history.information, history.moment)
+    since = stack.mean(after, _NOTHING, np.zeros(6))
+    still = stack.mean(np.ones((1, len(history.looks)), np.bool_), history.information, history.moment)
+    xi = np.zeros_like(before.offset)
+    for t, (was, is_now) in enumerate(zip(before.offset, since.offset, strict=True)):
+        xi[t] = se3.difference(se3.perturb(history.origin, is_now), se3.perturb(history.origin, was))
+    place = np.max(np.array([look.place for look in history.looks]).reshape(-1, 6), axis=0, initial=0.0)
+    covariance = before.covariance + since.covariance + np.diag(2.0 * place**2)  # one place before, another one since
+    good = since.good
+    looks = good.sum(axis=1)
+    again = np.array([look.log_bad_again for look in history.looks])
+    first = np.array([look.log_bad for look in history.looks]) - again
+    # The first bad one is rarer than the next.
+    log_transient = (good * again).sum(axis=1) + np.max(good, axis=1, initial=0.0) * np.max(first, initial=0.0)
+    return Steps(
+        xi,
+        covariance,
+        looks,
+        np.minimum(log_transient, 0.0),
+        before.log_evidence + since.log_evidence,
+        float(still.log_evidence[0]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Means:
+    """Of some looks, in T ways: offset (T, 6), covariance (T, 6, 6), how far each look is a good one (T, N), and their
+    log evidence (T,): the integral of their likelihood over the offset (Laplace)."""
+
+    offset: Array
+    covariance: Array
+    good: Array
+    log_evidence: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stack:
+    """Some looks as arrays, offsets from one origin."""
+
+    offset: Array  # (N, 6)
+    information: Array  # (N, 6, 6)
+    axes: Array  # (N,) told
+    log_good: Array  # (N,) logarithm of the density of a good one where it is likeliest, with its share
+    log_bad: Array  # (N,) the same of a bad one where it lies
+    share: Array  # (N,)
+
+    @classmethod
+    def of(cls, origin: Matrix4, looks: Sequence[Look]) -> _Stack:
+        offset = np.array([se3.difference(look.T_a_b, origin) for look in looks]).reshape(-1, 6)
+        information = np.array([look.information for look in looks]).reshape(-1, 6, 6)
+        told = np.array([look.information.diagonal() > 0.0 for look in looks]).reshape(-1, 6)
+        axes = told.sum(axis=1).astype(np.float64)
+        whole = information + np.where(told, 0.0, 1.0)[:, :, None] * np.eye(6)
+        spread = dense.log_determinant(dense.cholesky(whole))
+        bad = np.exp([look.log_bad for look in looks])
+        constant = np.array([lgamma((FREEDOM + d) / 2.0) - lgamma(FREEDOM / 2.0) for d in axes.tolist()])
+        log_good = np.log1p(-bad) + constant - 0.5 * axes * log(FREEDOM * pi) + 0.5 * spread
+        within = np.where(told, -0.5 * (offset / REACH) ** 2 - np.log(REACH) - 0.5 * log(2.0 * pi), 0.0)
+        share = np.array([look.share for look in looks])
+        return cls(offset, information, axes, log_good, np.log(bad) + within.sum(axis=1), share)
+
+    def weights(self, mean: Array) -> tuple[Array, Array, Array]:
+        """Of each look about a mean (T, S, 6): its log density, its weight in the next mean, and how far it is a good
+        one; (T, S, N) each."""
+        away = self.offset - mean[:, :, None, :]
+        q = dense.squared(self.information, away)
+        log_good = self.log_good - 0.5 * (FREEDOM + self.axes) * np.log1p(q / FREEDOM)
+        density = np.logaddexp(log_good, self.log_bad)
+        good = self.share * np.exp(log_good - density)
+        return self.share * density, good * np.minimum((FREEDOM + self.axes) / (FREEDOM + q), 1.0), good
+
+    def mean(self, mask: NDArray[np.bool_], information: Array, moment: Array) -> _Means:
+        """Of the looks in each row of a mask (T, N), with what is known beside them."""
+        known = dense.solved(dense.cholesky(information), moment[:, None])[:, 0]
+        if not len(self.offset):
+            covariance = np.broadcast_to(dense.inverse(information), (len(mask), 6, 6))
+            return _Means(
+                np.broadcast_to(known, (len(mask), 6)), covariance, np.zeros((len(mask), 0)), _volume(covariance)
+            )
+        mean = np.stack([self._starts(row, known) for row in mask])
+        for _ in range(TURNS):
+            weight = self.weights(mean)[1] * mask[:, None, :]
+            precision, moments = self._sums(weight, information, moment)
+            mean = dense.solved(dense.cholesky(precision), moments[..., None])[..., 0]
+        density, weight, good = self.weights(mean)
+        apart = mean - known
+        likely = (density * mask[:, None, :]).sum(axis=-1) - 0.5 * dense.squared(information, apart)
+        rows, best = np.arange(len(mask)), np.argmax(likely, axis=1)
+        precision, _ = self._sums(weight[rows, best] * mask, information, moment)
+        covariance = dense.inverse(precision)
+        log_evidence = likely[rows, best] + _volume(covariance)
+        return _Means(mean[rows, best], covariance, good[rows, best] * mask, log_evidence)
+
+    def _starts(self, row: NDArray[np.bool_], known: Array) -> Array:
+        """(STARTS + 1, 6) from where the mean of a row is sought: some of its looks, and what is known."""
+        there = np.flatnonzero(row)
+        if not len(there):
+            return np.broadcast_to(known, (STARTS + 1, 6))
+        some = there[np.linspace(len(there) - 1, 0, STARTS).round().astype(np.int64)]
+        return np.concatenate([self.offset[some], known[None]])
+
+    def _sums(self, weight: Array, information: Array, moment: Array) -> tuple[Array, Array]:
+        """Information (..., 6, 6) and moments (..., 6) of the looks, weighted (..., N), and of what is known."""
+        pulled = dense.applied(self.information, self.offset)
+        precision = np.broadcast_to(information, (*weight.shape[:-1], 6, 6)).copy()
+        moments = np.broadcast_to(moment, (*weight.shape[:-1], 6)).copy()
+        for n in range(weight.shape[-1]):
+            precision += weight[..., n, None, None] * self.information[n]
+            moments += weight[..., n, None] * pulled[n]
+        return precision, moments
+
+
+def _volume(covariance: Array) -> Array:
+    """(...) logarithm of the integral of exp(-½·xᵀ·C⁻¹·x)."""
+    return np.asarray(0.5 * dense.log_determinant(dense.cholesky(covariance)) + 3.0 * log(2.0 * pi))

@@ -1,0 +1,179 @@
+"""The rig of a vehicle as a graph: sensors are its nodes, what can be measured between two of them its edges.
+
+An edge `a <- b` measures T_a_b, which maps coordinates of b to those of a; a camera-LiDAR pair is the edge camera <-
+LiDAR. Every sensor has a pose in the rig, T_sensor_rig. A sensor that moves by x (6,) about its own axes has
+T_sensor_rig(x) = perturb(T_sensor_rig, x), so that to first order
+
+    T_a_b moves by   ξ = x_a - Ad(T_a_b) · x_b        about the axes of a.
+
+Only differences are measured: moving everything at once changes no edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import Matrix4
+from coec.geometry import se3
+
+MOST_SENSORS = 12
+"""Eight cameras, three LiDARs and the vehicle itself: what is solved is dense."""
+
+
+class Kind(StrEnum):
+    """What a node is. The vehicle's own frame, where something measures it, is a node that cannot move."""
+
+    CAMERA = "camera"
+    LIDAR = "lidar"
+    VEHICLE = "vehicle"
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A node."""
+
+    name: str
+    kind: Kind
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """What can be measured: T_a_b (4, 4) as the vehicle was built. `name` is that of the pair."""
+
+    name: str
+    a: str
+    b: str
+    T_a_b: Matrix4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """Two sensors on one bar: T_a_b (4, 4) is known, and stays so to `sigma` (6,) about the axes of a (rad, m)."""
+
+    name: str
+    a: str
+    b: str
+    T_a_b: Matrix4
+    sigma: NDArray[np.float64]
+
+
+class Known(NamedTuple):
+    """An edge or a link, by what they have in common."""
+
+    name: str
+    a: str
+    b: str
+    T_a_b: Matrix4
+
+
+@dataclass(frozen=True, eq=False)
+class RigGraph:
+    """Sensors, edges and links, each in the order of their names: what is decided does not depend on how they came."""
+
+    sensors: tuple[Sensor, ...]
+    edges: tuple[Edge, ...]
+    links: tuple[Link, ...]
+
+    @classmethod
+    def of(cls, sensors: Sequence[Sensor], edges: Sequence[Edge], links: Sequence[Link] = ()) -> RigGraph:
+        """The graph.
+
+        Raises:
+            ValueError: too many sensors; a name twice, an edge to a sensor that is not there or to itself, a pose that
+                is not rigid, a link whose standard deviations are not six positive numbers.
+        """
+        if not 1 <= len(sensors) <= MOST_SENSORS:
+            raise ValueError(f"a rig has 1 to {MOST_SENSORS} sensors, got {len(sensors)}: leave some out of it")
+        all_known = _known(edges, links)
+        _once("sensors", [sensor.name for sensor in sensors])
+        _once("edges and links", [known.name for known in all_known])
+        names = {sensor.name for sensor in sensors}
+        for known in all_known:
+            if known.a == known.b or not {known.a, known.b} <= names:
+                raise ValueError(f"{known.name}: joins {known.a} and {known.b}, which are no two sensors of the rig")
+            if not se3.is_rigid(known.T_a_b):
+                raise ValueError(f"{known.name}: T_a_b must be a rigid transform (4, 4)")
+        for link in links:
+            if link.sigma.shape != (6,) or not (np.isfinite(link.sigma).all() and (link.sigma > 0.0).all()):
+                raise ValueError(f"{link.name}: sigma must be six positive numbers, got {link.sigma.tolist()}")
+        return cls(
+            tuple(sorted(sensors, key=lambda sensor: sensor.name)),
+            tuple(sorted(edges, key=lambda edge: edge.name)),
+            tuple(sorted(links, key=lambda link: link.name)),
+        )
+
+    @cached_property
+    def place(self) -> Mapping[str, int]:
+        """The number of each sensor, by name."""
+        return {sensor.name: number for number, sensor in enumerate(self.sensors)}
+
+    @cached_property
+    def edge(self) -> Mapping[str, Edge]:
+        """By name."""
+        return {edge.name: edge for edge in self.edges}
+
+    @cached_property
+    def known(self) -> tuple[Known, ...]:
+        """Edges, then links."""
+        return _known(self.edges, self.links)
+
+    @cached_property
+    def poses(self) -> tuple[Matrix4, ...]:
+        """T_sensor_rig (4, 4) of each sensor as the vehicle was built, its first sensor being the origin; so is the
+        first of any part that no edge joins to it."""
+        found: dict[str, Matrix4] = {}
+        for sensor in self.sensors:
+            if sensor.name in found:
+                continue
+            found[sensor.name] = np.eye(4)
+            reached = [sensor.name]
+            for name in reached:  # grows as it goes: breadth first
+                for known in self.known:
+                    if known.b == name and known.a not in found:
+                        found[known.a] = np.asarray(known.T_a_b @ found[name])
+                        reached.append(known.a)
+                    elif known.a == name and known.b not in found:
+                        found[known.b] = np.asarray(se3.inverse(known.T_a_b) @ found[name])
+                        reached.append(known.b)
+        return tuple(found[sensor.name] for sensor in self.sensors)
+
+    def loop_through(self, closing: str, among: Sequence[str]) -> tuple[str, ...] | None:
+        """The shortest loop through the edge or link `closing` along those of the names `among`: their names, from that
+        one on. None if there is none."""
+        by_name = {known.name: known for known in self.known}
+        first = by_name[closing]
+        others = [by_name[name] for name in sorted(among) if name != closing]
+        came: dict[str, tuple[str, str]] = {first.b: ("", "")}
+        reached = [first.b]
+        for name in reached:
+            for known in others:
+                for here, there in ((known.a, known.b), (known.b, known.a)):
+                    if here == name and there not in came:
+                        came[there] = (name, known.name)
+                        reached.append(there)
+        if first.a not in came:
+            return None
+        path, name = [], first.a
+        while name != first.b:
+            name, by = came[name]
+            path.append(by)
+        return (closing, *path)
+
+
+def _known(edges: Sequence[Edge], links: Sequence[Link]) -> tuple[Known, ...]:
+    return (
+        *(Known(edge.name, edge.a, edge.b, edge.T_a_b) for edge in edges),
+        *(Known(link.name, link.a, link.b, link.T_a_b) for link in links),
+    )
+
+
+def _once(what: str, names: Sequence[str]) -> None:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"{what} of a rig need names of their own, twice there are: {', '.join(twice)}")

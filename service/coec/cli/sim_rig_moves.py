@@ -1,0 +1,18 @@
+"""`coec sim rig-moves`: are the sensors of a rig that moved named, and no others."""
+
+from __future__ import annotations
+
+from coec.evaluation import rig_moves
+from coec.reports import console, rig_tables
+
+
+def run(drives: int, rigs: int, *, as_json: bool) -> int:
+    """Draws so many drives of each fault, and so many rigs, and prints the report."""
+    with console.progress() as bars:
+        task = bars.add_task("drives", total=len(rig_moves.FAULTS) * drives, note="")
+        report = rig_moves.report(drives, rigs, lambda note: bars.update(task, advance=1, note=note))
+    if as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        rig_tables.show(report)
+    return 0

@@ -1,0 +1,158 @@
+"""Are the sensors that moved named, and no others? On drawn evidence of rigs (`rig_evidence`), drive after drive; and
+how much better a rig knows its pairs than they know themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from math import radians
+
+import numpy as np
+
+from coec.calibration.rig.attribution import RigState, SensorHealth, after_look, begun, sensors, served
+from coec.calibration.rig.evidence import Look
+from coec.calibration.rig.joint import estimate
+from coec.evaluation.rig_evidence import BUILT, FOUR, FULL, SINGLE, Bend, DrawnRig, checks, moved, off, windows
+from coec.geometry import se3
+from coec.geometry.vectors import random_direction
+from coec.schemas.replies import Vector6
+from coec.schemas.rig import JointRow, MovesRow, RigMovesReport
+
+AT_S, ALLOWED_S = 90.0, 60.0
+"""When sensors move, about; and after how long they have to be named."""
+
+STEP_RAD = radians(1.0)
+SEED = 17_000_001
+"""Any number that nothing was learned on."""
+
+MOVED = frozenset({SensorHealth.CAMERA_MOVED, SensorHealth.LIDAR_MOVED})
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What happens on a drive: how many of which sensors turn by how much; or one pair is disturbed by so much."""
+
+    name: str
+    cameras: int = 0
+    lidars: int = 0
+    pairs: int = 0
+    angle_rad: float = STEP_RAD
+
+
+NOBODY = Fault("nobody")
+FAULTS: tuple[tuple[DrawnRig, Fault], ...] = (
+    (FOUR, NOBODY),
+    (FOUR, Fault("one camera 1°", cameras=1)),
+    (FOUR, Fault("the LiDAR 1°", lidars=1)),
+    (FOUR, Fault("two cameras 1°", cameras=2)),
+    (FOUR, Fault("one camera 0.5°", cameras=1, angle_rad=radians(0.5))),
+    (FOUR, Fault("the LiDAR 10°", lidars=1, angle_rad=radians(10.0))),
+    (FULL, NOBODY),
+    (FULL, Fault("one camera 1°", cameras=1)),
+    (FULL, Fault("one LiDAR 1°", lidars=1)),
+    (FULL, Fault("two cameras 1°", cameras=2)),
+    (FULL, Fault("one pair disturbed by 1°", pairs=1)),
+    (SINGLE, Fault("the LiDAR 1°", lidars=1)),
+    (SINGLE, Fault("the camera 1°", cameras=1)),
+)
+"""Rigs and what happens to them. Of the last two rows nobody can know more than that something moved."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What was said on one drive: when exactly those that moved were named, seconds after the fault (None: not in
+    time), and whether ever one was that had not."""
+
+    delay_s: float | None
+    wrong: bool
+
+
+def report(drives: int, rigs: int, heard: Callable[[str], None]) -> RigMovesReport:
+    """All rows, of so many drives each, and of so many rigs whose windows are combined; `heard` is told of each."""
+    return RigMovesReport(
+        allowed_s=ALLOWED_S,
+        moves=tuple(_row(rig, fault, drives, heard) for rig, fault in FAULTS),
+        joint=tuple(joint_row(rig, rigs) for rig in (FOUR, FULL)),
+    )
+
+
+def _row(rig: DrawnRig, fault: Fault, drives: int, heard: Callable[[str], None]) -> MovesRow:
+    driven = []
+    for number in range(drives):
+        driven.append(drive(rig, fault, number))
+        heard(f"{rig.name}: {fault.name}")
+    right = [one.delay_s for one in driven if one.delay_s is not None and not one.wrong]
+    wrong = sum(one.wrong for one in driven)
+    return MovesRow(
+        rig=rig.name,
+        fault=fault.name,
+        drives=drives,
+        right=len(right),
+        undecided=drives - len(right) - wrong,
+        wrong=wrong,
+        delay_s=tuple(sorted(right)),
+    )
+
+
+def drive(rig: DrawnRig, fault: Fault, number: int) -> Drive:
+    """One drive, drawn from its number. Where no sensor moves it is right, after 0 s, if none is ever named."""
+    rng = np.random.default_rng([SEED, number, *fault.name.encode(), *rig.name.encode()])
+    cameras = [sensor.name for sensor in rig.graph.sensors if sensor.kind == "camera"]
+    lidars = [sensor.name for sensor in rig.graph.sensors if sensor.kind == "lidar"]
+    who = {str(name) for name in rng.permutation(cameras)[: fault.cameras]}
+    who |= {str(name) for name in rng.permutation(lidars)[: fault.lidars]}
+    before = off(rig.poses, BUILT, rng)
+    after = moved(before, sorted(who), fault.angle_rad, rng)
+    bend = None
+    if fault.pairs:
+        edge = rig.graph.edges[int(rng.integers(len(rig.graph.edges)))].name
+        bend = Bend(edge, np.concatenate([fault.angle_rad * random_direction(rng), np.zeros(3)]))
+    at_s = AT_S + float(rng.uniform(0.0, 20.0))
+    delay_s: float | None = None if who else 0.0
+    wrong = False
+    state = begun(rig.graph)
+    for name, window in windows(rig, before, rng).items():
+        state = served(state, name, window.T_camera_lidar, window.uncertainty.sigma)
+    for at, named in _named(rig, state, checks(rig, before, after, bend, at_s, at_s + ALLOWED_S, rng)):
+        wrong = wrong or not named <= (who if at >= at_s else set())
+        if who and delay_s is None and at >= at_s and named == who:
+            delay_s = at - at_s
+    return Drive(delay_s, wrong)
+
+
+def _named(rig: DrawnRig, state: RigState, looks: Sequence[Look]) -> Iterator[tuple[float, set[str]]]:
+    """Time, seconds, and the sensors that were named then, whenever it was asked."""
+    for look in looks:
+        before, state = state, after_look(state, rig.graph, look)
+        if state.asked_ns != before.asked_ns:
+            yield state.asked_ns / 1e9, {one.name for one in sensors(state, rig.graph) if one.health in MOVED}
+
+
+def joint_row(rig: DrawnRig, rigs: int) -> JointRow:
+    """Of windows of some rigs."""
+    of_rig, of_pairs = np.zeros(6), np.zeros(6)
+    nees: list[float] = []
+    consistent = found = missed = 0
+    for number in range(rigs):
+        rng = np.random.default_rng([SEED, number, *rig.name.encode()])
+        poses = off(rig.poses, BUILT, rng)
+        told = windows(rig, poses, rng)
+        result = estimate(rig.graph, told)
+        consistent += result.consistent
+        for edge in rig.graph.edges:
+            truth = poses[edge.a] @ se3.inverse(poses[edge.b])
+            error = se3.difference(result.T_a_b[edge.name], truth)
+            of_rig += error**2
+            of_pairs += se3.difference(told[edge.name].T_camera_lidar, truth) ** 2
+            nees.append(float(error @ np.linalg.solve(result.between(edge.name, edge.name), error)) / 6.0)
+        biased = estimate(rig.graph, windows(rig, poses, rng, STEP_RAD))
+        found += biased.left_out == rig.graph.edges[0].name
+        missed += biased.consistent
+    ratio = np.sqrt(of_rig / of_pairs)
+    rx, ry, rz, tx, ty, tz = ratio.tolist()
+    each: Vector6 = (rx, ry, rz, tx, ty, tz)
+    return JointRow(
+        rig=rig.name, rigs=rigs, pairs=len(rig.graph.edges), rms_ratio=each,
+        rms_ratio_all=float(np.sqrt(np.mean(ratio**2))), nees=float(np.mean(nees)), consistent=consistent,
+        biased_found=found, biased_missed=missed,
+    )  # fmt: skip

@@ -1,0 +1,174 @@
+"""Who moved: the sensor that explains it with fewest moves is named, and nobody where that cannot be told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coec.calibration.rig.attribution import RigState, SensorHealth, after_look, begun, sensors, served
+from coec.calibration.rig.evidence import information_of
+from coec.calibration.rig.types import Edge, Kind, Link, RigGraph, Sensor
+from coec.geometry import se3
+from rigs import PLACE, POSES, SIGMA, TURN, driven, graph, look, with_moved
+
+STAR = (("front", "roof"), ("left", "roof"), ("rear", "roof"))
+MOVED = {SensorHealth.CAMERA_MOVED, SensorHealth.LIDAR_MOVED}
+
+
+def _health(state: RigState, rig: RigGraph) -> dict[str, SensorHealth]:
+    return {sensor.name: sensor.health for sensor in sensors(state, rig)}
+
+
+def _named(state: RigState, rig: RigGraph) -> set[str]:
+    return {name for name, health in _health(state, rig).items() if health in MOVED}
+
+
+@pytest.mark.fault("sensors of a rig are knocked by 1°", "they are named, no other is, after five looks of each pair")
+@pytest.mark.parametrize("who", [("front",), ("roof",), ("front", "rear")])
+def test_those_that_moved_are_named_and_told_by_how_much(
+    who: tuple[str, ...], record_property: Callable[[str, object], None]
+) -> None:
+    rig = graph(STAR)
+    state = driven(rig, POSES, with_moved(*who))
+    assert _named(state, rig) == set(who)
+    assert all(health is SensorHealth.CALIBRATED for name, health in _health(state, rig).items() if name not in who)
+    for sensor in sensors(state, rig):
+        if sensor.name in who:
+            assert sensor.moved is not None
+            away = sensor.moved.x - TURN
+            assert float(away @ np.linalg.solve(sensor.moved.covariance, away)) < 22.5  # 99.9 % of six axes
+    record_property("figure", f"{min(s.probability for s in sensors(state, rig) if s.name in who):.3f}")
+
+
+def test_nothing_happened_and_nobody_is_named() -> None:
+    rig = graph(STAR)
+    assert set(_health(driven(rig, POSES, POSES), rig).values()) == {SensorHealth.CALIBRATED}
+
+
+def test_before_the_first_look_nothing_is_known() -> None:
+    rig = graph(STAR)
+    assert set(_health(begun(rig), rig).values()) == {SensorHealth.UNKNOWN}
+
+
+@pytest.mark.parametrize("who", ["front", "roof"])
+def test_one_camera_and_one_lidar_are_undecided_whoever_moved(who: str) -> None:
+    rig = graph([("front", "roof")])
+    state = driven(rig, POSES, with_moved(who, xi=np.array([0.0, 0.15, 0.0, 0.0, 0.0, 0.0])))
+    assert set(_health(state, rig).values()) == {SensorHealth.UNDECIDED}
+    probabilities = [sensor.probability for sensor in sensors(state, rig)]
+    assert probabilities[0] == pytest.approx(probabilities[1], abs=1e-12)
+    assert 0.4 < probabilities[0] <= 0.5
+    reasons = [reason.text for sensor in sensors(state, rig) for reason in sensor.reasons]
+    assert "roof" in reasons[0]
+    assert "front" in reasons[1]
+
+
+def test_two_of_three_that_moved_are_not_told_from_the_other_two() -> None:
+    rig = graph(STAR[:2])
+    after = {**with_moved("front"), "left": with_moved("left", xi=-2.0 * TURN)["left"]}
+    state = driven(rig, POSES, after)
+    assert not _named(state, rig)
+    assert SensorHealth.UNDECIDED in _health(state, rig).values()
+
+
+@pytest.mark.fault("one pair of a rig is disturbed, its sensors stand still", "no sensor is named, the pair is")
+def test_a_pair_that_others_contradict_is_disturbed_and_its_sensors_undecided() -> None:
+    rig = graph([*STAR[:2], ("front", "bumper"), ("left", "bumper")])
+    rng, state = np.random.default_rng(3), begun(rig)
+    for turn in range(14):
+        for place, edge in enumerate(rig.edges):
+            error = SIGMA * rng.normal(size=6) + (TURN if edge.name == "front-roof" and turn >= 8 else 0.0)
+            state = after_look(state, rig, look(edge, POSES, 5.0 * turn + 0.3 * place, error))
+    assert not _named(state, rig)
+    assert state.posterior is not None
+    assert state.posterior.disturbed["front-roof"] > 0.9
+    undecided = {name for name, health in _health(state, rig).items() if health is SensorHealth.UNDECIDED}
+    assert undecided == {"front", "roof"}
+
+
+def test_a_bar_that_was_knocked_is_one_move_of_all_on_it() -> None:
+    rigid = Link("bar", "front", "left", POSES["front"] @ se3.inverse(POSES["left"]), np.full(6, 1e-4))
+    rig = graph(STAR, [rigid])
+    T_front_rig = se3.perturb(POSES["front"], TURN)
+    after = {**POSES, "front": T_front_rig, "left": se3.inverse(rigid.T_a_b) @ T_front_rig}
+    assert _named(driven(rig, POSES, after), rig) == {"front", "left"}
+
+
+def test_a_pose_that_is_served_anew_settles_the_event() -> None:
+    rig, after = graph(STAR), with_moved("front")
+    state = driven(rig, POSES, after)
+    pose = after["front"] @ se3.inverse(after["roof"])
+    state = served(state, "front-roof", pose, np.full(6, 1e-3))
+    rng = np.random.default_rng(9)
+    for turn in range(3):
+        for place, edge in enumerate(rig.edges):
+            state = after_look(
+                state, rig, look(edge, after, 100.0 + 5.0 * turn + 0.5 * place, SIGMA * rng.normal(size=6))
+            )
+    assert set(_health(state, rig).values()) == {SensorHealth.CALIBRATED}
+
+
+def test_names_and_the_order_in_which_a_rig_is_given_change_nothing() -> None:
+    other = {"front": "z", "left": "m", "rear": "a", "roof": "k", "bumper": "b"}
+    rig, after = graph(STAR), with_moved("roof")
+    renamed = RigGraph.of(
+        [Sensor(other[sensor.name], sensor.kind) for sensor in reversed(rig.sensors)],
+        [Edge(f"e{edge.name}", other[edge.a], other[edge.b], edge.T_a_b) for edge in reversed(rig.edges)],
+    )
+    state, twin = begun(rig), begun(renamed)
+    rng = np.random.default_rng(2)
+    for turn in range(12):
+        for place, edge in enumerate(rig.edges):
+            seen = look(edge, POSES if turn < 8 else after, 5.0 * turn + 0.5 * place, SIGMA * rng.normal(size=6))
+            state = after_look(state, rig, seen)
+            twin = after_look(twin, renamed, replace(seen, edge=f"e{edge.name}"))
+    mine = {other[sensor.name]: sensor.probability for sensor in sensors(state, rig)}
+    theirs = {sensor.name: sensor.probability for sensor in sensors(twin, renamed)}
+    assert mine == pytest.approx(theirs, abs=1e-9)
+
+
+def test_it_replays_to_the_byte() -> None:
+    rig = graph(STAR)
+    one, two = (driven(rig, POSES, with_moved("front")) for _ in range(2))
+    assert one.posterior is not None
+    assert two.posterior is not None
+    assert one.posterior.sensors == two.posterior.sensors
+    assert one.posterior.steps["front"].x.tobytes() == two.posterior.steps["front"].x.tobytes()
+
+
+@pytest.mark.fault("a covariance of a rig's evidence is NaN, singular or absurd", "refused by its reason, no traceback")
+@pytest.mark.parametrize(
+    "covariance",
+    [
+        np.full((6, 6), np.nan),
+        np.zeros((6, 6)),
+        np.diag([1e-6, 1e-6, -1e-6, 1e-4, 1e-4, 1e-4]),
+        np.ones((6, 6)),
+        np.diag(np.full(6, 1e300)),
+        np.diag(np.full(6, 1e-300)),
+        np.eye(5),
+        np.triu(np.full((6, 6), 1e-4)),
+    ],
+)
+def test_evidence_that_is_none_is_refused(covariance: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"covariance|positive definite"):
+        information_of(covariance)
+
+
+def test_a_rig_that_is_none_is_refused() -> None:
+    sensor, pose = Sensor("a", Kind.CAMERA), np.eye(4)
+    with pytest.raises(ValueError, match="1 to 12 sensors"):
+        RigGraph.of([], [])
+    with pytest.raises(ValueError, match="twice"):
+        RigGraph.of([sensor, sensor], [])
+    with pytest.raises(ValueError, match="no two sensors"):
+        RigGraph.of([sensor], [Edge("e", "a", "b", pose)])
+    with pytest.raises(ValueError, match="rigid"):
+        RigGraph.of([sensor, Sensor("b", Kind.LIDAR)], [Edge("e", "a", "b", np.full((4, 4), np.nan))])
+    with pytest.raises(ValueError, match="six positive"):
+        graph([("front", "roof")], [Link("l", "front", "roof", pose, np.zeros(6))])
+    with pytest.raises(ValueError, match="no edge of this rig"):
+        served(begun(graph(STAR)), "other", pose, PLACE)

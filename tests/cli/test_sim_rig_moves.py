@@ -1,0 +1,24 @@
+"""`coec sim rig-moves`: from its words to its tables."""
+
+from __future__ import annotations
+
+import pytest
+
+from cli.conftest import Coec
+from coec.evaluation import rig_moves
+from coec.evaluation.rig_evidence import FOUR
+from coec.evaluation.rig_moves import Fault
+from coec.schemas.rig import RigMovesReport
+
+
+def test_a_knocked_camera_is_named_on_drawn_drives_and_told_in_tables(
+    coec: Coec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rig_moves, "FAULTS", ((FOUR, Fault("one camera 1°", cameras=1)),))
+    outcome = coec("sim", "rig-moves", "--drives", 1, "--rigs", 1, "--json")
+    report = RigMovesReport.model_validate(outcome.document)
+    assert (report.moves[0].right, report.moves[0].undecided, report.moves[0].wrong) == (1, 0, 0)
+    assert report.joint[1].rms_ratio_all < 0.9
+    assert report.joint[1].biased_found == 1
+    monkeypatch.setattr(rig_moves, "FAULTS", ())
+    assert "windows combined" in coec("sim", "rig-moves", "--rigs", 1).out
