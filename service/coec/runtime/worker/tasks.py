@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coec.adapters.depth.maps import CachedDepth, DepthAhead, open_depth
+from coec.adapters.depth.maps import CachedDepth, open_depth
 from coec.adapters.files.baseline_file import BASELINES, load_baseline, save_baseline
 from coec.adapters.files.rig import rig_of
 from coec.adapters.frames.msgpack_frames import decode_camera
@@ -19,7 +19,7 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.baseline import Baseline, learned_hash, mismatch
 from coec.calibration.commissioning.learning import commission
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.monitor.check_verdict import MIN_PAIRS, observe
+from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose, observe
 from coec.calibration.ports import Silence
 from coec.calibration.types import (
     CameraFrame,
@@ -100,7 +100,7 @@ class Solver:
             project(rig.camera, np.ones((1, 3)))
             alignment_of_parts(_one_edge(rig), np.zeros(1, np.uint8), 1, np.eye(4))
             with contextlib.suppress(CalibrationError, DecodeError):
-                observe(_invented_window(rig), _Ramp(), self._images, configuration, None)
+                diagnose(_invented_window(rig), _Ramp(), self._images, configuration, None)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
@@ -152,9 +152,7 @@ class Solver:
         network = self._network(configuration.depth)
         baseline, not_used = self._baseline(pair, configuration, network.identity)
         images = CachedGreys(self._images, len(window.pairs))
-        with DepthAhead(network, (each.camera for each in window.pairs)) as depth:
-            observation = observe(window, depth, images, configuration, baseline)
-        return Checked(observation, not_used)
+        return Checked(observe(window, network, images, configuration, baseline), not_used)
 
     def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> Drawn:
         """JPEG of the points of a window's last pair on its image, at an extrinsic (rows of the (4, 4) matrix).
