@@ -11,7 +11,8 @@ from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
-from coec.calibration.monitor.check_verdict import MIN_CONTRAST, MIN_EDGES_IN_VIEW, MIN_LOOKS, judge_check, over_limits
+from coec.calibration.monitor.check_verdict import MIN_EDGES_IN_VIEW, MIN_LOOKS, judge_check, over_limits
+from coec.calibration.monitor.neighbourhood import MIN_CONTRAST
 from coec.calibration.objective.curvature import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.ports import DepthModel, Silence

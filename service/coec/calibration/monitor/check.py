@@ -78,7 +78,7 @@ class Check:
         edges_in_view: range edges that lie in the images there, of all pairs.
         looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 where they do not tell.
         edges_kept: that of the finest band where the optimum is expected, over that where it is.
-        contrast: how far the edges at the local optimum stand above other poses within reach, standard deviations.
+        contrast: how far the edges at the local optimum stand above other poses, standard deviations.
         overlap: range edges in view at the pose over those that come into view within reach.
     """
 

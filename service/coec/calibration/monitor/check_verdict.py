@@ -27,7 +27,7 @@ from coec.calibration.frames.timing import explained_by_motion
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import NO_BIAS, Check, CheckInput, check_at, gather
 from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
-from coec.calibration.monitor.neighbourhood import POSE_DOF, ROTATION_DOF
+from coec.calibration.monitor.neighbourhood import MIN_CONTRAST, POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import data_causes, dirty_blocks
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import FramePair, Matrix4, Metric, Window
@@ -45,12 +45,6 @@ MIN_PAIRS = 4
 LOST_EDGES_SHARE = 0.25
 """Of the limits of the squared distances, where the edges are lost at the pose. Standard deviations are
 those of a rig's checks at large; how sharply this scene tells the pose, its edges know."""
-
-MIN_CONTRAST = 4.0
-"""Standard deviations by which the local optimum stands out from other poses, below which its edges count as faint: the
-best of some thousand poses stands out by 3.5 by chance. Checks of simulated highways through a coarse fisheye are at 2
-to 4, and 1.5 to 4 degrees off; right ones of other simulated scenes at 4.3 to 18, of the sample recordings at 6 to
-17."""
 
 MIN_EDGES_IN_VIEW = 150.0
 """Range edges in view, per pair, below which a check's edges count as faint, too, however well they fit: with fewer, a

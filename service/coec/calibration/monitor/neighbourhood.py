@@ -2,7 +2,7 @@
 
 Straight up from the pose on the sharpest edges, and from coarse to fine: by the finest band from there, and from where
 a cover of all rotations within reach on the coarsest band has another hill. What is found next to the pose is believed
-unless another place is clearly better. Nothing is drawn at random.
+unless another place is clearly better, and stands out. Nothing is drawn at random.
 """
 
 from __future__ import annotations
@@ -42,8 +42,16 @@ BEGINNINGS, APART = 2, 1.5
 FAIR_SHARE = 0.8
 """Of the best of the cover, what a beginning has at least."""
 
-OTHER_POSES = 64
-"""Poses of the cover from which the mean and the standard deviation of a significance are taken: known to an eighth."""
+OTHER_POSES, OTHER_POSES_RAD = 32, (radians(3.0), radians(28.0))
+"""Poses either way, turned about the axis of the LiDAR by so much, from which the mean and the standard deviation of a
+significance are taken. So turned, range edges stay on the strip of the image that was prepared, and in its layout: they
+lie as high as before, and on other things."""
+
+MIN_CONTRAST = 4.0
+"""Standard deviations by which an optimum stands out from other poses, below which its edges count as faint, and no
+other place is believed for them. Of 90 checks of 15 simulated drives those of streets and garages are at 11 to 38, of
+highways at 4.2 to 12; through a lens of 75° on a highway, and up to 1.4° off, at 0.7 to 1.2; in the dark up to 4.6,
+where significance itself is too small."""
 
 SAME = 0.25
 """Of the finest band's blur: ends of two climbs that are nearer are one."""
@@ -80,7 +88,7 @@ class Neighbourhood:
     Attributes:
         T_rotation: (4, 4) local optimum over rotations, the camera's centre being that of the pose.
         T_pose: (4, 4) local optimum over all six degrees of freedom.
-        contrast: how far the coarsest edges there stand above other poses within reach, standard deviations.
+        contrast: how far the edges of the finest band there stand above other poses, standard deviations.
     """
 
     T_rotation: Matrix4
@@ -116,16 +124,23 @@ def search(edges: LaidEdges, pose: Matrix4) -> Neighbourhood:
         if end.significance >= fair and _apart(end.pose, near.pose) >= SAME * finest.blur_rad:
             end = _climb(sharp.frames, end.pose, settled[:ROTATION_DOF], TOLERANCE)
             best = max(best, end, key=lambda one: one.significance)
-    rotation = near if near.significance >= NEAR_SHARE * best.significance else best
-    return Neighbourhood(rotation.pose, _pose_of(edges, rotation), _contrast(finest, cover, rotation.pose, apart))
+    there = _contrast(finest, best.pose)
+    if best is not near and (there < MIN_CONTRAST or near.significance >= NEAR_SHARE * best.significance):
+        best, there = near, _contrast(finest, near.pose)
+    return Neighbourhood(best.pose, _pose_of(edges, best), there)
 
 
-def _contrast(band: LaidLevel, cover: NDArray[np.float64], pose: Matrix4, apart_rad: float) -> float:
-    """How far a pose stands above others of the cover, so far from it; standard deviations."""
-    traces = np.einsum("kij,ij->k", cover[:, :3, :3], pose[:3, :3])
-    others = cover[traces < _trace_of(apart_rad)][:OTHER_POSES]
-    z = significances(band.frames, np.concatenate([pose[None], others]))
-    return float((z[0] - z[1:].mean()) / max(float(z[1:].std()), 1e-9)) if len(others) else 0.0
+def _contrast(band: LaidLevel, pose: Matrix4) -> float:
+    """How far a pose stands above others, from which the same sweeps lie on other parts of the images; standard
+    deviations."""
+    turned = np.tile(np.eye(4), (2 * OTHER_POSES, 1, 1))
+    one_way = np.linspace(*OTHER_POSES_RAD, OTHER_POSES)
+    angle_rad = np.concatenate([one_way, -one_way])
+    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angle_rad)
+    turned[:, 1, 0] = np.sin(angle_rad)
+    turned[:, 0, 1] = -turned[:, 1, 0]
+    z = significances(band.frames, np.concatenate([pose[None], pose @ turned]))
+    return float((z[0] - z[1:].mean()) / max(float(z[1:].std()), 1e-9))
 
 
 def _pose_of(edges: LaidEdges, rotation: _End) -> Matrix4:

@@ -1,4 +1,4 @@
-"""What a look of the monitor takes of the processor: six pairs of a simulated street, from their bytes to the verdict."""
+"""What a look of the monitor takes of the processor: six pairs of a simulated street, from bytes to the verdict."""
 
 from __future__ import annotations
 
