@@ -7,7 +7,6 @@ the vehicle. Each cause needs most pairs of a check, so that one bad frame is no
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,10 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.ego_mask import cell_means
 from coec.calibration.types import INTRINSICS_OFF, Reason
-from coec.geometry.bearings import Bearings, grid_counts
-from coec.geometry.picture import neighbour_differences
 
 BLOCK_ROWS, BLOCK_COLUMNS = 18, 32
 """The image is judged in blocks: dirt covers some of them, a covered lens all."""
@@ -43,12 +39,6 @@ is."""
 
 DIRTY_CHECKS = 3.5
 """Independent checks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
-
-BRIGHT_SHARE, BRIGHT_STEP = 0.9, 4
-"""Of the pixels, every fourth of every fourth row."""
-
-THUMBNAIL_CELL_PX = 8
-"""Pixels a side that are one of the thumbnail by which pictures are compared."""
 
 SAME_PICTURE = 0.01
 """Mean absolute difference of two exposures over the standard deviation of their grey values below which they are the
@@ -123,7 +113,7 @@ class PictureFacts:
     Attributes:
         gradient: (BLOCK_ROWS, BLOCK_COLUMNS) mean absolute difference of neighbouring grey values.
         bright: grey value below which nine pixels in ten lie.
-        thumbnail: float32, mean grey values of cells of `THUMBNAIL_CELL_PX`.
+        thumbnail: float32, mean grey values of small cells.
         digest: of the thumbnail.
     """
 
@@ -166,25 +156,6 @@ class SceneBaseline:
     bands: NDArray[np.float64]
     sectors: NDArray[np.float64]
     range_edges: float
-
-
-def picture_facts(grey: NDArray[np.uint8]) -> PictureFacts:
-    """The facts of an image, (h, w)."""
-    thumbnail = cell_means(grey, THUMBNAIL_CELL_PX).astype(np.float32)
-    levels = np.cumsum(np.bincount(grey[::BRIGHT_STEP, ::BRIGHT_STEP].ravel(), minlength=256))
-    return PictureFacts(
-        gradient=neighbour_differences(grey, BLOCK_ROWS, BLOCK_COLUMNS),
-        bright=float(np.searchsorted(levels, BRIGHT_SHARE * levels[-1])),
-        thumbnail=thumbnail,
-        digest=zlib.crc32(thumbnail.data),
-    )
-
-
-def sweep_facts(seen: Bearings, range_edges: int) -> SweepFacts:
-    """The facts of a sweep whose points lie so, and that has so many range edges."""
-    low, high = BAND_RANGE_RAD
-    bands, sectors = grid_counts(seen.elevation, seen.azimuth, low, high, BANDS, SECTORS)
-    return SweepFacts(bands, sectors, range_edges)
 
 
 def scene_baseline(scenes: Sequence[SceneFacts]) -> SceneBaseline:

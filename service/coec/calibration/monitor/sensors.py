@@ -17,7 +17,8 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.monitor.sensor_faults import PictureFacts, SweepFacts, picture_facts, sweep_facts
+from coec.calibration.monitor.facts import picture_facts, sweep_facts
+from coec.calibration.monitor.sensor_faults import PictureFacts, SweepFacts
 from coec.calibration.types import LidarFrame, Matrix4
 from coec.errors import CalibrationError
 from coec.geometry.bearings import bearings
