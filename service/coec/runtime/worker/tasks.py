@@ -51,7 +51,7 @@ WARM_UP_CAMERA_PX = 128
 """Longer side of the images of the warm-up: kernels are compiled for types, not for sizes, and a few milliseconds of
 work on an image of this size would be more than a second on the camera's own."""
 
-WARM_UP_EVALUATIONS = 4
+WARM_UP_EVALUATIONS, WARM_UP_REACH_DEG = 4, 4.0
 """Of the searches of the warm-up."""
 
 OVERLAY_JPEG_QUALITY = 88
@@ -92,15 +92,17 @@ class Solver:
     def warm_up(self) -> None:
         """Run every kernel once on a few invented points, so that no window waits for a compiler."""
         for pair in self._config.pairs:
-            search = pair.calibration.search.model_copy(update={"max_evaluations": WARM_UP_EVALUATIONS})
+            short = {"max_evaluations": WARM_UP_EVALUATIONS, "reach_deg": WARM_UP_REACH_DEG}
+            search = pair.calibration.search.model_copy(update=short)
             configuration = pair.calibration.model_copy(update={"search": search})
             rig = _small(self._rigs[pair.name])
-            # A check runs every kernel that a calibration runs but two, which its uncertainty takes. An invented one
-            # need not lead anywhere.
+            # Two kernels are those of the uncertainty of a result, and an invented window need not lead to one.
             project(rig.camera, np.ones((1, 3)))
             alignment_of_parts(_one_edge(rig), np.zeros(1, np.uint8), 1, np.eye(4))
             with contextlib.suppress(CalibrationError, DecodeError):
                 diagnose(_invented_window(rig), _Ramp(), self._images, configuration, None)
+            with contextlib.suppress(CalibrationError, DecodeError):
+                calibrate(_invented_window(rig), _Ramp(), self._images, configuration, Silence())
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
