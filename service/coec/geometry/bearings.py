@@ -34,7 +34,10 @@ class Bearings:
 
 def bearings(xyz_m: NDArray[np.float32]) -> Bearings:
     """Of points (N, 3). Angles are right to 5e-7 rad; that of the origin is zero."""
-    return Bearings(*_bearings(np.ascontiguousarray(xyz_m, np.float32)))
+    points_m = np.ascontiguousarray(xyz_m, np.float32).view()
+    # Compiled once, whether a sweep may be written to or not.
+    points_m.setflags(write=False)
+    return Bearings(*_bearings(points_m))
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
