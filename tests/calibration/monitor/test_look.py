@@ -9,8 +9,9 @@ import pytest
 
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.estimators import Sight, sight_of
-from coec.calibration.monitor.check import REACH_RAD, check_at, gather, join, seen_part
+from coec.calibration.monitor.check import check_at, gather, join, seen_part
 from coec.calibration.monitor.check_verdict import diagnose, observe
+from coec.calibration.monitor.neighbourhood import REACH_RAD
 from coec.calibration.monitor.sensors import OUTLINE_RAD, outline, prepare_images, prepare_sweep, union
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.types import CameraFrame, DepthMap, Window
