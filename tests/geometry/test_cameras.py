@@ -517,6 +517,16 @@ def test_impossible_intrinsics_are_refused_by_name(model: str, intrinsics: dict[
         cameras.build(model, **intrinsics)
 
 
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_a_cropped_camera_sees_its_part_of_the_image(camera: Camera) -> None:
+    part = cameras.cropped(camera, 40, 24, 320, 160)
+    rays = np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0], [0.0, 0.0, 2.0]])
+    (whole, valid), (of_part, valid_too) = project(camera, rays), project(part, rays)
+    np.testing.assert_allclose(of_part, whole - [40.0, 24.0], atol=1e-9)
+    np.testing.assert_array_equal(valid, valid_too)
+    assert (part.width, part.height) == (320, 160)
+
+
 def test_scales_must_be_above_zero() -> None:
     with pytest.raises(ValueError, match="scale_y"):
         cameras.scaled(CAMERAS["pinhole"], 1.0, 0.0)

@@ -11,9 +11,10 @@ import numpy as np
 from coec.adapters.files.baseline_file import load_baseline
 from coec.adapters.files.conversions import metric_of
 from coec.calibration.commissioning.baseline import learned_hash, mismatch
+from coec.calibration.commissioning.learning import FAR_RAD
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import gather
-from coec.calibration.monitor.check_verdict import observe
+from coec.calibration.monitor.check_verdict import diagnose
 from coec.cli import calibrate as calibrate_command
 from coec.cli import commission
 from coec.errors import UsageError
@@ -57,7 +58,7 @@ def run(options: Options) -> int:
 
 def _tabulate(rigged: commission.Rigged, options: Options, times: calibrate_command.StageTimes) -> int:
     window = rigged.windows[0]
-    evidence = gather(sight_of(window, rigged.depth, rigged.images, rigged.configuration, times))
+    evidence = gather(sight_of(window, rigged.depth, rigged.images, rigged.configuration, times), FAR_RAD)
     tried = try_detection(
         evidence,
         window.T_camera_lidar_start,
@@ -87,7 +88,7 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
         against = mismatch(baseline, window.rig, rigged.depth.identity, learned_hash(rigged.configuration))
         if against is not None:
             raise UsageError(f"{options.rig} does not hold for this recording: {against}")
-    seen = observe(window, rigged.depth, rigged.images, rigged.configuration, baseline)
+    seen = diagnose(window, rigged.depth, rigged.images, rigged.configuration, baseline)
     wrong = seen.flagged or bool(seen.causes)
     metrics = {metric.name: metric_of(metric) for metric in seen.metrics}
     if options.as_json:

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from coec.adapters.depth.maps import CachedDepth, open_depth
 from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.commissioning.baseline import Baseline, learned_hash
-from coec.calibration.commissioning.learning import learn_accuracy, learn_limits
+from coec.calibration.commissioning.learning import FAR_RAD, learn_accuracy, learn_limits
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.monitor.check import NO_BIAS, ROTATION_DOF, Check, CheckInput, check_at, gather
+from coec.calibration.monitor.check import NO_BIAS, Check, CheckInput, check_at, gather
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, UNCOMMISSIONED, faintness, judge_check
+from coec.calibration.monitor.neighbourhood import ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import CameraFrame, FramePair, Matrix4, Rig, Window
@@ -76,8 +77,8 @@ def commissioned(rig: str) -> Baseline:
     whole = stages[0].window(pairs)
     configuration = _configuration()
     depth = open_depth(configuration.depth, LimitsConfig())
-    evidence = gather(sight_of(whole, depth, GreyImages(LimitsConfig()), configuration, Silence()))
-    rotation, pose = learn_accuracy(evidence, stages[0].truth, configuration)
+    evidence = gather(sight_of(whole, depth, GreyImages(LimitsConfig()), configuration, Silence()), FAR_RAD)
+    rotation, pose = learn_accuracy(evidence, stages[0].truth)
     limits = learn_limits(evidence, stages[0].truth, configuration, (rotation, pose), FALSE_ALARM_RATE)
     return Baseline(
         pair=whole.rig.pair, T_camera_lidar=stages[0].truth, rotation=rotation, pose=pose, dof=ROTATION_DOF, limits={},
@@ -117,7 +118,8 @@ def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tup
     bias = NO_BIAS if baseline is None else baseline.rotation.expected
     starts = range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS)
     windows = [stage.window(stage.pairs[first : first + CHECK_PAIRS]) for first in starts]
-    gathered = [gather(sight_of(window, stage.depth, stage.images, configuration, Silence())) for window in windows]
+    sights = [sight_of(window, stage.depth, stage.images, configuration, Silence()) for window in windows]
+    gathered = [gather(sight, radians(max(turn_deg for _, turn_deg, _ in MOVES))) for sight in sights]
     rows = []
     drawn = zlib.crc32(drive.name.encode())
     rng = np.random.default_rng(drawn)
@@ -126,7 +128,7 @@ def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tup
         if xi is None:
             continue
         pose = se3.perturb(stage.truth, xi)
-        seen = [(evidence, check_at(evidence, pose, configuration, bias)) for evidence in gathered]
+        seen = [(evidence, check_at(evidence, pose, bias)) for evidence in gathered]
         of_any = tuple(_judged(*one, pose, None) for one in seen)
         # The reference moves with what is served: a commissioned rig whose mount has moved.
         of_rig = () if baseline is None else tuple(_judged(*one, pose, baseline) for one in seen)

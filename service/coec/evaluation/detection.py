@@ -19,6 +19,7 @@ from coec.calibration.commissioning.learning import is_flagged, learn_accuracy, 
 from coec.calibration.commissioning.quantiles import normal_quantile
 from coec.calibration.monitor.check import Check, CheckInput, check_at
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS
+from coec.calibration.monitor.depth_witness import ask_depth
 from coec.calibration.types import Matrix4
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
@@ -96,7 +97,8 @@ def try_detection(
     heard: Callable[[int, int], None],
 ) -> list[Tried]:
     """Cuts the pairs, taken as a ring, in two halves `splits` times (seeded), learns on one, and tries `checks` checks
-    after every move on the other; `heard(done, total)` counts the splits.
+    after every move on the other; `heard(done, total)` counts the splits. `evidence` is prepared for poses as far as
+    `FAR_RAD` beside the right one.
 
     Raises:
         CalibrationError: fewer than `MIN_RECORDED` pairs.
@@ -110,7 +112,7 @@ def try_detection(
         order = (int(rng.integers(count)) + np.arange(count)) % count
         learned, kept = sorted(order[: (count + 1) // 2].tolist()), order[(count + 1) // 2 :].tolist()
         of_learned = evidence.of(learned)
-        accuracies = learn_accuracy(of_learned, right, config)
+        accuracies = learn_accuracy(of_learned, right)
         limits = learn_limits(of_learned, right, config, accuracies, FALSE_ALARM_RATE)
         known = [axis for axis in range(3, 6) if accuracies[1].sigma(len(kept))[axis] <= OBSERVABLE_M]
         for name, turn_rad, shift_m in MOVES:
@@ -120,8 +122,10 @@ def try_detection(
                 size = int(rng.integers(MIN_PAIRS, len(kept) + 1))
                 indices = sorted(rng.permutation(kept)[:size].tolist())
                 xi = _move(rng, turn_rad, shift_m, known)
-                seen = check_at(evidence.of(indices), se3.perturb(right, xi), config, accuracies[0].expected)
-                tried.append(Tried(name, is_flagged(seen, *accuracies, limits), limits.of_paper.flags(seen), seen))
+                part, pose = evidence.of(indices), se3.perturb(right, xi)
+                seen = check_at(part, pose, accuracies[0].expected)
+                by_paper = limits.of_paper.flags(ask_depth(part, seen, pose, config))
+                tried.append(Tried(name, is_flagged(seen, *accuracies, limits), by_paper, seen))
         heard(split + 1, splits)
     return tried
 

@@ -12,6 +12,7 @@ from rich.progress import Progress
 from coec.adapters.depth.maps import CachedDepth
 from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.calibrator import calibrate
+from coec.calibration.commissioning.learning import FAR_RAD
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import gather
 from coec.calibration.ports import DepthModel, ImageReader, Silence
@@ -258,7 +259,7 @@ def detected(bench: Bench, splits: int, checks: int, stages: Stages) -> list[Tri
     the others."""
     decode, heard = stages.begin("checks", None), stages.begin("detection", splits)
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
-    evidence = gather(sight_of(window, bench.depth, bench.images, bench.configuration, Silence()))
+    evidence = gather(sight_of(window, bench.depth, bench.images, bench.configuration, Silence()), FAR_RAD)
     decode(1, "")
     return try_detection(
         evidence, bench.reference, bench.configuration, splits, checks, lambda done, _: heard(done, "")

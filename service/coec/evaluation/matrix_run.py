@@ -180,7 +180,8 @@ def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig
         return ()
     truth = stage.drive.truth(stage.pairs[0].stamp_ns)
     window = stage.window(stage.pairs, truth)
-    evidence = gather(sight_of(window, stage.depth, stage.images, configuration, Silence()))
+    most_rad = radians(max(turn_deg for _, turn_deg in MOVES_DEG))
+    evidence = gather(sight_of(window, stage.depth, stage.images, configuration, Silence()), most_rad)
     levels, rows = alarm_levels(MonitorConfig()), []
     for number, (name, turn_deg) in enumerate(MOVES_DEG):
         rng = np.random.default_rng([_number_of(drive.name), 1000 + number])
@@ -189,7 +190,7 @@ def _watched(stage: _Stage, drive: MatrixDrive, configuration: CalibrationConfig
         checks = flagged = blind = alarms = 0
         for first in range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS):
             part = evidence.of(range(first, first + CHECK_PAIRS))
-            seen = judge_check(part, check_at(part, pose, configuration), pose, None)
+            seen = judge_check(part, check_at(part, pose), pose, None)
             stood = tuple(pair.stamp_ns for pair in part.pairs if stands(pair, WindowConfig()))
             before, state = state, after_observation(state, replace(seen, standing_stamps_ns=stood), levels)
             checks += 1

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.adapters.depth.maps import CachedDepth, DepthAhead, PrecomputedDepth, models_folder, open_depth
+from coec.adapters.depth.maps import CachedDepth, PrecomputedDepth, models_folder, open_depth
 from coec.adapters.images.codec import encode_depth_png, encode_png, probe
 from coec.calibration.types import CameraFrame, DepthMap
 from coec.config import DepthConfig, LimitsConfig
@@ -132,19 +132,3 @@ def test_cache_remembers_no_failure() -> None:
 def test_cache_needs_room() -> None:
     with pytest.raises(ValueError, match="at least 1"):
         CachedDepth(_Counting(), entries=0)
-
-
-def test_maps_are_inferred_ahead_in_the_order_of_the_frames() -> None:
-    frames = [_frame(grey) for grey in (1, 2, 3)]
-    with DepthAhead(_Counting(), frames) as ahead:
-        assert [float(ahead.infer(frame).values[0, 0]) for frame in reversed(frames)] == [3.0, 2.0, 1.0]
-        assert ahead.identity == "counting"
-
-
-def test_a_frame_that_cannot_be_inferred_ahead_is_told_when_it_is_asked_for() -> None:
-    wrong = CameraFrame(8, "camera", probe(encode_png(np.zeros((8, 8, 3), np.uint8)), LIMITS))
-    right = _frame(1)
-    with DepthAhead(_Counting(), [wrong, right]) as ahead:
-        with pytest.raises(DecodeError, match="not of this test"):
-            ahead.infer(wrong)
-        assert ahead.infer(right).values[0, 0] == 1.0

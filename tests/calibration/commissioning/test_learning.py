@@ -21,7 +21,7 @@ from coec.calibration.commissioning.quantiles import distance2_quantile
 from coec.calibration.commissioning.verdict_limits import learned
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import CheckInput, gather
-from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, observe
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, diagnose, observe
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import Decision, Estimate, Metric, Rig, Verdict, Window
 from coec.config import CalibrationConfig, LimitsConfig, SearchConfig
@@ -69,7 +69,7 @@ class TestCommission:
     def test_a_check_at_the_commissioned_pose_is_clear_and_at_a_moved_one_is_not(
         self, baseline: Baseline, sharp_street: Window, stereo: DepthModel, images: ImageReader
     ) -> None:
-        right = observe(sharp_street, stereo, images, CONFIG, baseline)
+        right = diagnose(sharp_street, stereo, images, CONFIG, baseline)
         assert not right.flagged
         assert right.flagged_by_paper is not None
         moved = se3.perturb(sharp_street.T_camera_lidar_start, np.radians([0.6, -0.6, 0.5, 0, 0, 0]))
@@ -123,9 +123,7 @@ def test_spread_of_a_pair_is_found_from_checks_at_halves(sharp_street: Window, m
 
     monkeypatch.setattr(learning, "check_at", check_of)
     drives = true * np.random.default_rng(1).normal(size=(100, 48, 6))
-    learned_from = [
-        learn_accuracy(cast(CheckInput, _Scripted(says, sharp_street.rig)), np.eye(4), CONFIG) for says in drives
-    ]
+    learned_from = [learn_accuracy(cast(CheckInput, _Scripted(says, sharp_street.rig)), np.eye(4)) for says in drives]
     variance = np.mean([pose.spread**2 for _, pose in learned_from], axis=0)
     free = learning.BLOCKS - 1
     expected = learning.PRIOR_BLOCKS * PRIOR_SPREAD_POSE**2 + free * true**2
@@ -139,7 +137,7 @@ def test_spread_of_a_pair_is_found_from_checks_at_halves(sharp_street: Window, m
 def test_detection_learns_on_some_pairs_and_tries_others(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
-    evidence = gather(sight_of(sharp_street, stereo, images, CONFIG, Silence()))
+    evidence = gather(sight_of(sharp_street, stereo, images, CONFIG, Silence()), learning.FAR_RAD)
     heard: list[tuple[int, int]] = []
     tried = try_detection(evidence, sharp_street.T_camera_lidar_start, CONFIG, 1, 3, lambda *step: heard.append(step))
     rows = {row.name: row for row in table(tried)}
@@ -174,15 +172,17 @@ def limits_of(says: NDArray[np.float64], rig: Rig, monkeypatch: pytest.MonkeyPat
         offset = evidence.says.mean(axis=0) - se3.difference(pose, np.eye(4))
         return SimpleNamespace(
             pairs=len(evidence.pairs), offset_rotation=np.where(np.arange(6) < 3, offset, 0.0), offset_pose=offset,
-            edges_at_best=20.0, edges_kept=0.99, agreement_rad=0.0, overlap=1.0, mi=1.0, f1=1.0, f2=1.0,
+            edges_at_best=20.0, edges_kept=0.99, overlap=1.0,
         )  # fmt: skip
 
+    def depth_of(*_: object) -> SimpleNamespace:
+        return SimpleNamespace(agreement_rad=0.0, mi=1.0, f1=1.0, f2=1.0)
+
     monkeypatch.setattr(learning, "check_at", check_of)
+    monkeypatch.setattr(learning, "ask_depth", depth_of)
     monkeypatch.setattr(learning, "CHECKS", 12)
     evidence = cast(CheckInput, _Scripted(says, rig))
-    limits = learning.learn_limits(
-        evidence, np.eye(4), CONFIG, learn_accuracy(evidence, np.eye(4), CONFIG), FALSE_ALARM_RATE
-    )
+    limits = learning.learn_limits(evidence, np.eye(4), CONFIG, learn_accuracy(evidence, np.eye(4)), FALSE_ALARM_RATE)
     return limits.max_distance2_rotation, limits.max_farthest2_pose
 
 

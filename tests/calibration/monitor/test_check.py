@@ -11,7 +11,8 @@ from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
-from coec.calibration.monitor.check_verdict import MIN_CONTRAST, MIN_EDGES_IN_VIEW, MIN_LOOKS, judge_check, over_limits
+from coec.calibration.monitor.check_verdict import MIN_EDGES_IN_VIEW, MIN_LOOKS, judge_check, over_limits
+from coec.calibration.monitor.neighbourhood import MIN_CONTRAST
 from coec.calibration.objective.curvature import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.ports import DepthModel, Silence
@@ -52,20 +53,20 @@ def test_are_those_of_the_curvature() -> None:
 
 @pytest.fixture(scope="module")
 def evidence(sharp_street: Window, stereo: DepthModel) -> CheckInput:
-    return gather(sight_of(sharp_street, stereo, GreyImages(LimitsConfig()), CONFIG, Silence()))
+    return gather(sight_of(sharp_street, stereo, GreyImages(LimitsConfig()), CONFIG, Silence()), np.radians(1.0))
 
 
 class TestEdgesKept:
     def test_are_kept_at_the_right_pose_and_lost_to_its_left(self, evidence: CheckInput, sharp_street: Window) -> None:
         right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
-        kept = check_at(evidence, right, CONFIG).edges_kept
-        beside = check_at(evidence, se3.perturb(right, xi), CONFIG).edges_kept
+        kept = check_at(evidence, right).edges_kept
+        beside = check_at(evidence, se3.perturb(right, xi)).edges_kept
         assert kept > 0.9
         assert beside < 0.7 * kept
 
     def test_are_looked_for_where_the_bias_puts_them(self, evidence: CheckInput, sharp_street: Window) -> None:
         right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
-        assert check_at(evidence, se3.perturb(right, xi), CONFIG, -xi).edges_kept > 0.9
+        assert check_at(evidence, se3.perturb(right, xi), -xi).edges_kept > 0.9
 
 
 A_CHECK = Check(
@@ -74,18 +75,13 @@ A_CHECK = Check(
     T_pose=np.eye(4),
     offset_rotation=np.zeros(6),
     offset_pose=np.zeros(6),
-    mi=1.0,
-    first_derivative=np.zeros(6),
-    second_derivative=np.ones(6),
     edges=10.0,
     edges_at_best=10.0,
     edges_in_view=100_000,
     looks=6.0,
     edges_kept=1.0,
     contrast=10.0,
-    agreement_rad=0.0,
     overlap=1.0,
-    deficit=0.0,
 )
 
 

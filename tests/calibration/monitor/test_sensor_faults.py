@@ -26,8 +26,10 @@ from coec.calibration.monitor.sensor_faults import (
     BLOCK_ROWS,
     CAUSES,
     SECTORS,
+    PictureFacts,
     SceneBaseline,
     SceneFacts,
+    SweepFacts,
     data_causes,
     dirty_blocks,
     scene_baseline,
@@ -58,7 +60,7 @@ def drive(sample_data: Path) -> Drive:
     learned = replace(whole, pairs=whole.pairs[::2])
     evidence = gather(sight_of(learned, depth, GreyImages(LimitsConfig()), CalibrationConfig(), Silence()))
     right = whole.rig.T_camera_lidar_nominal
-    rotation, pose = learn_accuracy(evidence, right, CalibrationConfig())
+    rotation, pose = learn_accuracy(evidence, right)
     baseline = Baseline(
         pair=whole.rig.pair, T_camera_lidar=right, rotation=rotation, pose=pose, dof=3, limits={},
         monitor=replace(UNCOMMISSIONED, min_edges_per_pair=10.0), scene=scene_baseline(evidence.scenes),
@@ -157,18 +159,24 @@ class TestScenarios:
 
 def facts(stamp_ns: int = 0, **other: object) -> SceneFacts:
     """A sharp, bright picture of a full scene."""
-    plain = SceneFacts(
-        stamp_ns=stamp_ns,
+    picture = PictureFacts(
         gradient=np.full((BLOCK_ROWS, BLOCK_COLUMNS), 10.0),
         bright=180.0,
         thumbnail=np.random.default_rng(stamp_ns).normal(100, 40, (6, 8)).astype(np.float32),
         digest=stamp_ns,
-        bands=np.full(BANDS, 400, np.int64),
-        sectors=np.full(SECTORS, 400, np.int64),
-        range_edges=1000,
-        speed_mps=8.0,
     )
-    return replace(plain, **other)  # type: ignore[arg-type]
+    sweep = SweepFacts(np.full(BANDS, 400, np.int64), np.full(SECTORS, 400, np.int64), range_edges=1000)
+    return changed(SceneFacts(stamp_ns, picture, sweep, speed_mps=8.0), **other)
+
+
+def changed(scene: SceneFacts, **other: object) -> SceneFacts:
+    """With other figures, of whichever part has them."""
+    of_picture = {name: value for name, value in other.items() if hasattr(scene.picture, name)}
+    of_sweep = {name: value for name, value in other.items() if hasattr(scene.sweep, name)}
+    of_scene = {name: value for name, value in other.items() if name not in of_picture | of_sweep}
+    picture = replace(scene.picture, **of_picture)  # type: ignore[arg-type]
+    sweep = replace(scene.sweep, **of_sweep)  # type: ignore[arg-type]
+    return replace(scene, picture=picture, sweep=sweep, **of_scene)  # type: ignore[arg-type]
 
 
 def drive_of(**other: object) -> list[SceneFacts]:
@@ -196,8 +204,8 @@ class TestFacts:
         spot[:3] = 1.0
         scenes = drive_of()
         blocks = BLOCK_ROWS * BLOCK_COLUMNS
-        assert dirty_blocks([replace(scenes[0], gradient=spot), *scenes[1:]], usual()) == ((), blocks)
-        dirty = dirty_blocks([replace(scene, gradient=spot) for scene in scenes], usual())
+        assert dirty_blocks([changed(scenes[0], gradient=spot), *scenes[1:]], usual()) == ((), blocks)
+        dirty = dirty_blocks([changed(scene, gradient=spot) for scene in scenes], usual())
         assert dirty == (tuple(range(3 * BLOCK_COLUMNS)), blocks)
 
     def test_what_never_had_contrast_cannot_lose_it(self) -> None:
@@ -211,8 +219,8 @@ class TestFacts:
         holes = np.full(BANDS, 400, np.int64)
         holes[:6] = 0
         scenes = drive_of()
-        assert data_causes([replace(scenes[0], bands=holes), *scenes[1:]], usual()) == ()
-        lost = data_causes([replace(scene, bands=holes) for scene in scenes], usual())
+        assert data_causes([changed(scenes[0], bands=holes), *scenes[1:]], usual()) == ()
+        lost = data_causes([changed(scene, bands=holes) for scene in scenes], usual())
         assert [cause.code for cause in lost] == ["lidar_beams_lost"]
 
     def test_every_cause_is_listed_under_its_code(self) -> None:

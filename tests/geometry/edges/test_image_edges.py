@@ -15,6 +15,7 @@ from coec.geometry.edges.image_edges import (
     VOID,
     EdgePyramid,
     EdgeScales,
+    Rectangle,
     _less,
     halved,
 )
@@ -161,6 +162,15 @@ def test_maps_are_standardised_where_pixels_count_and_void_elsewhere(lit: NDArra
         counted = level[np.isfinite(level)]
         assert counted.mean() == pytest.approx(0.0, abs=0.005)
         assert counted.std() == pytest.approx(1.0, abs=0.01)
+
+
+def test_units_are_those_of_the_part_that_is_counted() -> None:
+    part = Rectangle(8, 16, 40, 24)
+    pyramid = EdgeScales(ALL, 0, 1, SLANTED, part).pyramid(picture(1))
+    for level, maps in ((0, pyramid.sharp), (0, pyramid.bands[0]), (1, pyramid.whole), (1, pyramid.bands[1])):
+        counted = strengths(maps)[part.halved(level).slices]
+        assert counted.mean() == pytest.approx(0.0, abs=0.01)
+        assert counted.std() == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_coarse_pixel_counts_only_if_all_four_below_it_do() -> None:

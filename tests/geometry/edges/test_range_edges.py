@@ -155,3 +155,16 @@ def test_an_empty_cloud_has_no_edges(ring: NDArray[np.uint16] | None) -> None:
     edges = range_edges(np.zeros((0, 3), np.float32), ring)
     assert edges.index.shape == (0,)
     assert edges.weight.shape == (0,)
+
+
+@pytest.mark.parametrize("begun", [0, 170])
+@pytest.mark.parametrize("step", [1, -1])
+def test_which_way_a_sensor_turns_and_where_it_begins_changes_nothing(begun: int, step: int) -> None:
+    xyz_m, ring = pole_before_wall(16)
+    per_ring = len(ring) // 16
+    turned = np.roll(np.arange(per_ring)[::step], begun)
+    order = (np.arange(16)[:, None] * per_ring + turned).ravel()
+    known, other = range_edges(xyz_m, ring), range_edges(np.ascontiguousarray(xyz_m[order]), ring[order])
+    assert sorted(order[other.index]) == sorted(known.index)
+    at = np.argsort(order[other.index])
+    np.testing.assert_allclose(other.shift_m[at], known.shift_m[np.argsort(known.index)], atol=1e-5)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import OrderedDict
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from coec.adapters.depth.model_cards import CARDS, ModelCard, built_in_cards, find_card
@@ -81,31 +79,6 @@ class CachedDepth:
                 self._maps.popitem(last=False)
         self._maps.move_to_end(key)
         return known
-
-
-class DepthAhead:
-    """Infers the maps of some frames on a thread of its own, in their order, while edges are found in their images. A
-    context manager; what it did not come to is not inferred after it. Implements `DepthModel`."""
-
-    def __init__(self, model: DepthModel, frames: Iterable[CameraFrame]) -> None:
-        self.identity = model.identity
-        self._pool = ThreadPoolExecutor(1, "depth")
-        self._begun = {id(frame): self._pool.submit(model.infer, frame) for frame in frames}
-
-    def __enter__(self) -> DepthAhead:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(cancel_futures=True)
-
-    def infer(self, frame: CameraFrame) -> DepthMap:
-        """The map of one of the frames.
-
-        Raises:
-            DecodeError: as the wrapped model does.
-            KeyError: it is none of them.
-        """
-        return self._begun[id(frame)].result()
 
 
 def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:

@@ -36,7 +36,7 @@ PIXEL_SHARE = 0.3
 """Share of a pixel that the local optimum may be off for the pixels alone, whatever the scenes of a commissioning say:
 edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
 
-FIGURES = "points-drawn"
+FIGURES = "edges-decide"
 """Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a check at
 the same pairs gives other figures: limits of the old ones would not fit."""
 

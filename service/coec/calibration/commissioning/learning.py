@@ -31,8 +31,10 @@ from coec.calibration.commissioning.equation_2 import PaperLimits, beyond
 from coec.calibration.commissioning.quantiles import chi2_quantile, distance2_quantile, normal_quantile
 from coec.calibration.commissioning.verdict_limits import verdict_limits
 from coec.calibration.estimators import sight_of
-from coec.calibration.monitor.check import POSE_DOF, ROTATION_DOF, Check, CheckInput, check_at, gather
+from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, edges_per_pair, over_limits
+from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
+from coec.calibration.monitor.neighbourhood import POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
 from coec.calibration.types import Matrix4, Window
@@ -136,8 +138,8 @@ def commission(
     whole = _merged(windows)
     rig = whole.rig
     right = rig.T_camera_lidar_nominal if reference is None else reference
-    evidence = gather(sight_of(replace(whole, T_camera_lidar_start=right), depth, images, config, heard))
-    rotation, pose = _accuracies(evidence, right, config, heard)
+    evidence = gather(sight_of(replace(whole, T_camera_lidar_start=right), depth, images, config, heard), FAR_RAD)
+    rotation, pose = _accuracies(evidence, right, heard)
     _check(rotation)
     checks = _Checks(evidence, right, config, rotation.expected, heard)
     clean = checks.left_out(rotation, pose, "right", CHECKS)
@@ -175,9 +177,9 @@ def is_flagged(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorL
     return max(over_limits(seen, rotation, pose, limits)) > 1.0
 
 
-def learn_accuracy(evidence: CheckInput, right: Matrix4, config: CalibrationConfig) -> tuple[Accuracy, Accuracy]:
+def learn_accuracy(evidence: CheckInput, right: Matrix4) -> tuple[Accuracy, Accuracy]:
     """How checks over three and over six degrees of freedom lie about the right pose (4, 4)."""
-    return _accuracies(evidence, right, config, Silence())
+    return _accuracies(evidence, right, Silence())
 
 
 def learn_limits(
@@ -211,16 +213,14 @@ def _merged(windows: Sequence[Window]) -> Window:
     return replace(windows[0], pairs=tuple(pairs))
 
 
-def _accuracies(
-    evidence: CheckInput, right: Matrix4, config: CalibrationConfig, heard: Progress
-) -> tuple[Accuracy, Accuracy]:
+def _accuracies(evidence: CheckInput, right: Matrix4, heard: Progress) -> tuple[Accuracy, Accuracy]:
     """The bias from all pairs, the spread of one pair from checks of halves of them."""
     count = len(evidence.pairs)
-    whole = check_at(evidence, right, config)
+    whole = check_at(evidence, right)
     halves = _halves(count)
     of_halves = []
     for number, half in enumerate(halves, start=1):
-        of_halves.append(check_at(evidence.of(half), right, config))
+        of_halves.append(check_at(evidence.of(half), right))
         heard.step("spread", number, len(halves))
     at_rotation = np.array([seen.offset_rotation for seen in of_halves])
     at_pose = np.array([seen.offset_pose for seen in of_halves])
@@ -284,10 +284,11 @@ def _check(rotation: Accuracy) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LeftOut:
-    """A check at the right pose, and how it lies about where pairs of other times put the rig: squared distance over
-    rotations, and the farthest axis of the pose, as in `Accuracy`."""
+    """A check at the right pose, what depth says there, and how it lies about where pairs of other times put the rig:
+    squared distance over rotations, and the farthest axis of the pose, as in `Accuracy`."""
 
     seen: Check
+    depth: DepthWitness
     distance2_rotation: float
     farthest2_pose: float
 
@@ -311,6 +312,9 @@ class _Checks:
 
     def moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[Check]:
         """`count` checks after a turn and a shift."""
+        return [seen for _, seen in self._moved(turn_rad, shift_m, name, count)]
+
+    def _moved(self, turn_rad: float, shift_m: float, name: str, count: int) -> list[tuple[CheckInput, Check]]:
         rng = np.random.default_rng([SEED, round(turn_rad * 1e6), round(shift_m * 1e6)])
         pairs = len(self._evidence.pairs)
         size = min(CHECK_PAIRS, pairs - 1)
@@ -321,7 +325,8 @@ class _Checks:
             indices = sorted((first + step) % pairs for step in range(size))
             xi = np.concatenate([turn_rad * random_direction(rng), shift_m * random_direction(rng)])
             moved = se3.perturb(self._right, xi)
-            seen.append(check_at(self._evidence.of(indices), moved, self._config, self._bias))
+            part = self._evidence.of(indices)
+            seen.append((part, check_at(part, moved, self._bias)))
             self._heard.step(name, number, count)
         return seen
 
@@ -331,27 +336,27 @@ class _Checks:
         pairs = len(self._evidence.pairs)
         blocks = [block.tolist() for block in np.array_split(np.arange(pairs), FOLDS)]
         if min(len(block) for block in blocks) < MIN_PAIRS:
-            return [self._against(seen, rotation, pose) for seen in self.moved(0.0, 0.0, name, count)]
+            return [self._against(part, seen, rotation, pose) for part, seen in self._moved(0.0, 0.0, name, count)]
         rng = np.random.default_rng([SEED, pairs])
         found: list[_LeftOut] = []
         for fold, block in enumerate(blocks):
             rest = [index for other in blocks if other is not block for index in other]
-            told = check_at(self._evidence.of(rest), self._right, self._config)
+            told = check_at(self._evidence.of(rest), self._right)
             of_rotation = replace(rotation, bias=told.offset_rotation + 0.0 * rotation.bias)
             of_pose = replace(pose, bias=told.offset_pose)
             size = min(CHECK_PAIRS, len(block))
             while len(found) * FOLDS < count * (fold + 1):
                 first = int(rng.integers(0, len(block) - size + 1))
                 part = self._evidence.of(block[first : first + size])
-                seen = check_at(part, self._right, self._config, of_rotation.expected)
-                found.append(self._against(seen, of_rotation, of_pose))
+                seen = check_at(part, self._right, of_rotation.expected)
+                found.append(self._against(part, seen, of_rotation, of_pose))
                 self._heard.step(name, len(found), count)
         return found
 
-    @staticmethod
-    def _against(seen: Check, rotation: Accuracy, pose: Accuracy) -> _LeftOut:
+    def _against(self, part: CheckInput, seen: Check, rotation: Accuracy, pose: Accuracy) -> _LeftOut:
         return _LeftOut(
             seen,
+            ask_depth(part, seen, self._right, self._config),
             rotation.distance2(seen.offset_rotation, seen.pairs),
             pose.farthest2(seen.offset_pose, seen.pairs),
         )
@@ -378,8 +383,8 @@ def _monitor_limits(
     edges = float(np.min([edges_per_pair(seen) for seen in clean]))
     lost = float(np.median([edges_per_pair(seen) for seen in far]))
     kept = float(np.min([seen.edges_kept for seen in clean]))
-    of_paper = PaperLimits.learned(clean, rate)
-    agreement = beyond([seen.agreement_rad for seen in clean], normal_quantile(1.0 - rate / 3.0))
+    of_paper = PaperLimits.learned([one.depth for one in left_out], rate)
+    agreement = beyond([one.depth.agreement_rad for one in left_out], normal_quantile(1.0 - rate / 3.0))
     return MonitorLimits(
         max_distance2_rotation=_between(right_rotation, min(turned)),
         max_farthest2_pose=_between(right_pose, min(shifted)),

@@ -17,6 +17,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.geometry.picture import square_sums
+
 Grid = NDArray[np.float64]
 Cells = NDArray[np.bool_]
 Value = TypeVar("Value", np.bool_, np.int64)
@@ -190,10 +192,7 @@ def lit_pixels(greys: Iterable[NDArray[np.uint8]]) -> Cells | None:
 
 def cell_means(grey: NDArray[np.uint8], cell_px: int) -> Grid:
     """Mean of every full cell; a remainder at the right and the bottom is left out."""
-    rows, columns = grey.shape[0] // cell_px, grey.shape[1] // cell_px
-    # Rows first: long sums of neighbours in memory.
-    of_rows = grey[: rows * cell_px, : columns * cell_px].reshape(rows, cell_px, -1).sum(axis=1, dtype=np.uint32)
-    return np.asarray(of_rows.reshape(rows, columns, cell_px).sum(axis=2) / cell_px**2)
+    return np.asarray(square_sums(grey, cell_px) / cell_px**2)
 
 
 def _at_pixels(cells: Cells, cell_px: int, width: int, height: int) -> Cells:

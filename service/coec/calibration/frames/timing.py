@@ -16,10 +16,9 @@ import numpy as np
 
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.monitor.sensor_faults import EGO_MOTION_WRONG, TIME_OFFSET, Cause
-from coec.calibration.types import EgoMotion, FramePair, LidarFrame, Matrix4, Rig
+from coec.calibration.types import EgoMotion, FramePair, Matrix4, Rig
 from coec.geometry.cameras import pixel_rad
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
-from coec.geometry.edges.range_edges import range_edges
 
 OFFSETS_S = (-0.2, -0.15, -0.1, -0.075, -0.05, -0.03, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2)
 """Clock errors that are tried: up to two periods of a 10 Hz sensor."""
@@ -43,22 +42,21 @@ MIN_SPEED_MPS = 1.0
 
 
 def explained_by_motion(
-    pairs: Sequence[FramePair], rig: Rig, level: EdgeFrames, expected: Matrix4, found: Matrix4, min_significance: float
+    edges: Sequence[FramePair], rig: Rig, level: EdgeFrames, expected: Matrix4, found: Matrix4, min_significance: float
 ) -> Cause | None:
     """The clock or ego-motion that explains the images better than the extrinsic alone; None if none does, or none can
     be tried for want of motion.
 
     Args:
-        pairs: of a check.
-        level: their range edges and edge maps, on one level.
+        edges: the pairs of a check with nothing of their sweeps but the range edges of `level`, as measured.
+        level: these, placed, and edge maps, on one level.
         expected: (4, 4) where the local optimum should be.
         found: (4, 4) where it is.
         min_significance: below this nothing is explained.
     """
-    moving = [pair for pair in pairs if pair.motion is not None and pair.motion.reaches(MIN_SPEED_MPS)]
-    if 2 * len(moving) < len(pairs):
+    moving = [pair for pair in edges if pair.motion is not None and pair.motion.reaches(MIN_SPEED_MPS)]
+    if 2 * len(moving) < len(edges):
         return None
-    edges = [_edges_only(pair) for pair in pairs]
     null, at_found = frame_alignment(level, expected).significance, frame_alignment(level, found)
     to_beat = at_found.significance
     least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
@@ -81,15 +79,6 @@ def _hypotheses(edges: Sequence[FramePair]) -> Iterator[tuple[list[FramePair], C
         yield [_shifted(pair, seconds) for pair in edges], TIME_OFFSET
     for factor in SCALES:
         yield [_scaled(pair, factor) for pair in edges], EGO_MOTION_WRONG
-
-
-def _edges_only(pair: FramePair) -> FramePair:
-    """The pair with nothing of the sweep but its range edges."""
-    lidar, edges = pair.lidar, range_edges(pair.lidar.xyz_m, pair.lidar.ring)
-    offsets_s = None if lidar.time_offset_s is None else lidar.time_offset_s[edges.index]
-    xyz_m = lidar.xyz_m[edges.index] + edges.shift_m
-    sweep = LidarFrame(lidar.stamp_ns, lidar.frame_id, xyz_m, time_offset_s=offsets_s)
-    return replace(pair, lidar=sweep)
 
 
 def _shifted(pair: FramePair, seconds: float) -> FramePair:

@@ -7,6 +7,7 @@ between the pose and the local optimum of both witnesses.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 from math import degrees, inf
 
@@ -25,7 +26,9 @@ from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.timing import explained_by_motion
 from coec.calibration.monitor.change_detector import Observation
-from coec.calibration.monitor.check import NO_BIAS, POSE_DOF, ROTATION_DOF, Check, CheckInput, check_at, gather
+from coec.calibration.monitor.check import NO_BIAS, Check, CheckInput, check_at, gather
+from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
+from coec.calibration.monitor.neighbourhood import MIN_CONTRAST, POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import data_causes, dirty_blocks
 from coec.calibration.ports import DepthModel, ImageReader, Silence
 from coec.calibration.types import FramePair, Matrix4, Metric, Window
@@ -43,12 +46,6 @@ MIN_PAIRS = 4
 LOST_EDGES_SHARE = 0.25
 """Of the limits of the squared distances, where the edges are lost at the pose. Standard deviations are
 those of a rig's checks at large; how sharply this scene tells the pose, its edges know."""
-
-MIN_CONTRAST = 4.7
-"""Standard deviations by which the local optimum stands out from other poses, below which its edges count as faint: the
-best of some thousand poses stands out by 3.5 by chance. Of 160 otherwise clear checks of right mounts on simulated
-drives 9 were less, among them the three that lay farthest off (0.3 to 0.5°, at 4.3 to 4.6), and of 63 on drives that
-this was not chosen on none; those of the sample recordings are at 6 to 17."""
 
 MIN_EDGES_IN_VIEW = 150.0
 """Range edges in view, per pair, below which a check's edges count as faint, too, however well they fit: with fewer, a
@@ -87,16 +84,60 @@ def observe(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
 ) -> Observation:
     """A check of the extrinsic at which `window` starts, with all its pairs: five to ten of the latest, in motion.
+    Depth is asked where the edges accuse the pose, or are too faint to tell.
 
     Raises:
         CalibrationError: fewer than `MIN_PAIRS` pairs, or an image or its depth cannot be decoded.
     """
+    evidence, seen = _look(window, depth, images, config, baseline)
+    pose = window.T_camera_lidar_start
+    told = judge_check(evidence, seen, pose, baseline)
+    if told.causes or not (told.flagged or told.weak):
+        return told
+    return with_depth(told, ask_depth(evidence, seen, pose, config), baseline)
+
+
+def diagnose(
+    window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
+) -> Observation:
+    """The same with both witnesses, whatever the edges say: for who asks once.
+
+    Raises:
+        CalibrationError: as `observe`.
+    """
+    evidence, seen = _look(window, depth, images, config, baseline)
+    pose = window.T_camera_lidar_start
+    told = judge_check(evidence, seen, pose, baseline)
+    return with_depth(told, ask_depth(evidence, seen, pose, config), baseline)
+
+
+def _look(
+    window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
+) -> tuple[CheckInput, Check]:
     if len(window.pairs) < MIN_PAIRS:
         raise CalibrationError(f"a check needs {MIN_PAIRS} pairs, there are {len(window.pairs)}")
     evidence = gather(sight_of(window, depth, images, config, Silence()))
-    pose = window.T_camera_lidar_start
     bias = NO_BIAS if baseline is None else baseline.rotation.expected
-    return judge_check(evidence, check_at(evidence, pose, config, bias), pose, baseline)
+    return evidence, check_at(evidence, window.T_camera_lidar_start, bias)
+
+
+def with_depth(told: Observation, depth: DepthWitness, baseline: Baseline | None) -> Observation:
+    """A check with what depth says of its pose: figures for who reads them, and the paper's verdict. The edges have
+    decided."""
+    limits = UNCOMMISSIONED if baseline is None else baseline.monitor
+    return replace(
+        told,
+        metrics=(
+            Metric("mi", depth.mi, limits.min_mi, at_least=True),
+            Metric("f1", depth.f1, limits.max_f1, at_least=False),
+            Metric("f2", depth.f2, limits.min_f2, at_least=True),
+            Metric("agreement_deg", degrees(depth.agreement_rad), degrees(limits.max_agreement_rad), at_least=False),
+            *told.metrics,
+        ),
+        flagged_by_paper=None if baseline is None else limits.of_paper.flags(depth),
+        first_derivative=depth.first_derivative,
+        second_derivative=depth.second_derivative,
+    )
 
 
 def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Baseline | None) -> Observation:
@@ -113,9 +154,9 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
     if not causes and not faint & {Faint.EDGES_IN_VIEW, Faint.LOOKS}:
         # What few edges fit, another clock fits as well as another mount.
         explained = explained_by_motion(
-            evidence.pairs,
+            evidence.edges.measured,
             evidence.rig,
-            evidence.edges.whole,
+            evidence.edges.whole.frames,
             se3.perturb(pose, rotation.expected),
             seen.T_rotation,
             limits.min_edges_per_pair * float(np.sqrt(seen.pairs)),
@@ -133,10 +174,8 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
         distance2=max(of_rotation, of_pose),
         flagged=flagged,
         weak=bool(faint),
-        flagged_by_paper=None if baseline is None else limits.of_paper.flags(seen),
+        flagged_by_paper=None,
         causes=causes,
-        first_derivative=seen.first_derivative,
-        second_derivative=seen.second_derivative,
         drift=None if baseline is None else _drift(seen, baseline),
         dirty=dirty,
         textured=textured,
@@ -189,14 +228,10 @@ def _drift(seen: Check, baseline: Baseline) -> Drift:
 
 def _metrics(seen: Check, of_rotation: float, of_pose: float, limits: MonitorLimits) -> tuple[Metric, ...]:
     return (
-        Metric("mi", seen.mi, limits.min_mi, at_least=True),
-        Metric("f1", seen.f1, limits.max_f1, at_least=False),
-        Metric("f2", seen.f2, limits.min_f2, at_least=True),
         Metric("distance_rotation", of_rotation, 1.0, at_least=False),
         Metric("distance_pose", of_pose, 1.0, at_least=False),
         Metric("edge_score", seen.edges, -inf, at_least=True),
         Metric("edges_per_pair", edges_per_pair(seen), limits.min_edges_per_pair, at_least=True),
         Metric("edges_kept", seen.edges_kept, limits.min_edges_kept, at_least=True),
-        Metric("agreement_deg", degrees(seen.agreement_rad), degrees(limits.max_agreement_rad), at_least=False),
         Metric("overlap", seen.overlap, limits.min_overlap, at_least=True),
     )

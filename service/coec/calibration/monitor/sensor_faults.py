@@ -7,18 +7,14 @@ the vehicle. Each cause needs most pairs of a check, so that one bad frame is no
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.ego_mask import cell_means
-from coec.calibration.types import INTRINSICS_OFF, FramePair, Reason
-from coec.geometry.vectors import lengths
+from coec.calibration.types import INTRINSICS_OFF, Reason
 
 BLOCK_ROWS, BLOCK_COLUMNS = 18, 32
 """The image is judged in blocks: dirt covers some of them, a covered lens all."""
@@ -43,9 +39,6 @@ is."""
 
 DIRTY_CHECKS = 3.5
 """Independent checks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
-
-THUMBNAIL_CELL_PX = 8
-"""Pixels a side that are one of the thumbnail by which pictures are compared."""
 
 SAME_PICTURE = 0.01
 """Mean absolute difference of two exposures over the standard deviation of their grey values below which they are the
@@ -114,28 +107,44 @@ CAUSES = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SceneFacts:
-    """What one pair shows of the sensors themselves.
+class PictureFacts:
+    """What one image shows of the camera itself.
 
     Attributes:
         gradient: (BLOCK_ROWS, BLOCK_COLUMNS) mean absolute difference of neighbouring grey values.
         bright: grey value below which nine pixels in ten lie.
-        thumbnail: float32, mean grey values of cells of `THUMBNAIL_CELL_PX`.
-        digest: of the pixels.
-        bands: (BANDS,) points by elevation.
-        sectors: (SECTORS,) the same points by azimuth.
-        range_edges: range edges of the sweep.
-        speed_mps: of the vehicle; None = unknown.
+        thumbnail: float32, mean grey values of small cells.
+        digest: of the thumbnail.
     """
 
-    stamp_ns: int
     gradient: NDArray[np.float64]
     bright: float
     thumbnail: NDArray[np.float32]
     digest: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepFacts:
+    """What one sweep shows of the LiDAR itself.
+
+    Attributes:
+        bands: (BANDS,) points by elevation.
+        sectors: (SECTORS,) the same points by azimuth.
+        range_edges: range edges of the sweep.
+    """
+
     bands: NDArray[np.int64]
     sectors: NDArray[np.int64]
     range_edges: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneFacts:
+    """What one pair shows of the sensors themselves; `speed_mps` is that of the vehicle, None = unknown."""
+
+    stamp_ns: int
+    picture: PictureFacts
+    sweep: SweepFacts
     speed_mps: float | None
 
 
@@ -149,42 +158,22 @@ class SceneBaseline:
     range_edges: float
 
 
-def scene_facts(pair: FramePair, grey: NDArray[np.uint8], range_edges: int) -> SceneFacts:
-    """The facts of a pair whose image is `grey` (h, w) and whose sweep has so many range edges."""
-    xyz_m = pair.lidar.xyz_m
-    range_m = np.maximum(lengths(xyz_m), 1e-6)
-    elevation = np.arcsin(np.clip(xyz_m[:, 2] / range_m, -1.0, 1.0))
-    downwards = (elevation >= BAND_RANGE_RAD[0]) & (elevation <= BAND_RANGE_RAD[1])
-    azimuth = np.arctan2(xyz_m[downwards, 1], xyz_m[downwards, 0])
-    return SceneFacts(
-        stamp_ns=pair.stamp_ns,
-        gradient=_block_gradients(grey),
-        bright=float(np.quantile(grey[::4, ::4], 0.9)),
-        thumbnail=cell_means(grey, THUMBNAIL_CELL_PX).astype(np.float32),
-        digest=zlib.crc32(np.ascontiguousarray(grey).data),
-        bands=np.histogram(elevation, BANDS, BAND_RANGE_RAD)[0].astype(np.int64),
-        sectors=np.histogram(azimuth, SECTORS, (-pi, pi))[0].astype(np.int64),
-        range_edges=range_edges,
-        speed_mps=None if pair.motion is None else pair.motion.speed_mps,
-    )
-
-
 def scene_baseline(scenes: Sequence[SceneFacts]) -> SceneBaseline:
     """Medians over the pairs that commissioned a rig."""
     return SceneBaseline(
-        gradient=np.median([scene.gradient for scene in scenes], axis=0),
-        bands=np.median([scene.bands for scene in scenes], axis=0),
-        sectors=np.median([scene.sectors for scene in scenes], axis=0),
-        range_edges=float(np.median([scene.range_edges for scene in scenes])),
+        gradient=np.median([scene.picture.gradient for scene in scenes], axis=0),
+        bands=np.median([scene.sweep.bands for scene in scenes], axis=0),
+        sectors=np.median([scene.sweep.sectors for scene in scenes], axis=0),
+        range_edges=float(np.median([scene.sweep.range_edges for scene in scenes])),
     )
 
 
 def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) -> tuple[Cause, ...]:
     """Every reason in the frames themselves not to believe a check of them, those that hide others first. Lost beams
     are seen against a commissioned rig only, dirt only over several checks."""
-    gradient = np.array([scene.gradient for scene in scenes])
+    gradient = np.array([scene.picture.gradient for scene in scenes])
     causes = []
-    dark = float(np.median([scene.bright for scene in scenes])) < DARK_LEVEL
+    dark = float(np.median([scene.picture.bright for scene in scenes])) < DARK_LEVEL
     if dark:
         causes.append(DARK)
     elif float((gradient.max(axis=0) < FLAT_GRADIENT).mean()) > COVERED_SHARE:
@@ -194,13 +183,13 @@ def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) ->
     if (
         baseline is not None
         and max(
-            _lost(np.array([scene.bands for scene in scenes]), baseline.bands),
-            _lost(np.array([scene.sectors for scene in scenes]), baseline.sectors),
+            _lost(np.array([scene.sweep.bands for scene in scenes]), baseline.bands),
+            _lost(np.array([scene.sweep.sectors for scene in scenes]), baseline.sectors),
         )
         > LOST_SHARE
     ):
         causes.append(BEAMS_LOST)
-    edges = float(np.median([scene.range_edges for scene in scenes]))
+    edges = float(np.median([scene.sweep.range_edges for scene in scenes]))
     few = OPEN_FIELD_EDGES if baseline is None else max(OPEN_FIELD_EDGES, OPEN_FIELD_RATIO * baseline.range_edges)
     if edges < few and not causes:
         causes.append(OPEN_FIELD)
@@ -211,7 +200,7 @@ def dirty_blocks(scenes: Sequence[SceneFacts], baseline: SceneBaseline) -> tuple
     """Blocks of the image, by their number, that are dirty for all that these pairs show, and of how many that can
     be."""
     textured = baseline.gradient >= TEXTURED_GRADIENT
-    sharpest = np.max([scene.gradient for scene in scenes], axis=0)
+    sharpest = np.max([scene.picture.gradient for scene in scenes], axis=0)
     dirty = textured & (sharpest < DIRTY_RATIO * baseline.gradient)
     return tuple(int(block) for block in np.flatnonzero(dirty)), int(textured.sum())
 
@@ -239,23 +228,10 @@ def _moved(a: SceneFacts, b: SceneFacts) -> bool:
 
 
 def _same_picture(a: SceneFacts, b: SceneFacts) -> bool:
-    if a.digest == b.digest:
+    one, other = a.picture, b.picture
+    if one.digest == other.digest:
         return True
-    if a.thumbnail.shape != b.thumbnail.shape or a.speed_mps is None:
+    if one.thumbnail.shape != other.thumbnail.shape or a.speed_mps is None:
         return False
-    contrast = max(float(a.thumbnail.std()), 1.0)
-    return float(np.abs(a.thumbnail - b.thumbnail).mean()) < SAME_PICTURE * contrast
-
-
-def _block_gradients(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
-    rows, columns = grey.shape[0] // BLOCK_ROWS, grey.shape[1] // BLOCK_COLUMNS
-    whole = grey[: rows * BLOCK_ROWS, : columns * BLOCK_COLUMNS]
-    sums = np.empty((BLOCK_ROWS, BLOCK_COLUMNS), np.int64)
-    # A row of blocks at a time stays in the cache; the first pixels of the next belong to its last differences.
-    for block in range(BLOCK_ROWS):
-        values = whole[block * rows : (block + 1) * rows + 1].astype(np.int16)
-        across, down = np.abs(np.diff(values[:rows], axis=1)), np.abs(np.diff(values, axis=0))
-        of_columns = down.sum(axis=0, dtype=np.int64)
-        of_columns[:-1] += across.sum(axis=0, dtype=np.int64)
-        sums[block] = of_columns.reshape(BLOCK_COLUMNS, columns).sum(axis=1)
-    return np.asarray(sums / (rows * columns))
+    contrast = max(float(one.thumbnail.std()), 1.0)
+    return float(np.abs(one.thumbnail - other.thumbnail).mean()) < SAME_PICTURE * contrast

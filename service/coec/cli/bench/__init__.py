@@ -26,7 +26,7 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.objective.mutual_information import MutualInformation, SearchBox
 from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import box_of, maximise
-from coec.cli.bench import live, rig, rows, scene, worker
+from coec.cli.bench import live, look, rig, rows, scene, worker
 from coec.cli.calibrate import StageTimes
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
 from coec.geometry import se3
@@ -116,6 +116,7 @@ def measure(bars: Progress) -> dict[str, Any]:
     document["solve_10deg_3dof_s"] = min(times)
     document["solve_10deg_3dof_evaluations"] = found.evaluations
     document["solve_10deg_3dof_error_deg"] = windows.rotation_error_deg(found.T_camera_lidar, pose)
+    document |= look.measure(lambda text: bars.update(task, description=text))
     return document | measure_fused(bars)
 
 

@@ -12,7 +12,7 @@ from coec.geometry.cameras.mei import Mei
 from coec.geometry.cameras.pinhole import Pinhole
 from coec.geometry.cameras.radtan import RadTan
 from coec.geometry.cameras.rational import Rational
-from coec.geometry.cameras.registry import MODELS, Camera, Model, build, intrinsics_of, name_of, scaled
+from coec.geometry.cameras.registry import MODELS, Camera, Model, build, cropped, intrinsics_of, name_of, scaled
 from coec.geometry.cameras.view import domain_angle_rad, in_image, pixel_rad
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "RadTan",
     "Rational",
     "build",
+    "cropped",
     "domain_angle_rad",
     "image_point",
     "in_image",

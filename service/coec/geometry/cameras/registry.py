@@ -88,6 +88,12 @@ def intrinsics_of(camera: Camera) -> dict[str, float | int]:
     return {name: fields[name] for name in model_of(type(camera)).parameters}
 
 
+def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
+    """The camera of a part of its image: so many columns and rows (above zero, else ValueError) from there on."""
+    part = {"width": width, "height": height, "cx": camera.cx - left, "cy": camera.cy - top}
+    return build(name_of(camera), **intrinsics_of(camera) | part)
+
+
 def scaled(camera: Camera, scale_x: float, scale_y: float) -> Camera:
     """The camera of an image that was resized by these factors (above zero, else ValueError).
 

@@ -113,6 +113,36 @@ def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.
     )
 
 
+def smooth_significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """z at many poses (K, 4, 4), with e interpolated between pixels: (K,). To the last bits that of
+    `frame_alignment`."""
+    return np.asarray(_smooth_z(frames.camera, poses, frames.xyz_m, frames.weight, frames.first_point, frames.maps))
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _smooth_z(
+    camera: Camera,
+    poses: NDArray[np.float64],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.int8],
+) -> NDArray[np.float64]:
+    frames = first_point.shape[0] - 1
+    sums = np.empty((poses.shape[0], frames, 2))
+    for task in prange(poses.shape[0] * frames):
+        k, f = task // frames, task % frames
+        sums[k, f] = _smooth_sums_of_frame(camera, poses[k], xyz, weight, first_point[f], first_point[f + 1], maps[f])
+    z = np.empty(poses.shape[0])
+    for k in range(poses.shape[0]):
+        strength, square = 0.0, 0.0
+        for f in range(frames):
+            strength += sums[k, f, 0]
+            square += sums[k, f, 1]
+        z[k] = strength / math.sqrt(max(square, LEAST_SQUARE))
+    return z
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
 def _smooth_sums(
     camera: Camera,
@@ -125,22 +155,36 @@ def _smooth_sums(
     frames = first_point.shape[0] - 1
     sums = np.zeros((frames, 2))
     for f in prange(frames):
-        strength, square = 0.0, 0.0
-        u, v, place = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.int32)
-        edges = maps[f].ravel()
-        for begin in range(first_point[f], first_point[f + 1], BLOCK):
-            end = min(begin + BLOCK, first_point[f + 1])
-            _pixels(camera, T, xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end], u, v)
-            _split(camera, u[: end - begin], v[: end - begin], place)
-            for i in range(end - begin):
-                if place[i] >= 0:
-                    e, seen = _between(edges, camera.width, place[i], u[i], v[i])
-                    if seen:
-                        w = float(weight[begin + i])
-                        strength += w * e
-                        square += w * w
-        sums[f, 0], sums[f, 1] = strength / STRENGTH_STEPS, square
+        sums[f] = _smooth_sums_of_frame(camera, T, xyz, weight, first_point[f], first_point[f + 1], maps[f])
     return sums
+
+
+@njit(cache=True, error_model="numpy")
+def _smooth_sums_of_frame(
+    camera: Camera,
+    T: NDArray[np.float64],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first: int,
+    last: int,
+    edge_map: NDArray[np.int8],
+) -> tuple[float, float]:
+    """Σ w·e and Σ w² over the range edges of one frame, those from `first` to before `last`."""
+    strength, square = 0.0, 0.0
+    u, v, place = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.int32)
+    edges = edge_map.ravel()
+    for begin in range(first, last, BLOCK):
+        end = min(begin + BLOCK, last)
+        _pixels(camera, T, xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end], u, v)
+        _split(camera, u[: end - begin], v[: end - begin], place)
+        for i in range(end - begin):
+            if place[i] >= 0:
+                e, seen = _between(edges, camera.width, place[i], u[i], v[i])
+                if seen:
+                    w = float(weight[begin + i])
+                    strength += w * e
+                    square += w * w
+    return strength / STRENGTH_STEPS, square
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -29,7 +29,7 @@ lines, and what they belong to crosses those. Not less: roofs and kerbs, which s
 (without them, roll scatters by a third more on simulated drives), and slow traffic under a bridge is mostly such
 edges."""
 
-SAMPLES = 100_000
+SAMPLES = 25_000
 """Pixels of an image from which that quantile (flat ones apart) and the mean gradient are taken."""
 
 MEAN_RADIUS_PX = 20
@@ -39,8 +39,14 @@ FLOOR_SHARE = 0.25
 """Added to the local mean, as a share of the mean of the whole image: noise of flat regions is not blown up to
 edges."""
 
+BLUR_ROWS = 32
+"""Rows that are blurred at a time: with those around them they stay in the cache between the two directions."""
+
 STRIP_ROWS = 128
 """Rows whose local means are carried from one to the next, three times as many as a mean spans."""
+
+GAIN_SQUARE_PX = 16
+"""Side of the squares in which a mask is looked at: more than a blur reaches."""
 
 LEAST_SHARE = 1e-3
 """Least weight of the pixels that count under a blur, where hardly any does."""
@@ -89,11 +95,42 @@ class EdgePyramid:
     sharp: NDArray[np.int8]
 
 
+@dataclass(frozen=True, slots=True)
+class Rectangle:
+    """A part of an image: where it begins and how large it is, pixels."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Of an array (h, w)."""
+        return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
+
+    def halved(self, times: int) -> Rectangle:
+        """The same part at a resolution that was halved so many times; a pixel at least."""
+        left, top = self.left >> times, self.top >> times
+        return Rectangle(left, top, max(self.width >> times, 1), max(self.height >> times, 1))
+
+    def within(self, other: Rectangle) -> Rectangle:
+        """The same part, seen from where another begins."""
+        return Rectangle(self.left - other.left, self.top - other.top, self.width, self.height)
+
+
 class EdgeScales:
     """How the images of one camera become pyramids, one after the other: what they share, the mask at every level, is
     dealt with once."""
 
-    def __init__(self, lit: NDArray[np.bool_], finest: int, coarsest: int, upright: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        lit: NDArray[np.bool_],
+        finest: int,
+        coarsest: int,
+        upright: NDArray[np.float64],
+        counted: Rectangle | None = None,
+    ) -> None:
         """
         Args:
             lit: (h, w) bool; False = ignore this pixel.
@@ -101,7 +138,9 @@ class EdgeScales:
             coarsest: halvings of the resolution of the last level.
             upright: (2,) right and down, what the image shows of a unit vector along the axis of the LiDAR; nothing
                 where the camera looks along it, and no gradient counts less.
+            counted: the part of the images from which mean and deviation of the maps are taken; None: all.
         """
+        self._counted = Rectangle(0, 0, lit.shape[1], lit.shape[0]) if counted is None else counted
         self._upright = upright.astype(np.float32)
         self._inner = _eroded(lit)
         self._finest = finest
@@ -131,22 +170,32 @@ class EdgeScales:
             edges = [halved(edges[0])]
         for _ in self._lit[1:]:
             edges.append(halved(edges[-1]))
-        along = self._gradient.reshape(-1)[: edges[0].size].reshape(edges[0].shape)  # the gradient is done with
         wider = [
-            _smoothed(level, lit, gain, _BLUR, np.empty_like(level), np.empty_like(level))
+            _smoothed(level, lit, gain, _BLUR, np.empty_like(level))
             for level, lit, gain in zip(edges[1:], self._lit[1:], self._gain[1:], strict=True)
         ]
-        sharp = _smoothed(edges[0], self._lit[0], self._sharp_gain, _SHARP, along, self._smooth)
-        sharp_map = _standardised(_less(sharp, wider[0]), self._lit[0])
-        smooth = _smoothed(edges[0], self._lit[0], self._gain[0], _BLUR, along, self._smooth)
+        sharp = _smoothed(edges[0], self._lit[0], self._sharp_gain, _SHARP, self._smooth)
+        sharp_map = self._standardised(_less(sharp, wider[0]), 0)
+        smooth = _smoothed(edges[0], self._lit[0], self._gain[0], _BLUR, self._smooth)
         return EdgePyramid(
-            whole=_standardised(halved(smooth), self._lit[1]),
+            whole=self._standardised(halved(smooth), 1),
             bands=tuple(
-                _standardised(_less(fine, coarse), lit)
-                for (fine, coarse), lit in zip(pairwise([smooth, *wider]), self._lit, strict=False)
+                self._standardised(_less(fine, coarse), level)
+                for level, (fine, coarse) in enumerate(pairwise([smooth, *wider]))
             ),
             sharp=sharp_map,
         )
+
+    def _standardised(self, values: NDArray[np.float32], level: int) -> NDArray[np.int8]:
+        """In whole steps of `STRENGTH_STEPS` to a deviation from the mean over the pixels that count; `VOID` where
+        masked."""
+        lit, part = self._lit[level], self._counted.halved(self._finest + level).slices
+        count, total, square = (math.fsum(column) for column in _row_sums(values[part], lit[part]).T)
+        mean, mean_square = total / max(count, 1.0), square / max(count, 1.0)
+        variance = mean_square - mean * mean
+        # A map that does not vary beyond rounding has no edges.
+        steps = STRENGTH_STEPS / math.sqrt(variance) if variance > 1e-12 * mean_square else 0.0
+        return _stepped(values, lit, np.float32(mean), np.float32(steps))
 
 
 def _gain(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -157,10 +206,47 @@ def _gain(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.flo
     return _gain_over(lit, kernel)
 
 
+@njit(cache=True, parallel=True)
 def _gain_over(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
-    one = np.ones(lit.shape, np.float32)
-    share = _smoothed(one, lit, one, kernel, np.empty_like(one), np.empty_like(one))
-    return np.asarray(1.0 / np.maximum(share, LEAST_SHARE), np.float32)
+    """By squares: far from the border of a mask every pixel is the same, and most squares are far from it."""
+    h, w = lit.shape
+    taps, side = kernel.shape[0] - 1, GAIN_SQUARE_PX
+    rows, columns = -(-h // side), -(-w // side)
+    counts = np.zeros((rows, columns), np.int64)
+    for row in prange(rows):
+        for y in range(row * side, min((row + 1) * side, h)):
+            for x in range(w):
+                counts[row, x // side] += lit[y, x]
+    whole = kernel[0] + np.float32(2.0) * kernel[1:].sum()
+    gain = np.empty((h, w), np.float32)
+    for row in prange(rows):
+        top, bottom = row * side, min((row + 1) * side, h)
+        along = np.empty((side + 2 * taps, side), np.float32)
+        for column in range(columns):
+            left, right = column * side, min((column + 1) * side, w)
+            around, most = 0, 0
+            for i in range(max(row - 1, 0), min(row + 2, rows)):
+                for j in range(max(column - 1, 0), min(column + 2, columns)):
+                    around += counts[i, j]
+                    most += (min((i + 1) * side, h) - i * side) * (min((j + 1) * side, w) - j * side)
+            if around == 0 or around == most:
+                share = whole if around > 0 else np.float32(0.0)
+                gain[top:bottom, left:right] = np.float32(1.0) / max(share, np.float32(LEAST_SHARE))
+                continue
+            for i in range(bottom - top + 2 * taps):
+                y = min(max(top + i - taps, 0), h - 1)
+                for x in range(left, right):
+                    share = kernel[0] * lit[y, x]
+                    for k in range(1, taps + 1):
+                        share += kernel[k] * (np.float32(lit[y, max(x - k, 0)]) + np.float32(lit[y, min(x + k, w - 1)]))
+                    along[i, x - left] = share
+            for y in range(top, bottom):
+                for x in range(right - left):
+                    share = kernel[0] * along[y - top + taps, x]
+                    for k in range(1, taps + 1):
+                        share += kernel[k] * (along[y - top + taps - k, x] + along[y - top + taps + k, x])
+                    gain[y, left + x] = np.float32(1.0) / max(share, np.float32(LEAST_SHARE))
+    return gain
 
 
 def _normalised_gradient(
@@ -191,14 +277,14 @@ def _gradient(
     right, down = spared * upright[0], spared * upright[1]
     out[0], out[h - 1], out[:, 0], out[:, w - 1] = 0.0, 0.0, 0.0, 0.0
     for y in prange(1, h - 1):
-        # Three rows of 32-bit numbers: the loop over the pixels runs in vector registers.
-        above, here, below = grey[y - 1].astype(np.int32), grey[y].astype(np.int32), grey[y + 1].astype(np.int32)
-        across, along = above + np.int32(2) * here + below, below - above
+        # Three rows of floats, in which all of this is exact: the loop over the pixels runs in vector registers.
+        above, here, below = grey[y - 1].astype(np.float32), grey[y].astype(np.float32), grey[y + 1].astype(np.float32)
+        across, along = above + np.float32(2.0) * here + below, below - above
         for x in range(1, w - 1):
             gx = across[x + 1] - across[x - 1]
-            gy = along[x - 1] + np.int32(2) * along[x] + along[x + 1]
-            less = right * np.float32(gx) + down * np.float32(gy)
-            square = np.float32(gx * gx + gy * gy) - less * less
+            gy = along[x - 1] + np.float32(2.0) * along[x] + along[x + 1]
+            less = right * gx + down * gy
+            square = gx * gx + gy * gy - less * less
             steepness = np.sqrt(max(square, np.float32(0.0))) / np.float32(8.0)
             out[y, x] = steepness if inner[y, x] else np.float32(0.0)
 
@@ -257,7 +343,6 @@ def _smoothed(
     lit: NDArray[np.bool_],
     gain: NDArray[np.float32],
     kernel: NDArray[np.float32],
-    along: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> NDArray[np.float32]:
     """Blurred along the rows and along the columns, over the pixels that count; the border is repeated outside.
@@ -265,26 +350,29 @@ def _smoothed(
     Args:
         values, lit, gain: (h, w).
         kernel: (taps + 1,) the middle and one side of a symmetric kernel.
-        along: (h, w) scratch.
         out: (h, w), returned.
     """
     h, w = values.shape
     taps = kernel.shape[0] - 1
-    for y in prange(h):
+    for strip in prange(-(-h // BLUR_ROWS)):
+        top, bottom = strip * BLUR_ROWS, min((strip + 1) * BLUR_ROWS, h)
+        above, below = max(top - taps, 0), min(bottom + taps, h)
+        along = np.empty((below - above, w), np.float32)
         row = np.empty(w + 2 * taps, np.float32)
-        for x in range(w):
-            row[taps + x] = values[y, x] if lit[y, x] else np.float32(0.0)
-        row[:taps] = row[taps]
-        row[taps + w :] = row[taps + w - 1]
-        _weigh(row[taps : taps + w], kernel[0], along[y])
-        for k in range(1, taps + 1):
-            _add_both(row[taps - k : taps - k + w], row[taps + k : taps + k + w], kernel[k], along[y])
-    for y in prange(h):
-        _weigh(along[y], kernel[0], out[y])
-        for k in range(1, taps + 1):
-            _add_both(along[max(y - k, 0)], along[min(y + k, h - 1)], kernel[k], out[y])
-        for x in range(w):
-            out[y, x] *= gain[y, x]
+        for y in range(above, below):
+            for x in range(w):
+                row[taps + x] = values[y, x] if lit[y, x] else np.float32(0.0)
+            row[:taps] = row[taps]
+            row[taps + w :] = row[taps + w - 1]
+            _weigh(row[taps : taps + w], kernel[0], along[y - above])
+            for k in range(1, taps + 1):
+                _add_both(row[taps - k : taps - k + w], row[taps + k : taps + k + w], kernel[k], along[y - above])
+        for y in range(top, bottom):
+            _weigh(along[y - above], kernel[0], out[y])
+            for k in range(1, taps + 1):
+                _add_both(along[max(y - k, 0) - above], along[min(y + k, h - 1) - above], kernel[k], out[y])
+            for x in range(w):
+                out[y, x] *= gain[y, x]
     return out
 
 
@@ -339,16 +427,6 @@ def _less(fine: NDArray[np.float32], coarse: NDArray[np.float32]) -> NDArray[np.
                 near * coarse[b, c] + far * coarse[b, d]
             )
     return fine
-
-
-def _standardised(values: NDArray[np.float32], lit: NDArray[np.bool_]) -> NDArray[np.int8]:
-    """In whole steps of `STRENGTH_STEPS` to a deviation from the mean over the pixels that count; `VOID` elsewhere."""
-    count, total, square = (math.fsum(column) for column in _row_sums(values, lit).T)
-    mean, mean_square = total / max(count, 1.0), square / max(count, 1.0)
-    variance = mean_square - mean * mean
-    # A map that does not vary beyond rounding has no edges.
-    steps = STRENGTH_STEPS / math.sqrt(variance) if variance > 1e-12 * mean_square else 0.0
-    return _stepped(values, lit, np.float32(mean), np.float32(steps))
 
 
 @njit(cache=True, parallel=True)

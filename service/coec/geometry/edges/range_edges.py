@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.geometry.bearings import Bearings, bearings
 from coec.geometry.compiler import njit, prange
-from coec.geometry.vectors import lengths
 
 BAND_RAD = math.radians(0.42)
 """Height of a band of elevation where no ring is known: the beam spacing of a 64-beam sensor. Wider bands only cost
@@ -77,96 +77,136 @@ class RangeEdges:
     weight: NDArray[np.float32]
 
 
-def range_edges(xyz_m: NDArray[np.float32], ring: NDArray[np.uint16] | None) -> RangeEdges:
+def range_edges(
+    xyz_m: NDArray[np.float32], ring: NDArray[np.uint16] | None, seen: Bearings | None = None
+) -> RangeEdges:
     """The silhouettes that the range jumps of a sweep tell (METHOD, section 3, "Edge alignment").
 
     Args:
         xyz_m: (N, 3) float32, sensor frame, as measured (motion compensation would tear scan lines apart).
         ring: (N,) uint16 or None.
+        seen: the bearings of the points, where the caller has them.
     """
-    range_m = lengths(xyz_m)
-    far = np.flatnonzero(range_m >= MIN_RANGE_M)
-    kept_m, range_m = xyz_m[far], range_m[far]
-    azimuth = np.arctan2(kept_m[:, 1], kept_m[:, 0])
-    elevation = np.arcsin(np.clip(kept_m[:, 2] / np.maximum(range_m, MIN_RANGE_M), -1.0, 1.0))
+    seen = bearings(xyz_m) if seen is None else seen
     if ring is None or (len(ring) and ring.min() == ring.max()):  # one number for all beams tells none from another
         # A point without an elevation lands in the highest band: it is near to none there.
-        band = np.fmin(np.floor(elevation / BAND_RAD), BANDS - 1)
+        band = np.fmin(np.floor(seen.elevation / BAND_RAD), BANDS - 1)
         row, rows, same_line = (band + BANDS).astype(np.uint16), 2 * BANDS, SAME_LINE_RAD
     else:
-        row, rows, same_line = ring[far], int(ring.max(initial=0)) + 1, math.pi
-    order = _along_the_rows(row, rows, azimuth)
-    index, turn_rad, weight = _jumps(row[order], azimuth[order], elevation[order], range_m[order], same_line)
-    near = far[order[index]]
-    return RangeEdges(near, _about_the_axis(kept_m[order[index]], turn_rad), weight)
+        row, rows, same_line = ring, int(ring.max(initial=0)) + 1, math.pi
+    order, first, azimuth, elevation, range_m = _along_the_rows(row, rows, seen.azimuth, seen.elevation, seen.range_m)
+    index, turn_rad, weight = _jumps(first, azimuth, elevation, range_m, same_line)
+    found = order[index]
+    return RangeEdges(found, _about_the_axis(xyz_m[found], turn_rad), weight)
+
+
+_Rows = tuple[
+    NDArray[np.int64], NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]
+]  # fmt: skip
 
 
 @njit(cache=True, parallel=True)
-def _along_the_rows(row: NDArray[np.uint16], rows: int, azimuth: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Indices that bring points into order of their row, and within a row of their azimuth; else as they were.
+def _along_the_rows(
+    row: NDArray[np.uint16],
+    rows: int,
+    azimuth: NDArray[np.float32],
+    elevation: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+) -> _Rows:
+    """The points that are not the vehicle itself in order of their row, and within a row of their azimuth, else as they
+    were: their indices; where each row begins, (rows + 1,); and their bearings.
 
-    Counted into their rows first: those of most sweeps are in order then, or begin in the middle of a turn.
+    Counted into their rows first: those of most sweeps are in order then, one way or the other, or begin
+    in the middle of a turn.
     """
     first = np.zeros(rows + 1, np.int64)
-    for k in row:
-        first[k + 1] += 1
+    for i in range(row.shape[0]):
+        first[row[i] + 1] += range_m[i] >= MIN_RANGE_M
     for k in range(rows):
         first[k + 1] += first[k]
-    order, following = np.empty(row.shape[0], np.int64), first[:-1].copy()
+    order, following = np.empty(first[rows], np.int64), first[:-1].copy()
+    turned, raised, far_m = np.empty((3, first[rows]), np.float32)
     for i in range(row.shape[0]):
-        order[following[row[i]]] = i
-        following[row[i]] += 1
+        if range_m[i] >= MIN_RANGE_M:
+            at = following[row[i]]
+            order[at], turned[at], raised[at], far_m[at] = i, azimuth[i], elevation[i], range_m[i]
+            following[row[i]] = at + 1
     for k in prange(rows):
-        of_row = order[first[k] : first[k + 1]]
-        count, descents, cut = of_row.shape[0], 0, 0
+        of_row = slice(first[k], first[k + 1])
+        angles = turned[of_row]
+        count, descents, ascents, fall, rise = angles.shape[0], 0, 0, 0, 0
         for i in range(1, count):
-            if azimuth[of_row[i]] < azimuth[of_row[i - 1]]:
-                descents, cut = descents + 1, i
-        if descents == 1 and azimuth[of_row[count - 1]] < azimuth[of_row[0]]:
-            turned = of_row.copy()
-            of_row[: count - cut], of_row[count - cut :] = turned[cut:], turned[:cut]
-        elif descents > 0:
-            of_row[:] = of_row[np.argsort(azimuth[of_row], kind="mergesort")]
-    return order
+            if angles[i] < angles[i - 1]:
+                descents, fall = descents + 1, i
+            elif angles[i] > angles[i - 1]:
+                ascents, rise = ascents + 1, i
+        if descents == 0:
+            continue
+        if descents == 1 and angles[count - 1] < angles[0]:
+            sequence = np.concatenate((np.arange(fall, count), np.arange(fall)))
+        elif ascents == 0 or (ascents == 1 and angles[count - 1] > angles[0]):  # the sensor turns clockwise
+            sequence = np.concatenate((np.arange(rise)[::-1], np.arange(rise, count)[::-1]))
+        else:
+            sequence = np.argsort(angles, kind="mergesort")
+        order[of_row] = order[of_row][sequence]
+        turned[of_row] = angles[sequence]
+        raised[of_row] = raised[of_row][sequence]
+        far_m[of_row] = far_m[of_row][sequence]
+    return order, first, turned, raised, far_m
 
 
-@njit(cache=True)
+@njit(cache=True, parallel=True)
 def _jumps(
-    row: NDArray[np.uint16],
+    first: NDArray[np.int64],
     azimuth: NDArray[np.float32],
     elevation: NDArray[np.float32],
     range_m: NDArray[np.float32],
     same_line: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
-    """Indices of the near sides, the azimuth from there to the edge, and weights; over points sorted by row and
-    azimuth."""
-    count = row.shape[0]
-    index = np.empty(count, np.int64)
-    turn_rad = np.empty(count, np.float64)
-    weight = np.empty(count, np.float32)
-    found = 0
-    for k in range(count):
-        least = max(MIN_JUMP_M, MIN_JUMP_SHARE * range_m[k])
-        highest, sides, turn = 0.0, 0, 0.0
-        for step in (-1, 1):
-            for ahead in range(1, LOOK_AHEAD + 1):
-                j = k + step * ahead
-                if j < 0 or j >= count or row[j] != row[k] or abs(azimuth[j] - azimuth[k]) > NEIGHBOUR_RAD:
-                    break
-                if abs(elevation[j] - elevation[k]) < same_line:
-                    jump = range_m[j] - range_m[k]
-                    if jump > least:
-                        highest = max(highest, jump)
-                        sides += 1
-                        gap = abs(azimuth[j] - azimuth[k])
-                        turn = step * (0.5 * gap - SPILL_RAD) if gap <= WIDE_RAD else 0.0
-                    break
-        if sides > 0:
-            index[found] = k
-            turn_rad[found] = turn if sides == 1 else 0.0
-            weight[found] = math.sqrt(min(highest, MAX_WEIGHT_M))
-            found += 1
-    return index[:found].copy(), turn_rad[:found].copy(), weight[:found].copy()
+    """Places of the near sides, the azimuth from there to the edge, and weights; of points (N,) in the order of
+    `_along_the_rows`."""
+    rows, count = first.shape[0] - 1, azimuth.shape[0]
+    index, turn_rad = np.empty(count, np.int64), np.empty(count, np.float64)
+    weight, found = np.empty(count, np.float32), np.zeros(rows, np.int64)
+    # Where all of a row are of one line, only who is next counts: whoever has no higher neighbour is told at once.
+    beside = same_line >= math.pi
+    for r in prange(rows):
+        begin, end = first[r], first[r + 1]
+        at = begin
+        for k in range(begin, end):
+            if beside:
+                before = range_m[k - 1] if k > begin else np.float32(0.0)
+                behind = range_m[k + 1] if k + 1 < end else np.float32(0.0)
+                if (before if before > behind else behind) - range_m[k] <= MIN_JUMP_M:
+                    continue
+            least = max(MIN_JUMP_M, MIN_JUMP_SHARE * range_m[k])
+            highest, sides, turn = 0.0, 0, 0.0
+            for step in (-1, 1):
+                for ahead in range(1, LOOK_AHEAD + 1):
+                    j = k + step * ahead
+                    if j < begin or j >= end or abs(azimuth[j] - azimuth[k]) > NEIGHBOUR_RAD:
+                        break
+                    if abs(elevation[j] - elevation[k]) < same_line:
+                        jump = range_m[j] - range_m[k]
+                        if jump > least:
+                            highest = max(highest, jump)
+                            sides += 1
+                            gap = abs(azimuth[j] - azimuth[k])
+                            turn = step * (0.5 * gap - SPILL_RAD) if gap <= WIDE_RAD else 0.0
+                        break
+            if sides > 0:
+                index[at] = k
+                turn_rad[at] = turn if sides == 1 else 0.0
+                weight[at] = math.sqrt(min(highest, MAX_WEIGHT_M))
+                at += 1
+        found[r] = at - begin
+    total, kept = found.sum(), 0
+    index_kept, turn_kept, weight_kept = np.empty(total, np.int64), np.empty(total), np.empty(total, np.float32)
+    for r in range(rows):
+        for at in range(first[r], first[r] + found[r]):
+            index_kept[kept], turn_kept[kept], weight_kept[kept] = index[at], turn_rad[at], weight[at]
+            kept += 1
+    return index_kept, turn_kept, weight_kept
 
 
 def _about_the_axis(xyz_m: NDArray[np.float32], turn_rad: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coec.adapters.depth.maps import CachedDepth, DepthAhead, open_depth
+from coec.adapters.depth.maps import CachedDepth, open_depth
 from coec.adapters.files.baseline_file import BASELINES, load_baseline, save_baseline
 from coec.adapters.files.rig import rig_of
 from coec.adapters.frames.msgpack_frames import decode_camera
@@ -19,7 +19,7 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.baseline import Baseline, learned_hash, mismatch
 from coec.calibration.commissioning.learning import commission
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.monitor.check_verdict import MIN_PAIRS, observe
+from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose, observe
 from coec.calibration.ports import Silence
 from coec.calibration.types import (
     CameraFrame,
@@ -51,7 +51,7 @@ WARM_UP_CAMERA_PX = 128
 """Longer side of the images of the warm-up: kernels are compiled for types, not for sizes, and a few milliseconds of
 work on an image of this size would be more than a second on the camera's own."""
 
-WARM_UP_EVALUATIONS = 4
+WARM_UP_EVALUATIONS, WARM_UP_REACH_DEG = 4, 4.0
 """Of the searches of the warm-up."""
 
 OVERLAY_JPEG_QUALITY = 88
@@ -92,15 +92,17 @@ class Solver:
     def warm_up(self) -> None:
         """Run every kernel once on a few invented points, so that no window waits for a compiler."""
         for pair in self._config.pairs:
-            search = pair.calibration.search.model_copy(update={"max_evaluations": WARM_UP_EVALUATIONS})
+            short = {"max_evaluations": WARM_UP_EVALUATIONS, "reach_deg": WARM_UP_REACH_DEG}
+            search = pair.calibration.search.model_copy(update=short)
             configuration = pair.calibration.model_copy(update={"search": search})
             rig = _small(self._rigs[pair.name])
-            # A check runs every kernel that a calibration runs but two, which its uncertainty takes. An invented one
-            # need not lead anywhere.
+            # Two kernels are those of the uncertainty of a result, and an invented window need not lead to one.
             project(rig.camera, np.ones((1, 3)))
             alignment_of_parts(_one_edge(rig), np.zeros(1, np.uint8), 1, np.eye(4))
             with contextlib.suppress(CalibrationError, DecodeError):
-                observe(_invented_window(rig), _Ramp(), self._images, configuration, None)
+                diagnose(_invented_window(rig), _Ramp(), self._images, configuration, None)
+            with contextlib.suppress(CalibrationError, DecodeError):
+                calibrate(_invented_window(rig), _Ramp(), self._images, configuration, Silence())
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
@@ -152,9 +154,7 @@ class Solver:
         network = self._network(configuration.depth)
         baseline, not_used = self._baseline(pair, configuration, network.identity)
         images = CachedGreys(self._images, len(window.pairs))
-        with DepthAhead(network, (each.camera for each in window.pairs)) as depth:
-            observation = observe(window, depth, images, configuration, baseline)
-        return Checked(observation, not_used)
+        return Checked(observe(window, network, images, configuration, baseline), not_used)
 
     def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> Drawn:
         """JPEG of the points of a window's last pair on its image, at an extrinsic (rows of the (4, 4) matrix).

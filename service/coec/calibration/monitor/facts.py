@@ -1,0 +1,49 @@
+"""What one image and one sweep show of the sensors themselves, measured: what `sensor_faults` judges.
+
+Apart from it, as measuring takes kernels, and the process that serves queries knows faults and loads no compiler.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.ego_mask import cell_means
+from coec.calibration.monitor.sensor_faults import (
+    BAND_RANGE_RAD,
+    BANDS,
+    BLOCK_COLUMNS,
+    BLOCK_ROWS,
+    SECTORS,
+    PictureFacts,
+    SweepFacts,
+)
+from coec.geometry.bearings import Bearings, grid_counts
+from coec.geometry.picture import neighbour_differences
+
+BRIGHT_SHARE, BRIGHT_STEP = 0.9, 4
+"""Of the pixels, every fourth of every fourth row."""
+
+THUMBNAIL_CELL_PX = 8
+"""Pixels a side that are one of the thumbnail by which pictures are compared."""
+
+
+def picture_facts(grey: NDArray[np.uint8]) -> PictureFacts:
+    """The facts of an image, (h, w)."""
+    thumbnail = cell_means(grey, THUMBNAIL_CELL_PX).astype(np.float32)
+    levels = np.cumsum(np.bincount(grey[::BRIGHT_STEP, ::BRIGHT_STEP].ravel(), minlength=256))
+    return PictureFacts(
+        gradient=neighbour_differences(grey, BLOCK_ROWS, BLOCK_COLUMNS),
+        bright=float(np.searchsorted(levels, BRIGHT_SHARE * levels[-1])),
+        thumbnail=thumbnail,
+        digest=zlib.crc32(thumbnail.data),
+    )
+
+
+def sweep_facts(seen: Bearings, range_edges: int) -> SweepFacts:
+    """The facts of a sweep whose points lie so, and that has so many range edges."""
+    low, high = BAND_RANGE_RAD
+    bands, sectors = grid_counts(seen.elevation, seen.azimuth, low, high, BANDS, SECTORS)
+    return SweepFacts(bands, sectors, range_edges)

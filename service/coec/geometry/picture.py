@@ -1,0 +1,59 @@
+"""Squares and blocks of an image in figures, in one pass."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.geometry.compiler import njit, prange
+
+
+@njit(cache=True, parallel=True)
+def square_sums(grey: NDArray[np.uint8], side: int) -> NDArray[np.uint32]:
+    """(h // side, w // side) sums of the pixels of each full square; a remainder at the right and the bottom is left
+    out. grey: (h, w)."""
+    rows, columns = grey.shape[0] // side, grey.shape[1] // side
+    sums = np.zeros((rows, columns), np.uint32)
+    for row in prange(rows):
+        of_column = np.zeros(columns * side, np.uint32)
+        for y in range(row * side, (row + 1) * side):
+            for x in range(columns * side):
+                of_column[x] += np.uint32(grey[y, x])
+        for column in range(columns):
+            total = np.uint32(0)
+            for x in range(column * side, (column + 1) * side):
+                total += of_column[x]
+            sums[row, column] = total
+    return sums
+
+
+@njit(cache=True, parallel=True)
+def neighbour_differences(grey: NDArray[np.uint8], block_rows: int, block_columns: int) -> NDArray[np.float64]:
+    """(block_rows, block_columns) means, over every second row of each block of an image (h, w), of the absolute
+    differences to the neighbours on the right and below in sum. Blocks are as large as so many fit; what is beyond
+    them does not count."""
+    rows, columns = grey.shape[0] // block_rows, grey.shape[1] // block_columns
+    height, width = rows * block_rows, columns * block_columns
+    means = np.zeros((block_rows, block_columns))
+    for block in prange(block_rows):
+        of_column = np.zeros(width, np.int32)
+        for y in range(block * rows, (block + 1) * rows, 2):
+            here = grey[y]
+            for x in range(width - 1):
+                of_column[x] += _apart(here[x + 1], here[x])
+            if y + 1 < height:
+                below = grey[y + 1]
+                for x in range(width):
+                    of_column[x] += _apart(below[x], here[x])
+        for column in range(block_columns):
+            total = np.int64(0)
+            for x in range(column * columns, (column + 1) * columns):
+                total += of_column[x]
+            means[block, column] = total / ((rows + 1) // 2 * columns)
+    return means
+
+
+@njit(cache=True, inline="always")
+def _apart(a: np.uint8, b: np.uint8) -> np.int32:
+    """In eight bits: sixteen times as many at once as in 64, which differences are taken in otherwise."""
+    return np.int32(np.uint8(a - b) if a > b else np.uint8(b - a))

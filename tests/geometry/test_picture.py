@@ -1,0 +1,31 @@
+"""Figures of an image, held against plain NumPy."""
+
+import numpy as np
+import pytest
+
+from coec.geometry.picture import neighbour_differences, square_sums
+
+GREY = np.random.default_rng(6).integers(0, 256, (47, 70), np.uint8)
+
+
+@pytest.mark.parametrize("side", [1, 4, 8])
+def test_sums_of_squares(side: int) -> None:
+    rows, columns = GREY.shape[0] // side, GREY.shape[1] // side
+    whole = GREY[: rows * side, : columns * side].astype(np.int64)
+    expected = whole.reshape(rows, side, columns, side).sum(axis=(1, 3))
+    np.testing.assert_array_equal(square_sums(GREY, side), expected)
+
+
+def test_differences_are_those_of_every_second_row() -> None:
+    rows, columns = 5, 4
+    height, width = GREY.shape[0] // rows, GREY.shape[1] // columns
+    whole = GREY[: rows * height, : columns * width].astype(np.int64)
+    apart = np.zeros(whole.shape, np.int64)
+    apart[:, :-1] += np.abs(np.diff(whole, axis=1))
+    apart[:-1] += np.abs(np.diff(whole, axis=0))
+    blocks = apart.reshape(rows, height, columns, width)[:, ::2]
+    np.testing.assert_allclose(neighbour_differences(GREY, rows, columns), blocks.mean(axis=(1, 3)))
+
+
+def test_a_flat_image_has_none() -> None:
+    assert not neighbour_differences(np.full((36, 64), 9, np.uint8), 18, 32).any()
