@@ -10,6 +10,10 @@ from typing import Any
 
 import pytest
 
+# These draw for themselves, whichever test loads them first.
+import coec.cli.sim
+import coec.evaluation.check_run
+import coec.evaluation.matrix_run
 from coec.cli import main
 from drives import drawn
 
