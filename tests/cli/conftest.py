@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-# These draw for themselves, whichever test loads them first.
-import coec.cli.sim
-import coec.evaluation.check_run
-import coec.evaluation.matrix_run
-from coec.cli import main
+from coec.cli import (
+    main,
+    sim,  # noqa: F401  it draws for itself, whichever test loads it first; so do these
+)
+from coec.evaluation import check_run, matrix_run  # noqa: F401
 from drives import drawn
 
 SMALL = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes"

@@ -206,10 +206,10 @@ def test_worker_killed_and_service_stopped_in_a_solve_lose_no_window(
         assert running.terminate() == 0
     files = sorted(windows.iterdir())
     assert [(path.suffix, read_result(path) is None) for path in files] == [(".mcap", n > 0) for n in range(3)]
-    *finished, left_open = (len(read_window(path)[0].pairs) for path in files)
-    assert finished == [SHORT_PAIRS] * 2
-    # Where another worker takes long to come, silence ends what had begun of a slice, and the last one begins later.
-    assert WINDOW.min_pairs <= left_open <= SHORT_PAIRS
+    first, *others = (len(read_window(path)[0].pairs) for path in files)
+    assert first == SHORT_PAIRS
+    # Where another worker takes long to come, silence ends what had begun of a slice, and the next one begins later.
+    assert all(WINDOW.min_pairs <= pairs <= SHORT_PAIRS for pairs in others)
 
     with service(config, router, warm=False) as running:
         told = running.until(running.history, lambda told: told["total"] == 3, "what the last run left is solved")
