@@ -104,6 +104,17 @@ def test_checks_go_first_then_windows_errands_prefetches_and_the_backlog() -> No
     assert order == ["check", "window", "picture", "baseline", "prefetch", "old"]
 
 
+def test_a_window_that_checks_have_kept_waiting_goes_before_them() -> None:
+    queue = asked([a_job("window")])
+    for second in (0.0, 4.0, 8.0):
+        queue.ask(check(f"check {second:.0f}", "rear"), second)
+    order = []
+    for now_s in (4.0, 8.0, 8.0, 8.0):
+        order.append(begin(queue, now_s))
+        queue.answered(ANSWER, now_s)
+    assert order == ["check 0", "window", "check 4", "check 8"]
+
+
 def test_the_newest_checks_and_windows_of_a_pair_stay_and_pairs_do_not_push_each_other_out() -> None:
     queue = asked([a_job("w0"), a_job("left-0", pair="left"), a_job("w1"), a_job("w2"), check("other", "left")])
     assert ends(queue) == [("w0", Fate.SUPERSEDED, "superseded")]

@@ -34,6 +34,10 @@ SUPERSEDING = frozenset({Lane.CHECK, Lane.LIVE})
 PREFETCHES_WAITING, PREFETCH_BYTES_WAITING = 8, 32 * 2**20
 """Images that may wait for early inference, and their bytes; beyond, the solve infers them itself."""
 
+WINDOW_WAITS_S = 5.0
+"""How long checks may keep a window of this run from the worker, s: while one waits, its pair is not looked at. The
+usual time between two checks of a pair."""
+
 SUPERSEDED = Reason("superseded", "A newer one of the pair came before the worker was free.")
 BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
 STOPPING = Reason("stopping", "The service is stopping.")
@@ -139,7 +143,7 @@ class JobQueue:
         if self._in_hand is not None:
             raise ValueError("the worker has something to do")
         self.expire(now_s)
-        work = self._next()
+        work = self._next(now_s)
         if work is None:
             return None
         self._number += 1
@@ -255,10 +259,11 @@ class JobQueue:
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
-    def _next(self) -> _Entry | Prefetch | None:
+    def _next(self, now_s: float) -> _Entry | Prefetch | None:
         checks, live = self._lanes[Lane.CHECK], self._lanes[Lane.LIVE]
-        # Checks that kill must not keep every new worker from its windows.
-        if checks and not (self._check_was_fatal and live):
+        # Checks that kill must not keep every new worker from its windows, nor checks of other pairs from any.
+        windows_turn = live and (self._check_was_fatal or now_s - live[0].asked_s > WINDOW_WAITS_S)
+        if checks and not windows_turn:
             return checks.popleft()
         for waiting in (live, self._lanes[Lane.ERRAND], self._prefetches, self._lanes[Lane.BACKLOG]):
             if waiting:
