@@ -80,11 +80,10 @@ def main(endpoint: str, name: str, pace: str = "1") -> int:
                 return 0
             stamp_ns = begin_ns + round(1e9 * drive_s)
             send(EgoMotion(stamp_ns, "ego", (SPEED_MPS, 0.0, 0.0), (0.0, 0.0, 0.0), count), 0)
+            room = pairs[count % ROOMS]
             for index in range(load.cameras):
-                room = pairs[(count + index) % ROOMS]
                 send(replace(room.camera, stamp_ns=stamp_ns, sequence=count), index)
             for index in range(load.lidars if count % load.sweep_every == 0 else 0):
-                room = pairs[(count + index) % ROOMS]
                 send(replace(room.lidar, stamp_ns=stamp_ns, sequence=count // load.sweep_every), index)
     return 0
 
