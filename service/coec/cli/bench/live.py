@@ -66,7 +66,7 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
 
 def native(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     """By native frames as they come, and then with one solve after another."""
-    with _loaded(folder, "native", WindowConfig(slice_s=SLICE_S), heard) as (session, process):
+    with _settled(folder, "native", WindowConfig(slice_s=SLICE_S), heard) as (session, process):
         document = _resources(session, process, heard)
         heard("the daemon under load: queries during solves")
         return document | _round_trips(session, process)
@@ -74,37 +74,49 @@ def native(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
 
 def ros(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     """By the same sensors as nodes of ROS, with windows as long as they are by default."""
-    with _loaded(folder, "ros", WindowConfig(), heard) as (session, process):
+    with _settled(folder, "ros", WindowConfig(), heard) as (session, process):
         return {f"ros_{name}": figure for name, figure in _resources(session, process, heard).items()}
 
 
 def large_rig(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     """By eight cameras below three LiDARs that they share, with windows as long as they are by default."""
-    with _loaded(folder, "large_rig", WindowConfig(), heard) as (session, process):
+    with _settled(folder, "large_rig", WindowConfig(), heard) as (session, process):
         return {f"large_rig_{figure}": value for figure, value in _resources(session, process, heard).items()}
 
 
 @contextmanager
-def _loaded(
+def _settled(
     folder: Path, form: str, window: WindowConfig, heard: Callable[[str], None]
 ) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
-    """A daemon that has been under load for a while, `form` of `load.LOADS`, and who may ask it."""
+    """A daemon that has been under load for a while, without a bound on what its worker may take."""
+    with loaded(folder, form, (window, BudgetConfig(cores=ENOUGH_CORES)), heard) as (session, process):
+        _ask(session, KEYS, process, SETTLE_S, at_work=False)
+        yield session, process
+
+
+@contextmanager
+def loaded(
+    folder: Path, form: str, stages: tuple[WindowConfig, BudgetConfig], heard: Callable[[str], None], pace: float = 1.0
+) -> Iterator[tuple[zenoh.Session, ProcessReading]]:
+    """A daemon under the load `form` of `load.LOADS`, at so many seconds of driving in a second, and who may ask it.
+
+    Raises:
+        ConnectionFailedError: the daemon did not become ready.
+    """
     heard(f"the daemon starts, {form}")
     endpoint = f"tcp/127.0.0.1:{daemons.free_port()}"
     written = folder / f"{form}.yaml"
     # JSON is YAML.
-    config = configuration(endpoint, folder / form, form, window, BudgetConfig(cores=ENOUGH_CORES))
+    config = _configuration(endpoint, folder / form, form, *stages)
     written.write_text(config.model_dump_json(exclude_none=True))
     with (
         daemons.running("-m", "coec", "run", "--config", str(written)) as daemon,
         connected([endpoint], daemons.TIMEOUT_S) as session,
-        daemons.running("-c", daemons.SENSORS, endpoint, form),
+        daemons.running("-c", daemons.SENSORS, endpoint, form, str(pace)),
     ):
         heard(f"the daemon under load, {form}")
         daemons.await_running(session, KEYS)
-        process = ProcessReading(daemon.pid)
-        _ask(session, KEYS, process, SETTLE_S, at_work=False)
-        yield session, process
+        yield session, ProcessReading(daemon.pid)
 
 
 def _resources(session: zenoh.Session, process: ProcessReading, heard: Callable[[str], None]) -> dict[str, Any]:
@@ -167,7 +179,7 @@ def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
     return {**streams, **counted, "lost": lost}
 
 
-def configuration(endpoint: str, state: Path, form: str, window: WindowConfig, budget: BudgetConfig) -> Config:
+def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig, budget: BudgetConfig) -> Config:
     """Every camera with every LiDAR, as if all were at one place: what is found there does not matter."""
     what = load.LOADS[form]
     many = {"camera": range(what.cameras), "lidar": range(what.lidars)}

@@ -14,7 +14,6 @@ from typing import Any
 
 import zenoh
 
-from coec.adapters.zenoh.client import connected
 from coec.cli.bench import daemons, live, load
 from coec.cli.bench.process import ProcessReading
 from coec.config import BudgetConfig, WindowConfig
@@ -46,23 +45,9 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     Raises:
         ConnectionFailedError: the daemon did not become ready.
     """
-    heard("the daemon starts, four cameras")
-    endpoint = f"tcp/127.0.0.1:{daemons.free_port()}"
-    configuration = folder / "rig.yaml"
-    configuration.write_text(
-        live.configuration(endpoint, folder / "rig", "rig", WindowConfig(), BudgetConfig()).model_dump_json(
-            exclude_none=True
-        )
-    )
-    with (
-        daemons.running("-m", "coec", "run", "--config", str(configuration)) as daemon,
-        connected([endpoint], daemons.TIMEOUT_S) as session,
-        daemons.running("-c", daemons.SENSORS, endpoint, "rig", str(PACE)),
-    ):
-        heard("four cameras")
-        daemons.await_running(session, KEYS)
+    with live.loaded(folder, "rig", (WindowConfig(), BudgetConfig()), heard, PACE) as (session, process):
         time.sleep(SETTLE_S / PACE)
-        return _figures(session, ProcessReading(daemon.pid))
+        return _figures(session, process)
 
 
 def _figures(session: zenoh.Session, service: ProcessReading) -> dict[str, Any]:
