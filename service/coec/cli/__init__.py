@@ -58,6 +58,13 @@ class Encoding(StrEnum):
     CDR = "cdr"
 
 
+class BatchEngine(StrEnum):
+    """What judges the windows of a batch."""
+
+    LOCAL = "local"
+    RAY = "ray"
+
+
 class DegreesOfFreedom(StrEnum):
     """Of the search."""
 
@@ -631,6 +638,47 @@ def _router(
     from coec.cli import router as command
 
     raise typer.Exit(command.run(config))
+
+
+@app.command("batch")
+def _batch(
+    windows: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="WINDOW...", help="Windows (.mcap), folders or patterns, as paths or URLs.", show_default=False
+        ),
+    ],
+    output: Annotated[Path, typer.Option(help="Folder of the tables (Parquet).", metavar="DIR", show_default=False)],
+    engine: Annotated[BatchEngine, typer.Option(help="Processes here, or of a Ray cluster.")] = BatchEngine.LOCAL,
+    with_config: Annotated[
+        Path | None,
+        typer.Option("--with-config", help="Judge by this configuration, not by each window's own.", metavar="FILE"),
+    ] = None,
+    rig: Annotated[Path | None, typer.Option(help="Judge with this rig (JSON).", metavar="FILE")] = None,
+    depth: Depth = None,
+    jobs: Annotated[int | None, typer.Option(help="Windows at a time.", min=1, show_default="cores")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the batch that is in the folder.")] = False,
+    deadline: Annotated[float, typer.Option(help="For one window, s.", min=1.0)] = 600.0,
+    memory: Annotated[int, typer.Option(help="For one process, MiB.", min=256)] = 2048,
+    as_json: Json = False,
+) -> None:
+    """Judge many windows again: exit 0 if every one has a result, 1 if not."""
+    from coec.cli import batch as command
+
+    options = command.Options(
+        windows=tuple(windows),
+        output=output,
+        engine=engine.value,
+        with_config=with_config,
+        rig=rig,
+        depth=depth,
+        jobs=jobs,
+        resume=resume,
+        deadline_s=deadline,
+        memory_mib=memory,
+        as_json=as_json,
+    )
+    raise typer.Exit(command.run(options))
 
 
 @app.command("replay")

@@ -400,6 +400,21 @@ def read_result(path: Path) -> CalibrationResult | None:
         raise WindowError(f"{path}: {RESULT}: {error}") from error
 
 
+def read_vehicle(path: Path) -> str:
+    """The vehicle that recorded a window, empty where the window does not say. Does not read the frames.
+
+    Raises:
+        WindowError: unreadable or damaged at its beginning.
+    """
+    for record in _records(path):
+        match record:
+            case Metadata() if record.name == _METADATA:
+                return record.values.get("vehicle", "")
+            case Message():
+                break
+    return ""
+
+
 def is_window(path: Path) -> bool:
     """Whether a sound MCAP file is a window of ours. Does not read the frames.
 

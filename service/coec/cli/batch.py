@@ -1,0 +1,124 @@
+"""`coec batch`: many windows judged again, tables out."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from coec.fleet import batch
+from coec.fleet.engines.engine import Bounds, Engine
+from coec.fleet.places import jobs_of
+from coec.fleet.terms import terms_of
+from coec.reports import console
+from coec.schemas.fleet import BatchReport, WindowRow
+
+MIB = 2**20
+
+LINE_S = 30.0
+"""Between two lines of progress where standard error is no terminal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    windows: tuple[str, ...]
+    output: Path
+    engine: str = "local"
+    jobs: int | None = None
+    with_config: Path | None = None
+    rig: Path | None = None
+    depth: str | None = None
+    resume: bool = False
+    deadline_s: float = 600.0
+    memory_mib: int = 2048
+    as_json: bool = False
+
+
+def run(options: Options) -> int:
+    """Judges every window that has no row yet; 1 if one of them has no result.
+
+    Raises:
+        UsageError: no window, or the folder holds another batch.
+        ConfigError: the configuration cannot be used.
+        SourceError: a store cannot be asked, or an optional extra is not installed.
+        OutputError: the folder cannot be written.
+        FleetError: the engine failed.
+    """
+    terms = terms_of(options.with_config, options.rig, options.depth)
+    jobs = jobs_of(options.windows)
+    engine = _engine(options)
+    with _progress(len(jobs)) as told:
+        report = batch.run(jobs, terms, engine, options.output, told, resume=options.resume)
+    if options.as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        _show(report, engine.cores)
+    return 1 if report.errors else 0
+
+
+def _engine(options: Options) -> Engine:
+    bounds = Bounds(options.deadline_s, options.memory_mib * MIB)
+    if options.engine == "ray":
+        from coec.fleet.engines.ray import RayEngine
+
+        return RayEngine(options.jobs, bounds)
+    from coec.fleet.engines.local import LocalEngine
+
+    return LocalEngine(options.jobs or len(os.sched_getaffinity(0)), bounds)
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
+    """What is to be called with every row: a bar with rate and remaining time, or a line now and then."""
+    bars = Progress(
+        TextColumn("windows"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=console.err,
+        transient=True,
+        disable=not console.err.is_terminal,
+        speed_estimate_period=300.0,
+    )
+    task = bars.add_task("windows", total=total, note="")
+    done, errors, began_s, said_s = 0, 0, time.monotonic(), time.monotonic()
+
+    def told(row: WindowRow) -> None:
+        nonlocal done, errors, said_s
+        done, errors = done + 1, errors + (row.error is not None)
+        now_s = time.monotonic()
+        note = f"{done / max(now_s - began_s, 1e-9):.2f}/s, {errors} without a result"
+        bars.update(task, advance=1, note=note)
+        if bars.disable and now_s - said_s > LINE_S:
+            said_s = now_s
+            console.say(f"{done} of {total} windows judged, {note}")
+
+    with bars:
+        yield told
+
+
+def _show(report: BatchReport, cores: int) -> None:
+    rows = console.table("windows", "", right=(1,))
+    rows.add_row("in all", str(report.windows))
+    if report.kept:
+        rows.add_row("judged before", str(report.kept))
+    rows.add_row("accepted", str(report.accepted))
+    rows.add_row("refused", str(report.refused))
+    for code, count in report.errors.items():
+        rows.add_row(f"without a result: {code}", str(count))
+    rows.add_row("compared with the vehicle's decision", str(report.compared))
+    rows.add_row("decided otherwise", str(report.differing))
+    console.out.print(rows)
+    if report.share_of_ideal is not None:
+        share = f"{100.0 * report.share_of_ideal:.0f} % of what {cores} cores can do"
+        console.show(f"{report.elapsed_s:.1f} s, {report.cpu_s:.1f} s of processor, {share}")
+    console.show(f"tables in {report.output}")

@@ -1,0 +1,1 @@
+"""Many windows on an existing engine: jobs in, tables out."""

@@ -1,0 +1,92 @@
+"""Many windows judged again, on one page: jobs -> engine -> rows -> tables."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from coec.fleet.engines.engine import Engine
+from coec.fleet.places import Job
+from coec.fleet.results import Results
+from coec.fleet.terms import Terms
+from coec.schemas.fleet import BatchReport, WindowRow
+
+
+def run(
+    jobs: Sequence[Job],
+    terms: Terms,
+    engine: Engine,
+    folder: Path,
+    told: Callable[[WindowRow], object],
+    *,
+    resume: bool,
+) -> BatchReport:
+    """Judge windows, and make tables of what is said of them in a folder.
+
+    Args:
+        jobs: the windows.
+        terms: on which all are judged.
+        engine: that judges them.
+        folder: of the tables; one that holds a batch already is gone on with.
+        told: called with every row, when it is on the disk.
+        resume: whether the folder may hold a batch.
+
+    Raises:
+        UsageError, OutputError, SourceError: the folder cannot be used; see `Results`.
+        FleetError: the engine failed. What was finished is kept.
+    """
+    results = Results(folder, terms, resume=resume)
+    known = results.urls
+    left = [job for job in jobs if job.url not in known]
+    tally = _Tally()
+    began_s = time.monotonic()
+    try:
+        for row in engine.rows(left, terms):
+            results.add(row)
+            tally.add(row)
+            told(row)
+    finally:  # an interrupted batch has its tables, too
+        results.finish()
+    elapsed_s = time.monotonic() - began_s
+    return tally.report(folder, len(jobs), len(jobs) - len(left), elapsed_s, engine.cores)
+
+
+class _Tally:
+    """Of the rows of one run."""
+
+    def __init__(self) -> None:
+        self._accepted = self._refused = self._compared = self._differing = 0
+        self._errors: Counter[str] = Counter()
+        self._seconds = self._cpu_s = 0.0
+
+    def add(self, row: WindowRow) -> None:
+        """One more."""
+        self._seconds += row.seconds
+        self._cpu_s += row.cpu_s
+        if row.error_code is not None:
+            self._errors[row.error_code] += 1
+        if row.result is not None:
+            accepted = row.result.verdict.decision == "accepted"
+            self._accepted += accepted
+            self._refused += not accepted
+            self._compared += row.recorded is not None
+            self._differing += row.recorded not in (None, row.decided)
+
+    def report(self, folder: Path, windows: int, kept: int, elapsed_s: float, cores: int) -> BatchReport:
+        """Of this run."""
+        judged = windows > kept and elapsed_s > 0.0
+        return BatchReport(
+            output=str(folder),
+            windows=windows,
+            kept=kept,
+            accepted=self._accepted,
+            refused=self._refused,
+            errors=dict(sorted(self._errors.items())),
+            compared=self._compared,
+            differing=self._differing,
+            elapsed_s=elapsed_s,
+            cpu_s=self._cpu_s,
+            share_of_ideal=self._seconds / (cores * elapsed_s) if judged else None,
+        )

@@ -1,0 +1,99 @@
+"""Where windows are judged, one at a time, in a process of its own: a job in, a row out, whatever the window is."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import threading
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from coec import __version__
+from coec.adapters.depth.maps import open_depth
+from coec.adapters.files.conversions import result_of
+from coec.adapters.images.codec import GreyImages
+from coec.adapters.mcap.windows import read_result, read_vehicle, read_window
+from coec.calibration.calibrator import calibrate
+from coec.calibration.ports import DepthModel, Silence
+from coec.config import DepthConfig, LimitsConfig
+from coec.errors import CoecError, SourceError
+from coec.fleet.places import Job, fetched, sha256_of
+from coec.fleet.terms import Terms
+from coec.fleet.trouble import begun, failed
+from coec.schemas.base import to_json
+from coec.schemas.fleet import WindowRow
+from coec.schemas.replies import CalibrationResult
+
+_log = logging.getLogger(__name__)
+
+NETWORKS_KEPT = 4
+"""Open at a time; a fleet has one or two, and each takes a hundred megabytes."""
+
+CALCULATING = ("numpy", "numba", "nlopt", "onnxruntime")
+"""Packages whose versions a row tells: the decision is theirs as well."""
+
+
+class Desk:
+    """Judges windows on the same terms. `row` may be called on several threads: one fetches while another's window is
+    solved."""
+
+    def __init__(self, terms: Terms) -> None:
+        self._terms = terms
+        self._solving = threading.Lock()
+        self._limits = LimitsConfig()
+        self._images = GreyImages(self._limits)
+        self._networks: dict[DepthConfig, DepthModel] = {}
+        self._versions = {"coec": __version__, **{package: version(package) for package in CALCULATING}}
+
+    def row(self, job: Job) -> WindowRow:
+        """The row of a window; what is wrong with it stands in the row."""
+        row = begun(job, self._versions)
+        try:
+            with fetched(job.url) as path:
+                sha256 = sha256_of(path)
+                row = row.model_copy(update={"sha256": sha256, "bytes": path.stat().st_size})
+                if job.sha256 not in (None, sha256):
+                    raise SourceError(f"{job.url} has the sha256 {sha256}, but {job.sha256} is stated beside it")
+                with self._solving:
+                    began_s, began_cpu_s = time.monotonic(), time.process_time()
+                    try:
+                        update = self._judged(path)
+                    finally:
+                        took_s, cpu_s = time.monotonic() - began_s, time.process_time() - began_cpu_s
+                        row = row.model_copy(update={"seconds": took_s, "cpu_s": cpu_s})
+        except CoecError as error:
+            return failed(row, error.reply_code, str(error))
+        except Exception as error:  # a fault of ours; the other windows are judged all the same
+            _log.exception("a window could not be judged", extra={"fields": {"url": job.url}})
+            return failed(row, CoecError.reply_code, f"{type(error).__name__}: {error}")
+        return row.model_copy(update=update)
+
+    def _judged(self, path: Path) -> dict[str, object]:
+        recorded = read_result(path)
+        vehicle = read_vehicle(path) if recorded is None else recorded.vehicle
+        window, configuration = self._terms.applied(*read_window(path))
+        network = self._network(self._terms.network(configuration.depth))
+        result = result_of(calibrate(window, network, self._images, configuration, Silence()), window.rig, vehicle)
+        if recorded is not None:
+            # What an earlier version of the program recorded says so of itself; that is no difference in the decision.
+            result = result.model_copy(update={"schema_version": recorded.schema_version})
+        return {
+            "vehicle": vehicle,
+            "result": result,
+            "decided": _digest(result),
+            "recorded": None if recorded is None else _digest(recorded),
+        }
+
+    def _network(self, config: DepthConfig) -> DepthModel:
+        # The process has one core: more threads would only wait for each other. What is inferred does not hang on it.
+        config = config.model_copy(update={"threads": 1})
+        if config not in self._networks:
+            while len(self._networks) >= NETWORKS_KEPT:
+                self._networks.pop(next(iter(self._networks)))
+            self._networks[config] = open_depth(config, self._limits)
+        return self._networks[config]
+
+
+def _digest(result: CalibrationResult) -> str:
+    return hashlib.sha256(to_json(result)).hexdigest()

@@ -1,0 +1,186 @@
+"""Where windows are: on this machine, or behind a URL of a store that fsspec knows."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from urllib.parse import urlsplit
+
+from coec.errors import SourceError, UsageError
+
+SUFFIX = ".mcap"
+
+SUMS = "SHA256SUMS"
+"""File beside windows with their hashes, as `sha256sum *.mcap` prints it; what it names is checked before use."""
+
+MAX_SUMS_BYTES = 64 * 2**20
+"""Of such a file: half a million windows."""
+
+_SUM = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
+
+EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs", "az": "az", "abfs": "az", "abfss": "az"}
+"""Of coec, that bring what speaks to a store, by the scheme of its URLs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A window to be judged.
+
+    Attributes:
+        url: a path, or a URL with its scheme.
+        sha256: of the file, as it is stated beside it; None: nobody states it.
+    """
+
+    url: str
+    sha256: str | None = None
+
+
+def jobs_of(patterns: Sequence[str]) -> list[Job]:
+    """The windows that patterns name, in order of their URLs, each once. A pattern is a file, a folder (all windows
+    in and below it) or has `*`, `?` and `**`, by path or by URL.
+
+    Raises:
+        UsageError: one names no window.
+        SourceError: a store cannot be asked, or the hashes beside windows cannot be read.
+    """
+    found: set[str] = set()
+    for pattern in patterns:
+        urls = _remote(pattern) if _scheme(pattern) else _local(pattern)
+        if not urls:
+            raise UsageError(f"{pattern} names no window ({SUFFIX})")
+        found.update(urls)
+    urls = sorted(found)
+    sums = {folder: _sums(folder) for folder in sorted({_folder(url) for url in urls})}
+    return [Job(url, sums[_folder(url)].get(_name(url))) for url in urls]
+
+
+@contextmanager
+def fetched(url: str) -> Iterator[Path]:
+    """A window as a file of this machine, for as long as it is needed.
+
+    Raises:
+        SourceError: it cannot be had.
+    """
+    if not _scheme(url):
+        yield Path(url)
+        return
+    with TemporaryDirectory(prefix="coec-batch-") as folder:
+        path = Path(folder) / _name(url)
+        with _asking(url):
+            store, place = _store(url)
+            with store.open(place, "rb") as source, path.open("wb") as target:
+                shutil.copyfileobj(source, target, 2**20)
+        yield path
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file, hexadecimal.
+
+    Raises:
+        SourceError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _local(pattern: str) -> list[str]:
+    path = Path(pattern)
+    if path.is_dir():
+        found = path.rglob(f"*{SUFFIX}")
+    elif not _is_pattern(pattern):
+        return [pattern]  # one that is not there is a row with its error, as those of a store are
+    else:
+        fixed = next(index for index, part in enumerate(path.parts) if _is_pattern(part))
+        found = Path(*path.parts[:fixed]).glob(str(Path(*path.parts[fixed:])))
+    return [str(path) for path in found if path.suffix == SUFFIX and path.is_file()]
+
+
+def _is_pattern(text: str) -> bool:
+    return any(sign in text for sign in "*?[")
+
+
+def _remote(pattern: str) -> list[str]:
+    with _asking(pattern):
+        store, place = _store(pattern)
+        if not _is_pattern(place):
+            if not store.isdir(place):
+                return [pattern]
+            place = f"{place.rstrip('/')}/**"
+        return [store.unstrip_protocol(path) for path in store.glob(place) if path.endswith(SUFFIX)]
+
+
+def _sums(folder: str) -> dict[str, str]:
+    """Hashes by name, that are stated in a folder; none where they are not."""
+    url = f"{folder}{SUMS}"
+    try:
+        if _scheme(url):
+            with _asking(url):
+                store, place = _store(url)
+                if not store.exists(place):
+                    return {}
+                text = store.cat_file(place, 0, MAX_SUMS_BYTES)
+        else:
+            with Path(url).open("rb") as stream:
+                text = stream.read(MAX_SUMS_BYTES)
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise SourceError(f"cannot read {url}: {error.strerror}") from error
+    lines = (_SUM.fullmatch(line) for line in text.decode(errors="replace").splitlines())
+    return {line[2].removeprefix("./"): line[1].lower() for line in lines if line}
+
+
+def _scheme(url: str) -> str:
+    """Of a URL; empty for a path."""
+    scheme, colon, _ = url.partition("://")
+    return scheme if colon else ""
+
+
+def _folder(url: str) -> str:
+    """All of it before the last name."""
+    return url[: url.rfind("/") + 1]
+
+
+def _name(url: str) -> str:
+    return url[url.rfind("/") + 1 :]
+
+
+def _store(url: str) -> tuple[Any, str]:
+    """What speaks to the store of a URL, and the place in it."""
+    try:
+        import fsspec
+    except ImportError as error:
+        raise SourceError(f"{url}: URLs need the optional extra `fleet`: pip install 'coec[fleet]'") from error
+    try:
+        store, place = fsspec.core.url_to_fs(url)
+    except ImportError as error:
+        extra = EXTRAS.get(_scheme(url))
+        hint = "" if extra is None else f": pip install 'coec[{extra}]'"
+        raise SourceError(f"{url}: what speaks to {_scheme(url)}:// is not installed{hint}") from error
+    except ValueError as error:
+        raise UsageError(f"{url}: {error}") from error
+    return store, place
+
+
+@contextmanager
+def _asking(url: str) -> Iterator[None]:
+    """Whatever a library for a store raises is an error of that store: they have no class in common."""
+    try:
+        yield
+    except (SourceError, UsageError):
+        raise
+    except Exception as error:
+        where = urlsplit(url)
+        raise SourceError(
+            f"{where.scheme}://{where.hostname or ''}{where.path}: {type(error).__name__}: {error}"
+        ) from error

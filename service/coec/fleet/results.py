@@ -1,0 +1,121 @@
+"""The folder of a batch: its terms, the rows that are finished, the tables that are made of them.
+
+A finished row is on the disk before the next is waited for: a batch that is stopped at any point, or whose machine
+loses its power, loses the windows under way. Rows wait in a journal until there are enough for a file of a table.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from coec.adapters.files import durable, output
+from coec.adapters.files.output import OutputError
+from coec.errors import DecodeError, UsageError
+from coec.fleet import tables
+from coec.fleet.terms import Terms
+from coec.schemas.base import from_json, to_json
+from coec.schemas.fleet import WindowRow
+
+TERMS, JOURNAL = "terms.json", "journal.jsonl"
+
+ROWS_A_FILE = 512
+"""Of a table: files of some megabytes, and no more than that many rows are read again at a start."""
+
+
+class Results:
+    """Of one batch. Call `finish` at its end, however it ends."""
+
+    def __init__(self, folder: Path, terms: Terms, *, resume: bool) -> None:
+        """Begin a folder, or go on with one.
+
+        Raises:
+            UsageError: there is a batch already, or it was on other terms.
+            OutputError: the folder cannot be written.
+            SourceError: a table in it is damaged.
+        """
+        self._folder = folder
+        self._claim(terms, resume=resume)
+        self._made = tables.urls(folder)
+        self._rows: list[WindowRow] = []
+        self._journal = durable.Log(folder / JOURNAL, 2 * ROWS_A_FILE, self._lines)
+        with self._writing(folder / JOURNAL):
+            rows = [_row(line) for line in self._journal.load()]
+        # A run that ended when tables were made may not have come to empty the journal.
+        self._rows = [row for row in rows if row is not None and row.url not in self._made]
+
+    @property
+    def urls(self) -> frozenset[str]:
+        """Of the windows that have a row."""
+        return frozenset(self._made | {row.url for row in self._rows})
+
+    def add(self, row: WindowRow) -> None:
+        """A window is finished; on the disk when this returns.
+
+        Raises:
+            OutputError: it is not.
+        """
+        self._rows.append(row)
+        with self._writing(self._folder / JOURNAL):
+            self._journal.add(to_json(row))
+            self._journal.flush()
+        if len(self._rows) >= ROWS_A_FILE:
+            self.finish()
+
+    def finish(self) -> None:
+        """Make tables of the rows that wait.
+
+        Raises:
+            OutputError: one cannot be written; the rows are in the journal, and the next run makes them.
+        """
+        if not self._rows:
+            return
+        # The name hangs on what is in it, so that no file replaces another's rows.
+        urls = [row.url for row in self._rows]
+        name = hashlib.sha256("\n".join(sorted(urls)).encode()).hexdigest()[:16]
+        tables.write(self._folder, self._rows, f"part-{name}")
+        self._made.update(urls)
+        self._rows = []
+        with self._writing(self._folder / JOURNAL):
+            self._journal.renew()
+            self._journal.flush()
+
+    def _lines(self) -> Iterator[bytes]:
+        return (to_json(row) for row in self._rows)
+
+    def _claim(self, terms: Terms, *, resume: bool) -> None:
+        path = self._folder / TERMS
+        try:
+            there = json.loads(path.read_bytes())["fingerprint"]
+        except FileNotFoundError:
+            there = None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UsageError(f"{path} cannot be read ({error}): choose another folder") from error
+        if there is None:
+            document = {"fingerprint": terms.fingerprint, "terms": terms.model_dump(mode="json")}
+            output.replace(path, json.dumps(document, sort_keys=True, indent=1).encode())
+        elif not resume:
+            raise UsageError(f"{self._folder} holds a batch: --resume goes on with it, another folder begins anew")
+        elif there != terms.fingerprint:
+            raise UsageError(
+                f"{self._folder} holds a batch of another configuration, rig, network or version of coec: its rows "
+                "cannot be compared with new ones; choose another folder"
+            )
+
+    @contextmanager
+    def _writing(self, path: Path) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _row(line: bytes) -> WindowRow | None:
+    """None: the line was damaged, and its window is judged again."""
+    try:
+        return from_json(WindowRow, line)
+    except DecodeError:
+        return None

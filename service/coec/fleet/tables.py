@@ -1,0 +1,190 @@
+"""Rows as Parquet: one file after another, in folders by date and vehicle, as DuckDB, Spark and pandas read them."""
+
+from __future__ import annotations
+
+import io
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from coec.adapters.files import output
+from coec.errors import SourceError
+from coec.fleet.extra import pyarrow
+from coec.schemas.fleet import WindowRow
+from coec.schemas.replies import Maybe6, Maybe6x6
+
+NS_PER_S = 1_000_000_000
+
+UNDATED, NAMELESS = "unknown", "unknown"
+"""Date and vehicle of windows that could not be read; a vehicle cannot be called so, as a folder's name, by accident:
+its rows still hold its own."""
+
+AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
+
+
+def schema() -> Any:
+    """Columns of the table (a `pyarrow.Schema`); `date` and `vehicle` are the folders."""
+    pa = pyarrow()
+    text, number, whole = pa.string(), pa.float64(), pa.int64()
+    six = pa.list_(number, 6)
+    return pa.schema(
+        [
+            ("url", text),
+            ("sha256", text),
+            ("bytes", whole),
+            ("window_id", text),
+            ("pair", text),
+            ("camera_frame", text),
+            ("lidar_frame", text),
+            ("stamp_ns", whole),
+            ("time", pa.timestamp("us", tz="UTC")),
+            ("pairs", whole),
+            *((axis, number) for axis in AXES),
+            *((f"sigma_{axis}", number) for axis in AXES),
+            ("correlation", pa.list_(number, 36)),
+            ("camera_from_lidar", pa.list_(number, 16)),
+            ("observed", pa.list_(pa.bool_(), 6)),
+            ("accepted", pa.bool_()),
+            ("reason_codes", pa.list_(text)),
+            ("reasons", pa.list_(text)),
+            ("figures", pa.map_(text, number)),
+            ("limits", pa.map_(text, number)),
+            ("independent_looks", number),
+            ("score", number),
+            ("score_at_start", number),
+            ("mi", number),
+            ("overlap", number),
+            ("points_in_view", whole),
+            ("evaluations", whole),
+            ("stop_reason", text),
+            ("first_derivative", six),
+            ("second_derivative", six),
+            ("depth_identity", text),
+            ("config_hash", text),
+            ("recorded_decision", text),
+            ("decision", text),
+            ("result", text),
+            ("versions", pa.map_(text, text)),
+            ("seconds", number),
+            ("cpu_s", number),
+            ("error_code", text),
+            ("error", text),
+        ]
+    )
+
+
+def write(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
+    """Writes a file of this name for each date and vehicle; each is there whole or not at all.
+
+    Raises:
+        OutputError: one cannot be written.
+    """
+    groups: dict[str, list[WindowRow]] = defaultdict(list)
+    for row in rows:
+        groups[_place(row)].append(row)
+    for place, group in sorted(groups.items()):
+        output.replace(folder / place / f"{name}.parquet", _parquet(group))
+
+
+def urls(folder: Path) -> set[str]:
+    """Of all windows that have a row in a folder.
+
+    Raises:
+        SourceError: a file is damaged.
+    """
+    pyarrow()
+    from pyarrow import parquet
+
+    found: set[str] = set()
+    for path in sorted(folder.glob("date=*/vehicle=*/*.parquet")):
+        try:
+            found.update(parquet.ParquetFile(path).read(["url"])["url"].to_pylist())
+        except (OSError, ValueError, KeyError) as error:
+            raise SourceError(f"{path} is damaged ({error}): remove it, and its windows are judged again") from error
+    return found
+
+
+def _place(row: WindowRow) -> str:
+    date = UNDATED if row.result is None else f"{_time(row.result.data_stamp_ns):%Y-%m-%d}"
+    return f"date={date}/vehicle={quote(row.vehicle, safe='') or NAMELESS}"
+
+
+def _time(stamp_ns: int) -> datetime:
+    return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC)
+
+
+def _parquet(rows: Sequence[WindowRow]) -> bytes:
+    pa = pyarrow()
+    from pyarrow import parquet
+
+    table = pa.Table.from_pylist([_values(row) for row in sorted(rows, key=lambda row: row.url)], schema())
+    stream = io.BytesIO()
+    parquet.write_table(table, stream, compression="zstd")
+    return stream.getvalue()
+
+
+def _values(row: WindowRow) -> dict[str, Any]:
+    told: dict[str, Any] = {
+        "url": row.url,
+        "sha256": row.sha256,
+        "bytes": row.bytes,
+        "recorded_decision": row.recorded,
+        "decision": row.decided,
+        "versions": row.versions,
+        "seconds": row.seconds,
+        "cpu_s": row.cpu_s,
+        "error_code": row.error_code,
+        "error": row.error,
+    }
+    result = row.result
+    if result is None:
+        return told
+    seen = zip(result.solved, result.unobservable, strict=True)
+    return {
+        **told,
+        "window_id": result.window_id,
+        "pair": result.pair,
+        "camera_frame": result.camera_frame,
+        "lidar_frame": result.lidar_frame,
+        "stamp_ns": result.data_stamp_ns,
+        "time": _time(result.data_stamp_ns),
+        "pairs": result.pairs,
+        **dict(zip(AXES, result.correction, strict=True)),
+        **{f"sigma_{axis}": value for axis, value in zip(AXES, result.sigma, strict=True)},
+        "correlation": _correlation(result.noise),
+        "camera_from_lidar": [value for line in result.camera_from_lidar.matrix for value in line],
+        "observed": [solved and not blind for solved, blind in seen],
+        "accepted": result.verdict.decision == "accepted",
+        "reason_codes": [reason.code for reason in result.verdict.reasons],
+        "reasons": [reason.text for reason in result.verdict.reasons],
+        "figures": {name: metric.value for name, metric in result.metrics.items()},
+        "limits": {name: metric.limit for name, metric in result.metrics.items()},
+        "independent_looks": result.independent_looks,
+        "score": result.score,
+        "score_at_start": result.score_at_start,
+        "mi": result.mi,
+        "overlap": result.overlap,
+        "points_in_view": result.points_in_view,
+        "evaluations": result.evaluations,
+        "stop_reason": result.stop_reason,
+        "first_derivative": result.first_derivative,
+        "second_derivative": result.second_derivative,
+        "depth_identity": result.depth_identity,
+        "config_hash": result.config_hash,
+        "result": result.model_dump_json(),
+    }
+
+
+def _correlation(noise: Maybe6x6) -> list[float | None]:
+    """Row by row, of what differs from window to window; null where an axis is not known."""
+    variances: Maybe6 = tuple(noise[axis][axis] for axis in range(6))  # type: ignore[assignment]
+    return [
+        None
+        if covariance is None or not variances[a] or not variances[b]
+        else covariance / ((variances[a] or 0.0) * (variances[b] or 0.0)) ** 0.5
+        for a, line in enumerate(noise)
+        for b, covariance in enumerate(line)
+    ]

@@ -1,0 +1,113 @@
+"""On what terms windows are judged again: each as it was recorded, or all by another configuration or rig."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from coec import __version__
+from coec.adapters.files.rig import rig_from_json, rig_to_json
+from coec.calibration.types import Window
+from coec.config import CalibrationConfig, DepthConfig
+from coec.config.reading import load_config
+from coec.errors import ConfigError, UsageError, WindowError
+
+MAX_RIG_BYTES = 2**20
+"""Of a file that describes a rig: a thousand times what intrinsics and a pose take."""
+
+
+class Terms(BaseModel):
+    """What windows are judged by; travels to the processes that judge.
+
+    Attributes:
+        calibrations: of another configuration, by pair; empty: each window by the one that it carries.
+        any_pair: of the same, for windows of pairs that it does not name; None: such a window is refused.
+        rig: another rig (`rig_to_json`) for the windows of its pair; None: each window's own.
+        depth: another depth network for all: where that of the vehicles lies elsewhere, or a new one is tried. It is no
+            part of what a result says of its configuration, which has the hash of the network.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    calibrations: dict[str, CalibrationConfig] = {}
+    any_pair: CalibrationConfig | None = None
+    rig: dict[str, Any] | None = None
+    depth: str | None = None
+
+    @property
+    def fingerprint(self) -> str:
+        """Equal for equal decisions: of the terms, and of the program that decides."""
+        told = json.dumps([__version__, self.model_dump(mode="json")], sort_keys=True)
+        return hashlib.sha256(told.encode()).hexdigest()
+
+    def applied(self, window: Window, carried: CalibrationConfig) -> tuple[Window, CalibrationConfig]:
+        """A window and the configuration that it carries, as they are judged on these terms.
+
+        Raises:
+            ConfigError: the configuration does not name the pair of the window.
+        """
+        calibration = self._calibration(window.rig.pair, carried)
+        if self.rig is None or (rig := rig_from_json(self.rig, None)).pair != window.rig.pair:
+            return window, calibration
+        old, new = window.rig.camera, rig.camera
+        mask = window.rig.mask if (old.width, old.height) == (new.width, new.height) else None
+        return replace(window, rig=replace(rig, mask=mask)), calibration
+
+    def network(self, configured: DepthConfig) -> DepthConfig:
+        """The network by which a window is judged that is configured for one."""
+        return configured if self.depth is None else configured.model_copy(update={"model": self.depth})
+
+    def _calibration(self, pair: str, carried: CalibrationConfig) -> CalibrationConfig:
+        if not self.calibrations:
+            return carried
+        calibration = self.calibrations.get(pair, self.any_pair)
+        if calibration is None:
+            known = ", ".join(sorted(self.calibrations))
+            raise ConfigError(f"the configuration knows no pair {pair}; it has {known}")
+        return calibration
+
+
+def terms_of(config: Path | None, rig: Path | None, depth: str | None) -> Terms:
+    """The terms that a user states, each of which may be missing.
+
+    Args:
+        config: configuration of a daemon (YAML).
+        rig: JSON of a rig, as windows have it attached.
+        depth: an ONNX file, or the name of a network that comes with coec.
+
+    Raises:
+        ConfigError: the configuration cannot be used.
+        UsageError: the rig cannot be read.
+    """
+    calibrations, any_pair = {}, None
+    if config is not None:
+        pairs = load_config(config).every_pair
+        calibrations = {pair.name: pair.calibration for pair in pairs}
+        # One pair says how windows are calibrated, whatever the vehicles call theirs.
+        any_pair = pairs[0].calibration if len(pairs) == 1 else None
+    return Terms(calibrations=calibrations, any_pair=any_pair, rig=None if rig is None else _rig(rig), depth=depth)
+
+
+def _rig(path: Path) -> dict[str, Any]:
+    """The rig in a file as windows have it attached, with or without what else stands there.
+
+    Raises:
+        UsageError: there is none.
+    """
+    try:
+        if path.stat().st_size > MAX_RIG_BYTES:
+            raise UsageError(f"{path} is larger than {MAX_RIG_BYTES} bytes: no description of a rig")
+        document = json.loads(path.read_bytes())
+        document = document.get("rig", document) if isinstance(document, dict) else document
+        return rig_to_json(rig_from_json(document, None))
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path} is not JSON") from error
+    except WindowError as error:
+        raise UsageError(f"{path}: {error}") from error
