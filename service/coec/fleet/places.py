@@ -25,6 +25,9 @@ MAX_SUMS_BYTES = 64 * 2**20
 
 _SUM = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
 
+_DEEP = re.compile(r"(^|/)\*\*([^/]+)$")
+"""`**.mcap`, which shells and stores read differently: all names that end so, at any depth."""
+
 EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs", "az": "az", "abfs": "az", "abfss": "az"}
 """Of coec, that bring what speaks to a store, by the scheme of its URLs."""
 
@@ -44,7 +47,7 @@ class Job:
 
 def jobs_of(patterns: Sequence[str]) -> list[Job]:
     """The windows that patterns name, in order of their URLs, each once. A pattern is a file, a folder (all windows
-    in and below it) or has `*`, `?` and `**`, by path or by URL.
+    in and below it) or has `*`, `?`, `[...]` and `**`, by path or by URL.
 
     Raises:
         UsageError: one names no window.
@@ -52,7 +55,8 @@ def jobs_of(patterns: Sequence[str]) -> list[Job]:
     """
     found: set[str] = set()
     for pattern in patterns:
-        urls = _remote(pattern) if _scheme(pattern) else _local(pattern)
+        spread = _DEEP.sub(r"\1**/*\2", pattern)
+        urls = _remote(spread) if _scheme(spread) else _local(spread)
         if not urls:
             raise UsageError(f"{pattern} names no window ({SUFFIX})")
         found.update(urls)

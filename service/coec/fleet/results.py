@@ -90,7 +90,7 @@ class Results:
         path = self._folder / TERMS
         try:
             there = json.loads(path.read_bytes())["fingerprint"]
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):  # a folder that cannot be made is told by whoever makes it
             there = None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UsageError(f"{path} cannot be read ({error}): choose another folder") from error

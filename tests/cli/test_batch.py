@@ -1,0 +1,46 @@
+"""`coec batch`: windows in, tables and a summary out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import duckdb
+import pytest
+
+from cli.conftest import Coec
+from fleet_windows import recorded_windows
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded_windows(tmp_path_factory.mktemp("recorded"))
+
+
+def test_a_batch_makes_tables_compares_with_the_vehicles_and_goes_on(
+    coec: Coec, recorded: Path, tmp_path: Path
+) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"rubbish")
+    folder = tmp_path / "results"
+    first = coec("batch", recorded / "one", bad, "--output", folder, "--jobs", 1, "--json")
+    assert first.status == 1
+    document = first.document
+    assert (document["windows"], document["kept"], document["compared"], document["differing"]) == (2, 0, 1, 0)
+    assert document["errors"] == {"bad_window": 1}
+    assert "2 of 2" not in first.out
+
+    refused = coec("batch", recorded, "--output", folder)
+    assert refused.status == 2
+    assert "--resume" in refused.err
+
+    second = coec("batch", recorded, bad, "--output", folder, "--jobs", 1, "--resume")
+    assert second.status == 0
+    assert "judged before" in second.out
+    rows = duckdb.sql(f"SELECT url FROM read_parquet('{folder}/**/*.parquet')").fetchall()
+    assert sorted(Path(url).name for (url,) in rows) == ["bad.mcap", "one-1.mcap", "two-1.mcap"]
+
+
+def test_what_names_no_window_is_an_error(coec: Coec, tmp_path: Path) -> None:
+    outcome = coec("batch", f"{tmp_path}/*.mcap", "--output", tmp_path / "results")
+    assert outcome.status == 2
+    assert "names no window" in outcome.err

@@ -1,0 +1,139 @@
+"""The folder of a batch: no finished row is lost, none is there twice, whenever it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pytest
+
+from coec.adapters.files import durable
+from coec.adapters.files.output import OutputError
+from coec.errors import SourceError, UsageError
+from coec.fleet import results, tables
+from coec.fleet.desk import Desk
+from coec.fleet.places import Job
+from coec.fleet.results import Results
+from coec.fleet.terms import Terms
+from coec.fleet.trouble import begun, lost
+from coec.schemas.fleet import WindowRow
+
+
+@pytest.fixture(scope="module")
+def row(recorded: Path) -> WindowRow:
+    return Desk(Terms()).row(Job(str(recorded / "one" / "one-1.mcap")))
+
+
+@pytest.fixture(autouse=True)
+def small_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(results, "ROWS_A_FILE", 4)
+
+
+def rows(count: int) -> Iterator[WindowRow]:
+    return (begun(Job(f"{index}.mcap"), {}) for index in range(count))
+
+
+def asked(folder: Path, query: str) -> list[tuple[Any, ...]]:
+    table = f"read_parquet('{folder}/**/*.parquet', hive_partitioning = true)"
+    return duckdb.sql(query.replace("TABLE", table)).fetchall()
+
+
+def test_a_row_holds_everything_that_was_decided(tmp_path: Path, row: WindowRow) -> None:
+    tables.write(tmp_path, [row, lost(Job("gone.mcap"), "process_died", "it ended")], "part-1")
+    result = row.result
+    assert result is not None
+    ((url, vehicle, date, accepted, rx, sigma, figures, pitch_height, text),) = asked(
+        tmp_path,
+        "SELECT url, vehicle, date, accepted, rx_deg, sigma_rx_deg, figures, correlation[5], result FROM TABLE"
+        " WHERE error IS NULL",
+    )
+    assert (url, vehicle, accepted) == (row.url, "one", result.verdict.decision == "accepted")
+    assert str(date) == "2020-09-13"
+    assert (rx, sigma) == (result.correction[0], result.sigma[0])
+    assert figures == {name: metric.value for name, metric in result.metrics.items()}
+    assert pitch_height == result.correlation_pitch_height
+    assert type(result).model_validate_json(text) == result
+    ((vehicle, code),) = asked(tmp_path, "SELECT vehicle, error_code FROM TABLE WHERE error IS NOT NULL")
+    assert (vehicle, code) == ("unknown", "process_died")
+
+
+def test_a_vehicle_of_any_name_has_a_folder_within_the_folder(tmp_path: Path) -> None:
+    for index, vehicle in enumerate(["../../etc", "a/b", "x=1", "", "Ä ö"]):
+        tables.write(tmp_path, [begun(Job(f"{index}"), {}).model_copy(update={"vehicle": vehicle})], f"part-{index}")
+    assert len(list(tmp_path.glob("date=unknown/vehicle=*/*.parquet"))) == 5
+    assert {name for (name,) in asked(tmp_path, "SELECT vehicle FROM TABLE")} >= {"../../etc", "a/b", "x=1", "Ä ö"}
+
+
+@pytest.mark.fault("a batch is stopped at any point", "no finished row is lost, none is there twice")
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 9])
+def test_a_batch_that_ends_anywhere_is_gone_on_with(tmp_path: Path, count: int) -> None:
+    first = Results(tmp_path, Terms(), resume=False)
+    for row in rows(count):
+        first.add(row)
+    # It is gone without a word.
+    second = Results(tmp_path, Terms(), resume=True)
+    assert second.urls == {row.url for row in rows(count)}
+    for row in rows(11):
+        if row.url not in second.urls:
+            second.add(row)
+    second.finish()
+    assert asked(tmp_path, "SELECT count(*), count(DISTINCT url) FROM TABLE") == [(11, 11)]
+    assert Results(tmp_path, Terms(), resume=True).urls == {row.url for row in rows(11)}
+
+
+def test_tables_that_were_made_before_the_journal_was_emptied_are_not_made_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = Results(tmp_path, Terms(), resume=False)
+    with monkeypatch.context() as patch:
+
+        def gone(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        patch.setattr(durable.Log, "renew", gone)
+        *before, last = rows(4)
+        for row in before:
+            first.add(row)
+        with pytest.raises(KeyboardInterrupt):
+            first.add(last)
+    second = Results(tmp_path, Terms(), resume=True)
+    assert len(second.urls) == 4
+    second.finish()
+    assert asked(tmp_path, "SELECT count(*) FROM TABLE") == [(4,)]
+
+
+def test_a_torn_or_damaged_line_of_the_journal_costs_its_own_window(tmp_path: Path) -> None:
+    first = Results(tmp_path, Terms(), resume=False)
+    for row in rows(3):
+        first.add(row)
+    journal = tmp_path / results.JOURNAL
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(lines[0] + b'{"url": 3}\n' + lines[2][:-20])
+    assert Results(tmp_path, Terms(), resume=True).urls == {"0.mcap"}
+
+
+def test_a_folder_with_a_batch_is_gone_on_with_only_if_asked_and_on_the_same_terms(tmp_path: Path) -> None:
+    Results(tmp_path, Terms(), resume=True)
+    with pytest.raises(UsageError, match="--resume"):
+        Results(tmp_path, Terms(), resume=False)
+    with pytest.raises(UsageError, match="another configuration"):
+        Results(tmp_path, Terms(depth="street"), resume=True)
+
+
+@pytest.mark.fault("tables of a batch are damaged, its folder cannot be written", "it is said which file, what to do")
+def test_what_cannot_be_read_or_written_is_told(tmp_path: Path) -> None:
+    batch = Results(tmp_path / "batch", Terms(), resume=False)
+    for row in rows(4):
+        batch.add(row)
+    (table,) = (tmp_path / "batch").glob("date=*/vehicle=*/*.parquet")
+    table.write_bytes(b"PAR1 rubbish PAR1")
+    with pytest.raises(SourceError, match="judged again"):
+        Results(tmp_path / "batch", Terms(), resume=True)
+    (tmp_path / "batch" / results.TERMS).write_text("[")
+    with pytest.raises(UsageError, match="another folder"):
+        Results(tmp_path / "batch", Terms(), resume=True)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        Results(tmp_path / "file", Terms(), resume=False)
