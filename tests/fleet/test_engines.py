@@ -59,7 +59,7 @@ def decided(engine: Engine, jobs: list[Job]) -> dict[str, str | None]:
 
 
 def expected(recorded: Path) -> dict[str, str | None]:
-    told = {}
+    told: dict[str, str | None] = {}
     for path in sorted(recorded.rglob("*.mcap")):
         result = read_result(path)
         assert result is not None

@@ -17,7 +17,8 @@ def jobs(count: int) -> list[Job]:
 
 
 def test_a_process_has_one_window_ahead_and_no_more() -> None:
-    queue, has = Queue(jobs(5)), []
+    queue = Queue(jobs(5))
+    has: list[Job] = []
     while (job := queue.next_for(has)) is not None:
         has.append(job)
     assert has == jobs(5)[:AHEAD]
@@ -43,7 +44,8 @@ def test_whoever_is_poisoned_nobody_else_is_lost(seed: int) -> None:
     rng = random.Random(seed)
     everything = jobs(rng.randrange(1, 30))
     poisoned = set(rng.sample(everything, rng.randrange(len(everything) + 1)))
-    queue, seats = Queue(everything), [[] for _ in range(rng.randrange(1, 5))]  # type: list[list[Job]]
+    queue = Queue(everything)
+    seats: list[list[Job]] = [[] for _ in range(rng.randrange(1, 5))]
     judged: list[Job] = []
     lost: list[str] = []
     while queue or any(seats):

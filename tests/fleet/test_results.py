@@ -37,7 +37,8 @@ def rows(count: int) -> Iterator[WindowRow]:
 
 def asked(folder: Path, query: str) -> list[tuple[Any, ...]]:
     table = f"read_parquet('{folder}/**/*.parquet', hive_partitioning = true)"
-    return duckdb.sql(query.replace("TABLE", table)).fetchall()
+    rows: list[tuple[Any, ...]] = duckdb.sql(query.replace("TABLE", table)).fetchall()
+    return rows
 
 
 def test_a_row_holds_everything_that_was_decided(tmp_path: Path, row: WindowRow) -> None:

@@ -7,11 +7,11 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from coec.adapters.files import output
+from coec.adapters.system.cores import one_thread_each
 from coec.config import CalibrationConfig
 from coec.errors import CoecError, DecodeError, UsageError
 from coec.evaluation import matrix, matrix_drives, matrix_run
@@ -21,9 +21,6 @@ from coec.reports import console, matrix_plots, matrix_tables
 from coec.schemas.base import from_json, to_json
 from coec.schemas.matrix import MatrixRow
 from coec.simulation.source import require_extra
-
-THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Variables that say how many threads a library starts; read when it is imported."""
 
 
 class MatrixError(CoecError):
@@ -100,7 +97,7 @@ def _run(drives: Sequence[MatrixDrive], settings: Settings, jobs: int) -> Iterat
     if jobs == 1:
         yield from (matrix_run.run(drive, settings) for drive in drives)
         return
-    with _one_thread_each():
+    with one_thread_each():
         pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))
         try:
             for done in as_completed([pool.submit(matrix_run.run, drive, settings) for drive in drives]):
@@ -112,18 +109,3 @@ def _run(drives: Sequence[MatrixDrive], settings: Settings, jobs: int) -> Iterat
             ) from error
         finally:  # also where the caller has gone before the end
             pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """The processes that are begun in here keep to one core: the others have drives of their own."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import checks, commands, doctor, evaluation, frames, matrix, replies, rig
+from coec.schemas import checks, commands, doctor, evaluation, fleet, frames, matrix, replies, rig
 from coec.schemas.base import Message
 
 SENT: tuple[type[Message], ...] = (
@@ -43,6 +43,8 @@ MESSAGES: tuple[type[Message], ...] = (
     checks.ChecksReport,
     rig.RigMovesReport,
     doctor.DoctorReport,
+    fleet.WindowRow,
+    fleet.BatchReport,
 )
 
 
