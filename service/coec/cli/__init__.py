@@ -681,6 +681,30 @@ def _batch(
     raise typer.Exit(command.run(options))
 
 
+fleet_app = typer.Typer(no_args_is_help=True, help="What the windows of many vehicles say together.")
+app.add_typer(fleet_app, name="fleet")
+
+
+@fleet_app.command("report")
+def _fleet_report(
+    results: Annotated[
+        Path, typer.Argument(metavar="RESULTS", help="Folder of `coec batch` (--output).", show_default=False)
+    ],
+    output: Annotated[Path | None, typer.Option(help="Write report.html and report.json.", metavar="DIR")] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="Results of an earlier batch over the same windows.", metavar="RESULTS")
+    ] = None,
+    sql: Annotated[
+        bool, typer.Option("--sql", help="Print the columns, and queries that answer questions; nothing else.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Drift of every pair, what is refused and why, and what an earlier batch decided otherwise."""
+    from coec.cli import fleet as command
+
+    raise typer.Exit(command.run(command.Options(results, output, against, sql, as_json)))
+
+
 @app.command("replay")
 def _replay(
     window: Annotated[Path, typer.Argument(help="A recorded window with its result (.mcap).", show_default=False)],

@@ -45,6 +45,7 @@ MESSAGES: tuple[type[Message], ...] = (
     doctor.DoctorReport,
     fleet.WindowRow,
     fleet.BatchReport,
+    fleet.FleetReport,
 )
 
 

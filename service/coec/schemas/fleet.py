@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from coec.schemas.base import Message
-from coec.schemas.replies import CalibrationResult, Count, Counts
+from coec.schemas.base import Message, Part
+from coec.schemas.replies import CalibrationResult, Count, Counts, Maybe6
 
 
 class WindowRow(Message):
@@ -44,3 +44,81 @@ class BatchReport(Message):
     share_of_ideal: float | None = Field(
         description="time that this run's windows took, over cores and elapsed time: 1 where no core ever waited"
     )
+
+
+class DayOfPair(Part):
+    """Accepted windows of a pair on one day; null on axes that none of them told."""
+
+    date: str = Field(description="UTC, as 2026-11-22")
+    windows: Count
+    low: Maybe6 = Field(description="16th percentile of the correction: one standard deviation below, were it normal")
+    middle: Maybe6 = Field(description="median")
+    high: Maybe6 = Field(description="84th percentile")
+
+
+class PairOfFleet(Part):
+    """A pair of a vehicle over time. Corrections are from its nominal calibration."""
+
+    vehicle: str
+    pair: str
+    windows: Count
+    accepted: Count
+    errors: Count = Field(description="windows without a result")
+    last_ns: int | None = Field(description="stamp of the last window with a result, ns")
+    latest: Maybe6 = Field(description="median of the last accepted windows; null on axes that they do not tell")
+    drift: Maybe6 = Field(description="`latest` less the median of as many that were accepted first")
+    slope: Maybe6 = Field(description="of the corrections over time, per 30 days; null with windows of one day")
+    worst: str | None = Field(description="axis that drifted furthest, measured by what a monitor has to see")
+    urgency: float = Field(ge=0, description="drift of that axis, in multiples of that")
+    days: tuple[DayOfPair, ...]
+
+
+class FigureOfFleet(Part):
+    """A figure of self-diagnosis over the accepted windows of all vehicles."""
+
+    name: str
+    pair: str
+    vehicles: Count
+    windows: Count
+    low: float = Field(description="0.5 % of the windows are below")
+    middle: float
+    high: float = Field(description="0.5 % of the windows are above")
+
+
+class ChangedWindow(Part):
+    """A window that is decided otherwise than before."""
+
+    vehicle: str
+    window_id: str
+    before: str = Field(description="`accepted`, or codes of the reasons or the error")
+    now: str
+    rotation_deg: float | None = Field(description="largest difference of the corrections; null without two results")
+    translation_m: float | None
+
+
+class FleetChanges(Part):
+    """Windows of two batches, matched by their hashes."""
+
+    both: Count
+    identical: Count = Field(description="to the byte")
+    newly_accepted: Count
+    newly_refused: Count
+    newly_failing: Count = Field(description="without a result now, with one before")
+    rotation_deg: float | None = Field(description="root mean square over windows accepted twice")
+    translation_m: float | None
+    windows: tuple[ChangedWindow, ...] = Field(description="decided otherwise, those furthest apart first")
+
+
+class FleetReport(Message):
+    """What `coec fleet report --json` prints."""
+
+    vehicles: Count
+    pairs: tuple[PairOfFleet, ...] = Field(description="the most urgent first")
+    windows: Count
+    accepted: Count
+    refusals: Counts = Field(description="windows by code of a reason; one window may have several")
+    errors: Counts = Field(description="windows without a result, by code")
+    first_ns: int | None
+    last_ns: int | None
+    figures: tuple[FigureOfFleet, ...]
+    changes: FleetChanges | None = Field(default=None, description="with --against")

@@ -1,0 +1,92 @@
+"""`coec fleet report`: what many windows say of a fleet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from coec.adapters.files import output
+from coec.fleet import questions, report
+from coec.reports import console, fleet_page
+from coec.reports.console import figure
+from coec.schemas.base import to_json
+from coec.schemas.fleet import FleetReport
+
+SHOWN = 15
+"""Pairs in the table on the screen; the page has all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    results: Path
+    output: Path | None = None
+    against: Path | None = None
+    sql: bool = False
+    as_json: bool = False
+
+
+def run(options: Options) -> int:
+    """Writes page and document into the output folder, if one is given, and shows the most urgent pairs.
+
+    Raises:
+        UsageError: there are no tables.
+        SourceError: the optional extra is not installed.
+        OutputError: a file cannot be written.
+    """
+    if options.sql:
+        _show_sql(options.results)
+        return 0
+    told = report.report(options.results, options.against)
+    if options.output is not None:
+        page = fleet_page.page(told, f"coec fleet: {options.results.resolve().name}")
+        output.write(options.output / "report.html", page.encode())
+        output.write(options.output / "report.json", to_json(told))
+    if options.as_json:
+        console.print_json(told.model_dump(mode="json"))
+        return 0
+    _show(told)
+    if options.output is not None:
+        console.show(f"{options.output / 'report.html'}")
+    return 0
+
+
+def _show(told: FleetReport) -> None:
+    console.show(fleet_page.sentence(told))
+    table = console.table(
+        "vehicle", "pair", "windows", "accepted", "worst axis", "drift", "urgency", right=(2, 3, 5, 6)
+    )
+    for pair in told.pairs[:SHOWN]:
+        axis = None if pair.worst is None else fleet_page.AXES.index(pair.worst)
+        table.add_row(
+            pair.vehicle,
+            pair.pair,
+            str(pair.windows),
+            str(pair.accepted),
+            "-" if pair.worst is None else pair.worst,
+            "-" if axis is None else figure(pair.drift[axis], sign=True),
+            f"{pair.urgency:.1f}",
+        )
+    console.out.print(table)
+    if len(told.pairs) > SHOWN:
+        console.show(f"and {len(told.pairs) - SHOWN} more")
+    if told.changes is not None:
+        changes = told.changes
+        console.show(
+            f"against the earlier batch: {changes.both} windows in both, {changes.identical} identical, "
+            f"{changes.newly_accepted} newly accepted, {changes.newly_refused} newly refused, "
+            f"{changes.newly_failing} without a result any more"
+        )
+
+
+def _show_sql(results: Path) -> None:
+    console.raw(f"-- the view `{questions.WINDOWS}` of the examples below\n")
+    pattern = results / "date=*" / "vehicle=*" / "*.parquet"
+    console.raw(
+        f"CREATE VIEW {questions.WINDOWS} AS SELECT * FROM read_parquet('{pattern}', hive_partitioning = true);\n\n"
+    )
+    for name, kind in questions.columns(results):
+        console.raw(f"--   {name:<22} {kind}\n")
+    for question, query in questions.EXAMPLES.items():
+        console.raw(f"\n-- {question}{query};\n")

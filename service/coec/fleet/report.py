@@ -1,0 +1,206 @@
+"""What many windows say of a fleet: drift of every pair, what is refused and why, what another batch decided."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from coec.fleet.questions import WINDOWS, ask, view
+from coec.fleet.tables import AXES
+from coec.schemas.fleet import ChangedWindow, DayOfPair, FigureOfFleet, FleetChanges, FleetReport, PairOfFleet
+from coec.schemas.replies import Maybe6
+
+BEFORE = "before"
+"""The view of the batch that is compared with."""
+
+ENDS = 5
+"""Accepted windows whose median is where a pair began, and is now: one that is far off moves none of both."""
+
+SEEN = (0.5, 0.5, 0.5, 0.1, 0.1, 0.1)
+"""Steps, deg and m, that a monitor has to see: the measure of a drift."""
+
+MONTH_S = 30 * 86_400.0
+
+LISTED = 50
+"""Windows decided otherwise that are listed."""
+
+NS_PER_S = 1e9
+
+_TOLD = ", ".join(f"CASE WHEN observed[{index}] THEN {axis} END AS {axis}" for index, axis in enumerate(AXES, 1))
+"""The corrections, null where a window does not tell them."""
+
+_ACCEPTED = f"(SELECT vehicle, pair, date, stamp_ns, {_TOLD} FROM {WINDOWS} WHERE accepted)"
+
+
+def report(folder: Path, against: Path | None) -> FleetReport:
+    """Of the tables in a folder; `against`: those of an earlier batch over the same windows.
+
+    Raises:
+        UsageError: there are no tables.
+        SourceError: the optional extra is not installed.
+    """
+    connection = ask(folder)
+    windows, accepted, first_ns, last_ns = connection.execute(
+        f"SELECT count(*), count(*) FILTER (accepted), min(stamp_ns), max(stamp_ns) FROM {WINDOWS}"
+    ).fetchone()
+    pairs = _pairs(connection)
+    return FleetReport(
+        vehicles=len({pair.vehicle for pair in pairs}),
+        pairs=pairs,
+        windows=windows,
+        accepted=accepted,
+        refusals=_counts(connection, f"SELECT unnest(reason_codes) AS code FROM {WINDOWS} WHERE NOT accepted"),
+        errors=_counts(connection, f"SELECT error_code AS code FROM {WINDOWS} WHERE error_code IS NOT NULL"),
+        first_ns=first_ns,
+        last_ns=last_ns,
+        figures=_figures(connection),
+        changes=None if against is None else _changes(connection, against),
+    )
+
+
+def _counts(connection: Any, codes: str) -> dict[str, int]:
+    return dict(connection.execute(f"SELECT code, count(*) FROM ({codes}) GROUP BY ALL ORDER BY ALL").fetchall())
+
+
+def _pairs(connection: Any) -> tuple[PairOfFleet, ...]:
+    days = _days(connection)
+    ends = _ends(connection)
+    counted = connection.execute(
+        f"SELECT vehicle, pair, count(*), count(*) FILTER (accepted), count(*) FILTER (error_code IS NOT NULL),"
+        f" max(stamp_ns) FROM {WINDOWS} GROUP BY ALL"
+    ).fetchall()
+    made = []
+    for vehicle, pair, windows, accepted, errors, last_ns in counted:
+        first, latest, slope = ends.get((vehicle, pair), (_UNKNOWN, _UNKNOWN, _UNKNOWN))
+        drift = [None if a is None or b is None else b - a for a, b in zip(first, latest, strict=True)]
+        shares = [0.0 if d is None else abs(d) / seen for d, seen in zip(drift, SEEN, strict=True)]
+        urgency = max(shares)
+        made.append(
+            PairOfFleet(
+                vehicle=vehicle,
+                pair=pair or "",
+                windows=windows,
+                accepted=accepted,
+                errors=errors,
+                last_ns=last_ns,
+                latest=latest,
+                drift=_six(drift),
+                slope=slope,
+                worst=AXES[shares.index(urgency)] if urgency > 0.0 else None,
+                urgency=urgency,
+                days=tuple(days[vehicle, pair]),
+            )
+        )
+    return tuple(sorted(made, key=lambda pair: (-pair.urgency, pair.vehicle, pair.pair)))
+
+
+_UNKNOWN: Maybe6 = (None,) * 6
+
+
+def _six(values: Sequence[float | None]) -> Maybe6:
+    return cast("Maybe6", tuple(values))
+
+
+def _ends(connection: Any) -> dict[tuple[str, str], tuple[Maybe6, Maybe6, Maybe6]]:
+    """By vehicle and pair: medians of the first and of the last accepted windows, and the slope of all."""
+    medians = ", ".join(
+        f"median({axis}) FILTER (up <= {ENDS}), median({axis}) FILTER (down <= {ENDS}),"
+        f" regr_slope({axis}, stamp_ns / {NS_PER_S}) * {MONTH_S}"
+        for axis in AXES
+    )
+    # Over each axis by itself would be eighteen sorts; a pair has the same axes in all its windows, nearly.
+    rows = connection.execute(
+        f"SELECT vehicle, pair, count(DISTINCT date) > 1, {medians} FROM (SELECT *,"
+        " row_number() OVER (PARTITION BY vehicle, pair ORDER BY stamp_ns) AS up,"
+        " row_number() OVER (PARTITION BY vehicle, pair ORDER BY stamp_ns DESC) AS down"
+        f" FROM {_ACCEPTED}) GROUP BY ALL"
+    ).fetchall()
+    return {
+        (vehicle, pair): (
+            _six(values[0::3]),
+            _six(values[1::3]),
+            _six(values[2::3]) if several_days else _UNKNOWN,
+        )
+        for vehicle, pair, several_days, *values in rows
+    }
+
+
+def _days(connection: Any) -> dict[tuple[str, str], list[DayOfPair]]:
+    spread = ", ".join(f"quantile_cont({axis}, [0.16, 0.5, 0.84])" for axis in AXES)
+    rows = connection.execute(
+        f"SELECT vehicle, pair, date, count(*), {spread} FROM {_ACCEPTED} GROUP BY ALL ORDER BY vehicle, pair, date"
+    ).fetchall()
+    made: dict[tuple[str, str], list[DayOfPair]] = defaultdict(list)
+    for vehicle, pair, date, windows, *spreads in rows:
+        low, middle, high = zip(*(each or (None, None, None) for each in spreads), strict=True)
+        day = DayOfPair(date=date, windows=windows, low=_six(low), middle=_six(middle), high=_six(high))
+        made[vehicle, pair].append(day)
+    return made
+
+
+def _figures(connection: Any) -> tuple[FigureOfFleet, ...]:
+    rows = connection.execute(
+        "SELECT figure.key, pair, count(DISTINCT vehicle), count(*), quantile_cont(figure.value, [0.005, 0.5, 0.995])"
+        f" FROM (SELECT vehicle, pair, unnest(map_entries(figures)) AS figure FROM {WINDOWS} WHERE accepted)"
+        " WHERE figure.value IS NOT NULL GROUP BY ALL ORDER BY ALL"
+    ).fetchall()
+    return tuple(
+        FigureOfFleet(
+            name=name, pair=pair, vehicles=vehicles, windows=windows, low=spread[0], middle=spread[1], high=spread[2]
+        )
+        for name, pair, vehicles, windows, spread in rows
+    )
+
+
+def _once(name: str) -> str:
+    """The windows of a view, of copies the one with the first URL."""
+    return f"(SELECT * FROM {name} QUALIFY row_number() OVER (PARTITION BY sha256 ORDER BY url) = 1)"
+
+
+def _changes(connection: Any, against: Path) -> FleetChanges:
+    view(connection, BEFORE, against)
+    rotation = "greatest(" + ", ".join(f"abs(now.{axis} - was.{axis})" for axis in AXES[:3]) + ")"
+    translation = "greatest(" + ", ".join(f"abs(now.{axis} - was.{axis})" for axis in AXES[3:]) + ")"
+    connection.execute(
+        "CREATE TEMP TABLE changed AS SELECT now.vehicle, coalesce(now.window_id, was.window_id, now.url) AS window_id,"
+        " coalesce(now.decision = was.decision, now.error_code = was.error_code, false) AS same,"
+        " coalesce(was.accepted, false) AS was_accepted, coalesce(now.accepted, false) AS now_accepted,"
+        " was.error_code IS NULL AND now.error_code IS NOT NULL AS failing,"
+        " coalesce(was.error_code, array_to_string(was.reason_codes, ', ')) AS was_why,"
+        " coalesce(now.error_code, array_to_string(now.reason_codes, ', ')) AS now_why,"
+        f" {rotation} AS rotation, {translation} AS translation"
+        f" FROM {_once(WINDOWS)} AS now JOIN {_once(BEFORE)} AS was USING (sha256)"
+    )
+    both, identical, gained, lost, failing, rotation_deg, translation_m = connection.execute(
+        "SELECT count(*), count(*) FILTER (same), count(*) FILTER (now_accepted AND NOT was_accepted),"
+        " count(*) FILTER (was_accepted AND NOT now_accepted), count(*) FILTER (failing),"
+        " sqrt(avg(rotation ** 2) FILTER (was_accepted AND now_accepted)),"
+        " sqrt(avg(translation ** 2) FILTER (was_accepted AND now_accepted)) FROM changed"
+    ).fetchone()
+    rows = connection.execute(
+        "SELECT vehicle, window_id, was_accepted, was_why, now_accepted, now_why, rotation, translation FROM changed"
+        " WHERE was_accepted <> now_accepted OR failing"
+        f" ORDER BY rotation DESC NULLS LAST, vehicle, window_id LIMIT {LISTED}"
+    ).fetchall()
+    return FleetChanges(
+        both=both,
+        identical=identical,
+        newly_accepted=gained,
+        newly_refused=lost,
+        newly_failing=failing,
+        rotation_deg=rotation_deg,
+        translation_m=translation_m,
+        windows=tuple(
+            ChangedWindow(
+                vehicle=vehicle,
+                window_id=window_id,
+                before="accepted" if was_accepted else was_why,
+                now="accepted" if now_accepted else now_why,
+                rotation_deg=rotation_deg,
+                translation_m=translation_m,
+            )
+            for vehicle, window_id, was_accepted, was_why, now_accepted, now_why, rotation_deg, translation_m in rows
+        ),
+    )

@@ -1,0 +1,177 @@
+"""What many windows say of a fleet: the drifting vehicles first, the right numbers, and what another batch decided."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coec.adapters.mcap.windows import read_result
+from coec.errors import UsageError
+from coec.fleet import questions, tables
+from coec.fleet.report import report
+from coec.reports import fleet_page
+from coec.schemas.fleet import FleetReport, WindowRow
+from coec.schemas.replies import CalibrationResult
+from fleets import FAILED, REFUSED, SIGMA, fleet
+
+VEHICLES, WINDOWS = 12, 40
+DRIFTS = {3: (1, 1.2), 7: (3, 0.15)}
+"""Yaw by 1.2°, and to the right by 15 cm."""
+
+
+@pytest.fixture(scope="module")
+def pattern(recorded: Path) -> CalibrationResult:
+    result = read_result(recorded / "one" / "one-1.mcap")
+    assert result is not None
+    return result
+
+
+@pytest.fixture(scope="module")
+def rows(pattern: CalibrationResult) -> list[WindowRow]:
+    return list(fleet(pattern, VEHICLES, WINDOWS, DRIFTS, 1))
+
+
+@pytest.fixture(scope="module")
+def results(rows: list[WindowRow], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results")
+    tables.write(folder, rows, "part-1")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def told(results: Path) -> FleetReport:
+    return report(results, None)
+
+
+def test_vehicles_that_drift_come_first_with_their_axis(told: FleetReport) -> None:
+    by_urgency = [(pair.vehicle, pair.worst) for pair in told.pairs[:2]]
+    assert by_urgency == [("v003", "ry_deg"), ("v007", "tx_m")]
+    yaw = told.pairs[0]
+    assert yaw.drift[1] == pytest.approx(1.2, rel=0.15)
+    assert yaw.urgency == pytest.approx(abs(yaw.drift[1] or 0.0) / 0.5)
+    days = WINDOWS * 2.4 / 24.0
+    assert yaw.slope[1] == pytest.approx(1.2 / days * 30.0, rel=0.15)
+    for pair in told.pairs[2:]:
+        assert pair.urgency < 0.5
+
+
+def test_counts_are_those_of_the_rows(told: FleetReport, rows: list[WindowRow]) -> None:
+    results = [row.result for row in rows if row.result is not None]
+    accepted = [result for result in results if result.verdict.decision == "accepted"]
+    assert (told.windows, told.accepted) == (len(rows), len(accepted))
+    assert told.refusals == {"sigma_deg": len(results) - len(accepted)}
+    assert told.errors == {"bad_window": len(rows) - len(results)}
+    assert len(results) < len(rows) * (1.0 - FAILED / 4.0)
+    assert len(results) - len(accepted) > len(rows) * REFUSED / 4.0
+    # Windows that could not be read have no vehicle; they are no vehicle's drift either.
+    assert {pair.vehicle for pair in told.pairs} == {*(f"v{index:03}" for index in range(VEHICLES)), "unknown"}
+    (first_ns, last_ns) = min(r.data_stamp_ns for r in results), max(r.data_stamp_ns for r in results)
+    assert (told.first_ns, told.last_ns) == (first_ns, last_ns)
+
+
+def test_days_are_medians_and_bands_as_numpy_has_them(told: FleetReport, rows: list[WindowRow]) -> None:
+    pair = next(pair for pair in told.pairs if pair.vehicle == "v005")
+    by_day: dict[str, list[float]] = {}
+    for row in rows:
+        result = row.result
+        if result is not None and result.vehicle == "v005" and result.verdict.decision == "accepted":
+            date = str(np.datetime64(result.data_stamp_ns, "ns").astype("datetime64[D]"))
+            by_day.setdefault(date, []).append(result.correction[2])
+    assert [day.date for day in pair.days] == sorted(by_day)
+    for day in pair.days:
+        low, middle, high = np.quantile(by_day[day.date], [0.16, 0.5, 0.84])
+        assert (day.low[2], day.middle[2], day.high[2]) == pytest.approx((low, middle, high))
+    assert len(pair.days) > 3
+
+
+def test_an_axis_that_no_window_tells_has_no_drift(rows: list[WindowRow], tmp_path: Path) -> None:
+    blind = [
+        row.model_copy(update={"result": row.result.model_copy(update={"unobservable": (False,) * 5 + (True,)})})
+        for row in rows[:WINDOWS]
+        if row.result is not None
+    ]
+    tables.write(tmp_path, blind, "part-1")
+    (pair,) = report(tmp_path, None).pairs
+    assert pair.drift[5] is None
+    assert pair.latest[5] is None
+    assert pair.latest[4] == pytest.approx(0.0, abs=40.0 * SIGMA[4])
+    assert all(day.middle[5] is None for day in pair.days)
+
+
+def test_what_another_batch_decided_otherwise(results: Path, rows: list[WindowRow], tmp_path: Path) -> None:
+    turned, failing = 5, 9
+    before = list(rows)
+    for index in (turned, failing):
+        assert rows[index].result is not None
+    result = rows[turned].result
+    assert result is not None
+    refused = result.verdict.model_copy(update={"decision": "failed", "reasons": ()})
+    moved = (result.correction[0] + 0.7, *result.correction[1:])
+    before[turned] = rows[turned].model_copy(
+        update={"decided": "other", "result": result.model_copy(update={"verdict": refused, "correction": moved})}
+    )
+    now = list(rows)
+    now[failing] = rows[failing].model_copy(
+        update={"result": None, "decided": None, "error_code": "deadline", "error": "late"}
+    )
+    for name, batch in (("before", before), ("now", now)):
+        tables.write(tmp_path / name, [*batch, batch[0].model_copy(update={"url": "a copy of it"})], "part-1")
+    changes = report(tmp_path / "now", tmp_path / "before").changes
+    assert changes is not None
+    assert (changes.both, changes.identical) == (len(rows), len(rows) - 2)
+    assert (changes.newly_accepted, changes.newly_refused, changes.newly_failing) == (1, 1, 1)
+    first, second = changes.windows
+    assert first.now == "accepted"
+    assert first.rotation_deg == pytest.approx(0.7)
+    assert (second.before, second.now, second.rotation_deg) == ("accepted", "deadline", None)
+    same = report(results, results).changes
+    assert same is not None
+    assert (same.identical, same.windows, same.rotation_deg) == (len(rows), (), 0.0)
+
+
+def test_every_example_of_a_query_answers(results: Path) -> None:
+    connection = questions.ask(results)
+    for question, query in questions.EXAMPLES.items():
+        rows = connection.execute(query).fetchall()
+        assert rows or "otherwise" in question, question
+    assert dict(questions.columns(results))["correlation"] == "DOUBLE[]"
+
+
+def test_a_folder_without_tables_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="coec batch"):
+        report(tmp_path, None)
+
+
+class Page(HTMLParser):
+    """What of a page would be loaded or run, and its tags that are not closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.loads += [f"{tag} {name}" for name, _ in attrs if name in ("src", "href", "onload", "onerror")]
+        if tag in ("table", "tbody", "thead", "svg", "div", "script"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in self.open:
+            assert self.open.pop() == tag
+
+
+@pytest.mark.fault("a vehicle that calls itself markup", "text in the page of the fleet")
+def test_the_page_loads_nothing_and_names_are_text_in_it(told: FleetReport) -> None:
+    name = "<script src=x onerror=alert(1)>'\"&"
+    pairs = (told.pairs[0].model_copy(update={"vehicle": name, "pair": name}), *told.pairs[1:])
+    text = fleet_page.page(told.model_copy(update={"pairs": pairs}), name)
+    page = Page(text)
+    assert page.loads == []
+    assert page.open == []
+    assert "<script" not in text
+    assert text.count("<svg") == sum(pair.worst is not None for pair in told.pairs)
+    assert "2 of" in fleet_page.sentence(told)
