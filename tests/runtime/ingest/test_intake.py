@@ -67,10 +67,10 @@ class Looks:
         if self.keeps:
             self.pairs.append(pair)
 
-    def advance(self, now_ns: int, end_ns: int) -> None:
-        assert now_ns > end_ns
-        self.ended.append(end_ns)
+    def end_slice_by(self, now_ns: int) -> bool:
+        self.ended.append(now_ns)
         self.slice_end_ns = None
+        return True
 
 
 class Vehicle:

@@ -74,6 +74,7 @@ class StoredPair(Part):
     completed_wall_ns: WallNs | None
     health: replies.HealthState = "unknown"
     reasons: tuple[replies.Reason, ...] = ()
+    unseen_from: replies.HealthState | None = None
     pending: StoredCandidate | None = None
     frozen: bool = False
     proven: bool = False
@@ -165,6 +166,7 @@ class StateStore:
             completed_wall_ns=clocks.completed_wall_ns,
             health=state.health.value,
             reasons=_told(state.reasons),
+            unseen_from=None if state.unseen_from is None else state.unseen_from.value,
             pending=self._candidate(state.pending, rig) if state.pending else None,
             frozen=state.frozen,
             proven=state.proven,
@@ -283,6 +285,7 @@ def _state_of(stored: StoredPair) -> PairState:
         failures=_reasons(stored.failures),
         health=HealthState(stored.health),
         reasons=_reasons(stored.reasons),
+        unseen_from=None if stored.unseen_from is None else HealthState(stored.unseen_from),
         pending=None
         if pending is None
         else Candidate(
