@@ -125,8 +125,8 @@ class PairState:
         accepted: the accepted estimate on which the served extrinsic rests; None for a nominal one.
         failures: why the last attempt produced no estimate; empty when it produced one.
         health, reasons: the state of the machine, and why it is in it.
-        unseen_from: the state out of which time without a check took it; None while it has not. What is decided by the
-            data goes on from there: how soon a check was due on the clock of a machine is none of theirs.
+        unseen_from: the health out of which time without a check took it; None while it has not. What the data decide
+            goes on from there: how long a machine took for a check is none of their business.
         pending: what waits for `apply`.
         frozen: whether a person holds the extrinsic.
         proven: whether a window, or commissioning, has confirmed what is served.
@@ -147,7 +147,7 @@ class PairState:
     failures: tuple[Reason, ...] = ()
     health: HealthState = HealthState.UNKNOWN
     reasons: tuple[Reason, ...] = (NOT_EVALUATED,)
-    unseen_from: HealthState | None = None
+    unseen_from: Health | None = None
     pending: Candidate | None = None
     frozen: bool = False
     proven: bool = False
@@ -160,7 +160,7 @@ class PairState:
     @property
     def seen(self) -> HealthState:
         """Health by what was looked at, however long ago."""
-        return self.health if self.unseen_from is None else self.unseen_from
+        return self.health if self.unseen_from is None else self.unseen_from.state
 
 
 def initial_state(rig: Rig) -> PairState:
@@ -370,7 +370,7 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
         if state.proven:
             return _well_again(state, Event.CLEAR, observation.stamp_ns)
         after = _well_again(state, Event.NO_OBJECTION, observation.stamp_ns, NOT_EVALUATED)
-        return after if after.health is not state.health or after.reasons == (SETTLING,) else state
+        return after if after.health is not state.seen or after.reasons == (SETTLING,) else _seen_again(state)
     return state
 
 
@@ -386,7 +386,7 @@ def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason)
     `SETTLING_NS` before."""
     since_ns = state.poor_since_ns
     if state.seen is HealthState.DEGRADED and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
-        return replace(state, health=state.seen, reasons=(SETTLING,), unseen_from=None)
+        return replace(_seen_again(state), reasons=(SETTLING,))
     return replace(happened(state, event, *reasons), poor_since_ns=None)
 
 
@@ -406,7 +406,17 @@ def aged(state: PairState, age_s: float, stale_after_s: float) -> PairState:
 def _by_the_clock(state: PairState, event: Event, why: Reason) -> PairState:
     """Nothing was looked at in time: told, until something is, and then forgotten."""
     after = _unseen(state, event, why)
-    return state if after is state else replace(after, unseen_from=state.seen)
+    return (
+        state
+        if after is state
+        else replace(after, unseen_from=state.unseen_from or Health(state.health, state.reasons))
+    )
+
+
+def _seen_again(state: PairState) -> PairState:
+    """A check was completed that changes nothing: health is what it was before nobody looked."""
+    seen = state.unseen_from
+    return state if seen is None else replace(state, health=seen.state, reasons=seen.reasons, unseen_from=None)
 
 
 def _unseen(state: PairState, event: Event, why: Reason) -> PairState:
