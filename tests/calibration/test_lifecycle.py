@@ -513,6 +513,50 @@ def test_without_a_completed_check_green_turns_yellow_and_what_was_known_is_said
     assert "Last known: suspect. The latest pairs" in overdue(suspect, WORKER).reasons[1].text
 
 
+def anything(rng: np.random.Generator, stamp_s: int) -> Callable[[PairState], PairState]:
+    """Something that happens to a pair at this time."""
+    turned_deg = float(rng.choice([0.5, 0.6, 3.0]))
+    ways: list[Callable[[PairState], PairState]] = [
+        lambda state: watched(state, check(stamp_s)),
+        lambda state: watched(state, *flagged_from(stamp_s, 3)),
+        lambda state: watched(state, *(check(stamp_s + i, flagged=True, cause="dark") for i in range(3))),
+        lambda state: solved(state, estimate(turned_deg, stamp_s)),
+        lambda state: solved(state, moved_within(turned_deg, 3.0, stamp_s)),
+        lambda state: time_stepped_back(state, stamp_s * S),
+        restored,
+    ]
+    return ways[rng.choice(len(ways), p=[0.4, 0.15, 0.1, 0.15, 0.1, 0.05, 0.05])]
+
+
+@pytest.mark.fault("checks that are overdue on the clock of a busy machine", "told, and of no consequence")
+@pytest.mark.parametrize("seed", range(8))
+def test_what_the_data_decide_does_not_hang_on_how_long_the_machine_took(seed: int) -> None:
+    rng, busy_rng = np.random.default_rng(seed), np.random.default_rng(seed + 1000)
+    prompt = busy = initial_state(RIG)
+    told: set[HealthState] = set()
+    for stamp_s in range(300, 1200, 20):
+        happens = anything(rng, stamp_s)
+        prompt, busy = happens(prompt), happens(busy)
+        assert (busy.seen, window_wanted_since(busy)) == (prompt.seen, window_wanted_since(prompt))
+        assert np.array_equal(busy.T_camera_lidar, prompt.T_camera_lidar)
+        for name in ("monitor", "flagged_since_ns", "poor_since_ns", "proven", "status"):
+            assert getattr(busy, name) == getattr(prompt, name)
+        if busy_rng.random() < 0.5:
+            busy = overdue(busy, WORKER)
+        if busy_rng.random() < 0.2:
+            busy = aged(busy, DAY_S + 1.0, DAY_S)
+        told.add(busy.health)
+    assert told & {HealthState.DEGRADED, HealthState.STALE}
+
+
+def test_a_check_that_changes_nothing_ends_what_was_said_of_its_delay() -> None:
+    suspect = replace(HEALTHY, health=HealthState.SUSPECT, reasons=(KNOCK,), proven=False)
+    late = overdue(suspect, WORKER)
+    assert late.health is HealthState.DEGRADED
+    after = watched(late, check(300), check(305), check(310))
+    assert (after.health, after.reasons) == (HealthState.SUSPECT, (KNOCK,))
+
+
 def test_sensor_time_that_steps_back_leaves_nothing_green_and_no_suspicion_out_of_reach() -> None:
     state = time_stepped_back(HEALTHY, 10 * S)
     assert (state.health, state.reasons[0].code) == (HealthState.UNKNOWN, "time_stepped_back")

@@ -194,6 +194,8 @@ def decided_by(path: Path, router: Router, frames: list[Frame], middleware: str)
             running.send_by(sensors.send, frames)
             sensors.close()
         running.rest()
+        # Whether silence has ended the last slice by now is the clock's on the wall to say: until it has.
+        running.end()
         counters, decided = running.counters(), decisions(running)
         told = {
             **decided,

@@ -59,6 +59,7 @@ def test_the_same_drive_is_decided_alike_however_it_comes(tmp_path: Path, router
     with service(configured(tmp_path / "live", drive, router, "native"), router) as running:
         running.send(frames)
         running.rest()
+        running.end()
         live = decisions(running)
         assert running.terminate() == 0
     assert len(live["windows"]) == ENDED_S // SLICE_S
@@ -81,5 +82,6 @@ def test_the_same_drive_is_decided_alike_however_it_comes(tmp_path: Path, router
             assert played.returncode == 0, played.stderr
             running.sent = Counter(camera=len([f for f in frames if type(f).__name__ == "CameraFrame"]))
             running.rest()
+            running.end()
             assert decisions(running) == live, f"{middleware} {source.name}"
             assert running.terminate() == 0

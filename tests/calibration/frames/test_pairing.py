@@ -118,6 +118,30 @@ def test_motion_that_comes_nine_tenths_of_a_second_late_is_used() -> None:
     assert [pair.motion.linear_mps for pair in pairs if pair.motion] == [(i * 2, 0.0, 0.0) for i in range(10)]
 
 
+def late_motion(late_ms: int, period_ms: int) -> tuple[list[FramePair], Pairer]:
+    """Pictures and sweeps for three seconds, and motion that comes so late."""
+    pictures = [(ms, message) for ms in range(0, 3000, period_ms) for message in (sweep(ms), camera(ms))]
+    motions = [(ms + late_ms, motion(ms, speed=ms)) for ms in range(0, 3000, 50)]
+    coming = [message for _, message in sorted([*pictures, *motions], key=lambda one: one[0])]
+    return run(coming, expects_motion=True)
+
+
+@pytest.mark.parametrize("period_ms", [50, 100])
+def test_motion_may_come_a_second_late_however_fast_the_pictures_come(period_ms: int) -> None:
+    pairs, pairer = late_motion(900, period_ms)
+    assert [pair.motion.linear_mps[0] for pair in pairs if pair.motion and pair.motion.linear_mps] == [
+        float(ms) for ms in range(0, 3000, period_ms)
+    ]
+    assert pairer.losses == {}
+
+
+@pytest.mark.fault("ego-motion later than a second", "pairs go without it, and it is counted")
+def test_motion_that_comes_after_its_pair_went_without_it_is_counted() -> None:
+    pairs, pairer = late_motion(1300, 100)
+    assert sum(pair.motion is None for pair in pairs) > 10
+    assert pairer.losses["motion_late"] > 10
+
+
 @pytest.mark.fault("ego-motion stops", "pairs go on without it, a second later")
 def test_a_pair_goes_without_its_motion_when_pictures_are_more_than_a_second_ahead() -> None:
     pairer = Pairer(PairingConfig(), expects_motion=True)

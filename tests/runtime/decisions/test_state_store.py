@@ -12,6 +12,7 @@ from coec.adapters.files.conversions import result_of
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.lifecycle import (
     Change,
+    Health,
     HealthState,
     PairState,
     Provenance,
@@ -21,6 +22,7 @@ from coec.calibration.lifecycle import (
     after_failure,
     held,
     initial_state,
+    overdue,
 )
 from coec.calibration.monitor.change_detector import Finding, MonitorState
 from coec.calibration.monitor.hypotheses import Hypotheses, Hypothesis
@@ -64,6 +66,14 @@ def test_a_state_comes_back_bit_for_bit(tmp_path: Path) -> None:
         assert result_of(kept, RIG, "test") == result_of(made, RIG, "test")
         assert np.array_equal(kept.correction, made.correction)
     assert (back.health, back.reasons, back.proven) == (HealthState.HEALTHY, (), True)
+
+
+def test_what_was_known_before_nobody_looked_comes_back(tmp_path: Path) -> None:
+    late = overdue(after_estimate(initial_state(RIG), estimate(1), 0, RULES), Reason("overdue_worker", "No answer."))
+    saved(StateStore(tmp_path, "test"), RIG, late, HEADS)
+    back = restarted(tmp_path)
+    assert back is not None
+    assert back.unseen_from == late.unseen_from == Health(HealthState.HEALTHY, ())
 
 
 def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -64,13 +64,14 @@ class Looks:
         return self.waits
 
     def choose(self, pair: FramePair) -> None:
+        self.chosen = replace(self.chosen, last_ns=pair.stamp_ns)
         if self.keeps:
             self.pairs.append(pair)
 
-    def advance(self, now_ns: int, end_ns: int) -> None:
-        assert now_ns > end_ns
-        self.ended.append(end_ns)
+    def end_slice_by(self, now_ns: int) -> bool:
+        self.ended.append(now_ns)
         self.slice_end_ns = None
+        return True
 
 
 class Vehicle:
@@ -337,6 +338,28 @@ def test_silence_of_a_pair_is_noticed_while_others_speak(monkeypatch: pytest.Mon
             stream.tick(waiting=bool(waiting))
     assert vehicle.looks["0-0"].ended == [BEGIN_NS + 20 * HZ10_NS]
     assert vehicle.looks["1-1"].ended == []
+
+
+@pytest.mark.fault("frames that are held up for long, and come then", "the window that ended too early is counted")
+@pytest.mark.parametrize(("comes", "counted"), [(20, 1), (400, 0)])
+def test_frames_of_a_slice_that_silence_has_ended_are_counted(
+    monkeypatch: pytest.MonkeyPatch, comes: int, counted: int
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(pair_stream, "time", SimpleNamespace(monotonic=lambda: now_s))
+    vehicle = Vehicle(rig_of(1, 1))
+    looks, stream = vehicle.looks["0-0"], vehicle.streams["0-0"]
+    looks.slice_end_ns = BEGIN_NS + 50 * HZ10_NS
+    for number in range(20):
+        now_s += 0.1
+        vehicle.drive([number], 1, 1)
+    for _ in range(400):
+        now_s += 0.1
+        vehicle.settle()
+        stream.tick(waiting=False)
+    assert looks.ended == [BEGIN_NS + 50 * HZ10_NS]
+    vehicle.drive([comes, comes + 1], 1, 1)
+    assert stream.losses().get(("window", "ended_too_early"), 0) == counted
 
 
 def test_motion_is_of_every_lidar_that_it_moves() -> None:

@@ -105,6 +105,18 @@ def test_a_window_is_written_and_reported(bench: Bench) -> None:
     assert bench.recorder.latest == path
 
 
+def test_a_window_is_calibrated_by_what_held_when_it_began(bench: Bench) -> None:
+    later = CalibrationConfig(motion_compensation=False)
+    bench.recorder.add("front-10", pair(10), NOMINAL)
+    bench.recorder.use(later)
+    bench.recorder.add("front-10", pair(20), NOMINAL)
+    bench.recorder.end(SliceEnded("front-10", 2, True))
+    bench.window("front-30", [30, 40])
+    with bench.running():
+        paths = [bench.recorded.get(timeout=DEADLINE_S)[1] for _ in range(2)]
+        assert [read_window(path)[1] for path in paths] == [CalibrationConfig(), later]
+
+
 def metadata_of(path: Path) -> dict[str, str]:
     """What a window says of where it comes from."""
     found: dict[str, str] = {}

@@ -24,6 +24,9 @@ MOTION_LATE_NS = NS_PER_S
 """How far pictures may be ahead of ego-motion, in sensor time, before a pair goes without it: filters and bridges hold
 motion back by some tenths of a second, and a pair that is not compensated is worth less than one that comes later."""
 
+PAIRS_WAITING = 32
+"""Pairs that may wait for ego-motion, whatever their stamps say: those of a second, of a LiDAR at 30 Hz."""
+
 Frame = TypeVar("Frame", CameraFrame, LidarFrame, EgoMotion)
 
 
@@ -72,6 +75,7 @@ class Pairer:
         self._sweeps: deque[LidarFrame] = deque()
         self._motions: deque[EgoMotion] = deque(maxlen=MOTION_SAMPLES)
         self._waiting: deque[FramePair] = deque()
+        self._unmoved_ns: int | None = None
         self.losses: Counter[str] = Counter()
 
     def push(self, frame: CameraFrame | LidarFrame | EgoMotion) -> list[FramePair]:
@@ -82,6 +86,9 @@ class Pairer:
             case LidarFrame():
                 self._enqueue(frame, self._lidar_time, self._sweeps, "lidar")
             case EgoMotion():
+                if self._unmoved_ns is not None and frame.stamp_ns <= self._unmoved_ns + self._motion_tolerance_ns:
+                    # A pair went without it, and is another than if it had come in time.
+                    self.losses["motion_late"] += 1
                 self._enqueue(frame, self._motion_time, self._motions, "motion")
         self._match(final=False)
         return self._release(final=False)
@@ -137,20 +144,23 @@ class Pairer:
         released = []
         while self._waiting:
             pair = self._waiting[0]
-            if self._expects_motion and not final and not self._motion_is_settled(pair.stamp_ns):
-                break
+            if self._expects_motion and not final and not self._motion_has_come(pair.stamp_ns):
+                if not self._motion_is_overdue(pair.stamp_ns):
+                    break
+                self._unmoved_ns = pair.stamp_ns
             self._waiting.popleft()
             released.append(FramePair(pair.camera, pair.lidar, self._motion_at(pair.stamp_ns)))
         return released
 
-    def _motion_is_settled(self, stamp_ns: int) -> bool:
-        newest_motion, newest_camera = self._motion_time.latest_ns, self._camera_time.latest_ns
-        if newest_motion is not None and newest_motion >= stamp_ns:
-            return True
+    def _motion_has_come(self, stamp_ns: int) -> bool:
+        newest_ns = self._motion_time.latest_ns
+        return newest_ns is not None and newest_ns >= stamp_ns
+
+    def _motion_is_overdue(self, stamp_ns: int) -> bool:
+        newest_camera_ns = self._camera_time.latest_ns
         patience_ns = max(self._motion_tolerance_ns, MOTION_LATE_NS)
-        return (newest_camera is not None and newest_camera - stamp_ns > patience_ns) or len(
-            self._waiting
-        ) > self._queue_frames
+        late = newest_camera_ns is not None and newest_camera_ns - stamp_ns > patience_ns
+        return late or len(self._waiting) > PAIRS_WAITING
 
     def _motion_at(self, stamp_ns: int) -> EgoMotion | None:
         """Ego-motion at the stamp: a sample with exactly this stamp as it is, else interpolated between its neighbours,

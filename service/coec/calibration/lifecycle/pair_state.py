@@ -125,6 +125,8 @@ class PairState:
         accepted: the accepted estimate on which the served extrinsic rests; None for a nominal one.
         failures: why the last attempt produced no estimate; empty when it produced one.
         health, reasons: the state of the machine, and why it is in it.
+        unseen_from: the health out of which time without a check took it; None while it has not. What the data decide
+            goes on from there: how long a machine took for a check is none of their business.
         pending: what waits for `apply`.
         frozen: whether a person holds the extrinsic.
         proven: whether a window, or commissioning, has confirmed what is served.
@@ -145,6 +147,7 @@ class PairState:
     failures: tuple[Reason, ...] = ()
     health: HealthState = HealthState.UNKNOWN
     reasons: tuple[Reason, ...] = (NOT_EVALUATED,)
+    unseen_from: Health | None = None
     pending: Candidate | None = None
     frozen: bool = False
     proven: bool = False
@@ -153,6 +156,11 @@ class PairState:
     flagged_since_ns: int | None = None
     poor_since_ns: int | None = None
     changes: tuple[policy.Change, ...] = ()
+
+    @property
+    def seen(self) -> HealthState:
+        """Health by what was looked at, however long ago."""
+        return self.health if self.unseen_from is None else self.unseen_from.state
 
 
 def initial_state(rig: Rig) -> PairState:
@@ -181,7 +189,7 @@ def agrees(T_one: Matrix4, T_other: Matrix4, rules: PolicyConfig) -> bool:
 
 def happened(state: PairState, event: Event, *reasons: Reason) -> PairState:
     """The state after an event: the table decides, and the reasons are the newest ones for being there."""
-    return replace(state, health=TRANSITIONS[state.health, event], reasons=reasons)
+    return replace(state, health=TRANSITIONS[state.seen, event], reasons=reasons, unseen_from=None)
 
 
 # --- windows --------------------------------------------------------------------------------------------------------
@@ -250,7 +258,7 @@ def window_wanted_since(state: PairState) -> int | None:
     if state.monitor.outcome in ACCUSING and state.flagged_since_ns is not None:
         return state.flagged_since_ns
     moved = None if state.latest is None else _well_told_move(state.latest)
-    suspected = state.health in (HealthState.SUSPECT, HealthState.MISCALIBRATED)
+    suspected = state.seen in (HealthState.SUSPECT, HealthState.MISCALIBRATED)
     return moved.first_after_ns if moved is not None and suspected else None
 
 
@@ -325,7 +333,7 @@ def _confirmed(state: PairState, stamp_ns: int) -> PairState:
     if cause is None:
         return _well_again(state, Event.CONFIRMED_BY_WINDOW, stamp_ns)
     after = happened(happened(state, Event.CONFIRMED_BY_WINDOW), Event.DATA_CAUSE, cause.as_reason())
-    return after if state.health is HealthState.DEGRADED else replace(after, poor_since_ns=stamp_ns)
+    return after if state.seen is HealthState.DEGRADED else replace(after, poor_since_ns=stamp_ns)
 
 
 # --- the monitor, and time ------------------------------------------------------------------------------------------
@@ -362,14 +370,14 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
         if state.proven:
             return _well_again(state, Event.CLEAR, observation.stamp_ns)
         after = _well_again(state, Event.NO_OBJECTION, observation.stamp_ns, NOT_EVALUATED)
-        return after if after.health is not state.health or after.reasons == (SETTLING,) else state
+        return after if after.health is not state.seen or after.reasons == (SETTLING,) else _seen_again(state)
     return state
 
 
 def _poor(state: PairState, event: Event, stamp_ns: int, why: Reason) -> PairState:
     """The data do not tell, at this sensor time."""
     after = _unless_red(state, event, why)
-    goes_on = state.health is HealthState.DEGRADED and state.poor_since_ns is not None
+    goes_on = state.seen is HealthState.DEGRADED and state.poor_since_ns is not None
     return after if goes_on else replace(after, poor_since_ns=stamp_ns)
 
 
@@ -377,14 +385,14 @@ def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason)
     """The event, at this sensor time, which makes a pair healthy, unless its data began not to tell less than
     `SETTLING_NS` before."""
     since_ns = state.poor_since_ns
-    if state.health is HealthState.DEGRADED and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
-        return replace(state, reasons=(SETTLING,))
+    if state.seen is HealthState.DEGRADED and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
+        return replace(_seen_again(state), reasons=(SETTLING,))
     return replace(happened(state, event, *reasons), poor_since_ns=None)
 
 
 def overdue(state: PairState, why: Reason) -> PairState:
     """No check has been completed in time, for this reason; what was last known is said with it."""
-    return _unseen(state, Event.OVERDUE, why)
+    return _by_the_clock(state, Event.OVERDUE, why)
 
 
 def aged(state: PairState, age_s: float, stale_after_s: float) -> PairState:
@@ -392,7 +400,23 @@ def aged(state: PairState, age_s: float, stale_after_s: float) -> PairState:
     if age_s <= stale_after_s:
         return state
     text = f"No check has been completed for {age_s:.0f} s, more than {stale_after_s:.0f} s."
-    return _unseen(state, Event.AGED, Reason("stale", text))
+    return _by_the_clock(state, Event.AGED, Reason("stale", text))
+
+
+def _by_the_clock(state: PairState, event: Event, why: Reason) -> PairState:
+    """Nothing was looked at in time: told, until something is, and then forgotten."""
+    after = _unseen(state, event, why)
+    return (
+        state
+        if after is state
+        else replace(after, unseen_from=state.unseen_from or Health(state.health, state.reasons))
+    )
+
+
+def _seen_again(state: PairState) -> PairState:
+    """A check was completed that changes nothing: health is what it was before nobody looked."""
+    seen = state.unseen_from
+    return state if seen is None else replace(state, health=seen.state, reasons=seen.reasons, unseen_from=None)
 
 
 def _unseen(state: PairState, event: Event, why: Reason) -> PairState:

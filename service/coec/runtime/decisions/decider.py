@@ -118,8 +118,8 @@ class Decider:
         calibrate_with: Callable[[CalibrationConfig], None],
         tell: Callable[[Known], None],
     ) -> None:
-        """`calibrate_with` says how the next windows are to be calibrated; `tell` hears what is known, whenever
-        something may have changed and once a second."""
+        """`calibrate_with` says how windows that begin from now on are to be calibrated; `tell` hears what is known,
+        whenever something may have changed and once a second."""
         self.thread = ServiceThread(f"decisions-{pair.name}", self._run)
         self._rules = Rules(pair.policy, pair.tracker, pair.monitor)
         self._stale_after_s = stale_after_s
@@ -290,8 +290,7 @@ class Decider:
         if not isinstance(answer, Checked):
             self._check_in_vain(outcome.reason or _NO_ANSWER)
             return None
-        if answer.baseline_not_used is not None and self._baseline.refuse(answer.baseline_not_used):
-            self._calibrate_with(self._baseline.calibration)
+        refused = answer.baseline_not_used is not None and self._baseline.refuse(answer.baseline_not_used)
         observation = replace(answer.observation, standing_stamps_ns=standing_ns)
         effect = self._step(
             lambda state: lifecycle.after_observation(state, observation, self._rules),
@@ -302,12 +301,12 @@ class Decider:
         )
         if effect is None:
             self._losses.add("monitor", "check_overtaken")
-            return None
-        self._check_attempts.succeeded()
-        self._checks += 1
-        self._latest_check = check_of(observation, self._store.state)
-        self._store.note_check(self._latest_check)
-        return effect
+        else:
+            self._check_attempts.succeeded()
+            self._checks += 1
+            self._latest_check = check_of(observation, self._store.state)
+            self._store.note_check(self._latest_check)
+        return self._calibrating_anew(effect) if refused else effect
 
     def _check_in_vain(self, reason: Reason) -> None:
         self._losses.add("monitor", f"check_{reason.code}", detail=reason.text)
@@ -322,18 +321,20 @@ class Decider:
             self._note_file(result, answer.written)
         if answer.note is not None:
             self._losses.add("window", "result_not_written", detail=answer.note.text)
-        if not self._baseline.fits_network(result.depth_identity):
+        fits = self._baseline.fits_network(result.depth_identity)
+        if not fits:
             self._baseline.refuse("It was made with another depth network.")
-            self._calibrate_with(self._baseline.calibration)
         self._store.note_result(result)
         self._solved += 1
         self._window_attempts.succeeded()
         latest = self._store.state.latest
         # A window of an earlier run is old news when a newer one has been evaluated.
+        effect = None
         if live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
-            return self._judge(result)
-        self._store.save()
-        return None
+            effect = self._judge(result)
+        else:
+            self._store.save()
+        return effect if fits else self._calibrating_anew(effect)
 
     def _note_file(self, result: CalibrationResult, file: WrittenFile) -> None:
         version = WindowVersion(
@@ -361,6 +362,17 @@ class Decider:
         )
         kept = lifecycle.kept_for_next(estimate)
         return effect if kept is None or effect is None else partial(self._keep_and_go_on, kept, effect)
+
+    def _calibrating_anew(self, effect: Effect | None) -> Effect:
+        """Windows that begin once this answer counts are calibrated in another way."""
+        configuration = self._baseline.calibration
+
+        def both() -> None:
+            self._calibrate_with(configuration)
+            if effect is not None:
+                effect()
+
+        return both
 
     def _take_failure(self, reason: Reason, live: bool) -> Effect | None:
         if reason.code == STOPPING.code:

@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import rig_to_json
 from coec.adapters.files.state_file import StateFile
-from coec.calibration.lifecycle import Candidate, Change, HealthState, PairState, Provenance, Status
+from coec.calibration.lifecycle import Candidate, Change, Health, HealthState, PairState, Provenance, Status
 from coec.calibration.monitor.change_detector import MonitorState
 from coec.calibration.tracker import Track, track_from_dict, track_to_dict
 from coec.calibration.types import Estimate, Matrix4, Reason, Rig
@@ -51,6 +51,13 @@ class StoredCandidate(Part):
     contradicts: bool
 
 
+class StoredHealth(Part):
+    """`Health` on the disk."""
+
+    state: replies.HealthState
+    reasons: tuple[replies.Reason, ...]
+
+
 class StoredChange(Part):
     """`Change` on the disk."""
 
@@ -74,6 +81,7 @@ class StoredPair(Part):
     completed_wall_ns: WallNs | None
     health: replies.HealthState = "unknown"
     reasons: tuple[replies.Reason, ...] = ()
+    unseen_from: StoredHealth | None = None
     pending: StoredCandidate | None = None
     frozen: bool = False
     proven: bool = False
@@ -165,6 +173,9 @@ class StateStore:
             completed_wall_ns=clocks.completed_wall_ns,
             health=state.health.value,
             reasons=_told(state.reasons),
+            unseen_from=None
+            if state.unseen_from is None
+            else StoredHealth(state=state.unseen_from.state.value, reasons=_told(state.unseen_from.reasons)),
             pending=self._candidate(state.pending, rig) if state.pending else None,
             frozen=state.frozen,
             proven=state.proven,
@@ -283,6 +294,9 @@ def _state_of(stored: StoredPair) -> PairState:
         failures=_reasons(stored.failures),
         health=HealthState(stored.health),
         reasons=_reasons(stored.reasons),
+        unseen_from=None
+        if stored.unseen_from is None
+        else Health(HealthState(stored.unseen_from.state), _reasons(stored.unseen_from.reasons)),
         pending=None
         if pending is None
         else Candidate(

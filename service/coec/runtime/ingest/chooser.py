@@ -167,9 +167,11 @@ class Chooser:
 
     def must_wait(self, stamp_ns: int) -> bool:
         """Whether a pair of this stamp may not be looked at yet. With the first pair of a new time whatever waits in
-        the old one is due."""
+        the old one is due; a slice that is over by then has ended before it is looked at."""
         if self._has_stepped_back(stamp_ns):
             self._asks.bring_forward(stamp_ns)
+        elif not self.end_slice_by(stamp_ns):
+            return True
         return self._asks.waits(stamp_ns)
 
     def choose(self, pair: FramePair) -> None:
@@ -177,6 +179,8 @@ class Chooser:
         stepped_back = self._has_stepped_back(pair.stamp_ns)
         if stepped_back:
             self._asks.bring_forward(pair.stamp_ns)
+        elif self._slice_is_over(pair.stamp_ns):
+            self._end_slice()
         if self._asks.waits(pair.stamp_ns):
             self._losses.add("monitor", "not_awaited")
         self._asks.settle(pair.stamp_ns)
@@ -207,10 +211,19 @@ class Chooser:
         if pair.stamp_ns >= self._window_due_ns:
             self._ask_checks(pair.stamp_ns)
 
-    def advance(self, now_ns: int, end_ns: int) -> None:
-        """The streams are silent, and it would be `now_ns` by now: the slice that ends at `end_ns` is over."""
-        for event in self._cutter.advance(now_ns):
-            self._end(event, end_ns)
+    def end_slice_by(self, now_ns: int) -> bool:
+        """It is so late, sensor time: the open slice ends if it is over. False while an answer that counts by its end
+        has not come.
+
+        Whether a pair tells the time or silence, the slice ends at its own end, and what its window says counts from
+        the same time on."""
+        if not self._slice_is_over(now_ns):
+            return True
+        end_ns = self._cutter.slice_end_ns
+        if end_ns is not None and self._asks.waits(end_ns):
+            return False
+        self._end_slice()
+        return True
 
     def finish(self) -> SliceEnded | None:
         """End the open slice here and now."""
@@ -256,6 +269,22 @@ class Chooser:
 
     def _has_stepped_back(self, stamp_ns: int) -> bool:
         return self._last_ns is not None and stamp_ns < self._last_ns
+
+    def _slice_is_over(self, now_ns: int) -> bool:
+        end_ns = self._cutter.slice_end_ns
+        return end_ns is not None and now_ns >= end_ns
+
+    def _end_slice(self) -> None:
+        """End the open slice at its end, with all answers known that count by then."""
+        end_ns = self._cutter.slice_end_ns
+        if end_ns is None:
+            return
+        self._asks.settle(end_ns)
+        for ended in self._urgency.heed(self._cutter, self._pace.rate_hz):
+            self._end(ended, end_ns)
+        for ended in self._cutter.advance(end_ns):
+            self._end(ended, end_ns)
+            self._urgency.ended(ended, self._cutter, self._pace.rate_hz)
 
     def _follow_stretch(self) -> None:
         """Slices are longer where the budget does not suffice for all windows, as the periods of checks are."""

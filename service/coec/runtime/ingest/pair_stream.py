@@ -66,6 +66,7 @@ class PairStream:
         self._pairs = 0
         self._sync_error_s: float | None = None
         self._quiet_ticks = 0
+        self._silence: tuple[int, int] | None = None
         intake.join(self)
 
     def losses(self) -> dict[tuple[str, str], int]:
@@ -125,6 +126,7 @@ class PairStream:
     def push(self, frame: Frame) -> None:
         """The next frame of one of its streams came."""
         self._quiet_ticks = 0
+        self._look_back(frame.stamp_ns)
         self.take(self._pairer.push(frame))
 
     def take(self, pairs: list[FramePair]) -> None:
@@ -178,9 +180,22 @@ class PairStream:
         if now_ns is None or now_ns < end_ns + GRACE_NS:
             return
         # They are certain because nothing came for long: now is not when they came.
-        self._hold(self._pairer.flush())
+        pairs = self._pairer.flush()
+        self._hold(pairs)
+        last_ns = pairs[-1].stamp_ns if pairs else self._chooser.chosen.last_ns
+        self._silence = last_ns or 0, end_ns
         if not self._held:
-            self._chooser.advance(now_ns, end_ns)
+            self._chooser.end_slice_by(end_ns)
+
+    def _look_back(self, stamp_ns: int) -> None:
+        """A frame came: one of the slice that was taken to be over tells that what came before it was no silence. Then
+        frames were held up for so long that the window is another than that of a replay, and that is counted."""
+        if self._silence is None:
+            return
+        last_ns, end_ns = self._silence
+        self._silence = None
+        if last_ns < stamp_ns < end_ns:
+            self._losses.add("window", "ended_too_early", detail="frames that were held up came after the slice ended")
 
     def tell(self) -> None:
         """Renew the report."""

@@ -98,7 +98,7 @@ class Recorder:
         self._on_recorded = on_recorded
         self._on_lost = on_lost
         self._condition = threading.Condition()
-        self._queue: deque[_Add | SliceEnded] = deque()
+        self._queue: deque[_Add | SliceEnded | CalibrationConfig] = deque()
         self._adds = 0
         self._open: _Open | None = None
         self._lost: str | None = None
@@ -133,8 +133,11 @@ class Recorder:
         return self._adds < PAIRS_WAITING
 
     def use(self, configuration: CalibrationConfig) -> None:
-        """The next window is to be calibrated with this: the limits of the rig were learned anew."""
-        self._configuration = configuration
+        """Windows that begin from now on, in the order of what is queued, are to be calibrated with this: the limits of
+        the rig were learned anew, or do not fit it."""
+        with self._condition:
+            self._queue.append(configuration)
+            self._condition.notify()
 
     def follow(self, plan: RecordingPlan) -> None:
         """The next window is to be recorded by this; how it is to be calibrated is for `use` to say."""
@@ -184,6 +187,8 @@ class Recorder:
                 self.writing_took.add(time.monotonic() - begun_s)
             elif isinstance(item, SliceEnded):
                 self._end(item.window_id, item.kept)
+            elif isinstance(item, CalibrationConfig):
+                self._configuration = item
             elif thread.stopping:
                 break
             else:

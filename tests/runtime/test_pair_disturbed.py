@@ -1,0 +1,226 @@
+"""Live is replayed: whatever the machine does meanwhile, the same frames make the same windows and the same checks, of
+the same pairs, at the same extrinsics.
+
+A drive is sent twice: once in the order of its stamps, to a worker that answers at once; and once with each stream in
+its own order but late by whatever is allowed, to a worker that takes its time, with a clock that stalls.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from itertools import chain, groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coec.calibration.frames.pairing import MOTION_LATE_NS
+from coec.calibration.frames.window import SliceEnded
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4
+from coec.config import LimitsConfig
+from coec.runtime.worker.jobs import Job, Kind
+from coec.runtime.worker.messages import unpack_pairs
+from pair_bench import BEGIN_S, END_S, Bench, KnowingWorker, S, SlowWorker, pair_at
+
+Frame = CameraFrame | LidarFrame | EgoMotion
+
+MOTION_NS = S // 10
+PARKED_S = (BEGIN_S + 30, BEGIN_S + 75)
+"""Nothing is sent between these: the first slice ends meanwhile, and its window corrects what is served."""
+
+AHEAD = 12
+"""Frames by which camera and LiDAR may be ahead of one another; `pairing.queue_frames` are 16."""
+
+STALL_S = 25.0
+"""Of the whole service; a check is overdue after fifteen."""
+
+
+class Clock:
+    """The steady clock of the machine."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(time, "monotonic", clock)
+    return clock
+
+
+def streams() -> dict[str, deque[Frame]]:
+    """Of a drive on which the mount moves, and the vehicle is parked for a while."""
+    stamps = [
+        stamp_ns
+        for stamp_ns in range(BEGIN_S * S, END_S * S, S // 2)
+        if not PARKED_S[0] * S <= stamp_ns < PARKED_S[1] * S
+    ]
+    pairs = [pair_at(stamp_ns) for stamp_ns in stamps]
+    ends = ((BEGIN_S, PARKED_S[0]), (PARKED_S[1], END_S))
+    motions = [
+        EgoMotion(stamp_ns + 7_000_000, "ego", (5.0 + (stamp_ns // MOTION_NS) % 7, 0.0, 0.0), (0.0, 0.0, 0.01))
+        for begin_s, end_s in ends
+        for stamp_ns in range(begin_s * S, end_s * S, MOTION_NS)
+    ]
+    return {
+        "camera": deque(pair.camera for pair in pairs),
+        "lidar": deque(pair.lidar for pair in pairs),
+        "ego": deque(motions),
+    }
+
+
+class Watched:
+    """A pair, and everything that its stream makes of the frames, in order."""
+
+    def __init__(self, folder: Path, worker: type[KnowingWorker]) -> None:
+        self.bench = Bench(folder, worker=worker)
+        self.looked: list[Any] = []
+        self.windows: list[Any] = []
+        self.checks: list[Any] = []
+        bench = self.bench
+        bench.recorder.sees_knocks = True
+        choose, add, end, ask = bench.pair._chooser.choose, bench.recorder.add, bench.recorder.end, bench.worker.ask
+
+        def chosen(pair: FramePair) -> None:
+            self.looked.append((pair.camera.stamp_ns, pair.lidar.stamp_ns, pair.motion))
+            choose(pair)
+
+        def added(window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
+            self.windows.append((window_id, pair.stamp_ns, T_camera_lidar.tobytes()))
+            add(window_id, pair, T_camera_lidar)
+
+        def ended(event: SliceEnded) -> None:
+            self.windows.append(event)
+            end(event)
+
+        def asked(job: Job) -> None:
+            if job.kind is Kind.CHECK:
+                pairs = unpack_pairs(job.body["frames"], LimitsConfig())
+                self.checks.append((job.body["pose"], [(pair.stamp_ns, pair.motion) for pair in pairs]))
+            ask(job)
+
+        bench.pair._chooser.choose = chosen  # type: ignore[method-assign]
+        bench.recorder.add, bench.recorder.end = added, ended  # type: ignore[method-assign]
+        bench.worker.ask = asked  # type: ignore[method-assign]
+
+    def push(self, frame: Frame) -> None:
+        self.bench.pair.stream.push(frame)
+        self.bench.settle()
+
+    def finish(self) -> None:
+        """The streams have ended, and all is judged."""
+        self.bench.pair.stream._hold(self.bench.pair.stream._pairer.flush())
+        for _ in range(1000):
+            if isinstance(self.bench.worker, SlowWorker):
+                self.bench.worker.work(share=1.0)
+            self.bench.settle()
+            if not self.bench.pair.stream.report.held:
+                return
+        pytest.fail("pairs wait for ever")
+
+    @property
+    def told(self) -> dict[str, Any]:
+        entries = [
+            entry.model_copy(update={"wall_ns": 0, "previous_sha256": "", "sequence": 0})
+            for entry in self.bench.entries("estimate", "extrinsic")
+        ]
+        # Whether an answer is overdue is the clock's on the wall to say.
+        codes = [entry.code for entry in self.bench.entries("state") if entry.code not in ("degraded", "stale")]
+        return {
+            "looked": self.looked,
+            "windows": self.windows,
+            "checks": self.checks,
+            "entries": entries,
+            "states": [code for code, _ in groupby(codes)],
+            "losses": self.bench.losses,
+            "unpaired": self.bench.pair.stream.report.unpaired,
+        }
+
+
+def undisturbed(folder: Path) -> dict[str, Any]:
+    watched = Watched(folder, KnowingWorker)
+    for frame in sorted(chain(*streams().values()), key=lambda frame: frame.stamp_ns):
+        watched.push(frame)
+    watched.finish()
+    return watched.told
+
+
+def may_come(stream: str, waiting: dict[str, deque[Frame]]) -> bool:
+    """Whether the next frame of a stream may be the next of all: what is promised of streams, and no more."""
+    if not waiting[stream]:
+        return False
+    stamp_ns = waiting[stream][0].stamp_ns
+    others = {name: frames[0].stamp_ns for name, frames in waiting.items() if name != stream and frames}
+    if any(stamp_ns > other_ns + 20 * S for other_ns in others.values()):
+        return False  # what was sent before the vehicle was parked has come
+    if stream == "ego":
+        return True
+    if "ego" in others and stamp_ns - others["ego"] > MOTION_LATE_NS - S // 2:
+        return False
+    return all(stamp_ns - others[name] <= AHEAD * S // 2 for name in ("camera", "lidar") if name in others)
+
+
+def disturbed(folder: Path, seed: int, clock: Clock) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    watched = Watched(folder, SlowWorker)
+    bench = watched.bench
+    assert isinstance(bench.worker, SlowWorker)
+    bench.worker.rng = rng
+    stream, waiting = bench.pair.stream, streams()
+    last_ns = 0
+    favourite = "camera"
+    while any(waiting.values()):
+        if rng.random() < 0.05:
+            favourite = str(rng.choice(list(waiting)))
+        allowed = [name for name in waiting if may_come(name, waiting)]
+        name = favourite if favourite in allowed else str(rng.choice(allowed))
+        frame = waiting[name].popleft()
+        if frame.stamp_ns - last_ns > 30 * S and last_ns:
+            wait_in_silence(watched, clock)
+        last_ns = max(last_ns, frame.stamp_ns)
+        clock.now_s += rng.exponential(0.05)
+        if rng.random() < 0.005:
+            bench.worker.work(share=1.0)
+            bench.settle()
+            clock.now_s += STALL_S
+            bench.pair.decider.look_at_clocks(clock.now_s)
+        watched.push(frame)
+        stream.tick(waiting=False)
+    watched.finish()
+    assert "degraded" in [entry.code for entry in bench.entries("state")], "checks were overdue"
+    return watched.told
+
+
+def wait_in_silence(watched: Watched, clock: Clock) -> None:
+    """Nothing comes for much longer than any pause before; all that was asked is answered."""
+    bench = watched.bench
+    assert isinstance(bench.worker, SlowWorker)
+    for _ in range(400):
+        clock.now_s += STALL_S / 20
+        bench.worker.work(share=0.5)
+        bench.settle()
+        bench.pair.stream.tick(waiting=False)
+    assert isinstance(watched.windows[-1], SliceEnded), "silence ends the slice"
+
+
+@pytest.mark.fault(
+    "streams late and out of step, a slow worker, a stalling clock", "the same windows and checks, to the byte"
+)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_whatever_the_machine_does_the_same_frames_make_the_same_decisions(
+    tmp_path: Path, seed: int, clock: Clock, record_property: Callable[[str, object], None]
+) -> None:
+    calm = undisturbed(tmp_path / "calm")
+    told = disturbed(tmp_path / "disturbed", seed, clock)
+    record_property("figure", f"{len(calm['looked'])} pairs, {len(calm['checks'])} checks, all equal")
+    assert len(calm["checks"]) > 20
+    assert {"suspect", "miscalibrated", "healthy"} <= set(calm["states"])
+    for what in calm:
+        assert told[what] == calm[what], what
