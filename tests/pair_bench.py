@@ -165,6 +165,7 @@ class KnowingWorker:
             sigma=np.full(6, 1e-3),
             noise=np.full(6, 8e-4),
             place=np.full(6, 5e-4),
+            dispersion=1.0,
             distance2=float(np.abs(offset).max() / 0.005),
             flagged=bool(np.abs(offset).max() > 0.005),
             weak=False,

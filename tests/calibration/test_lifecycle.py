@@ -112,6 +112,7 @@ def check(stamp_s: int, flagged: bool = False, cause: str | None = None) -> Obse
         sigma=np.full(6, 1e-3),
         noise=np.full(6, 8e-4),
         place=np.full(6, 5e-4),
+        dispersion=1.0,
         distance2=9.0 if flagged else 0.1,
         flagged=flagged,
         weak=False,

@@ -17,7 +17,7 @@ def judged(pitch_deg: float, *, faint: tuple[str, ...] = (), causes: tuple[str, 
     noise: Vector6 = (0.001, 0.001, 0.001, 0.01, 0.01, 0.01)
     return Judged(
         offset=(radians(pitch_deg), 0.0, 0.0, 0.0, 0.0, 0.0), sigma=sigma, noise=noise, place=noise,
-        distance2=(radians(pitch_deg) / 0.007) ** 2, flagged=abs(radians(pitch_deg)) > 0.007,
+        dispersion=1.0,        distance2=(radians(pitch_deg) / 0.007) ** 2, flagged=abs(radians(pitch_deg)) > 0.007,
         faint=faint, causes=causes,
     )  # fmt: skip
 

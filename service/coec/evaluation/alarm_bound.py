@@ -55,7 +55,7 @@ class Places:
     Attributes:
         checks: of every place, those that can tell.
         displacement: (n,) of every place: the mean of its checks on the axis that is farthest off, in standard
-            deviations of `place`.
+            deviations of `place` in such a scene.
     """
 
     checks: tuple[tuple[Judged, ...], ...]
@@ -66,7 +66,7 @@ class Places:
         """A place a drive; drives without a clear check are none."""
         clear = [tuple(check for check in drive if not check.causes and not check.faint) for drive in drives]
         kept = tuple(checks for checks in clear if checks)
-        far = [float(np.max(np.abs(_offsets(checks).mean(axis=0)) / np.array(checks[0].place))) for checks in kept]
+        far = [float(np.max(np.abs(_offsets(checks).mean(axis=0)) / _place(checks))) for checks in kept]
         return cls(kept, np.array(far))
 
 
@@ -142,12 +142,17 @@ def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.
     about = (offsets - offsets.mean(axis=0)) * np.sqrt(len(checks) / (len(checks) - 1.0))
     off = np.zeros(6)
     axis = int(rng.integers(6))
-    off[axis] = displacement * checks[0].place[axis] * float(rng.choice([-1.0, 1.0]))
+    off[axis] = displacement * _place(checks)[axis] * float(rng.choice([-1.0, 1.0]))
     drawn = rng.integers(len(checks), size=SETTLED_CHECKS + stay_checks)
     return [
         checks[one].model_copy(update={"offset": tuple((about[one] + off * (number >= SETTLED_CHECKS)).tolist())})
         for number, one in enumerate(drawn.tolist())
     ]
+
+
+def _place(checks: Sequence[Judged]) -> NDArray[np.float64]:
+    """(6,) the standard deviation of a place where checks are of such dispersions."""
+    return np.asarray(np.mean([np.array(check.place) * check.dispersion for check in checks], axis=0))
 
 
 def _offsets(checks: Sequence[Judged]) -> NDArray[np.float64]:

@@ -242,6 +242,7 @@ def _stream(rng: np.random.Generator, truth: NDArray[np.float64], config: Monito
             sigma=sigma,
             noise=noise,
             place=STREET,
+            dispersion=1.0,
             distance2=float(distance2[number]),
             flagged=bool(distance2[number] > 1.0),
             weak=False,

@@ -196,7 +196,7 @@ def _judged(evidence: CheckInput, check: Check, pose: Matrix4, baseline: Baselin
     faint = faintness(evidence.pairs, check, UNCOMMISSIONED if baseline is None else baseline.monitor)
     return Judged(
         offset=_six(seen.offset), sigma=_six(seen.sigma), noise=_six(seen.noise), place=_six(seen.place),
-        distance2=seen.distance2, flagged=seen.flagged, faint=tuple(sorted(faint)),
+        dispersion=seen.dispersion, distance2=seen.distance2, flagged=seen.flagged, faint=tuple(sorted(faint)),
         causes=tuple(cause.code for cause in seen.causes),
     )  # fmt: skip
 

@@ -203,6 +203,6 @@ def _observation(check: Judged, number: int) -> Observation:
     return Observation(
         stamp_ns=begin_ns + CHECK_PAIRS - 1, pair_stamps_ns=tuple(begin_ns + pair for pair in range(CHECK_PAIRS)),
         metrics=(), offset=np.array(check.offset), sigma=np.array(check.sigma), noise=np.array(check.noise),
-        place=np.array(check.place), distance2=check.distance2, flagged=check.flagged, weak=bool(check.faint),
-        flagged_by_paper=None, causes=tuple(CAUSES[code] for code in check.causes),
+        place=np.array(check.place), dispersion=check.dispersion, distance2=check.distance2, flagged=check.flagged,
+        weak=bool(check.faint), flagged_by_paper=None, causes=tuple(CAUSES[code] for code in check.causes),
     )  # fmt: skip

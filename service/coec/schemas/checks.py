@@ -16,6 +16,7 @@ class Judged(Part):
     sigma: Vector6
     noise: Vector6
     place: Vector6
+    dispersion: float
     distance2: float
     flagged: bool
     faint: tuple[str, ...] = Field(description="of what its edges have too little; empty where they are not faint")

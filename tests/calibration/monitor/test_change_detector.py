@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +40,7 @@ def seen(
     causes: tuple[Cause, ...] = (),
     offset: NDArray[np.float64] | None = None,
     standing: bool = False,
+    dispersion: float = 1.0,
 ) -> Observation:
     return Observation(
         stamp_ns=stamps[-1],
@@ -49,6 +50,7 @@ def seen(
         sigma=np.full(6, 0.001),
         noise=np.full(6, 0.0008),
         place=np.full(6, 0.0005),
+        dispersion=dispersion,
         distance2=9.0 if flagged else 0.1,
         flagged=flagged,
         weak=weak,
@@ -140,6 +142,23 @@ class TestEvidence:
 
     def test_what_confirms_is_no_more_after_an_hour_than_after_a_minute(self) -> None:
         assert after(*(fresh(k) for k in range(720))).evidence == LEVELS.most
+
+    @pytest.mark.fault("every check of a highway is off alike", "it accuses the mount by no more than it can tell")
+    def test_what_a_scene_cannot_tell_accuses_nobody(self, record_property: Callable[[str, object], None]) -> None:
+        off_alike = [turned(0.4, 0.0, 0.0)] * 60
+        states = {
+            scene: after(*(fresh(n, offset=offset, dispersion=scene) for n, offset in enumerate(off_alike)))
+            for scene in (1.0, 5.0)
+        }
+        record_property("figure", f"{states[5.0].evidence:.1f} of {LEVELS.confirmed:.1f} nats")
+        assert states[1.0].outcome is Finding.CONFIRMED
+        assert states[5.0].evidence < LEVELS.clear
+
+    def test_a_large_move_is_confirmed_on_a_highway_too(self) -> None:
+        assert (
+            after(*(fresh(n, offset=turned(2.0, 0.0, 0.0), dispersion=5.0) for n in range(8))).outcome
+            is Finding.CONFIRMED
+        )
 
     def test_faint_edges_suspect_and_never_confirm(self) -> None:
         state = after(*[fresh(k, weak=True) for k in range(40)])

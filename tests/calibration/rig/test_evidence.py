@@ -25,7 +25,7 @@ EDGE = graph([("front", "roof")]).edges[0]
 def _observation(offset: np.ndarray, weak: bool = False) -> Observation:
     return Observation(
         stamp_ns=NS, pair_stamps_ns=(NS,), metrics=(), offset=offset, sigma=np.hypot(SIGMA, BIAS), noise=SIGMA,
-        place=PLACE, distance2=0.0, flagged=False, weak=weak, flagged_by_paper=None, causes=(),
+        place=PLACE, dispersion=1.0, distance2=0.0, flagged=False, weak=weak, flagged_by_paper=None, causes=(),
     )  # fmt: skip
 
 

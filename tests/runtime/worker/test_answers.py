@@ -29,6 +29,7 @@ OBSERVATION = Observation(
     sigma=np.full(6, np.nan),
     noise=np.full(6, 1 / 11),
     place=np.full(6, np.inf),
+    dispersion=1.0,
     distance2=1 / 7,
     flagged=True,
     weak=False,
@@ -81,7 +82,7 @@ def test_figures_of_numpy_are_plain_figures_on_the_other_side() -> None:
     strange: Any = np.bool_(True), np.float64(0.25), np.int64(9)
     made = Observation(
         strange[2], (strange[2],), (Metric("mi", strange[1], strange[1], strange[0]),), np.zeros(6), np.zeros(6),
-        np.zeros(6), np.zeros(6), strange[1], strange[0], strange[0], strange[0], (),
+        np.zeros(6), np.zeros(6), strange[1], strange[1], strange[0], strange[0], strange[0], (),
     )  # fmt: skip
     back = returned(Checked(made, None), Kind.CHECK).observation
     assert (type(back.stamp_ns), type(back.distance2), type(back.flagged)) == (int, float, bool)

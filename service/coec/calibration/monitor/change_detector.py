@@ -84,9 +84,10 @@ class Observation:
         offset: (6,) from the current pose to where the check puts the mount, the estimator's bias removed where known
             (rad, m): rotations of the optimum over rotations, translations of that over all axes. To first order the
             errors of the one do not tell those of the other.
-        sigma: (6,) its standard deviation.
+        sigma: (6,) its standard deviation on a street.
         noise: (6,) the part of it that is new at every check.
         place: (6,) the part that all checks of a street share; the rest is the rig's.
+        dispersion: times `noise` and `place` that checks of this scene scatter by, 1 at least; see `dispersion`.
         distance2: squared distance in standard deviations over its limit: above 1 is flagged.
         flagged: the pose is wrong, or the data are.
         weak: the edges at the local optimum are fainter than they should be.
@@ -107,6 +108,7 @@ class Observation:
     sigma: NDArray[np.float64]
     noise: NDArray[np.float64]
     place: NDArray[np.float64]
+    dispersion: float
     distance2: float
     flagged: bool
     weak: bool
@@ -239,12 +241,13 @@ def told_by(observation: Observation, axes: slice, before: Three | None) -> Told
     offset, sigma, noise, place = ([float(value) for value in column[axes]] for column in columns)
     if not all(isfinite(value) for value in (*offset, *sigma, *noise, *place)) or min(noise) <= 0.0:
         return None
-    times = WEAK_TIMES if observation.weak else 1.0
+    scene = observation.dispersion
+    times = max(WEAK_TIMES, scene) if observation.weak else scene
     farther2 = sum((FARTHER * value) ** 2 for value in offset)
     return Told(
         offset=three(offset),
         noise=three([(times * n) ** 2 + farther2 for n in noise]),
-        place=three([p * p for p in place]),
+        place=three([(scene * p) ** 2 for p in place]),
         rig=three([max(s * s - n * n, p * p) for s, n, p in zip(sigma, noise, place, strict=True)]),
         before=before,
         weak=observation.weak,

@@ -28,6 +28,7 @@ from coec.calibration.frames.timing import explained_by_motion
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import NO_BIAS, Check, CheckInput, check_at, gather
 from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
+from coec.calibration.monitor.dispersion import dispersion
 from coec.calibration.monitor.neighbourhood import MIN_CONTRAST, POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import data_causes, dirty_blocks
 from coec.calibration.ports import DepthModel, ImageReader, Silence
@@ -171,6 +172,7 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
         sigma=_of_both(rotation.sigma(seen.pairs), accuracy.sigma(seen.pairs)),
         noise=_of_both(rotation.noise(seen.pairs), accuracy.noise(seen.pairs)),
         place=street_sigma(camera),
+        dispersion=dispersion(seen.contrast),
         distance2=max(of_rotation, of_pose),
         flagged=flagged,
         weak=bool(faint),
@@ -197,9 +199,10 @@ def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: Monitor
     """Squared distances of the local optima over three and six degrees of freedom, over their limits: a check is
     flagged above 1."""
     within = LOST_EDGES_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0
+    scattered = dispersion(seen.contrast)
     return (
-        rotation.distance2(seen.offset_rotation, seen.pairs) / (within * limits.max_distance2_rotation),
-        pose.farthest2(seen.offset_pose, seen.pairs) / (within * limits.max_farthest2_pose),
+        rotation.distance2(seen.offset_rotation, seen.pairs, scattered) / (within * limits.max_distance2_rotation),
+        pose.farthest2(seen.offset_pose, seen.pairs, scattered) / (within * limits.max_farthest2_pose),
     )
 
 
@@ -223,7 +226,7 @@ def edges_per_pair(seen: Check) -> float:
 def _drift(seen: Check, baseline: Baseline) -> Drift:
     """How far the local optimum of a check lies from the commissioned calibration, over six degrees of freedom."""
     value = se3.difference(seen.T_pose, baseline.T_camera_lidar) - baseline.pose.bias
-    return Drift(value, baseline.pose.sigma(seen.pairs))
+    return Drift(value, baseline.pose.sigma(seen.pairs, dispersion(seen.contrast)))
 
 
 def _metrics(seen: Check, of_rotation: float, of_pose: float, limits: MonitorLimits) -> tuple[Metric, ...]:
