@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from cli.conftest import SMALL, Coec
 from coec.calibration.commissioning import learning
 from coec.calibration.types import LidarFrame
-from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, Options, configuration_of
+from coec.cli.commands.evaluate import Options
+from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, configuration_of
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import UsageError
 from coec.evaluation import experiments, steps
@@ -224,7 +225,7 @@ def test_search_box_holds_the_starts() -> None:
 
 
 def test_degrees_of_freedom_are_those_that_were_asked_for() -> None:
-    options = Options(source="", depth="stereo", directions=1, rotation_deg=5.0, translation_m=0.5, dof=3)
+    options = Options(source="", depth="stereo", directions=1, rotation_deg=5.0, translation_m=0.5, dof="3")
     assert configuration_of(options, CalibrationConfig()).search.dof == 3
 
 

@@ -8,9 +8,11 @@ import sys
 import pytest
 
 from cli.conftest import Coec
+from coec.cli import COMMANDS as COMMANDS_WITHOUT_COMMANDS
+from coec.cli import application
 
 COMMANDS = ("calibrate", "run", "check-config", "play", "query", "replay", "convert", "models", "demo")
-HEAVY = ("cv2", "mcap", "numba", "numpy", "onnxruntime", "rosbags", "zenoh")
+HEAVY = ("cv2", "mcap", "numba", "numpy", "onnxruntime", "pydantic", "rosbags", "zenoh")
 
 
 def test_help_lists_every_command(coec: Coec) -> None:
@@ -24,9 +26,9 @@ def test_every_command_has_help(coec: Coec, command: str) -> None:
     assert coec(command, "--help").status == 0
 
 
-def test_help_imports_nothing_heavy() -> None:
+def test_help_of_all_commands_imports_nothing_heavy() -> None:
     code = (
-        "import sys; sys.argv = ['coec', 'calibrate', '--help']\n"
+        "import sys; sys.argv = ['coec', '--help']\n"
         "from coec.cli import main; main()\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
@@ -34,6 +36,18 @@ def test_help_imports_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={"PYTHONPATH": path})
     assert done.returncode == 0
     assert done.stderr.strip() == "[]"
+
+
+def test_a_command_is_declared_without_the_others() -> None:
+    (alone,) = application(["check-config", "--defaults"]).registered_commands
+    assert alone.name == "check-config"
+    assert len(application(["--help", "check-config"]).registered_commands) == len(COMMANDS_WITHOUT_COMMANDS)
+
+
+def test_a_mistyped_command_is_told_which_is_meant(coec: Coec) -> None:
+    outcome = coec("calibrat")
+    assert outcome.status == 2
+    assert "'calibrate'" in outcome.err
 
 
 def test_usage_error_is_2_on_standard_error(coec: Coec) -> None:

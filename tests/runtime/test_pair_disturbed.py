@@ -107,7 +107,7 @@ class Watched:
             ask(job)
 
         bench.pair._chooser.choose = chosen  # type: ignore[method-assign]
-        bench.recorder.add, bench.recorder.end = added, ended  # type: ignore[method-assign]
+        bench.recorder.add, bench.recorder.end = added, ended  # type: ignore[method-assign, assignment]
         bench.worker.ask = asked  # type: ignore[method-assign]
 
     def push(self, frame: Frame) -> None:

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 from pydantic import ValidationError
 
 from coec.adapters.files import output
+from coec.cli.commands.alarms import Options
 from coec.config import MonitorConfig, describe
 from coec.errors import UsageError
 from coec.evaluation.alarms import measured
 from coec.reports import alarm_reports, console
 from coec.schemas.base import to_json
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command."""
-
-    hours: float
-    steps: int
-    period_s: float
-    between_h: float
-    output: Path | None = None
-    as_json: bool = False
 
 
 def run(options: Options) -> int:

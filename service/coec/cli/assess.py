@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from math import degrees
 from pathlib import Path
 from typing import cast
@@ -17,6 +16,8 @@ from coec.calibration.estimators import Sight, sight_of
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.types import Window
 from coec.cli import calibrate as calibrate_command
+from coec.cli.commands import calibrate
+from coec.cli.commands.models_assess import Options
 from coec.config import LimitsConfig, WindowConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.evaluation import depth_quality
@@ -35,17 +36,6 @@ STAGES = 3
 STYLES = {"good": "bold green", "usable_in_fused": "bold yellow", "do_not_use": "bold red"}
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    model: str
-    source: str
-    frames: int | None = None
-    output: Path | None = None
-    as_json: bool = False
-
-
 def run(options: Options) -> int:
     """Prints the assessment; 1 if the network is of no use on this recording.
 
@@ -57,7 +47,7 @@ def run(options: Options) -> int:
         load = stages.begin("load", None)
         loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         window = loaded.window
-        asked = calibrate_command.Options(source=options.source, depth=options.model, objective="mi", dof=3)
+        asked = calibrate.Options(source=options.source, depth=options.model, objective="mi", dof="3")
         configuration = calibrate_command.configuration_of(asked, loaded.configuration)
         depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
         took_ms = _infer(window, depth, stages)

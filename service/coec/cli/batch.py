@@ -6,11 +6,10 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from coec.cli.commands.batch import Options
 from coec.fleet import batch
 from coec.fleet.engines.engine import Bounds, Engine
 from coec.fleet.places import jobs_of
@@ -22,23 +21,6 @@ MIB = 2**20
 
 LINE_S = 30.0
 """Between two lines of progress where standard error is no terminal."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    windows: tuple[str, ...]
-    output: Path
-    engine: str = "local"
-    jobs: int | None = None
-    with_config: Path | None = None
-    rig: Path | None = None
-    depth: str | None = None
-    resume: bool = False
-    deadline_s: float = 600.0
-    memory_mib: int = 2048
-    as_json: bool = False
 
 
 def run(options: Options) -> int:

@@ -18,6 +18,7 @@ from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.types import Rig, Window
+from coec.cli.commands.calibrate import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
 from coec.errors import UsageError
 from coec.geometry import se3
@@ -30,23 +31,6 @@ from coec.sources import windows
 
 FITTED = "double_sphere"
 """The one model that can be fitted to the others."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    source: str
-    depth: str | None = None
-    objective: str | None = None
-    dof: int | None = None
-    perturb: str | None = None
-    camera_model: str | None = None
-    frames: int | None = None
-    no_motion_compensation: bool = False
-    time_offset: bool = False
-    output: Path | None = None
-    as_json: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +118,7 @@ def configuration_of(options: Options, recorded: CalibrationConfig | None) -> Ca
     if options.objective is not None:
         values["objective"]["kind"] = options.objective
     if options.dof is not None:
-        values["search"]["dof"] = options.dof
+        values["search"]["dof"] = int(options.dof)
     if options.no_motion_compensation:
         values["motion_compensation"] = False
     try:

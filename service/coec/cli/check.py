@@ -13,6 +13,7 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import Estimate
 from coec.cli import calibrate as calibrate_command
+from coec.cli.commands.calibrate import Options
 from coec.config import LimitsConfig
 from coec.errors import CalibrationError, SourceError
 from coec.evaluation.fitness import Cadence, Fitness, Remark, fitness_of
@@ -56,7 +57,7 @@ def run(source: str, *, depth: str | None, as_json: bool) -> int:
 def _trial(recording: Recording, depth: str | None, times: calibrate_command.StageTimes) -> Estimate | CalibrationError:
     """A calibration of a few pairs about the recording's own extrinsic: how sharply this scene tells the pose."""
     loaded = windows.chosen_from(recording, PAIRS, lambda done, total: times.step("load", done, total))
-    options = calibrate_command.Options(source=recording.name, depth=depth)
+    options = Options(source=recording.name, depth=depth)
     configuration = calibrate_command.configuration_of(options, loaded.configuration)
     limits = LimitsConfig()
     window = replace(loaded.window, start_known_to_rad=MOUNT_RAD)

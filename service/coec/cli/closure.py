@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -11,6 +11,7 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.types import Matrix4
 from coec.cli import evaluate
+from coec.cli.commands.evaluate import Options
 from coec.config import LimitsConfig, WindowConfig
 from coec.evaluation import experiments
 from coec.evaluation.closure import Between, Closure, Solve, between, close
@@ -24,50 +25,43 @@ from coec.schemas.replies import Vector6
 from coec.sources import windows
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command. `each` holds what both calibrations share (its source is not looked at);
-    `relative` is the pose of sensor A in the frame of B, rx,ry,rz,tx,ty,tz in degrees and metres, None: as the
-    recordings tell."""
-
-    source_a: str
-    source_b: str
-    each: evaluate.Options
-    relative: str | None = None
-
-
-def run(options: Options) -> int:
+def run(options: Options, source_a: str, source_b: str) -> int:
     """Prints the report; how good the figures are is for the reader to judge.
+
+    Args:
+        options: what both calibrations share; its `relative` is the pose of sensor A in the frame of B, None: as the
+            recordings tell.
+        source_a: of the one sensor.
+        source_b: of the other.
 
     Raises:
         CoecError: there is nothing to compare.
     """
     given = None if options.relative is None else relative_of(options.relative)
-    each = options.each
     with console.progress() as bars:
         stages = Stages(bars)
-        bench_a = _bench(replace(each, source=options.source_a), "A", stages)
-        bench_b = _bench(replace(each, source=options.source_b), "B", stages)
+        bench_a = _bench(replace(options, source=source_a), "A", stages)
+        bench_b = _bench(replace(options, source=source_b), "B", stages)
         known = between(bench_a.window.rig, bench_b.window.rig, given)
         closures = close(
             known,
-            _solves(bench_a, each),
-            _solves(bench_b, each),
+            _solves(bench_a, options),
+            _solves(bench_b, options),
             (len(bench_a.window.pairs), len(bench_b.window.pairs)),
-            each.directions,
+            options.directions,
             bench_a.configuration.search.dof,
-            stages.begin("solve", each.directions),
+            stages.begin("solve", options.directions),
         )
-    document = _report(options, bench_a, known, closures, stages.elapsed_s())
-    if each.output is not None:
+    document = _report(options, (source_a, source_b), bench_a, known, closures, stages.elapsed_s())
+    if options.output is not None:
         # matplotlib takes a second to import.
         from coec.reports import evaluation_pictures
 
         name = f"closure of {bench_a.window.window_id} and {bench_b.window.window_id}"
         of_frames = {f"closure on {closure.frames.value}": closure.normalised for closure in closures}
-        evaluation_pictures.write_normalised(each.output, name, of_frames)
-        output.write(each.output / "report.json", to_json(document))
-    if each.as_json:
+        evaluation_pictures.write_normalised(options.output, name, of_frames)
+        output.write(options.output / "report.json", to_json(document))
+    if options.as_json:
         console.print_json(document.model_dump(mode="json"))
     else:
         evaluation_tables.show_closure(document)
@@ -83,7 +77,7 @@ def relative_of(text: str) -> Matrix4:
     return se3.perturbation(windows.vector_of("--relative", text))
 
 
-def _bench(options: evaluate.Options, name: str, stages: Stages) -> Bench:
+def _bench(options: Options, name: str, stages: Stages) -> Bench:
     load = stages.begin(f"load {name}", None)
     loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
     configuration = evaluate.configuration_of(options, loaded.configuration)
@@ -92,26 +86,31 @@ def _bench(options: evaluate.Options, name: str, stages: Stages) -> Bench:
     return Bench(loaded.window, depth, experiments.greys_of(loaded.window), configuration)
 
 
-def _solves(bench: Bench, options: evaluate.Options) -> Solve:
+def _solves(bench: Bench, options: Options) -> Solve:
     poses = experiments.poses_of(bench, options.directions, options.rotation_deg, options.translation_m)
     return lambda trial, frames: bench.solve(poses[trial], frames)
 
 
 def _report(
-    options: Options, bench: Bench, known: Between, closures: tuple[Closure, ...], elapsed_s: dict[str, float]
+    options: Options,
+    sources: tuple[str, str],
+    bench: Bench,
+    known: Between,
+    closures: tuple[Closure, ...],
+    elapsed_s: dict[str, float],
 ) -> ClosureReport:
     apart = se3.difference(known.T_b_a, np.eye(4))
     return ClosureReport(
-        source_a=options.source_a,
-        source_b=options.source_b,
+        source_a=sources[0],
+        source_b=sources[1],
         relation=known.relation.value,
         known=cast("Vector6", in_degrees(apart)),
         from_recordings=options.relative is None,
         objective=bench.configuration.objective.kind,
         dof=bench.configuration.search.dof,
-        start_rotation_deg=options.each.rotation_deg,
-        start_translation_m=options.each.translation_m,
-        trials=options.each.directions,
+        start_rotation_deg=options.rotation_deg,
+        start_translation_m=options.translation_m,
+        trials=options.directions,
         groups=tuple(closure_of(closure) for closure in closures),
         elapsed_s=elapsed_s,
     )

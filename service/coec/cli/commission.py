@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,25 +16,12 @@ from coec.calibration.commissioning.learning import MAX_PAIRS, commission
 from coec.calibration.ports import DepthModel, ImageReader
 from coec.calibration.types import Window
 from coec.cli import calibrate as calibrate_command
+from coec.cli.commands import calibrate
+from coec.cli.commands.commission import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import UsageError
 from coec.reports import console
 from coec.sources import windows
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    sources: tuple[str, ...]
-    output: Path
-    depth: str | None = None
-    objective: str | None = None
-    dof: int | None = None
-    frames: int | None = None
-    false_alarm_rate: float = 0.01
-    sensors: tuple[str, ...] = ()
-    as_json: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +40,7 @@ def run(options: Options) -> int:
     Raises:
         CoecError: there is none.
     """
-    sensors = sensors_of(options.sensors)
+    sensors = sensors_of(options.sensors or ())
     with console.progress() as bars:
         times = calibrate_command.StageTimes(bars)
         rigged = load(options.sources, options, times)
@@ -75,7 +62,7 @@ def run(options: Options) -> int:
     return 0
 
 
-def load(sources: tuple[str, ...], options: Options, times: calibrate_command.StageTimes) -> Rigged:
+def load(sources: Sequence[str], options: Options, times: calibrate_command.StageTimes) -> Rigged:
     """The windows of all sources, with the configuration of the first.
 
     Raises:
@@ -88,7 +75,7 @@ def load(sources: tuple[str, ...], options: Options, times: calibrate_command.St
         for source in sources
     ]
     configuration = calibrate_command.configuration_of(
-        calibrate_command.Options(source=sources[0], depth=options.depth, objective=options.objective, dof=options.dof),
+        calibrate.Options(source=sources[0], depth=options.depth, objective=options.objective, dof=options.dof),
         loaded[0].configuration,
     )
     depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), MAX_PAIRS)
@@ -97,7 +84,7 @@ def load(sources: tuple[str, ...], options: Options, times: calibrate_command.St
     return Rigged(found, configuration, depth, images)
 
 
-def sensors_of(named: tuple[str, ...]) -> dict[str, str]:
+def sensors_of(named: Sequence[str]) -> dict[str, str]:
     """Serial numbers by stream, from `camera=SERIAL` and the like.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +17,14 @@ from coec.calibration.monitor.check import gather
 from coec.calibration.monitor.check_verdict import diagnose
 from coec.cli import calibrate as calibrate_command
 from coec.cli import commission
+from coec.cli.commands import commission as commission_options
+from coec.cli.commands.diagnose import Options
 from coec.errors import UsageError
 from coec.evaluation.detection import try_detection
 from coec.geometry import se3
 from coec.reports import console, evaluation_tables
 from coec.reports.evaluation_documents import detection_of
 from coec.sources import windows
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    source: str
-    depth: str | None = None
-    rig: Path | None = None
-    perturb: str | None = None
-    detection: int = 0
-    checks: int = 10
-    frames: int | None = None
-    as_json: bool = False
 
 
 def run(options: Options) -> int:
@@ -47,8 +35,8 @@ def run(options: Options) -> int:
     """
     with console.progress() as bars:
         times = calibrate_command.StageTimes(bars)
-        of_source = commission.Options(
-            sources=(options.source,), output=Path(), depth=options.depth, frames=options.frames
+        of_source = commission_options.Options(
+            sources=[options.source], output=Path(), depth=options.depth, frames=options.frames
         )
         rigged = commission.load((options.source,), of_source, times)
         if options.detection > 0:

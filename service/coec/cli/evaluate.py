@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import degrees, radians
-from pathlib import Path
 from typing import Any, cast
 
 from pydantic import ValidationError
@@ -16,6 +15,8 @@ from coec.adapters.files import output
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import Matrix4, Window
 from coec.cli import calibrate as calibrate_command
+from coec.cli.commands import calibrate
+from coec.cli.commands.evaluate import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
 from coec.errors import CalibrationError, UsageError
 from coec.evaluation import experiments, normalised_errors, split_halves, statistics
@@ -58,31 +59,6 @@ OTHER_HALF = "the other half of the frames"
 
 METHODS = ("fused", "mi", "intensity")
 """This project's, the paper's, and the one before it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given. `halves` and `detection` are numbers of splits, `nees` is one of
-    windows and of splits, `steps` one of knocks of each kind; 0 = none."""
-
-    source: str
-    rotation_deg: float
-    directions: int
-    translation_m: float = 0.0
-    depth: str | None = None
-    objective: str | None = None
-    dof: int | None = None
-    camera_model: str | None = None
-    frames: int | None = None
-    no_motion_compensation: bool = False
-    against_frames: bool = False
-    against_slice: bool = False
-    halves: int = 0
-    nees: int = 0
-    detection: int = 0
-    steps: int = 0
-    output: Path | None = None
-    as_json: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,11 +119,11 @@ def configuration_of(options: Options, recorded: CalibrationConfig | None) -> Ca
         UsageError: a value that does not exist, or starts too far for any search box.
     """
     configuration = calibrate_command.configuration_of(
-        calibrate_command.Options(
+        calibrate.Options(
             source=options.source,
             depth=options.depth,
             objective=options.objective,
-            dof=6 if options.dof is None and options.translation_m > 0 else options.dof,
+            dof="6" if options.dof is None and options.translation_m > 0 else options.dof,
             no_motion_compensation=options.no_motion_compensation,
         ),
         recorded,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from coec.adapters.exports import FORMATS
@@ -13,6 +12,7 @@ from coec.adapters.files import output
 from coec.adapters.files.rig import intrinsics_config
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.types import Matrix4
+from coec.cli.commands.export import Options
 from coec.cli.one_pair import pair_named
 from coec.config import CameraIntrinsics, Config, load_config
 from coec.errors import DecodeError, SourceError, UsageError
@@ -26,22 +26,6 @@ from coec.sources.reading import read_bytes
 
 MAX_BYTES = 64 * 2**20
 """Of a file that is read, or of another program's that is changed: a robot's URDF has below one million."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    source: Path
-    format: str
-    parent: str | None
-    child: str | None
-    parent_pose: str | None
-    pair: str | None
-    config: Path | None
-    output: Path | None
-    force: bool
-    as_json: bool
 
 
 def run(options: Options) -> int:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from coec.adapters.files import output
+from coec.cli.commands.fleet_report import Options
 from coec.fleet import questions, report
 from coec.reports import console, fleet_page
 from coec.reports.console import figure
@@ -14,17 +14,6 @@ from coec.schemas.fleet import FleetReport
 
 SHOWN = 15
 """Pairs in the table on the screen; the page has all."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    results: Path
-    output: Path | None = None
-    against: Path | None = None
-    sql: bool = False
-    as_json: bool = False
 
 
 def run(options: Options) -> int:

@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
 from coec.adapters.registration.nearest import Trees
 from coec.calibration.lidar_to_lidar.registration import register
 from coec.calibration.lidar_to_lidar.types import LidarEdge
+from coec.cli.commands.lidars import Options
 from coec.geometry.se3 import difference
 from coec.reports import console
 from coec.sources.lidars import LidarRecording, open_lidars
 
 DEGREES = np.array([*np.rad2deg(np.ones(3)), *np.ones(3)])
 """From rad and m to degrees and m."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command."""
-
-    source: str
-    a: str
-    b: str
-    pairs: int
-    as_json: bool = False
 
 
 def run(options: Options) -> int:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from math import degrees, radians
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,8 @@ from coec.adapters.files import output
 from coec.calibration.estimators import depth_features, sight_of
 from coec.calibration.ports import Silence
 from coec.cli import calibrate as calibrate_command
+from coec.cli.commands import calibrate
+from coec.cli.commands.paper import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import SourceError
 from coec.evaluation import paper, paper_published, starts, statistics
@@ -35,22 +36,6 @@ DRIVE_PAIRS = 5
 """Pairs of one slice of a short drive; the paper takes 25 of 11,518 frames, and so does `slice_s`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given. `slice_s`: the drive is cut into windows of so many seconds;
-    without it, every run of `DRIVE_PAIRS` neighbours among the pairs is one."""
-
-    source: str
-    output: Path
-    depth: str | None = None
-    objective: str = "mi"
-    runs: int = 100
-    samples: int = 100
-    frames: int | None = None
-    slice_s: float | None = None
-    as_json: bool = False
-
-
 def run(options: Options) -> int:
     """Writes metrics.png, bullseye.png, drive.png and report.json, and prints what is in them.
 
@@ -62,7 +47,7 @@ def run(options: Options) -> int:
         load = stages.begin("load", None)
         loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         configuration = calibrate_command.configuration_of(
-            calibrate_command.Options(source=options.source, depth=options.depth, objective=options.objective),
+            calibrate.Options(source=options.source, depth=options.depth, objective=options.objective),
             loaded.configuration,
         )
         window = loaded.window

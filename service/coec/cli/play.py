@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -15,6 +13,7 @@ from coec.adapters.zenoh.cadence import Played, Stamped, repeated
 from coec.adapters.zenoh.client import connected, single_key
 from coec.adapters.zenoh.player import Player, Streams, shifted
 from coec.calibration.types import CameraFrame, LidarFrame
+from coec.cli.commands.play import Middleware, Options
 from coec.cli.stopping import until_signal
 from coec.config import Config, OpenPairConfig, RosConfig, ZenohConfig, load_config
 from coec.errors import SourceError, UsageError
@@ -28,26 +27,6 @@ LISTENER_S = 5.0
 
 DEFAULT_PERIOD_NS = 100_000_000
 """Between two passes of a recording with a single frame: 10 Hz."""
-
-Middleware = Literal["native", "rmw_zenoh", "ros2dds"]
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    source: str
-    config: Path | None = None
-    pair: str | None = None
-    middleware: Middleware | None = None
-    topics: tuple[str, ...] = ()
-    domain: int | None = None
-    rate: float = 1.0
-    loop: bool = False
-    connect: str | None = None
-    encoding: Literal["msgpack", "cdr"] = "msgpack"
-    start_now: bool = False
-    as_json: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,8 @@ from coec.adapters.ros.topics import TopicInfo, TopicMessage
 from coec.adapters.zenoh.cadence import repeated
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.player import Player, SensorKeys, shifted
-from coec.cli.play import CONNECT_S, LISTENER_S, Options, Target, display, report, say_deaf, say_without_depth
+from coec.cli.commands.play import Options
+from coec.cli.play import CONNECT_S, LISTENER_S, Target, display, report, say_deaf, say_without_depth
 from coec.cli.play_topics import Programme
 from coec.cli.sim_rig import vehicle_of
 from coec.cli.stopping import until_signal

@@ -12,11 +12,11 @@ from coec.adapters.zenoh.cadence import repeated
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.topic_player import Middleware, TopicPlayer, dialect_of, is_playable
 from coec.calibration.types import CameraFrame, Rig
+from coec.cli.commands.play import Options
 from coec.cli.play import (
     CONNECT_S,
     DEFAULT_PERIOD_NS,
     LISTENER_S,
-    Options,
     Target,
     display,
     pause_ns,
@@ -60,7 +60,7 @@ def topics(options: Options, target: Target, middleware: Middleware) -> int:
         raise UsageError("--encoding is of frames on the keys of a pair: topics of ROS 2 carry CDR")
     spec = parse_spec(options.source)
     programme = _programme(spec, options, target)
-    chosen = _chosen(programme, options.topics, middleware)
+    chosen = _chosen(programme, _split(options.topics), middleware)
     first = next(programme.messages(chosen), None)
     if first is None:
         raise SourceError(f"{programme.name} holds no message on {', '.join(chosen)}")
@@ -123,6 +123,10 @@ def _frames(options: Options, pair: OpenPairConfig | None) -> Programme:
     infos = {message.topic: TopicInfo(message.type_name, images) for message in told([0])}
     infos = {topic: TopicInfo(info.type_name, counts.get(topic, info.count)) for topic, info in infos.items()}
     return Programme(recording.name, infos, lambda _: told(), pause_ns(recording))
+
+
+def _split(asked: list[str] | None) -> tuple[str, ...]:
+    return tuple(topic for given in asked or () for topic in given.split(","))
 
 
 def _chosen(programme: Programme, asked: tuple[str, ...], middleware: Middleware) -> dict[str, TopicInfo]:

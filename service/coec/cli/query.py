@@ -35,6 +35,7 @@ from coec.adapters.zenoh.client import (
 from coec.adapters.zenoh.proven import give
 from coec.adapters.zenoh.settings import connected_of
 from coec.adapters.zenoh.settings_file import credentials_in, read_settings
+from coec.cli.commands.query import Options
 from coec.config import Config, ZenohConfig, load_config
 from coec.errors import NotFoundError, UsageError
 from coec.reports import console, replies
@@ -99,21 +100,6 @@ def asked_of(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given."""
-
-    key: str
-    pair: str | None
-    service: Asked
-    params: tuple[str, ...]
-    payload: str | None
-    timeout_s: float
-    output: Path | None
-    as_json: bool
-    anonymous: bool = False
-
-
 def run(options: Options) -> int:
     """Asks and shows the answers; 1 if a command was not accepted.
 
@@ -123,33 +109,34 @@ def run(options: Options) -> int:
         RemoteError: an error reply.
         NotProvenError: who answered a command is not the service.
     """
-    keys = _keys(options)
+    asked = asked_of(options.config, options.vehicle, options.prefix, options.connect, options.zenoh)
+    keys = _keys(options, asked)
     head, _, argument = options.key.partition("/")
     whole = f"/{VERSION_CHUNK}/" in options.key
     if not whole and head == "windows" and argument:
-        return _download(options, keys, argument)
+        return _download(options, asked.way, keys, argument)
     if options.output is not None:
-        return _save_picture(options, keys, head, argument)
-    with connected_by(options.service.way, options.timeout_s) as session:
+        return _save_picture(options, asked.way, keys, head, argument)
+    with connected_by(asked.way, options.timeout_s) as session:
         key, kind = _resolve(session, options, keys)
-        if any(item.startswith("format=") for item in options.params):
+        if any(item.startswith("format=") for item in options.params or ()):
             kind = None
-        replies = _answers(session, key, options)
+        replies = _answers(session, key, options, asked)
         if not replies:
             raise nobody(key, service_is_there=is_alive(session, keys, options.timeout_s))
     return _show(replies, kind, options, key)
 
 
-def _answers(session: zenoh.Session, key: str, options: Options) -> list[Reply]:
+def _answers(session: zenoh.Session, key: str, options: Options, asked: Asked) -> list[Reply]:
     """To the query; a command is proven where the session has a certificate."""
     selector, payload = _selector(key, _params(key, options)), _payload(options.payload)
-    credentials = options.service.credentials
+    credentials = asked.credentials
     if not _is_command(key):
         return ask(session, selector, options.timeout_s, payload)
     if credentials is None or options.anonymous:
         return ask(session, selector, options.timeout_s, payload, _myself())
-    speaker = Speaker(credentials, options.service.vehicle)
-    encoding = MSGPACK if "format=msgpack" in options.params else JSON
+    speaker = Speaker(credentials, asked.vehicle)
+    encoding = MSGPACK if "format=msgpack" in (options.params or ()) else JSON
     try:
         return [give(session, selector, payload, options.timeout_s, speaker, encoding)]
     except NotFoundError:  # nobody answered: as with every other key
@@ -167,7 +154,7 @@ def _myself() -> bytes:
     return socket.gethostname().encode("ascii", errors="replace")
 
 
-def _keys(options: Options) -> Keys:
+def _keys(options: Options, asked: Asked) -> Keys:
     """The keys that are asked for, once everything typed is known to fit into one.
 
     Raises:
@@ -175,8 +162,8 @@ def _keys(options: Options) -> Keys:
     """
     if not math.isfinite(options.timeout_s):
         raise UsageError(f"--timeout {options.timeout_s}: give a number of seconds")
-    keys = Keys(options.service.prefix, options.service.vehicle)
-    for typed in (options.service.prefix, options.service.vehicle, options.key, options.pair):
+    keys = Keys(asked.prefix, asked.vehicle)
+    for typed in (asked.prefix, asked.vehicle, options.key, options.pair):
         if typed is not None:
             key_expression(typed)
     head, _, argument = options.key.partition("/")
@@ -222,10 +209,11 @@ def _only_pair(session: zenoh.Session, options: Options, keys: Keys) -> str:
 
 def _params(key: str, options: Options) -> tuple[str, ...]:
     """Those that were given; with a command goes for how long its acknowledgement is waited for."""
-    if not _is_command(key) or any(item.startswith("timeout_ms=") for item in options.params):
-        return options.params
+    given = tuple(options.params or ())
+    if not _is_command(key) or any(item.startswith("timeout_ms=") for item in given):
+        return given
     timeout_ms = min(max(round(options.timeout_s * 1e3 * ON_SITE), 1), MAX_COMMAND_TIMEOUT_MS)
-    return (*options.params, f"timeout_ms={timeout_ms}")
+    return (*given, f"timeout_ms={timeout_ms}")
 
 
 def _selector(key: str, params: tuple[str, ...]) -> str:
@@ -282,18 +270,18 @@ def _succeeded(reply: Reply, kind: str | None) -> bool:
     return kind != "command" or bool(json.loads(reply.payload).get("accepted", True))
 
 
-def _save_picture(options: Options, keys: Keys, head: str, argument: str) -> int:
+def _save_picture(options: Options, way: Way, keys: Keys, head: str, argument: str) -> int:
     """`overlay`, or `evidence/ID` with `--param overlay=before`, as a JPEG file."""
     if head not in PICTURE_KEYS or (head == "evidence") != bool(argument):
         raise UsageError(
             "--output belongs to windows/ID, overlay, and evidence/ID with --param overlay=before or after"
         )
-    with connected_by(options.service.way, options.timeout_s) as session:
+    with connected_by(way, options.timeout_s) as session:
         if head == "overlay":
             key = keys.overlay(options.pair or _only_pair(session, options, keys))
         else:
             key = keys.evidence_of(_pair_of(session, options, keys, argument), argument)
-        reply = ask_one(session, _selector(single_key(key), options.params), options.timeout_s)
+        reply = ask_one(session, _selector(single_key(key), tuple(options.params or ())), options.timeout_s)
     if reply.encoding != JPEG:
         raise UsageError("the answer is no picture: give --param overlay=before or overlay=after")
     path = Path(str(options.output))
@@ -308,10 +296,10 @@ def _save_picture(options: Options, keys: Keys, head: str, argument: str) -> int
 # --- windows/ID -----------------------------------------------------------------------------------------------
 
 
-def _download(options: Options, keys: Keys, window_id: str) -> int:
+def _download(options: Options, way: Way, keys: Keys, window_id: str) -> int:
     if options.output is None:
         raise UsageError("say where to with --output FILE")
-    with connected_by(options.service.way, options.timeout_s) as session, console.progress(counted=False) as bars:
+    with connected_by(way, options.timeout_s) as session, console.progress(counted=False) as bars:
         pair = _pair_of(session, options, keys, window_id)
         single_key(keys.window(pair, window_id))
         task = bars.add_task(window_id, note="")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from coec.adapters.files.output import OutputError, write
@@ -13,6 +12,8 @@ from coec.adapters.mcap.bag_writer import write_bag
 from coec.adapters.ros import messages, outgoing
 from coec.adapters.ros.topics import Frame
 from coec.calibration.types import CameraFrame
+from coec.cli.commands import sim_view
+from coec.cli.commands.sim_drive import Options
 from coec.errors import UsageError
 from coec.reports import console
 from coec.simulation.source import open_rig, open_sim
@@ -27,44 +28,20 @@ TRUTH_TOPIC = "/ground_truth/tf"
 """True `camera` <- `lidar` and `world` <- `ego` at each exposure. No source reads it: the service cannot know."""
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What was asked for; the words of `simulation.source`."""
-
-    seed: int
-    seconds: float
-    camera: str
-    lidar: str = "64"
-    scene: str = "street"
-    speed_mps: float | None = None
-    rolling_shutter_s: float = 0.0
-    intrinsics_off: str | None = None
-    camera_hz: float = 10.0
-    lidar_hz: float = 10.0
-    faults: tuple[str, ...] = ()
-    workshop: str | None = None
-    rig: str | None = None
-
-    def open(self) -> SimulatedDrive:
-        """The drive. Raises UsageError, SourceError: see `open_sim`."""
-        return open_sim(self._query(("lidar", "rolling_shutter_s", "intrinsics_off")))
-
-    def open_rig(self) -> RigDrive:
-        """The drive of the rig. Raises UsageError, SourceError: see `open_rig`."""
-        own = (("--lidar", self.lidar != "64"), ("--rolling-shutter", self.rolling_shutter_s != 0.0))
-        if not_its := [name for name, given in (*own, ("--intrinsics-off", self.intrinsics_off is not None)) if given]:
-            raise UsageError(f"{', '.join(not_its)} of a rig: its sensors are what they are; leave it out")
-        return open_rig(self._query(("rig",)))
-
-    def _query(self, more: tuple[str, ...]) -> dict[str, str]:
-        names = ("seed", "seconds", "camera", "camera_hz", "lidar_hz", "scene", "speed_mps", "workshop", *more)
-        query = {name: str(getattr(self, name)) for name in names if getattr(self, name) is not None}
-        if self.faults:
-            query["faults"] = ";".join(self.faults)
-        return query
+def opened(options: Options) -> SimulatedDrive:
+    """The drive. Raises UsageError, SourceError: see `open_sim`."""
+    return open_sim(_query(options, ("lidar", "rolling_shutter_s", "intrinsics_off")))
 
 
-def drive(options: Options, output: Path, *, as_json: bool) -> int:
+def opened_rig(options: Options) -> RigDrive:
+    """The drive of the rig. Raises UsageError, SourceError: see `open_rig`."""
+    own = (("--lidar", options.lidar != "64"), ("--rolling-shutter", options.rolling_shutter_s != 0.0))
+    if not_its := [name for name, given in (*own, ("--intrinsics-off", options.intrinsics_off is not None)) if given]:
+        raise UsageError(f"{', '.join(not_its)} of a rig: its sensors are what they are; leave it out")
+    return open_rig(_query(options, ("rig",)))
+
+
+def drive(options: Options) -> int:
     """Writes a drive as a ROS 2 bag, frame by frame.
 
     Raises:
@@ -72,9 +49,10 @@ def drive(options: Options, output: Path, *, as_json: bool) -> int:
         SourceError: the optional extra is not installed.
         OutputError: it cannot be written.
     """
+    output = options.output
     if output.suffix != ".mcap":
         raise UsageError(f"{output}: the drive is written as a ROS 2 bag, its name must end in .mcap")
-    made = options.open()
+    made = opened(options)
     from coec.simulation.parallel import messages_by
 
     processes = min(os.cpu_count() or 1, MOST_PROCESSES)
@@ -97,7 +75,7 @@ def drive(options: Options, output: Path, *, as_json: bool) -> int:
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
-    if as_json:
+    if options.as_json:
         console.print_json(
             {"written": str(output), "bytes": output.stat().st_size, "frames": len(made.camera_stamps_ns)}
         )
@@ -106,23 +84,42 @@ def drive(options: Options, output: Path, *, as_json: bool) -> int:
     return 0
 
 
-def view(options: Options, at_s: float, output: Path, *, as_json: bool) -> int:
+def view(options: sim_view.Options) -> int:
     """Writes the picture nearest to a time.
 
     Raises:
         UsageError, SourceError, OutputError: as for `drive`.
     """
+    output = options.output
     if output.suffix not in (".jpg", ".jpeg"):
         raise UsageError(f"{output}: the picture is a JPEG, its name must end in .jpg")
-    made = options.open()
-    index = min(round(at_s * options.camera_hz), len(made.camera_stamps_ns) - 1)
+    drive = Options(
+        output,
+        seed=options.seed,
+        seconds=options.at_s + 1.0,
+        camera=options.camera,
+        scene=options.scene,
+        speed_mps=options.speed_mps,
+        faults=options.faults,
+    )
+    made = opened(drive)
+    index = min(round(options.at_s * drive.camera_hz), len(made.camera_stamps_ns) - 1)
     frame = next(frame for frame in made.messages([index]) if isinstance(frame, CameraFrame))
     path = write(output, frame.image.data)
-    if as_json:
+    if options.as_json:
         console.print_json({"written": str(path)})
     else:
         console.show(str(path))
     return 0
+
+
+def _query(options: Options, more: tuple[str, ...]) -> dict[str, str]:
+    """The words of `simulation.source`."""
+    names = ("seed", "seconds", "camera", "camera_hz", "lidar_hz", "scene", "speed_mps", "workshop", *more)
+    query = {name: str(getattr(options, name)) for name in names if getattr(options, name) is not None}
+    if options.faults:
+        query["faults"] = ";".join(options.faults)
+    return query
 
 
 def _truth(made: SimulatedDrive, frame: Frame) -> list[tuple[str, str, bytes]]:

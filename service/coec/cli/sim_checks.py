@@ -3,11 +3,11 @@ one."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from coec.adapters.files import output
 from coec.calibration.commissioning.baseline import Baseline
+from coec.cli.commands.sim_checks import Options
 from coec.errors import CalibrationError, DecodeError
 from coec.evaluation import check_drives, check_run, check_statistics
 from coec.evaluation.check_drives import CheckDrive
@@ -15,16 +15,6 @@ from coec.reports import check_tables, console
 from coec.schemas.base import from_json, to_json
 from coec.schemas.checks import CheckedDrive
 from coec.simulation.source import require_extra
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command."""
-
-    output: Path
-    rounds: int
-    hours: float
-    as_json: bool = False
 
 
 def run(options: Options) -> int:

@@ -7,11 +7,11 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from pathlib import Path
 
 from coec.adapters.files import output
 from coec.adapters.system.cores import one_thread_each
+from coec.cli.commands.sim_matrix import Options
 from coec.config import CalibrationConfig
 from coec.errors import CoecError, DecodeError, UsageError
 from coec.evaluation import matrix, matrix_drives, matrix_run
@@ -27,20 +27,6 @@ class MatrixError(CoecError):
     """The matrix could not be run to its end."""
 
     reply_code = "matrix_failed"
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command; None = not given: every drive, three and six degrees of freedom, all cores, the
-    network that comes with coec."""
-
-    output: Path
-    only: str | None = None
-    dof: int | None = None
-    frames: int = 10
-    depth: str | None = None
-    jobs: int | None = None
-    as_json: bool = False
 
 
 def run(options: Options) -> int:
@@ -59,7 +45,7 @@ def run(options: Options) -> int:
     if not drives:
         names = ", ".join(drive.name for drive in matrix_drives.DRIVES[:3])
         raise UsageError(f"no drive of the matrix is called {options.only!r}; they are called {names}, ...")
-    dofs = matrix.DOFS if options.dof is None else (options.dof,)
+    dofs = matrix.DOFS if options.dof is None else (int(options.dof),)
     settings = Settings(dofs, options.frames, options.depth or CalibrationConfig().depth.model)
     rows = {drive.name: row for drive in drives if (row := _kept(options.output, drive, settings)) is not None}
     waiting = [drive for drive in drives if drive.name not in rows]

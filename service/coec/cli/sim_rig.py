@@ -16,7 +16,8 @@ from coec.adapters.ros.outgoing import Placed
 from coec.adapters.ros.sensor_topics import SensorTopics, Vehicle, image_topic, points_topic
 from coec.adapters.ros.topics import TopicMessage
 from coec.calibration.types import CameraFrame
-from coec.cli.sim import MOST_PROCESSES, TRUTH_TOPIC, Options
+from coec.cli.commands.sim_drive import Options
+from coec.cli.sim import MOST_PROCESSES, TRUTH_TOPIC, opened_rig
 from coec.errors import UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.se3 import inverse
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 BAG = "drive.mcap"
 
 
-def drive(options: Options, folder: Path, *, as_json: bool) -> int:
+def drive(options: Options) -> int:
     """Writes `drive.mcap` with all sensors, and for each camera its mask and a YAML file that names it.
 
     Raises:
@@ -36,9 +37,10 @@ def drive(options: Options, folder: Path, *, as_json: bool) -> int:
         SourceError: the optional extra is not installed.
         OutputError: it cannot be written.
     """
+    folder = options.output
     if folder.suffix == ".mcap" or folder.is_file():
         raise UsageError(f"{folder}: a rig is written into a folder, {BAG} and a mask for each camera: name a folder")
-    made = options.open_rig()
+    made = opened_rig(options)
     from coec.simulation.parallel import messages_by
 
     total = sum(entry.stream != 0 for entry in made.plan)
@@ -67,7 +69,7 @@ def drive(options: Options, folder: Path, *, as_json: bool) -> int:
     for camera in made.cameras:
         _write_camera(made, camera, folder)
     sources = {f"{camera}-{lidar}": source_of(folder, camera, lidar) for camera, lidar in made.config.layout.pairs}
-    if as_json:
+    if options.as_json:
         console.print_json({"written": str(path), "bytes": path.stat().st_size, "frames": total, "sources": sources})
     else:
         console.show(f"{path}  {total} pictures and sweeps  {path.stat().st_size} bytes; pairs as sources:")

@@ -13,7 +13,8 @@ from typing import Any
 import zenoh
 
 from coec.adapters.zenoh.client import connected_by
-from coec.cli.query import Asked
+from coec.cli.commands.watch import Options
+from coec.cli.query import Asked, asked_of
 from coec.cli.stopping import until_signal
 from coec.errors import DecodeError
 from coec.reports import console
@@ -26,16 +27,6 @@ WAITING = 1024
 
 POLL_S = 0.2
 """Between two looks whether to stop."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command."""
-
-    service: Asked
-    seconds: float | None
-    timeout_s: float
-    as_json: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +46,9 @@ def run(options: Options) -> int:
         ConnectionFailedError: no router answered.
     """
     heard = 0
-    connection = connected_by(options.service.way, options.timeout_s)
-    with until_signal() as stop, connection as session, _changes(session, options) as changes:
+    asked = asked_of(options.config, options.vehicle, options.prefix, options.connect, options.zenoh)
+    connection = connected_by(asked.way, options.timeout_s)
+    with until_signal() as stop, connection as session, _changes(session, asked, options.timeout_s) as changes:
         end_s = None if options.seconds is None else time.monotonic() + options.seconds
         while not stop.is_set():
             try:
@@ -71,9 +63,9 @@ def run(options: Options) -> int:
 
 
 @contextmanager
-def _changes(session: zenoh.Session, options: Options) -> Iterator[queue.Queue[Change]]:
+def _changes(session: zenoh.Session, asked: Asked, timeout_s: float) -> Iterator[queue.Queue[Change]]:
     """What is so now, and every change from then on."""
-    keys = Keys(options.service.prefix, options.service.vehicle)
+    keys = Keys(asked.prefix, asked.vehicle)
     waiting: queue.Queue[Change] = queue.Queue(WAITING)
     changed: set[str] = set()
     order = threading.Lock()
@@ -98,7 +90,7 @@ def _changes(session: zenoh.Session, options: Options) -> Iterator[queue.Queue[C
         tokens = session.liveliness().declare_subscriber(keys.alive("*"), handler, history=True)
         stack.callback(tokens.undeclare)
         for key in (keys.health("*"), keys.extrinsic("*")):
-            for reply in session.get(key, target=zenoh.QueryTarget.ALL, timeout=options.timeout_s):
+            for reply in session.get(key, target=zenoh.QueryTarget.ALL, timeout=timeout_s):
                 with order:
                     # What has changed meanwhile is newer than this answer, or the same.
                     if reply.ok is not None and str(reply.ok.key_expr) not in changed:

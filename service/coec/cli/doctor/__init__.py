@@ -7,7 +7,6 @@ the router, the streams, the service. It changes nothing that runs, and works wi
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich.text import Text
@@ -19,6 +18,7 @@ from coec.adapters.zenoh.endpoints import Endpoint
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.adapters.zenoh.ros_topics import Topics
 from coec.adapters.zenoh.settings import connected_of, listened_of, settings_of
+from coec.cli.commands.doctor import Options
 from coec.cli.doctor import machine, router, service, streams, topics
 from coec.cli.doctor.found import fail, ok, warn
 from coec.cli.doctor.listening import listen
@@ -32,15 +32,6 @@ USUAL_FILE = Path("/etc/coec/coec.yaml")
 """As the unit of systemd names it."""
 
 STYLES: dict[Level, str] = {"ok": "green", "warn": "bold yellow", "fail": "bold red"}
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The arguments of the command. `config` None: the usual file."""
-
-    config: Path | None
-    seconds: float
-    as_json: bool
 
 
 def run(options: Options) -> int:

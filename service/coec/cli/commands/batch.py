@@ -1,0 +1,46 @@
+"""What `coec batch` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from coec.cli.options import Json
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    windows: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="WINDOW...", help="Windows (.mcap), folders or patterns, as paths or URLs.", show_default=False
+        ),
+    ]
+    output: Annotated[Path, typer.Option(help="Folder of the tables (Parquet).", metavar="DIR", show_default=False)]
+    engine: Annotated[Literal["local", "ray"], typer.Option(help="Processes here, or of a Ray cluster.")] = "local"
+    with_config: Annotated[
+        Path | None,
+        typer.Option("--with-config", help="Judge by this configuration, not by each window's own.", metavar="FILE"),
+    ] = None
+    rig: Annotated[Path | None, typer.Option(help="Judge with this rig (JSON).", metavar="FILE")] = None
+    depth: Annotated[
+        str | None,
+        typer.Option(help="Where the depth network is now, if not where it was; or another one.", metavar="MODEL"),
+    ] = None
+    jobs: Annotated[int | None, typer.Option(help="Windows at a time.", min=1, show_default="the cores")] = None
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the batch that is in the folder.")] = False
+    deadline_s: Annotated[float, typer.Option("--deadline", help="For one window, s.", min=1.0)] = 600.0
+    memory_mib: Annotated[int, typer.Option("--memory", help="For one process, MiB.", min=256)] = 2048
+    as_json: Json = False
+
+
+def run(options: Options) -> int:
+    """Judge many windows again: exit 0 if every one has a result, 1 if not."""
+    from coec.cli import batch as work
+
+    return work.run(options)

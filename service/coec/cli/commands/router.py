@@ -1,0 +1,25 @@
+"""What `coec router` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    config: Annotated[
+        Path, typer.Option(help="Zenoh configuration of a router (JSON5).", metavar="FILE", show_default=False)
+    ]
+
+
+def run(options: Options) -> int:
+    """Be the Zenoh router of the vehicle, with the access control of its configuration (deploy/router.json5)."""
+    from coec.cli import router as work
+
+    return work.run(options.config)

@@ -1,0 +1,73 @@
+"""What `coec sim drive` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coec.cli.options import Faults, Json, Seed, SimCamera, SimScene, SimSpeed
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The arguments of the command; None = not given."""
+
+    output: Annotated[
+        Path,
+        typer.Option(help="ROS 2 MCAP to write; of a rig, the folder.", metavar="FILE.mcap|DIR", show_default=False),
+    ]
+    rig: Annotated[
+        str | None,
+        typer.Option(
+            help="Several cameras and LiDARs on one vehicle: four-fisheyes. A fault then begins with the sensor's "
+            "name: front:step:40:ry=1, roof:step:40:rz=1, about the sensor's own axes.",
+            metavar="RIG",
+        ),
+    ] = None
+    seed: Seed = 0
+    seconds: Annotated[float, typer.Option(help="Length of the drive.", min=0.1)] = 60.0
+    camera: SimCamera = "fisheye700"
+    lidar: Annotated[
+        str, typer.Option(help="Beams: 16, 32, 64, 128; or without rings: raster, rosette.", metavar="LIDAR")
+    ] = "64"
+    scene: SimScene = "street"
+    speed_mps: SimSpeed = None
+    rolling_shutter_s: Annotated[
+        float, typer.Option("--rolling-shutter", help="Seconds from the first row to the last.", min=0, max=0.1)
+    ] = 0.0
+    intrinsics_off: Annotated[
+        str | None,
+        typer.Option(
+            help="What the rig is told of the focal length and the principal point is wrong by so many percent.",
+            metavar="FOCAL[,CX,CY]",
+        ),
+    ] = None
+    camera_hz: Annotated[float, typer.Option(help="Pictures per second.", min=0.01)] = 10.0
+    lidar_hz: Annotated[float, typer.Option(help="Sweeps per second.", min=0.01, max=10)] = 10.0
+    faults: Faults = None
+    workshop: Annotated[
+        str | None,
+        typer.Option(
+            help="Error of the nominal calibration, degrees and metres; of a rig SENSOR:RX,RY,RZ;...",
+            metavar="RX,RY,RZ[,TX,TY,TZ]",
+        ),
+    ] = None
+    as_json: Json = False
+
+
+def run(options: Options) -> int:
+    """Write a drive as a ROS 2 bag; the truth lies beside the sensors on /ground_truth/tf.
+
+    A bag has no place for a mask: what reads it back finds the vehicle's own body and the rim of the lens from the
+    frames themselves, given five or more in motion.
+    """
+    if options.rig is not None:
+        from coec.cli import sim_rig
+
+        return sim_rig.drive(options)
+    from coec.cli import sim as work
+
+    return work.drive(options)

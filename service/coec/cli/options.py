@@ -1,0 +1,91 @@
+"""What several commands take: each option is declared once, here or in the module of its only command.
+
+A help text takes no longer than this imports: nothing heavy may be imported here, nor in `commands`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+SOURCE_HELP = (
+    "a recorded window or ROS 2 bag (.mcap), kitti360:ROOT?camera=image_00, kitti-raw:ROOT?..., a folder or "
+    "dataset.yaml, sim:seed=1&seconds=60"
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, nothing else.")]
+Source = Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP, show_default=False)]
+ConfigFile = Annotated[
+    Path, typer.Option("--config", help="Configuration of the daemon (YAML).", metavar="FILE", show_default=False)
+]
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
+"""As `config` has it, which takes too long to import for a help text."""
+
+Connect = Annotated[
+    str | None, typer.Option(help="Zenoh endpoint of the router.", metavar="ENDPOINT", show_default=DEFAULT_CONNECT)
+]
+
+DegreesOfFreedom = Literal["3", "6"]
+"""Of a search: rotation only, or translation too."""
+
+Depth = Annotated[
+    str | None,
+    typer.Option(
+        help="An ONNX file, a built-in name (`coec models`), or `stereo`: the maps of the source. Without it, what a "
+        "recorded window names, else the network that comes with coec.",
+        metavar="MODEL",
+    ),
+]
+Objective = Annotated[
+    str | None,
+    typer.Option(help="What is maximised: fused (edges and depth), mi (the paper), intensity.", metavar="NAME"),
+]
+CameraModel = Annotated[
+    str | None,
+    typer.Option(help="Fit this model to the camera, and use it instead: double_sphere.", metavar="NAME"),
+]
+Frames = Annotated[
+    int | None, typer.Option(help="Use at most so many camera frames, evenly chosen.", min=1, show_default="25")
+]
+NoMotionCompensation = Annotated[
+    bool, typer.Option("--no-motion-compensation", help="Take the clouds as they were recorded.")
+]
+
+# Of a running service.
+ServiceConfig = Annotated[
+    Path | None,
+    typer.Option("--config", help="Of the service: names the vehicle, the prefix and the router.", metavar="FILE"),
+]
+Vehicle = Annotated[str | None, typer.Option(show_default="vehicle")]
+Prefix = Annotated[str | None, typer.Option(show_default="coec")]
+SessionFile = Annotated[
+    Path | None,
+    typer.Option("--zenoh", help="Zenoh configuration of the session (JSON5): endpoint, certificate.", metavar="FILE"),
+]
+RouterTimeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the router.", min=0.01)]
+
+# Of a vehicle that does not exist.
+Seed = Annotated[int, typer.Option(help="Same seed, same bytes.", min=0)]
+SimCamera = Annotated[
+    str,
+    typer.Option(
+        help="fisheyeW (185°, W×W pixels), pinholeWxH (90° wide) or pinholeWxH@D (D degrees wide).", metavar="CAMERA"
+    ),
+]
+SimScene = Annotated[str, typer.Option(help="street, highway, garage or room.", metavar="SCENE")]
+SimSpeed = Annotated[
+    float | None,
+    typer.Option("--speed", help="Mean speed, m/s; 0 stands. Without it, as usual in the scene.", min=0, max=45),
+]
+Faults = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--fault",
+        help="KIND:BEGIN[-END][:KEY=VALUE,...], repeatable: step:30:rx=3, drift:30-90:ry=2, dirt, dark, frozen, beams, "
+        "no-ego, offset, offset_drift:10-60:seconds=0.05, loss; poor stretches: tunnel:20-35, open_road:20-50, "
+        "night:20-60, rain:20-60:mmph=20, low_sun:20-60.",
+        metavar="FAULT",
+    ),
+]
