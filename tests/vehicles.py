@@ -19,8 +19,8 @@ from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.schemas.keys import Keys
-from coec.schemas.replies import StatusReply, StorageStatus, WorkerStatus
 from pair_bench import Bench
+from statuses import a_status
 
 VEHICLE = "vehicle"
 PAIR = "front"
@@ -59,17 +59,7 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
     document = Snapshot.of_document({"schema_version": 1, "config_hash": "0", "config": shown(bench.config)})
 
     def status() -> Snapshot:
-        told = StatusReply(
-            version="0",
-            vehicle=VEHICLE,
-            state="running",
-            started_ns=0,
-            uptime_s=1.0,
-            config_hash="0",
-            pairs=(pair.answers.status(),),
-            worker=WorkerStatus(state="idle"),
-            storage=StorageStatus(bytes_used=0, bytes_free=0),
-        )
+        told = a_status(vehicle=VEHICLE, pairs=(pair.answers.status(),))
         return Snapshot.of(told)
 
     VehicleAnswers(KEYS, {pair.name: pair.answers}, reception, status, lambda: b"# EOF\n", lambda: document).declare(

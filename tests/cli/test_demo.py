@@ -135,6 +135,12 @@ def test_a_service_rests_that_has_everything_and_no_work(
     assert at_rest(worker, replies.PairStatus(name="sim", camera=camera, held=held), sent=20) is rests
 
 
+def test_a_service_does_not_rest_while_an_answer_is_awaited() -> None:
+    """A window is with the recorder, say: it waits neither for the worker nor for its turn."""
+    pair = replies.PairStatus(name="sim", camera=replies.StreamStatus(received=20), unanswered=1)
+    assert not at_rest(replies.WorkerStatus(state="idle"), pair, sent=20)
+
+
 def test_the_curve_has_the_height_of_the_error_and_the_colour_of_the_health() -> None:
     text = curve([(0.0, 0.0, "unknown"), (1.0, 3.0, "miscalibrated"), (3.0, 0.1, "healthy")])
     assert text.plain == f"{BARS[0]}{BARS[7]} {BARS[0]}"

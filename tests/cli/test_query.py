@@ -21,14 +21,12 @@ from coec.schemas.keys import Keys, parse_command_selector, parse_range_selector
 from coec.schemas.replies import (
     Acknowledgement,
     PairStatus,
-    StatusReply,
-    StorageStatus,
     WindowInfo,
     WindowsReply,
-    WorkerStatus,
 )
 from conftest import REPOSITORY
 from ports import free_port
+from statuses import a_status
 
 DEADLINE_S = 20.0
 KEYS = Keys("coec", "vehicle")
@@ -73,17 +71,7 @@ def serve_document(bus: Bus, key: str, document: Message) -> None:
 
 
 def serve_status(bus: Bus, *pairs: str) -> None:
-    status = StatusReply(
-        version="0",
-        vehicle="vehicle",
-        state="running",
-        started_ns=0,
-        uptime_s=1.0,
-        config_hash="0",
-        pairs=tuple(PairStatus(name=name) for name in pairs),
-        worker=WorkerStatus(state="idle"),
-        storage=StorageStatus(bytes_used=0, bytes_free=0),
-    )
+    status = a_status(pairs=tuple(PairStatus(name=name) for name in pairs))
     serve_document(bus, KEYS.status, status)
 
 

@@ -264,7 +264,7 @@ class Service:
 
         def rests(status: Any) -> bool:
             worker, pair = status["worker"], status["pairs"][0]
-            at_work = worker["state"] != "idle" or worker["queued"] > 0 or pair["held"] > 0
+            at_work = worker["state"] != "idle" or worker["queued"] > 0 or pair["held"] > 0 or pair["unanswered"] > 0
             done = {name: pair[name] for name in ("pairs", "windows", "solved", "checks", "losses")}
             if at_work or not self._has_received(pair) or any(before != done for before in quiet.values()):
                 quiet.clear()

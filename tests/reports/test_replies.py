@@ -7,7 +7,7 @@ import pytest
 from coec.reports import replies
 from coec.schemas.base import to_json
 from coec.schemas.replies import BudgetShare, BudgetStatus, ConfigurationStatus
-from runtime.api.test_metrics import a_status
+from runtime.api.test_metrics import a_busy_status
 
 
 @pytest.mark.parametrize(
@@ -21,9 +21,9 @@ def test_a_configuration_that_is_not_in_force_is_said(
     capsys: pytest.CaptureFixture[str], told: dict[str, object], line: str
 ) -> None:
     configuration = ConfigurationStatus.model_validate({"read_ns": 1, **told})
-    replies.status(to_json(a_status()))
+    replies.status(to_json(a_busy_status()))
     assert line not in capsys.readouterr().out
-    replies.status(to_json(a_status().model_copy(update={"configuration": configuration})))
+    replies.status(to_json(a_busy_status().model_copy(update={"configuration": configuration})))
     assert line in capsys.readouterr().out
 
 
@@ -33,10 +33,10 @@ def test_a_budget_that_does_not_suffice_is_said(capsys: pytest.CaptureFixture[st
     budget = BudgetStatus(
         cores=0.5, spent=0.5, wanted=0.8, stretched_by=1.6, in_store_s=0.0, spent_s={}, pairs={"front": share}
     )
-    replies.status(to_json(a_status().model_copy(update={"budget": budget})))
+    replies.status(to_json(a_busy_status().model_copy(update={"budget": budget})))
     said = " ".join(capsys.readouterr().out.split())
     assert "budget 0.5 of a core; 0.50 spent, 0.80 wanted" in said
     assert "1.6 times as far apart as configured; waiting: front" in said
     enough = budget.model_copy(update={"wanted": 0.3, "stretched_by": 1.0})
-    replies.status(to_json(a_status().model_copy(update={"budget": enough})))
+    replies.status(to_json(a_busy_status().model_copy(update={"budget": enough})))
     assert "suffice" not in capsys.readouterr().out

@@ -96,9 +96,9 @@ class Watched:
             self.windows.append((window_id, pair.stamp_ns, T_camera_lidar.tobytes()))
             add(window_id, pair, T_camera_lidar)
 
-        def ended(event: SliceEnded) -> None:
-            self.windows.append(event)
-            end(event)
+        def finished(ended: SliceEnded) -> None:
+            self.windows.append(ended)
+            end(ended)
 
         def asked(job: Job) -> None:
             if job.kind is Kind.CHECK:
@@ -107,7 +107,7 @@ class Watched:
             ask(job)
 
         bench.pair._chooser.choose = chosen  # type: ignore[method-assign]
-        bench.recorder.add, bench.recorder.end = added, ended  # type: ignore[method-assign, assignment]
+        bench.recorder.add, bench.recorder.end = added, finished  # type: ignore[method-assign]
         bench.worker.ask = asked  # type: ignore[method-assign]
 
     def push(self, frame: Frame) -> None:

@@ -31,7 +31,7 @@ from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 from coec.schemas.checks import CheckedDrive, CheckedPose, Judged
 from coec.schemas.replies import Vector6
-from coec.simulation.source import config_of, open_sim
+from coec.simulation.source import drive_config_of, open_sim
 from coec.sources.spec import parse_spec
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def _move(
 def _draw(sources: Sequence[str]) -> list[_Stage]:
     """Drives that differ in their lens alone."""
     first: SimulatedDrive = open_sim(parse_spec(sources[0]).query)
-    configs = [config_of(parse_spec(source).query) for source in sources[1:]]
+    configs = [drive_config_of(parse_spec(source).query) for source in sources[1:]]
     drives = [first, *(first.through(config.camera, config.half_view_deg) for config in configs)]
     pairers = [Pairer(PairingConfig(), expects_motion=True) for _ in drives]
     pairs: list[list[FramePair]] = [[] for _ in drives]

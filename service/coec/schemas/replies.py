@@ -398,6 +398,7 @@ class PairStatus(Part):
     ego: StreamStatus | None = Field(default=None, description="null when no ego-motion is configured")
     pairs: Count = Field(default=0, description="pairs formed")
     held: Count = Field(default=0, description="pairs that wait until what was seen before them is judged")
+    unanswered: Count = Field(default=0, description="checks and windows whose answer has not come")
     selected: Count = Field(default=0, description="pairs chosen for the open window")
     unwritten: Count = Field(default=0, description="chosen pairs that wait for the disk")
     rejections: Counts = Field(default_factory=dict, description="pairs not chosen, by cause")

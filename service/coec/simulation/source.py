@@ -38,19 +38,19 @@ MOST_OFF_PERCENT = 20.0
 
 
 def open_sim(query: dict[str, str]) -> SimulatedDrive:
-    """The drive of `sim:KEY=VALUE&...`, see `config_of`.
+    """The drive of `sim:KEY=VALUE&...`, see `drive_config_of`.
 
     Raises:
         UsageError: an unknown key, or a value that does not fit; names the key.
         SourceError: the optional extra is not installed.
     """
-    config = config_of(query)
+    config = drive_config_of(query)
     from coec.simulation.drive import SimulatedDrive
 
     return SimulatedDrive(config)
 
 
-def config_of(query: dict[str, str]) -> DriveConfig:
+def drive_config_of(query: dict[str, str]) -> DriveConfig:
     """What `sim:KEY=VALUE&...` says; every key may be left out.
 
     `faults` are separated by `;` (see `faults.FORMS`), `workshop` is rx,ry,rz[,tx,ty,tz] in degrees and metres,

@@ -22,6 +22,7 @@ from coec.schemas.replies import (
     WorkerStatus,
 )
 from open_metrics import Family, MalformedError, parse
+from statuses import a_status
 
 
 def a_health(state: str = "healthy", level: int = 0) -> HealthReply:
@@ -69,21 +70,18 @@ def a_health(state: str = "healthy", level: int = 0) -> HealthReply:
     return HealthReply.model_validate(document)
 
 
-def a_status(state: str = "running") -> StatusReply:
+def a_busy_status(state: str = "running") -> StatusReply:
     camera = StreamStatus(received=3, waiting=2, age_s=0.25, losses={"frame_id": 2})
-    document = {
-        "version": '1 "a\\b\n',
-        "vehicle": "test",
-        "state": state,
-        "started_ns": 0,
-        "uptime_s": 1.5,
-        "config_hash": "c",
-        "pairs": (PairStatus(name="front", camera=camera, windows=4, unwritten=1, transitions={"healthy": 1}),),
-        "worker": WorkerStatus(state="busy", restarts=1, job="solve", job_age_s=1.0, outcomes={"result": 7}),
-        "storage": StorageStatus(bytes_used=10, bytes_free=2**60 + 1),
-        "queries_waiting": {"slow": 3, "drawing": 0},
-    }
-    return StatusReply.model_validate(document)
+    return a_status(
+        version='1 "a\\b\n',
+        vehicle="test",
+        state=state,
+        uptime_s=1.5,
+        pairs=(PairStatus(name="front", camera=camera, windows=4, unwritten=1, transitions={"healthy": 1}),),
+        worker=WorkerStatus(state="busy", restarts=1, job="solve", job_age_s=1.0, outcomes={"result": 7}),
+        storage=StorageStatus(bytes_used=10, bytes_free=2**60 + 1),
+        queries_waiting={"slow": 3, "drawing": 0},
+    )
 
 
 def a_view() -> View:
@@ -97,7 +95,7 @@ def a_view() -> View:
         metrics.DECODE: [Took(("front",), decode)],
         metrics.JOB: [Took((), job)],
     }
-    return View(a_status(), {"front": a_health()}, 5, 6, took)
+    return View(a_busy_status(), {"front": a_health()}, 5, 6, took)
 
 
 def read() -> dict[str, Family]:

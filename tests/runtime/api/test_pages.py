@@ -16,12 +16,12 @@ from coec.runtime.api.http_door import HttpDoor
 from coec.runtime.api.pages import pages
 from coec.runtime.api.router_watch import RouterWatch
 from ports import free_port
-from runtime.api.test_metrics import a_health, a_status
+from runtime.api.test_metrics import a_busy_status, a_health
 
 
 def health_page(state: str, **healths: tuple[str, int]) -> Page:
     known = {name: a_health(*health) for name, health in healths.items()}
-    page = pages(lambda: b"", lambda: a_status(state), lambda: known)("/health")
+    page = pages(lambda: b"", lambda: a_busy_status(state), lambda: known)("/health")
     assert page is not None
     return page
 
@@ -36,7 +36,7 @@ def test_health_is_good_when_every_pair_may_be_used() -> None:
 
 
 def test_there_are_two_pages() -> None:
-    find = pages(lambda: b"figures", a_status, dict)
+    find = pages(lambda: b"figures", a_busy_status, dict)
     metrics = find("/metrics")
     assert metrics is not None
     assert (metrics.body, metrics.content_type.partition(";")[0]) == (b"figures", "application/openmetrics-text")

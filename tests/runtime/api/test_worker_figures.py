@@ -13,21 +13,12 @@ from coec.runtime.api.status import worker_status_of
 from coec.runtime.worker import jobs
 from coec.runtime.worker.queue import WAITING, Lane
 from coec.runtime.worker.supervisor import Worker
-from coec.schemas.replies import StatusReply, StorageStatus, WorkerStatus
+from coec.schemas.replies import WorkerStatus
+from statuses import a_status
 
 
 def lines_of(worker: WorkerStatus) -> list[str]:
-    status = StatusReply(
-        version="1",
-        vehicle="v",
-        state="running",
-        started_ns=0,
-        uptime_s=1.0,
-        config_hash="c",
-        pairs=(),
-        worker=worker,
-        storage=StorageStatus(bytes_used=0, bytes_free=0),
-    )
+    status = a_status(worker=worker)
     return metrics.render(View(status, {})).decode().splitlines()
 
 

@@ -13,7 +13,7 @@ from coec.runtime.budget.prices import KEPT, Price
 from coec.runtime.budget.spending import BIN_S, OVER_S, Spending
 from coec.runtime.worker import jobs
 from coec.runtime.worker.costs import START, Cost
-from coec.schemas.replies import StatusReply, StorageStatus, WorkerStatus
+from statuses import a_status
 
 S = 1_000_000_000
 
@@ -62,18 +62,7 @@ def test_what_everything_would_take_is_told_with_what_it_stretches(budget: Budge
     assert told.pairs["front"].window_s == pytest.approx(9.0)
     assert told.pairs["rear"].window_s is None
     assert told.pairs["rear"].unseen_s == pytest.approx(3.0)
-    status = StatusReply(
-        version="1",
-        vehicle="v",
-        state="running",
-        started_ns=0,
-        uptime_s=1.0,
-        config_hash="c",
-        pairs=(),
-        worker=WorkerStatus(state="idle"),
-        budget=told,
-        storage=StorageStatus(bytes_used=0, bytes_free=0),
-    )
+    status = a_status(budget=told)
     lines = metrics.render(View(status, {})).decode().splitlines()
     assert 'coec_worker_processor_seconds_total{kind="solve"} 6.5' in lines
     assert "coec_budget_cores 0.5" in lines

@@ -51,5 +51,5 @@ def at_rest(worker: replies.WorkerStatus, pair: replies.PairStatus, sent: int) -
     What it says of its worker and its pairs is of one instant, and renewed every second.
     """
     arrived = pair.camera.received + sum(pair.camera.losses.values())
-    idle = worker.state == "idle" and not worker.queued and not pair.held
+    idle = worker.state == "idle" and not worker.queued and not pair.held and not pair.unanswered
     return idle and arrived + ON_THE_WAY >= sent

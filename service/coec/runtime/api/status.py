@@ -50,6 +50,7 @@ def pair_status_of(
         ego=stream(EGO) if has_ego else None,
         pairs=report.pairs,
         held=report.held,
+        unanswered=chosen.unanswered,
         selected=chosen.selected,
         unwritten=unwritten,
         rejections=dict(chosen.rejections),

@@ -117,6 +117,11 @@ class Questions:
         """The depth of a camera frame (native msgpack) will be needed."""
         self._worker.prefetch(self._pair.name, frame)
 
+    @property
+    def unanswered(self) -> int:
+        """Checks and windows whose answer has not come."""
+        return self._queue.unanswered
+
     def waits(self, stamp_ns: int) -> bool:
         """Whether an answer is due before a pair of this stamp, and has not come."""
         return self._queue.waits(stamp_ns)

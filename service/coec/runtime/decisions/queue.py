@@ -81,6 +81,11 @@ class DecisionQueue:
             self._take_answered()
         return len(late)
 
+    @property
+    def unanswered(self) -> int:
+        """Questions whose answer has not come, or waits for one in front of it. Any thread."""
+        return len(self._untaken)
+
     def waits(self, stamp_ns: int) -> bool:
         """Whether an answer has yet to come before a pair of this sensor time is looked at."""
         with self._lock:

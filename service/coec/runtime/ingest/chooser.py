@@ -57,6 +57,10 @@ class Asks(Protocol):
     def prefetch(self, frame: bytes) -> None:
         """The depth of a camera frame (native msgpack) will be needed."""
 
+    @property
+    def unanswered(self) -> int:
+        """Checks and windows whose answer has not come."""
+
     def waits(self, stamp_ns: int) -> bool:
         """Whether an answer is due before a pair of this stamp, and has not come."""
 
@@ -93,6 +97,7 @@ class Chosen:
         not_afforded: checks that never got their turn.
         last_ns: stamp of the pair looked at last; None before the first.
         steps_back: how often sensor time has stepped back.
+        unanswered: checks and windows whose answer has not come.
     """
 
     selected: int = 0
@@ -103,6 +108,7 @@ class Chosen:
     not_afforded: int = 0
     last_ns: int | None = None
     steps_back: int = 0
+    unanswered: int = 0
 
 
 class Chooser:
@@ -158,6 +164,7 @@ class Chooser:
             self._not_afforded,
             self._last_ns,
             self._steps_back,
+            self._asks.unanswered,
         )
 
     @property
