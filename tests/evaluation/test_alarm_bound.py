@@ -36,6 +36,16 @@ def test_places_are_where_clear_checks_put_them() -> None:
     assert [len(checks) for checks in places.checks] == [2, 2]
 
 
+def test_a_check_that_is_off_alone_displaces_no_place() -> None:
+    places = Places.of([(*displaced(1.0), *displaced(1.0), judged(9.0))])
+    np.testing.assert_allclose(places.displacement, [1.1])
+
+
+def test_places_count_in_what_their_scene_can_tell() -> None:
+    dispersed = tuple(check.model_copy(update={"dispersion": 4.0}) for check in displaced(6.0))
+    np.testing.assert_allclose(Places.of([dispersed]).displacement, [1.5])
+
+
 def test_a_tail_goes_on_as_what_was_seen_falls_off() -> None:
     seen = np.random.default_rng(1).exponential(1.0, 2_000)
     weight, beyond = tail(seen, np.array([1.0, 3.0, 6.0]))

@@ -17,6 +17,7 @@ from math import log
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.monitor.change_detector import doubtful_after
 from coec.schemas.checks import Judged
 
 SETTLED_CHECKS = 24
@@ -54,8 +55,8 @@ class Places:
 
     Attributes:
         checks: of every place, those that can tell.
-        displacement: (n,) of every place: the mean of its checks on the axis that is farthest off, in standard
-            deviations of `place` in such a scene.
+        displacement: (n,) of every place: the median of its checks on the axis that is farthest off, in standard
+            deviations of `place` in such a scene. What one of them says alone, the place does not.
     """
 
     checks: tuple[tuple[Judged, ...], ...]
@@ -64,9 +65,8 @@ class Places:
     @classmethod
     def of(cls, drives: Sequence[Sequence[Judged]]) -> Places:
         """A place a drive; drives without a clear check are none."""
-        clear = [tuple(check for check in drive if not check.causes and not check.faint) for drive in drives]
-        kept = tuple(checks for checks in clear if checks)
-        far = [float(np.max(np.abs(_offsets(checks).mean(axis=0)) / _place(checks))) for checks in kept]
+        kept = tuple(checks for checks in map(_clear, drives) if checks)
+        far = [float(np.max(np.abs(_centre(checks)) / _place(checks))) for checks in kept]
         return cls(kept, np.array(far))
 
 
@@ -79,6 +79,17 @@ class Bound:
     mean: float
     at_most: float
     half: float | None
+
+
+def _clear(drive: Sequence[Judged]) -> tuple[Judged, ...]:
+    """The checks of a drive that may accuse."""
+    clear: list[Judged] = []
+    doubtful = 0.0
+    for check in drive:
+        if not check.causes and not check.faint and doubtful == 0.0:
+            clear.append(check)
+        doubtful = doubtful_after(doubtful, bool(check.faint), 1.0)
+    return tuple(clear)
 
 
 def bound(places: Places, stay_checks: int, places_per_h: float, alarms: Alarms) -> Bound | None:
@@ -138,8 +149,8 @@ def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.
     scattered = [checks for checks in places.checks if len(checks) > 1]
     checks = scattered[int(rng.integers(len(scattered)))]
     offsets = _offsets(checks)
-    # What so few scatter about their mean is less than what they scatter about their place.
-    about = (offsets - offsets.mean(axis=0)) * np.sqrt(len(checks) / (len(checks) - 1.0))
+    # What so few scatter about their middle is less than what they scatter about their place.
+    about = (offsets - _centre(checks)) * np.sqrt(len(checks) / (len(checks) - 1.0))
     off = np.zeros(6)
     axis = int(rng.integers(6))
     off[axis] = displacement * _place(checks)[axis] * float(rng.choice([-1.0, 1.0]))
@@ -153,6 +164,11 @@ def _stay(places: Places, displacement: float, stay_checks: int, rng: np.random.
 def _place(checks: Sequence[Judged]) -> NDArray[np.float64]:
     """(6,) the standard deviation of a place where checks are of such dispersions."""
     return np.asarray(np.mean([np.array(check.place) * check.dispersion for check in checks], axis=0))
+
+
+def _centre(checks: Sequence[Judged]) -> NDArray[np.float64]:
+    """(6,) where the checks of a place put the mount, one that is far from the others or not."""
+    return np.asarray(np.median(_offsets(checks), axis=0))
 
 
 def _offsets(checks: Sequence[Judged]) -> NDArray[np.float64]:

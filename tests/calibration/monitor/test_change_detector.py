@@ -167,7 +167,7 @@ class TestEvidence:
     def test_faint_checks_that_are_off_alike_teach_nothing_of_the_rig(self) -> None:
         """So that clear checks of a right mount are no move after a long stretch of them."""
         rain = [fresh(n, offset=turned(0.5, 0.1, 0.6), weak=True) for n in range(60)]
-        states = [after(*rain, *(fresh(60 + n, flagged=False) for n in range(count))) for count in (0, 6)]
+        states = [after(*rain, *(fresh(60 + n, flagged=False) for n in range(count))) for count in (0, 8)]
         assert states[0].turned.right == after(rain[0]).turned.right
         assert states[1].outcome is Finding.CLEAR
 

@@ -55,27 +55,27 @@ class Accuracy:
         """(6,) the bias; zero on axes that are not searched."""
         return np.nan_to_num(self.bias)
 
-    def sigma(self, pairs: int, dispersion: float = 1.0) -> NDArray[np.float64]:
-        """(6,) standard deviation of the offset of a check at so many pairs, less the bias, in a scene of such a
-        dispersion (see `monitor.dispersion`)."""
-        return np.asarray(np.hypot(self.noise(pairs, dispersion), self.bias_sigma))
+    def sigma(self, pairs: int) -> NDArray[np.float64]:
+        """(6,) standard deviation of the offset of a check at so many pairs, less the bias."""
+        variance = self.spread**2 / max(pairs, 1) + self.bias_sigma**2 + FLOOR**2
+        return np.asarray(np.sqrt(variance))
 
-    def noise(self, pairs: int, dispersion: float = 1.0) -> NDArray[np.float64]:
+    def noise(self, pairs: int) -> NDArray[np.float64]:
         """(6,) the part of that which is new at every check."""
-        return np.asarray(dispersion * np.sqrt(self.spread**2 / max(pairs, 1) + FLOOR**2))
+        return np.asarray(np.sqrt(self.spread**2 / max(pairs, 1) + FLOOR**2))
 
-    def distance2(self, offset: NDArray[np.float64], pairs: int, dispersion: float = 1.0) -> float:
+    def distance2(self, offset: NDArray[np.float64], pairs: int) -> float:
         """Squared distance of an offset (6,) from the bias in standard deviations, over the axes that were searched."""
-        return fsum(self._squares(offset, pairs, dispersion))
+        return fsum(self._squares(offset, pairs))
 
-    def farthest2(self, offset: NDArray[np.float64], pairs: int, dispersion: float = 1.0) -> float:
+    def farthest2(self, offset: NDArray[np.float64], pairs: int) -> float:
         """Squared distance of an offset (6,) from the bias along the one axis on which it is farthest, in standard
         deviations: one axis that is off is not hidden by five that are
         not."""
-        return max(self._squares(offset, pairs, dispersion))
+        return max(self._squares(offset, pairs))
 
-    def _squares(self, offset: NDArray[np.float64], pairs: int, dispersion: float) -> list[float]:
-        standard = (offset - self.bias) / self.sigma(pairs, dispersion)
+    def _squares(self, offset: NDArray[np.float64], pairs: int) -> list[float]:
+        standard = (offset - self.bias) / self.sigma(pairs)
         return [float(s) ** 2 for s in standard if np.isfinite(s)]
 
 

@@ -34,7 +34,6 @@ from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
 from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, edges_per_pair, over_limits
 from coec.calibration.monitor.depth_witness import DepthWitness, ask_depth
-from coec.calibration.monitor.dispersion import dispersion
 from coec.calibration.monitor.neighbourhood import POSE_DOF, ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.ports import DepthModel, ImageReader, Progress, Silence
@@ -358,8 +357,8 @@ class _Checks:
         return _LeftOut(
             seen,
             ask_depth(part, seen, self._right, self._config),
-            rotation.distance2(seen.offset_rotation, seen.pairs, dispersion(seen.contrast)),
-            pose.farthest2(seen.offset_pose, seen.pairs, dispersion(seen.contrast)),
+            rotation.distance2(seen.offset_rotation, seen.pairs),
+            pose.farthest2(seen.offset_pose, seen.pairs),
         )
 
 
@@ -379,10 +378,8 @@ def _monitor_limits(
     right_pose = distance2_quantile(1.0 - rate / 2.0 / POSE_DOF, 1, known_by) * _times(
         [one.farthest2_pose for one in left_out], chi2_quantile(0.5 ** (1.0 / POSE_DOF), 1)
     )
-    turned = [
-        rotation.distance2(seen.offset_rotation, seen.pairs, dispersion(seen.contrast)) for seen in moved["0.5 deg"]
-    ]
-    shifted = [pose.farthest2(seen.offset_pose, seen.pairs, dispersion(seen.contrast)) for seen in moved["10 cm"]]
+    turned = [rotation.distance2(seen.offset_rotation, seen.pairs) for seen in moved["0.5 deg"]]
+    shifted = [pose.farthest2(seen.offset_pose, seen.pairs) for seen in moved["10 cm"]]
     edges = float(np.min([edges_per_pair(seen) for seen in clean]))
     lost = float(np.median([edges_per_pair(seen) for seen in far]))
     kept = float(np.min([seen.edges_kept for seen in clean]))

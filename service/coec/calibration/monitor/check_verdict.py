@@ -199,10 +199,9 @@ def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: Monitor
     """Squared distances of the local optima over three and six degrees of freedom, over their limits: a check is
     flagged above 1."""
     within = LOST_EDGES_SHARE if seen.edges_kept < limits.min_edges_kept else 1.0
-    scattered = dispersion(seen.contrast)
     return (
-        rotation.distance2(seen.offset_rotation, seen.pairs, scattered) / (within * limits.max_distance2_rotation),
-        pose.farthest2(seen.offset_pose, seen.pairs, scattered) / (within * limits.max_farthest2_pose),
+        rotation.distance2(seen.offset_rotation, seen.pairs) / (within * limits.max_distance2_rotation),
+        pose.farthest2(seen.offset_pose, seen.pairs) / (within * limits.max_farthest2_pose),
     )
 
 
@@ -226,7 +225,7 @@ def edges_per_pair(seen: Check) -> float:
 def _drift(seen: Check, baseline: Baseline) -> Drift:
     """How far the local optimum of a check lies from the commissioned calibration, over six degrees of freedom."""
     value = se3.difference(seen.T_pose, baseline.T_camera_lidar) - baseline.pose.bias
-    return Drift(value, baseline.pose.sigma(seen.pairs, dispersion(seen.contrast)))
+    return Drift(value, baseline.pose.sigma(seen.pairs))
 
 
 def _metrics(seen: Check, of_rotation: float, of_pose: float, limits: MonitorLimits) -> tuple[Metric, ...]:
