@@ -160,7 +160,7 @@ def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
 
 
 def loosened(name: str, certainty: float, moved_px: float) -> Loosened:
-    return Loosened(name, certainty, moved_px, np.zeros(12), np.zeros(6))
+    return Loosened(name, certainty, moved_px, np.zeros(12), np.zeros(6), believed=1.0)
 
 
 @pytest.mark.parametrize(

@@ -58,8 +58,8 @@ def calibrate(
     objective, search, every = found.objective, found.search, tuple(range(dof))
     curvature = measure_curvature(objective, search.T_camera_lidar, dof)
     held = tuple(axis for axis in TRANSLATIONS if axis not in every)
-    loosened = _loosened(found, sight.window, search.T_camera_lidar, held)
     held_m = config.verdict.held_translation_sigma_m
+    loosened = _loosened(found, sight.window, search.T_camera_lidar, held, held_m)
     rivals = (*found.rivals, *_from_before(found, sight.window, dof))
     uncertainty = measure_uncertainty(objective, search.T_camera_lidar, every, rivals, loosened, sight.window, held_m)
     blind = unobservable(curvature, uncertainty.sigma, dof, config.verdict)
@@ -67,7 +67,7 @@ def calibrate(
         search = without(blind, search, objective, window.T_camera_lidar_start, config.search, progress)
         curvature = measure_curvature(objective, search.T_camera_lidar, dof, blind)
         told = tuple(axis for axis in every if axis not in blind)
-        loosened = _loosened(found, sight.window, search.T_camera_lidar, blind)
+        loosened = _loosened(found, sight.window, search.T_camera_lidar, blind, config.verdict.max_sigma_m)
         uncertainty = measure_uncertainty(
             objective, search.T_camera_lidar, told, rivals, loosened, sight.window, held_m
         )
@@ -122,10 +122,12 @@ def calibrate(
     )
 
 
-def _loosened(found: Found, window: Window, pose: Matrix4, held: tuple[int, ...]) -> tuple[Loosened, ...]:
+def _loosened(
+    found: Found, window: Window, pose: Matrix4, held: tuple[int, ...], known_m: float
+) -> tuple[Loosened, ...]:
     """What setting free what was told comes to, on bands that feel a lens which is off by pixels, and on the sharpest
     edges."""
-    return () if found.edges is None else loosen(found.edges.to_the_sharpest, window, pose, held)
+    return () if found.edges is None else loosen(found.edges.to_the_sharpest, window, pose, held, known_m)
 
 
 def _from_before(found: Found, window: Window, dof: int) -> tuple[Rivals, ...]:

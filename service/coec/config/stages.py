@@ -141,7 +141,7 @@ class VerdictConfig(Stage):
         default=2.0,
         gt=0,
         description="certainty with which another lens may explain the window better, half a standard deviation each; "
-        "from 1.5 on σ grows by what that lens moves, above this the intrinsics are off (fused)",
+        "at 1.5 it is as likely, and σ grows by what that lens moves, above this the intrinsics are off (fused)",
     )
     held_translation_sigma_m: float = Field(
         default=0.01,

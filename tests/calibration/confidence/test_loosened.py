@@ -7,11 +7,21 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LEAST_PX, LENS_FREE, Loosened, loosen
+from coec.calibration.confidence.loosened import (
+    CLOCKS_FREE,
+    HELD_FREE,
+    LEAST_PX,
+    LENS_FREE,
+    Loosened,
+    beside_a_turn,
+    loosen,
+)
 from coec.calibration.confidence.told import CLOCKS, LENS, SHIFTS
 from coec.config import VerdictConfig
 from coec.geometry import se3
 from corners import ABOUT_NOTHING, CAMERA, FRAMES, levels, motions, pixels, things, window
+
+KNOWN_M = VerdictConfig().held_translation_sigma_m
 
 
 def by_name(found: tuple[Loosened, ...]) -> dict[str, Loosened]:
@@ -22,7 +32,7 @@ def by_name(found: tuple[Loosened, ...]) -> dict[str, Loosened]:
 def test_what_is_right_is_not_contradicted(held: tuple[int, ...], rng: np.random.Generator) -> None:
     """The pose itself may be off by a little: that is no fault of what was told."""
     points, beside = things(rng), se3.perturbation(np.array([1e-3, -1e-3, 1e-3, 0.0, 0.0, 0.0]))
-    found = loosen(levels(pixels(points), points), window(motions()), beside, held)
+    found = loosen(levels(pixels(points), points), window(motions()), beside, held, KNOWN_M)
     assert [one.name for one in found] == [*([HELD_FREE] if held else []), CLOCKS_FREE, LENS_FREE]
     for one in found:
         assert not (one.contradicts and one.matters)
@@ -50,7 +60,7 @@ def test_another_lens_is_seen_and_told(
     )
     turned = se3.perturbation(np.array([-deviation[1], deviation[0], 0.0, 0.0, 0.0, 0.0]))
     seen = pixels(points, lens)
-    found = by_name(loosen(levels(seen, points), window(motions()), turned, ()))
+    found = by_name(loosen(levels(seen, points), window(motions()), turned, (), KNOWN_M))
     assert found[LENS_FREE].contradicts
     record_property(
         "figure", f"certainty {found[LENS_FREE].certainty:.1f}, limit {VerdictConfig().max_intrinsics_certainty}"
@@ -77,7 +87,7 @@ def test_clocks_that_are_off_are_seen_and_told(
         late_s = expected_s[0] + expected_s[1] * elapsed + expected_s[2] * row
         speed = np.array(motion.linear_mps) + np.cross(motion.angular_radps, at)
         passed.append(at - speed * late_s[:, None])
-    found = by_name(loosen(levels(pixels(passed), points), window(driven), ABOUT_NOTHING, ()))
+    found = by_name(loosen(levels(pixels(passed), points), window(driven), ABOUT_NOTHING, (), KNOWN_M))
     assert found[CLOCKS_FREE].contradicts
     np.testing.assert_allclose(found[CLOCKS_FREE].deviation[CLOCKS], expected_s, atol=0.006)
     assert not (found[LENS_FREE].contradicts and found[LENS_FREE].matters)
@@ -90,29 +100,29 @@ def test_a_centre_that_was_held_elsewhere_is_seen_and_its_turn_told(rng: np.rand
     points, truth = things(rng), np.array([0.0, 0.0, 0.0, 0.05, -0.03, 0.0])
     near = [at[at[:, 2] < 8.0] for at in points]
     seen = pixels([at + truth[3:] for at in near])
-    found = by_name(loosen(levels(seen, near), window(motions()), ABOUT_NOTHING, (3, 4, 5)))
+    found = by_name(loosen(levels(seen, near), window(motions()), ABOUT_NOTHING, (3, 4, 5), KNOWN_M))
     assert found[HELD_FREE].contradicts
     np.testing.assert_allclose(found[HELD_FREE].deviation[list(SHIFTS)], truth[3:], atol=0.01)
-    assert not by_name(loosen(levels(seen, near), window(motions()), se3.perturbation(truth), (3, 4, 5)))[
+    assert not by_name(loosen(levels(seen, near), window(motions()), se3.perturbation(truth), (3, 4, 5), KNOWN_M))[
         HELD_FREE
     ].contradicts
 
 
 def test_a_standing_vehicle_tells_nothing_of_its_clocks(rng: np.random.Generator) -> None:
     points = things(rng)
-    found = loosen(levels(pixels(points), points), window(motions(speed=0.0)), ABOUT_NOTHING, ())
+    found = loosen(levels(pixels(points), points), window(motions(speed=0.0)), ABOUT_NOTHING, (), KNOWN_M)
     assert [one.name for one in found] == [LENS_FREE]
 
 
 def test_where_nothing_is_in_view_nothing_is_asked(rng: np.random.Generator) -> None:
     behind = [-at for at in things(rng)]
-    assert loosen(levels(pixels(things(rng)), behind), window(motions()), ABOUT_NOTHING, ()) == ()
+    assert loosen(levels(pixels(things(rng)), behind), window(motions()), ABOUT_NOTHING, (), KNOWN_M) == ()
 
 
 def test_the_same_window_gives_the_same_bits(rng: np.random.Generator) -> None:
     points = things(rng)
     edges, of = levels(pixels(points, CAMERA._replace(cx=242.0)), points), window(motions())
-    one, other = (loosen(edges, of, ABOUT_NOTHING, ()) for _ in range(2))
+    one, other = (loosen(edges, of, ABOUT_NOTHING, (), KNOWN_M) for _ in range(2))
     for a, b in zip(one, other, strict=True):
         assert (a.certainty, a.moved_px) == (b.certainty, b.moved_px)
         np.testing.assert_array_equal(a.deviation, b.deviation)
@@ -121,7 +131,4 @@ def test_the_same_window_gives_the_same_bits(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize(("moved_px", "share"), [(0.0, 0.0), (LEAST_PX, 0.5), (10.0 * LEAST_PX, 0.99)])
 def test_a_lens_is_believed_by_what_it_moves_beyond_what_edges_leave(moved_px: float, share: float) -> None:
     """Beside the turn that answers it: hardly anything of a principal point that a turn makes up for."""
-    lens = Loosened(LENS_FREE, 1.6, moved_px, np.zeros(12), np.zeros(6))
-    assert lens.contradicts
-    assert lens.believed == pytest.approx(share, abs=1e-3)
-    assert Loosened(HELD_FREE, 1.6, moved_px, np.zeros(12), np.zeros(6)).believed == 1.0
+    assert beside_a_turn(moved_px) == pytest.approx(share, abs=1e-3)

@@ -1,7 +1,7 @@
 """How far the optimum really reaches along each principal axis of its covariance.
 
 A covariance is the shape of a hill at its top. A ridge is flat where the hill of the same top would have fallen, and on
-it the optimum may lie anywhere: so the hill is walked down until its drop is certain.
+it the optimum may lie anywhere: so the hill is walked down until its drop is certain, and as sure as that is it counts.
 """
 
 from __future__ import annotations
@@ -20,9 +20,16 @@ CERTAIN, BEYOND_DOUBT = 1.5, 3.0
 """Certainty of a drop (`Landscape.certainty`) at three standard deviations of the optimum, on a paraboloid, and at six,
 where the walk ends: a drop that is certain may be a dent in a ridge that goes on behind it."""
 
+ABOUT = 0.25
+"""How well a certainty is known where a drop becomes certain: it is counted in a standard deviation that some twenty
+sectors tell to a sixth, 1 / √(2·19). A place where it is less than that off counts in part."""
+
 FIRST, DOUBLINGS = 4.0, 5
 """The walk begins so many standard deviations away and doubles so often, up to 128; on most hills it ends at 8 or
 16."""
+
+STRAIGHT = 1e-6
+"""Certainties that differ by less are one."""
 
 
 def widened(landscape: Landscape, noise: Noise) -> list[list[float]]:
@@ -51,18 +58,29 @@ def _expected(noise: Noise, axis: list[float]) -> float:
 
 
 def _reach(landscape: Landscape, one_sigma: NDArray[np.float64]) -> float:
-    """How many standard deviations away the drop along an offset (n,) of one of them becomes certain for good."""
+    """Over how many standard deviations, an offset (n,) each, the drop is not certain: on a ridge with dents, all that
+    is not one. A drop that is a little surer makes it a little less."""
     reach, before, certainty_before = 0.0, 0.0, 0.0
     distance = FIRST
     for _ in range(DOUBLINGS + 1):
         certainty = landscape.certainty(landscape.at(distance * one_sigma))
-        if certainty < CERTAIN:
-            reach = distance
-        elif certainty_before < CERTAIN:
-            share = (CERTAIN - certainty_before) / (certainty - certainty_before)
-            reach = before + share * (distance - before)
+        reach += (distance - before) * _share_open(certainty_before, certainty)
         if certainty >= BEYOND_DOUBT:
             break
         before, certainty_before = distance, certainty
         distance *= 2.0
     return reach
+
+
+def _share_open(begin: float, end: float) -> float:
+    """Of the places between two, with certainties from `begin` to `end` in a straight line, the share where the optimum
+    may lie: those with a drop that is not certain."""
+    if abs(end - begin) < STRAIGHT:
+        return min(max((CERTAIN + ABOUT - 0.5 * (begin + end)) / (2.0 * ABOUT), 0.0), 1.0)
+    return (_open_up_to(end) - _open_up_to(begin)) / (end - begin)
+
+
+def _open_up_to(certainty: float) -> float:
+    """The integral of the share over certainties: 1 as long as a drop is uncertain, falling to 0 about `CERTAIN`."""
+    falling = min(max(certainty - (CERTAIN - ABOUT), 0.0), 2.0 * ABOUT)
+    return min(certainty, CERTAIN + ABOUT) - falling * falling / (4.0 * ABOUT)

@@ -43,6 +43,5 @@ def measure_uncertainty(
     axis_of_sweep = pose[:3, 2]  # the third axis of the LiDAR
     shared = systematic(landscape.cells.sight, grain_of(window, pose, held_m), axes, axis_of_sweep)
     for one in loosened:
-        if one.contradicts:
-            shared[one.name] = one.believed * np.where(np.isin(np.arange(6), axes), one.shift, 0.0)
+        shared[one.name] = one.believed * np.where(np.isin(np.arange(6), axes), one.shift, 0.0)
     return Uncertainty(whole, shared, noise.looks)
