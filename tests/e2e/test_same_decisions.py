@@ -182,8 +182,11 @@ def test_live_restarted_and_replayed_the_decisions_are_the_same(
 TOPICS = {"camera": "/front/image_raw/compressed", "lidar": "/top/points", "ego": "/odometry"}
 
 
-def decided_by(path: Path, router: Router, frames: list[Frame], middleware: str) -> dict[str, Any]:
-    """What the service decides of frames that come this way, and the digests of the windows that it cuts."""
+def decided_by(
+    path: Path, router: Router, frames: list[Frame], middleware: str, *, until_silence: bool
+) -> dict[str, Any]:
+    """What the service decides of frames that come this way, and the digests of the windows that it cuts; with those of
+    the slice that is open at the end, if it is to be waited for `until_silence` has ended it."""
     if middleware != "native":
         by_topics(path, middleware, TOPICS)
     with service(path, router) as running:
@@ -194,8 +197,8 @@ def decided_by(path: Path, router: Router, frames: list[Frame], middleware: str)
             running.send_by(sensors.send, frames)
             sensors.close()
         running.rest()
-        # Whether silence has ended the last slice by now is the clock's on the wall to say: until it has.
-        running.end()
+        if until_silence:
+            running.end()
         counters, decided = running.counters(), decisions(running)
         told = {
             **decided,
@@ -230,7 +233,12 @@ def test_native_frames_and_topics_of_rmw_zenoh_come_to_the_same(tmp_path: Path, 
             tmp_path / name, short.recording, router.endpoint, window=window, calibration=calibration
         )
 
-    native, topics = (decided_by(configured(way), router, frames, way) for way in ("native", "rmw_zenoh"))
+    native, topics = (
+        decided_by(configured(way), router, frames, way, until_silence=False) for way in ("native", "rmw_zenoh")
+    )
+    for told in (native, topics):
+        # The one pair of the next slice, whose end in silence is not waited for.
+        told["losses"].pop("too_few_pairs", None)
     assert len(native["files"]) == len(native["results"]) == 1
     assert topics == native
 
@@ -241,8 +249,10 @@ def test_native_frames_rmw_zenoh_and_a_bridge_come_to_the_same(
 ) -> None:
     network = DepthConfig(model=str(sample_data / "depth" / "tcsmallnet_dyn.onnx"))
     frames = without_depth(drive.between(0, SECONDS + 1))
+    # The last slice has pairs enough for a window: unless its end is waited for, whether it has ended when the question
+    # comes is a matter of the clock on the wall.
     ways = {
-        way: decided_by(stepped_configuration(tmp_path / way, router, network), router, frames, way)
+        way: decided_by(stepped_configuration(tmp_path / way, router, network), router, frames, way, until_silence=True)
         for way in ("native", "rmw_zenoh", "ros2dds")
     }
     assert set(ways["native"]["states"]) >= {"healthy", "suspect", "miscalibrated"}
