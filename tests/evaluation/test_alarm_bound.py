@@ -41,6 +41,11 @@ def test_a_check_that_is_off_alone_displaces_no_place() -> None:
     np.testing.assert_allclose(places.displacement, [1.1])
 
 
+def test_a_check_just_after_a_faint_one_may_not_accuse_and_is_of_no_place() -> None:
+    places = Places.of([(judged(9.0, faint=("looks",)), judged(9.0), judged(9.0), *displaced(1.0))])
+    np.testing.assert_allclose(places.displacement, [1.0])
+
+
 def test_places_count_in_what_their_scene_can_tell() -> None:
     dispersed = tuple(check.model_copy(update={"dispersion": 4.0}) for check in displaced(6.0))
     np.testing.assert_allclose(Places.of([dispersed]).displacement, [1.5])

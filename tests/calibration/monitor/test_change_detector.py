@@ -154,6 +154,12 @@ class TestEvidence:
         assert states[1.0].outcome is Finding.CONFIRMED
         assert states[5.0].evidence < LEVELS.clear
 
+    def test_clear_checks_just_after_a_faint_one_count_as_faint(self) -> None:
+        """As on a highway, where now and then one is clear and as far off as the others."""
+        now_and_then = [fresh(n, weak=n % 3 != 2) for n in range(60)]
+        assert after(*now_and_then).outcome is Finding.SUSPECT
+        assert after(*now_and_then, *(fresh(60 + n) for n in range(5))).outcome is Finding.CONFIRMED
+
     def test_a_large_move_is_confirmed_on_a_highway_too(self) -> None:
         assert (
             after(*(fresh(n, offset=turned(2.0, 0.0, 0.0), dispersion=5.0) for n in range(8))).outcome
@@ -167,7 +173,7 @@ class TestEvidence:
     def test_faint_checks_that_are_off_alike_teach_nothing_of_the_rig(self) -> None:
         """So that clear checks of a right mount are no move after a long stretch of them."""
         rain = [fresh(n, offset=turned(0.5, 0.1, 0.6), weak=True) for n in range(60)]
-        states = [after(*rain, *(fresh(60 + n, flagged=False) for n in range(count))) for count in (0, 8)]
+        states = [after(*rain, *(fresh(60 + n, flagged=False) for n in range(count))) for count in (0, 10)]
         assert states[0].turned.right == after(rain[0]).turned.right
         assert states[1].outcome is Finding.CLEAR
 

@@ -116,8 +116,11 @@ def search(edges: LaidEdges, pose: Matrix4) -> Neighbourhood:
     # What the sharpest edges have next to the pose may be a ripple of a hill that the finest band has whole.
     ends = [_climb(finest.frames, near.pose, settled[:ROTATION_DOF], LEADING_TOLERANCE)]
     apart = APART * coarsest.blur_rad
+    z_near = float(significances(thin, near.pose[None])[0])
     for number in keep_apart(cover, np.argsort(-z, kind="stable"), BEGINNINGS, _trace_of(apart)):
-        if z[number] >= FAIR_SHARE * z_best and _apart(cover[number], near.pose) > apart:
+        # Nearer than that it is on the same hill, unless that goes up from what is next to the pose: that is a ripple
+        # on its slope, and the finest band, whose reach is a few tenths of a degree, may not lead off it.
+        if z[number] >= FAIR_SHARE * z_best and (_apart(cover[number], near.pose) > apart or z[number] > z_near):
             ends.append(_led(edges.bands, cover[number]))
     best = near
     for end in ends:
