@@ -19,7 +19,12 @@ if TYPE_CHECKING:
     from e2e.processes import Router
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-BENCHMARKS = REPOSITORY / "tests" / "bench"
+TESTS = REPOSITORY / "tests"
+BENCHMARKS = TESTS / "bench"
+
+LONGEST_FIRST = ("test_readme.py", "e2e", "cli/test_demo.py", "cli", "peers", "campaign", "deploy", "calibration")
+"""Files and folders whose tests start processes, and those that calibrate. A parallel run hands out one file after the
+other: a long one that comes last is waited for by a core that has nothing to do."""
 
 # The same examples in every run, and no verdict from the speed of the machine.
 hypothesis.settings.register_profile("coec", derandomize=True, deadline=None, database=None)
@@ -41,13 +46,21 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Leave benchmarks to the long run: how fast the machine is at the moment is no verdict on a change.
+    Long files come first.
 
     What a test is marked to hold travels with its report, from whatever process it runs in.
     """
+    items.sort(key=lambda item: _turn(item.path))
     for item in items:
         if item.path.is_relative_to(BENCHMARKS):
             item.add_marker("slow")
         item.user_properties.extend(("fault", json.dumps(row)) for row in rows_of_item(item))
+
+
+def _turn(path: Path) -> int:
+    """When a file comes; files of one turn stay in their order."""
+    turns = (turn for turn, name in enumerate(LONGEST_FIRST) if path.is_relative_to(TESTS / name))
+    return next(turns, len(LONGEST_FIRST))
 
 
 @pytest.fixture(scope="session")

@@ -7,12 +7,14 @@ draw it: their bytes and versions name the folder, so nobody has to remember to 
 from __future__ import annotations
 
 import ast
+import fcntl
 import functools
 import hashlib
 import os
 import pickle
 import shutil
 import sys
+from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -56,11 +58,7 @@ def _drawn(query: tuple[tuple[str, str], ...], cameras: tuple[int, ...] | None) 
     drive = open_sim(dict(query))
     name = hashlib.sha256(repr((query, cameras)).encode()).hexdigest()[:16]
     path = CACHE / _fingerprint() / f"{name}.pickle"
-    if path.is_file():
-        messages: list[Message] = pickle.loads(path.read_bytes())
-    else:
-        messages = list(drive.messages(cameras))
-        _keep(path, messages)
+    messages = _kept(path, lambda: list(drive.messages(cameras)))
     pictures = [message for message in messages if isinstance(message, CameraFrame)]
     sweeps = [message for message in messages if isinstance(message, LidarFrame)]
     frames = tuple(
@@ -75,12 +73,24 @@ def _same(frame: F) -> F:
     return frame
 
 
-def _keep(path: Path, messages: list[Message]) -> None:
-    if CACHE.is_dir():
-        for folder in CACHE.iterdir():
-            if folder != path.parent:
-                shutil.rmtree(folder, ignore_errors=True)  # the other half of the run may do the same
+def _kept(path: Path, draw: Callable[[], list[Message]]) -> list[Message]:
+    """What the file holds, or what is drawn now and kept in it. Processes that want the same wait for the one that
+    draws it."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if path.is_file():
+            found: list[Message] = pickle.loads(path.read_bytes())
+            return found
+        messages = draw()
+        _keep(path, messages)
+    return messages
+
+
+def _keep(path: Path, messages: list[Message]) -> None:
+    for folder in CACHE.iterdir():
+        if folder != path.parent:
+            shutil.rmtree(folder, ignore_errors=True)  # the other half of the run may do the same
     part = path.with_suffix(f".{os.getpid()}")
     part.write_bytes(pickle.dumps(messages, protocol=pickle.HIGHEST_PROTOCOL))
     part.replace(path)
