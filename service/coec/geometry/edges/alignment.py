@@ -93,7 +93,12 @@ class PartedAlignment:
 
 def frame_alignment(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> Alignment:
     """The alignment at one pose (4, 4), with e interpolated between pixels: smooth in the pose."""
-    sums = _smooth_sums(*_arguments(frames), T_camera_lidar.astype(np.float32))
+    return alignment_of_each(frames, np.broadcast_to(T_camera_lidar, (len(frames.maps), 4, 4)))
+
+
+def alignment_of_each(frames: EdgeFrames, poses: NDArray[np.float64]) -> Alignment:
+    """The same with a pose for each frame (F, 4, 4)."""
+    sums = _smooth_sums(*_arguments(frames), poses.astype(np.float32, order="C"))
     return Alignment(sums[:, 0], sums[:, 1])
 
 
@@ -156,12 +161,12 @@ def _smooth_sums(
     weight: NDArray[np.float32],
     first_point: NDArray[np.int64],
     maps: NDArray[np.int8],
-    T: NDArray[np.float32],
+    poses: NDArray[np.float32],
 ) -> NDArray[np.float64]:
     frames = first_point.shape[0] - 1
     sums = np.zeros((frames, 2))
     for f in prange(frames):
-        sums[f] = _smooth_sums_of_frame(camera, T, xyz, weight, first_point[f], first_point[f + 1], maps[f])
+        sums[f] = _smooth_sums_of_frame(camera, poses[f], xyz, weight, first_point[f], first_point[f + 1], maps[f])
     return sums
 
 
