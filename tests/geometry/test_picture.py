@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coec.geometry.picture import neighbour_differences, square_sums
+from coec.geometry.picture import level_counts, neighbour_differences, square_sums
 
 GREY = np.random.default_rng(6).integers(0, 256, (47, 70), np.uint8)
 
@@ -25,6 +25,13 @@ def test_differences_are_those_of_every_second_row() -> None:
     apart[:-1] += np.abs(np.diff(whole, axis=0))
     blocks = apart.reshape(rows, height, columns, width)[:, ::2]
     np.testing.assert_allclose(neighbour_differences(GREY, rows, columns), blocks.mean(axis=(1, 3)))
+
+
+@pytest.mark.parametrize("step", [1, 4])
+def test_levels_are_counted_as_numpy_counts_them(step: int) -> None:
+    grey = np.random.default_rng(3).integers(0, 256, (37, 53)).astype(np.uint8)
+    expected = np.bincount(grey[::step, ::step].ravel(), minlength=256)
+    assert level_counts(grey, step).tolist() == expected.tolist()
 
 
 def test_a_flat_image_has_none() -> None:

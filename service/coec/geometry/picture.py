@@ -53,6 +53,17 @@ def neighbour_differences(grey: NDArray[np.uint8], block_rows: int, block_column
     return means
 
 
+@njit(cache=True)
+def level_counts(grey: NDArray[np.uint8], step: int) -> NDArray[np.int64]:
+    """(256,) how many pixels have each grey value, of every `step`-th pixel of every `step`-th row of an image
+    (h, w)."""
+    counts = np.zeros(256, np.int64)
+    for y in range(0, grey.shape[0], step):
+        for x in range(0, grey.shape[1], step):
+            counts[grey[y, x]] += 1
+    return counts
+
+
 @njit(cache=True, inline="always")
 def _apart(a: np.uint8, b: np.uint8) -> np.int32:
     """In eight bits: sixteen times as many at once as in 64, which differences are taken in otherwise."""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import Camera, domain_angle_rad, image_point, project_point
+from coec.geometry.cameras import Camera, domain_angle_rad, image_point, in_single_precision, project_point
 from coec.geometry.compiler import njit
 
 OUTSIDE, UNSURE = -2, -1
@@ -78,16 +78,14 @@ class PixelFilter(NamedTuple):
         return self.certainty._replace(near_m=np.float32(max(NEAR_M, float(np.linalg.norm(T_camera_lidar[:3, 3])))))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=32, typed=True)
 def filter_of(camera: Camera) -> PixelFilter:
     """The filter of a camera, with its error bound measured.
 
     Where no bound holds (an image of more than 16 million pixels, a formula that single precision cannot follow), every
     point is left to double precision.
     """
-    single = type(camera)(
-        *(field if isinstance(field, int) else np.float32(field) for field in camera)  # type: ignore[arg-type]
-    )
+    single = in_single_precision(camera)
     edge = domain_angle_rad(camera)
     edge_cosine = np.float32(math.cos(edge))
     T, xyz = _sample(edge)

@@ -13,12 +13,14 @@ from dataclasses import replace
 from math import radians
 
 import numpy as np
+from numpy.typing import NDArray
 
-from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.frames.motion_compensation import compensate, sensor_twist
 from coec.calibration.monitor.sensor_faults import EGO_MOTION_WRONG, TIME_OFFSET, Cause
 from coec.calibration.types import EgoMotion, FramePair, Matrix4, Rig
+from coec.geometry import se3
 from coec.geometry.cameras import pixel_rad
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
+from coec.geometry.edges.alignment import EdgeFrames, alignment_of_each, frame_alignment
 
 OFFSETS_S = (-0.2, -0.15, -0.1, -0.075, -0.05, -0.03, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2)
 """Clock errors that are tried: up to two periods of a 10 Hz sensor."""
@@ -61,10 +63,9 @@ def explained_by_motion(
     to_beat = at_found.significance
     least_gain = 1.0 + GAIN * max(1.0, pixel_rad(rig.camera) / FINE_PIXEL_RAD)
     best, explanation = 0.0, None
-    for changed, cause in _hypotheses(edges):
-        xyz_m = np.concatenate([compensate(pair, rig, enabled=True) for pair in changed])
-        again = replace(level, xyz_m=np.ascontiguousarray(xyz_m.T))
-        unmoved, moved = frame_alignment(again, expected).significance, frame_alignment(again, found)
+    for again, motions, cause in _hypotheses(edges, rig, level):
+        unmoved = alignment_of_each(again, expected @ motions).significance
+        moved = alignment_of_each(again, found @ motions)
         agree = float((moved.strength > at_found.strength).mean()) >= FRAMES_AGREE
         gains = agree and moved.significance >= least_gain * to_beat
         enough = unmoved >= max(AS_GOOD * to_beat, BETTER * null)
@@ -74,16 +75,28 @@ def explained_by_motion(
     return explanation
 
 
-def _hypotheses(edges: Sequence[FramePair]) -> Iterator[tuple[list[FramePair], Cause]]:
+def _hypotheses(
+    edges: Sequence[FramePair], rig: Rig, level: EdgeFrames
+) -> Iterator[tuple[EdgeFrames, NDArray[np.float64], Cause]]:
+    """The range edges as each hypothesis places them, and by what those of each pair are moved after that (F, 4, 4)."""
+    xi = np.array([_twist(pair, rig) for pair in edges])
+    placed = _placed(edges, rig, level)
     for seconds in OFFSETS_S:
-        yield [_shifted(pair, seconds) for pair in edges], TIME_OFFSET
+        # Under a constant twist, later means a motion more, the same for all points of a sweep.
+        yield placed, np.array([se3.exp(seconds * of_pair) for of_pair in xi]), TIME_OFFSET
+    still = np.tile(np.eye(4), (len(edges), 1, 1))
     for factor in SCALES:
-        yield [_scaled(pair, factor) for pair in edges], EGO_MOTION_WRONG
+        yield _placed([_scaled(pair, factor) for pair in edges], rig, level), still, EGO_MOTION_WRONG
 
 
-def _shifted(pair: FramePair, seconds: float) -> FramePair:
-    """As if the sweep had been taken so much later."""
-    return replace(pair, lidar=replace(pair.lidar, stamp_ns=pair.lidar.stamp_ns + round(seconds * 1e9)))
+def _twist(pair: FramePair, rig: Rig) -> NDArray[np.float64]:
+    """(6,) of the LiDAR, by which `compensate` moves a sweep of the pair: rad/s and m/s."""
+    return np.zeros(6) if pair.motion is None else np.concatenate(sensor_twist(pair.motion, rig.T_lidar_ego))
+
+
+def _placed(edges: Sequence[FramePair], rig: Rig, level: EdgeFrames) -> EdgeFrames:
+    xyz_m = np.concatenate([compensate(pair, rig, enabled=True) for pair in edges])
+    return replace(level, xyz_m=np.ascontiguousarray(xyz_m.T))
 
 
 def _scaled(pair: FramePair, factor: float) -> FramePair:

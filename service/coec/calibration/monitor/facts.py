@@ -21,7 +21,7 @@ from coec.calibration.monitor.sensor_faults import (
     SweepFacts,
 )
 from coec.geometry.bearings import Bearings, grid_counts
-from coec.geometry.picture import neighbour_differences
+from coec.geometry.picture import level_counts, neighbour_differences
 
 BRIGHT_SHARE, BRIGHT_STEP = 0.9, 4
 """Of the pixels, every fourth of every fourth row."""
@@ -33,7 +33,7 @@ THUMBNAIL_CELL_PX = 8
 def picture_facts(grey: NDArray[np.uint8]) -> PictureFacts:
     """The facts of an image, (h, w)."""
     thumbnail = cell_means(grey, THUMBNAIL_CELL_PX).astype(np.float32)
-    levels = np.cumsum(np.bincount(grey[::BRIGHT_STEP, ::BRIGHT_STEP].ravel(), minlength=256))
+    levels = np.cumsum(level_counts(grey, BRIGHT_STEP))
     return PictureFacts(
         gradient=neighbour_differences(grey, BLOCK_ROWS, BLOCK_COLUMNS),
         bright=float(np.searchsorted(levels, BRIGHT_SHARE * levels[-1])),

@@ -152,6 +152,8 @@ def _pose_of(edges: LaidEdges, rotation: _End) -> Matrix4:
     settled = of_both(finest.blur_rad, POLISH_METRES_PER_RADIAN)
     near = _climb(edges.sharp.frames, rotation.pose, settled, TOLERANCE)
     led = _climb(finest.frames, rotation.pose, settled, LEADING_TOLERANCE)
+    if float(np.abs(se3.difference(led.pose, near.pose) / settled).max()) < SAME:
+        return near.pose  # from there the way leads to the same end
     far = _climb(edges.sharp.frames, led.pose, settled, TOLERANCE)
     return near.pose if near.significance >= NEAR_SHARE * far.significance else far.pose
 

@@ -13,7 +13,7 @@ from coec.geometry.cameras.pinhole import Pinhole
 from coec.geometry.cameras.radtan import RadTan
 from coec.geometry.cameras.rational import Rational
 from coec.geometry.cameras.registry import MODELS, Camera, Model, build, cropped, intrinsics_of, name_of, scaled
-from coec.geometry.cameras.view import domain_angle_rad, in_image, pixel_rad
+from coec.geometry.cameras.view import domain_angle_rad, in_image, in_single_precision, pixel_rad
 
 __all__ = [
     "MODELS",
@@ -31,6 +31,7 @@ __all__ = [
     "domain_angle_rad",
     "image_point",
     "in_image",
+    "in_single_precision",
     "intrinsics_of",
     "name_of",
     "pixel_rad",

@@ -1,6 +1,7 @@
 """What a camera sees: which pixels there are, how far from the optical axis a point has one, and how fine they are."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,13 @@ def in_image(camera: Camera, uv_px: NDArray[np.floating]) -> NDArray[np.bool_]:
     u, v = rows_of("uv_px", uv_px, 2).T
     inside: NDArray[np.bool_] = (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
     return inside
+
+
+@lru_cache(maxsize=64, typed=True)
+def in_single_precision(camera: Camera) -> Camera:
+    """The same camera with intrinsics as float32: a formula in single precision runs in registers of twice the
+    points."""
+    return type(camera)(*(field if isinstance(field, int) else np.float32(field) for field in camera))  # type: ignore[arg-type]
 
 
 def domain_angle_rad(camera: Camera) -> float:

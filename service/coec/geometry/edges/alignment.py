@@ -15,13 +15,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import Camera, project_point
+from coec.geometry.cameras import Camera, image_point, in_single_precision
 from coec.geometry.compiler import njit, prange
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.pixel_lookup import moved
 
 BLOCK = 256
-"""Points that are projected at a time: their pixels (4 kB) stay in the first-level cache until they are looked up."""
+"""Points that are projected at a time: their pixels (8 kB with all that is looked up there) stay in the first-level
+cache."""
+
+LEAST_RANGE2_M2, MOST_RANGE2_M2 = np.float32(1e-18), np.float32(1e18)
+"""Squares between which a distance from the camera means something, as in `cameras.formulas`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +93,12 @@ class PartedAlignment:
 
 def frame_alignment(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> Alignment:
     """The alignment at one pose (4, 4), with e interpolated between pixels: smooth in the pose."""
-    pose = np.ascontiguousarray(T_camera_lidar, np.float64)
-    sums = _smooth_sums(frames.camera, pose, frames.xyz_m, frames.weight, frames.first_point, frames.maps)
+    return alignment_of_each(frames, np.broadcast_to(T_camera_lidar, (len(frames.maps), 4, 4)))
+
+
+def alignment_of_each(frames: EdgeFrames, poses: NDArray[np.float64]) -> Alignment:
+    """The same with a pose for each frame (F, 4, 4)."""
+    sums = _smooth_sums(*_arguments(frames), poses.astype(np.float32, order="C"))
     return Alignment(sums[:, 0], sums[:, 1])
 
 
@@ -99,34 +107,37 @@ def alignment_of_parts(
 ) -> PartedAlignment:
     """The same at one pose (4, 4), of each of so many `parts` of the range edges by itself; `part` (E,) is where each
     belongs."""
-    pose = np.ascontiguousarray(T_camera_lidar, np.float64)
-    sums = _smooth_sums_of_parts(
-        frames.camera, pose, frames.xyz_m, frames.weight, part, frames.first_point, frames.maps, parts
-    )
+    sums = _smooth_sums_of_parts(*_arguments(frames), T_camera_lidar.astype(np.float32), part, parts)
     return PartedAlignment(sums[:, :, 0], sums[:, :, 1])
 
 
 def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4), with e at the nearest pixel: (K,)."""
-    return np.asarray(
-        _nearest_pixel_z(frames.camera, poses, frames.xyz_m, frames.weight, frames.first_point, frames.maps)
-    )
+    return np.asarray(_nearest_pixel_z(*_arguments(frames), poses.astype(np.float32)))
 
 
 def smooth_significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4), with e interpolated between pixels: (K,). To the last bits that of
     `frame_alignment`."""
-    return np.asarray(_smooth_z(frames.camera, poses, frames.xyz_m, frames.weight, frames.first_point, frames.maps))
+    return np.asarray(_smooth_z(*_arguments(frames), poses.astype(np.float32)))
+
+
+_Arguments = tuple[Camera, NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int8]]
+
+
+def _arguments(frames: EdgeFrames) -> _Arguments:
+    """Single precision places a point to a thousandth of a pixel, in half the time of double precision."""
+    return in_single_precision(frames.camera), frames.xyz_m, frames.weight, frames.first_point, frames.maps
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _smooth_z(
     camera: Camera,
-    poses: NDArray[np.float64],
     xyz: NDArray[np.float32],
     weight: NDArray[np.float32],
     first_point: NDArray[np.int64],
     maps: NDArray[np.int8],
+    poses: NDArray[np.float32],
 ) -> NDArray[np.float64]:
     frames = first_point.shape[0] - 1
     sums = np.empty((poses.shape[0], frames, 2))
@@ -146,23 +157,23 @@ def _smooth_z(
 @njit(cache=True, parallel=True, error_model="numpy")
 def _smooth_sums(
     camera: Camera,
-    T: NDArray[np.float64],
     xyz: NDArray[np.float32],
     weight: NDArray[np.float32],
     first_point: NDArray[np.int64],
     maps: NDArray[np.int8],
+    poses: NDArray[np.float32],
 ) -> NDArray[np.float64]:
     frames = first_point.shape[0] - 1
     sums = np.zeros((frames, 2))
     for f in prange(frames):
-        sums[f] = _smooth_sums_of_frame(camera, T, xyz, weight, first_point[f], first_point[f + 1], maps[f])
+        sums[f] = _smooth_sums_of_frame(camera, poses[f], xyz, weight, first_point[f], first_point[f + 1], maps[f])
     return sums
 
 
 @njit(cache=True, error_model="numpy")
 def _smooth_sums_of_frame(
     camera: Camera,
-    T: NDArray[np.float64],
+    T: NDArray[np.float32],
     xyz: NDArray[np.float32],
     weight: NDArray[np.float32],
     first: int,
@@ -170,131 +181,217 @@ def _smooth_sums_of_frame(
     edge_map: NDArray[np.int8],
 ) -> tuple[float, float]:
     """Σ w·e and Σ w² over the range edges of one frame, those from `first` to before `last`."""
-    strength, square = 0.0, 0.0
-    u, v, place = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.int32)
-    edges = edge_map.ravel()
+    # One sum for each place of a block: they are added in vector registers.
+    told, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
+    edges, block = edge_map.ravel(), _block()
     for begin in range(first, last, BLOCK):
         end = min(begin + BLOCK, last)
-        _pixels(camera, T, xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end], u, v)
-        _split(camera, u[: end - begin], v[: end - begin], place)
-        for i in range(end - begin):
-            if place[i] >= 0:
-                e, seen = _between(edges, camera.width, place[i], u[i], v[i])
-                if seen:
-                    w = float(weight[begin + i])
-                    strength += w * e
-                    square += w * w
-    return strength / STRENGTH_STEPS, square
+        x, y, z = xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end]
+        _add(told, square, *_between(camera, T, x, y, z, weight[begin:end], edges, block))
+    return _total(told) / STRENGTH_STEPS, _total(square)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _smooth_sums_of_parts(
     camera: Camera,
-    T: NDArray[np.float64],
     xyz: NDArray[np.float32],
     weight: NDArray[np.float32],
-    part: NDArray[np.uint8],
     first_point: NDArray[np.int64],
     maps: NDArray[np.int8],
+    T: NDArray[np.float32],
+    part: NDArray[np.uint8],
     parts: int,
 ) -> NDArray[np.float64]:
     frames = first_point.shape[0] - 1
     sums = np.zeros((frames, parts, 2))
     for f in prange(frames):
-        u, v, place = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.int32)
-        edges, of_frame = maps[f].ravel(), sums[f]
+        edges, of_frame, block = maps[f].ravel(), sums[f], _block()
         for begin in range(first_point[f], first_point[f + 1], BLOCK):
             end = min(begin + BLOCK, first_point[f + 1])
-            _pixels(camera, T, xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end], u, v)
-            _split(camera, u[: end - begin], v[: end - begin], place)
+            x, y, z = xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end]
+            told, square = _between(camera, T, x, y, z, weight[begin:end], edges, block)
             for i in range(end - begin):
-                if place[i] >= 0:
-                    e, seen = _between(edges, camera.width, place[i], u[i], v[i])
-                    if seen:
-                        w, k = float(weight[begin + i]), part[begin + i]
-                        of_frame[k, 0] += w * e
-                        of_frame[k, 1] += w * w
+                k = part[begin + i]
+                of_frame[k, 0] += told[i]
+                of_frame[k, 1] += square[i]
         of_frame[:, 0] /= STRENGTH_STEPS
     return sums
 
 
-@njit(cache=True, error_model="numpy")
-def _split(camera: Camera, u: NDArray[np.float64], v: NDArray[np.float64], place: NDArray[np.int32]) -> None:
-    """Pixel coordinates (n,) as the pixel above and to the left (row · width + column) into `place`, -1 where there is
-    none, and what is left of them, in place. Without a branch, as `_pixels`."""
-    right, bottom = camera.width - 1.0, camera.height - 1.0
-    for i in range(u.shape[0]):
-        inside = (u[i] >= 0.0) & (v[i] >= 0.0) & (u[i] < right) & (v[i] < bottom)
-        across, down = (u[i] if inside else 0.0), (v[i] if inside else 0.0)
-        column, row = np.floor(across), np.floor(down)
-        u[i], v[i] = across - column, down - row
-        place[i] = np.int32(row * camera.width + column) if inside else np.int32(-1)
-
-
-@njit(cache=True, inline="always")
-def _between(edges: NDArray[np.int8], width: int, place: np.int32, right: float, down: float) -> tuple[float, bool]:
-    """The strength, in steps, between a pixel of a map (h·w,), its neighbours to the right and below and the one
-    between those, so much aside; and whether all four have one."""
-    here = np.uint64(place)
-    below = here + np.uint64(width)
-    p, q, r, s = edges[here], edges[here + np.uint64(1)], edges[below], edges[below + np.uint64(1)]
-    upper, lower = (1.0 - right) * p + right * q, (1.0 - right) * r + right * s
-    return (1.0 - down) * upper + down * lower, (p != VOID) & (q != VOID) & (r != VOID) & (s != VOID)
-
-
-@njit(cache=True, parallel=True)
-def _nearest_pixel_z(
-    camera: Camera,
-    poses: NDArray[np.float64],
-    xyz: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    first_point: NDArray[np.int64],
-    maps: NDArray[np.int8],
-) -> NDArray[np.float64]:
-    z = np.empty(poses.shape[0])
-    for k in prange(poses.shape[0]):
-        z[k] = _nearest_pixel_z_at(camera, poses[k], xyz, weight, first_point, maps)
-    return z
+_Block = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int8]]
 
 
 @njit(cache=True)
-def _nearest_pixel_z_at(
+def _block() -> _Block:
+    """What a block of points is worked out in: (4, BLOCK) and (BLOCK,) numbers, and (4, BLOCK) strengths."""
+    return np.empty((4, BLOCK), np.float32), np.empty(BLOCK, np.int32), np.empty((4, BLOCK), np.int8)
+
+
+@njit(cache=True, error_model="numpy")
+def _between(
     camera: Camera,
-    T: NDArray[np.float64],
+    T: NDArray[np.float32],
+    x_m: NDArray[np.float32],
+    y_m: NDArray[np.float32],
+    z_m: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    edges: NDArray[np.int8],
+    block: _Block,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """w·e, in steps, and w² of range edges (n,), LiDAR frame, on a map (h·w,), with e interpolated between pixels:
+    (n,) each, nothing where one of the four pixels around does not count. In passes: what looks up goes point by point,
+    what calculates runs in vector registers."""
+    n, width = x_m.shape[0], np.uint64(camera.width)
+    numbers, places, strengths = block
+    u, v, place = numbers[0, :n], numbers[1, :n], places[:n]
+    _pixels(camera, T, x_m, y_m, z_m, u, v)
+    _split(camera.width, camera.height, u, v, place)
+    p, q, r, s = strengths[0, :n], strengths[1, :n], strengths[2, :n], strengths[3, :n]
+    for i in range(n):
+        here = np.uint64(max(place[i], 0))
+        below = here + width
+        p[i], q[i], r[i], s[i] = edges[here], edges[here + np.uint64(1)], edges[below], edges[below + np.uint64(1)]
+    told, square = numbers[2, :n], numbers[3, :n]
+    _mix(u, v, place, p, q, r, s, weight, told, square)
+    return told, square
+
+
+@njit(cache=True)
+def _split(width: int, height: int, u: NDArray[np.float32], v: NDArray[np.float32], place: NDArray[np.int32]) -> None:
+    """Pixel coordinates (n,) as the pixel above and to the left (row · width + column) into `place`, -1 where there is
+    none, and what is left of them, in place. Without a branch, as `_pixels`."""
+    right, bottom, zero = np.float32(width - 1), np.float32(height - 1), np.float32(0.0)
+    stride = np.int32(width)
+    for i in range(u.shape[0]):
+        inside = (u[i] >= zero) & (v[i] >= zero) & (u[i] < right) & (v[i] < bottom)
+        across, down = (u[i] if inside else zero), (v[i] if inside else zero)
+        column, row = np.floor(across), np.floor(down)
+        u[i], v[i] = across - column, down - row
+        place[i] = np.int32(row) * stride + np.int32(column) if inside else np.int32(-1)
+
+
+@njit(cache=True)
+def _mix(
+    right: NDArray[np.float32],
+    down: NDArray[np.float32],
+    place: NDArray[np.int32],
+    p: NDArray[np.int8],
+    q: NDArray[np.int8],
+    r: NDArray[np.int8],
+    s: NDArray[np.int8],
+    weight: NDArray[np.float32],
+    told: NDArray[np.float32],
+    square: NDArray[np.float32],
+) -> None:
+    """Weighed and squared, of points (n,) so much aside of pixels of strengths p, with q to the right, r below and s
+    below that; nothing where there is no place or one of them is void."""
+    for i in range(told.shape[0]):
+        seen = (place[i] >= 0) & (p[i] != VOID) & (q[i] != VOID) & (r[i] != VOID) & (s[i] != VOID)
+        upper = np.float32(p[i]) + right[i] * (np.float32(q[i]) - np.float32(p[i]))
+        lower = np.float32(r[i]) + right[i] * (np.float32(s[i]) - np.float32(r[i]))
+        w = weight[i] if seen else np.float32(0.0)
+        told[i] = w * (upper + down[i] * (lower - upper))
+        square[i] = w * w
+
+
+@njit(cache=True)
+def _add(
+    told: NDArray[np.float32], square: NDArray[np.float32], more: NDArray[np.float32], squares: NDArray[np.float32]
+) -> None:
+    for i in range(more.shape[0]):
+        told[i] += more[i]
+        square[i] += squares[i]
+
+
+@njit(cache=True)
+def _total(values: NDArray[np.float32]) -> float:
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _nearest_pixel_z(
+    camera: Camera,
     xyz: NDArray[np.float32],
     weight: NDArray[np.float32],
     first_point: NDArray[np.int64],
     maps: NDArray[np.int8],
+    poses: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    z = np.empty(poses.shape[0])
+    for k in prange(poses.shape[0]):
+        z[k] = _nearest_pixel_z_at(camera, xyz, weight, first_point, maps, poses[k])
+    return z
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest_pixel_z_at(
+    camera: Camera,
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.int8],
+    T: NDArray[np.float32],
 ) -> float:
-    strength, square = 0.0, 0.0
-    u, v = np.empty(BLOCK), np.empty(BLOCK)
+    told, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
+    block = _block()
     for f in range(first_point.shape[0] - 1):
+        edges = maps[f].ravel()
         for begin in range(first_point[f], first_point[f + 1], BLOCK):
             end = min(begin + BLOCK, first_point[f + 1])
-            _pixels(camera, T, xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end], u, v)
-            for i in range(end - begin):
-                if u[i] >= -0.5 and v[i] >= -0.5 and u[i] < camera.width - 0.5 and v[i] < camera.height - 0.5:
-                    e = maps[f, int(v[i] + 0.5), int(u[i] + 0.5)]
-                    if e != VOID:
-                        w = float(weight[begin + i])
-                        strength += w * e
-                        square += w * w
-    return strength / (STRENGTH_STEPS * math.sqrt(max(square, LEAST_SQUARE)))
+            x, y, z = xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end]
+            _add(told, square, *_nearest(camera, T, x, y, z, weight[begin:end], edges, block))
+    return _total(told) / (STRENGTH_STEPS * math.sqrt(max(_total(square), LEAST_SQUARE)))
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest(
+    camera: Camera,
+    T: NDArray[np.float32],
+    x_m: NDArray[np.float32],
+    y_m: NDArray[np.float32],
+    z_m: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    edges: NDArray[np.int8],
+    block: _Block,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """As `_between`, with e at the nearest pixel."""
+    n, half, stride = x_m.shape[0], np.float32(0.5), np.int32(camera.width)
+    numbers, places, strengths = block
+    u, v, place = numbers[0, :n], numbers[1, :n], places[:n]
+    _pixels(camera, T, x_m, y_m, z_m, u, v)
+    right, bottom = np.float32(camera.width) - half, np.float32(camera.height) - half
+    for i in range(n):
+        inside = (u[i] >= -half) & (v[i] >= -half) & (u[i] < right) & (v[i] < bottom)
+        across, down = (u[i] if inside else half), (v[i] if inside else half)
+        place[i] = np.int32(down + half) * stride + np.int32(across + half) if inside else np.int32(-1)
+    e, told, square = strengths[0, :n], numbers[2, :n], numbers[3, :n]
+    for i in range(n):
+        e[i] = edges[np.uint64(max(place[i], 0))]
+    for i in range(n):
+        w = weight[i] if (place[i] >= 0) & (e[i] != VOID) else np.float32(0.0)
+        told[i], square[i] = w * np.float32(e[i]), w * w
+    return told, square
 
 
 @njit(cache=True, error_model="numpy")
 def _pixels(
     camera: Camera,
-    T: NDArray[np.float64],
+    T: NDArray[np.float32],
     x_m: NDArray[np.float32],
     y_m: NDArray[np.float32],
     z_m: NDArray[np.float32],
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
 ) -> None:
-    """Pixel coordinates of points (n,), LiDAR frame, into the first n of `u` and `v`; -1 where there is none. A loop of
-    its own, without a branch: it runs in vector registers."""
+    """Pixel coordinates of points (n,), LiDAR frame, into `u` and `v` (n,); -1 where there is none. A loop of its own,
+    without a branch, and nothing wider than 32 bits: it runs in vector registers."""
+    nowhere = np.float32(-1.0)
     for i in range(x_m.shape[0]):
-        x, y, z = moved(T, float(x_m[i]), float(y_m[i]), float(z_m[i]))
-        across, down, valid = project_point(camera, x, y, z)
-        u[i], v[i] = (across if valid else -1.0), (down if valid else -1.0)
+        x, y, z = moved(T, x_m[i], y_m[i], z_m[i])
+        across, down, in_domain = image_point(camera, x, y, z)
+        range2 = x * x + y * y + z * z
+        valid = in_domain & (range2 > LEAST_RANGE2_M2) & (range2 < MOST_RANGE2_M2)  # false for NaN
+        u[i], v[i] = (across if valid else nowhere), (down if valid else nowhere)

@@ -214,9 +214,12 @@ def _gain_over(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[n
     rows, columns = -(-h // side), -(-w // side)
     counts = np.zeros((rows, columns), np.int64)
     for row in prange(rows):
+        of_column = np.zeros(w, np.int32)
         for y in range(row * side, min((row + 1) * side, h)):
             for x in range(w):
-                counts[row, x // side] += lit[y, x]
+                of_column[x] += np.int32(lit[y, x])
+        for x in range(w):
+            counts[row, x // side] += of_column[x]
     whole = kernel[0] + np.float32(2.0) * kernel[1:].sum()
     gain = np.empty((h, w), np.float32)
     for row in prange(rows):
@@ -329,12 +332,27 @@ def _over_local_mean(
 
 def _eroded(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Without the pixels within two rows and columns of a masked one: the border of a mask is an edge of nothing."""
-    if lit.all():
-        return lit
-    for axis in (0, 1):
-        padded = np.pad(lit, [(2, 2) if axis == k else (0, 0) for k in (0, 1)], mode="edge")
-        lit = np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=axis).all(axis=-1))
-    return lit
+    return lit if lit.all() else _eroded_by(lit, 2)
+
+
+@njit(cache=True, parallel=True)
+def _eroded_by(lit: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    h, w = lit.shape
+    out = np.empty((h, w), np.bool_)
+    for y in prange(h):
+        row = np.ones(w + 2 * reach, np.bool_)
+        for near in range(max(y - reach, 0), min(y + reach + 1, h)):
+            _both(row[reach : reach + w], lit[near])
+        out[y] = row[reach : reach + w]
+        for k in range(2 * reach + 1):
+            _both(out[y], row[k : k + w])
+    return out
+
+
+@njit(cache=True)
+def _both(out: NDArray[np.bool_], other: NDArray[np.bool_]) -> None:
+    for x in range(out.shape[0]):
+        out[x] &= other[x]
 
 
 @njit(cache=True, parallel=True)

@@ -94,64 +94,89 @@ def range_edges(
         row, rows, same_line = (band + BANDS).astype(np.uint16), 2 * BANDS, SAME_LINE_RAD
     else:
         row, rows, same_line = ring, int(ring.max(initial=0)) + 1, math.pi
-    order, first, azimuth, elevation, range_m = _along_the_rows(row, rows, seen.azimuth, seen.elevation, seen.range_m)
-    index, turn_rad, weight = _jumps(first, azimuth, elevation, range_m, same_line)
-    found = order[index]
+    # Where all of a row are of one line, only who is next counts, and not how high.
+    beside = same_line >= math.pi
+    order, first, azimuth, elevation, range_m = _along_the_rows(
+        row, rows, seen.azimuth, seen.elevation, seen.range_m, beside
+    )
+    index, turn_rad, weight = _jumps(first, azimuth, elevation, range_m, same_line, beside)
+    found = order[index].astype(np.int64)
     return RangeEdges(found, _about_the_axis(xyz_m[found], turn_rad), weight)
 
 
 _Rows = tuple[
-    NDArray[np.int64], NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]
+    NDArray[np.int32], NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]
 ]  # fmt: skip
 
+_RISING, _TURNED, _FALLING, _MIXED = 0, 1, 2, 3
+"""How the azimuths of a row come: in order; in order, but begun in the middle of a turn; against it, begun anywhere; or
+anyhow."""
 
-@njit(cache=True, parallel=True)
+
+@njit(cache=True)
 def _along_the_rows(
     row: NDArray[np.uint16],
     rows: int,
     azimuth: NDArray[np.float32],
     elevation: NDArray[np.float32],
     range_m: NDArray[np.float32],
+    beside: bool,
 ) -> _Rows:
     """The points that are not the vehicle itself in order of their row, and within a row of their azimuth, else as they
-    were: their indices; where each row begins, (rows + 1,); and their bearings.
+    were: their indices; where each row begins, (rows + 1,); and azimuth, elevation (none where all of a row count as
+    `beside` each other) and range.
 
-    Counted into their rows first: those of most sweeps are in order then, one way or the other, or begin
-    in the middle of a turn.
+    Rows are looked at before any point is placed: those of most sweeps are in order, one way or the other, or begin in
+    the middle of a turn, and every point goes to its place at once.
     """
-    first = np.zeros(rows + 1, np.int64)
-    for i in range(row.shape[0]):
-        first[row[i] + 1] += range_m[i] >= MIN_RANGE_M
-    for k in range(rows):
-        first[k + 1] += first[k]
-    order, following = np.empty(first[rows], np.int64), first[:-1].copy()
-    turned, raised, far_m = np.empty((3, first[rows]), np.float32)
+    count, begun, latest = np.zeros(rows, np.int64), np.empty(rows, np.float32), np.empty(rows, np.float32)
+    falls, rises = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
+    fall, rise = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
     for i in range(row.shape[0]):
         if range_m[i] >= MIN_RANGE_M:
-            at = following[row[i]]
-            order[at], turned[at], raised[at], far_m[at] = i, azimuth[i], elevation[i], range_m[i]
-            following[row[i]] = at + 1
-    for k in prange(rows):
-        of_row = slice(first[k], first[k + 1])
-        angles = turned[of_row]
-        count, descents, ascents, fall, rise = angles.shape[0], 0, 0, 0, 0
-        for i in range(1, count):
-            if angles[i] < angles[i - 1]:
-                descents, fall = descents + 1, i
-            elif angles[i] > angles[i - 1]:
-                ascents, rise = ascents + 1, i
-        if descents == 0:
-            continue
-        if descents == 1 and angles[count - 1] < angles[0]:
-            sequence = np.concatenate((np.arange(fall, count), np.arange(fall)))
-        elif ascents == 0 or (ascents == 1 and angles[count - 1] > angles[0]):  # the sensor turns clockwise
-            sequence = np.concatenate((np.arange(rise)[::-1], np.arange(rise, count)[::-1]))
-        else:
-            sequence = np.argsort(angles, kind="mergesort")
-        order[of_row] = order[of_row][sequence]
-        turned[of_row] = angles[sequence]
-        raised[of_row] = raised[of_row][sequence]
-        far_m[of_row] = far_m[of_row][sequence]
+            r, angle = row[i], azimuth[i]
+            if count[r] == 0:
+                begun[r] = angle
+            elif angle < latest[r]:
+                falls[r], fall[r] = falls[r] + 1, count[r]
+            elif angle > latest[r]:
+                rises[r], rise[r] = rises[r] + 1, count[r]
+            latest[r] = angle
+            count[r] += 1
+    first, kind = np.zeros(rows + 1, np.int64), np.full(rows, _MIXED)
+    for r in range(rows):
+        first[r + 1] = first[r] + count[r]
+        if falls[r] == 0:
+            kind[r] = _RISING
+        elif falls[r] == 1 and latest[r] < begun[r]:
+            kind[r] = _TURNED
+        elif rises[r] == 0 or (rises[r] == 1 and latest[r] > begun[r]):  # the sensor turns clockwise
+            kind[r] = _FALLING
+    order = np.empty(first[rows], np.int32)
+    turned, far_m = np.empty(first[rows], np.float32), np.empty(first[rows], np.float32)
+    raised = np.empty(0 if beside else first[rows], np.float32)
+    following = np.zeros(rows, np.int64)
+    for i in range(row.shape[0]):
+        if range_m[i] >= MIN_RANGE_M:
+            r = row[i]
+            k = at = following[r]
+            following[r] = k + 1
+            if kind[r] == _TURNED:
+                at = k - fall[r] if k >= fall[r] else k + count[r] - fall[r]
+            elif kind[r] == _FALLING:
+                at = rise[r] - 1 - k if k < rise[r] else rise[r] + count[r] - 1 - k
+            at += first[r]
+            order[at], turned[at], far_m[at] = i, azimuth[i], range_m[i]
+            if not beside:
+                raised[at] = elevation[i]
+    for r in range(rows):
+        if kind[r] == _MIXED:
+            of_row = slice(first[r], first[r + 1])
+            sequence = np.argsort(turned[of_row], kind="mergesort")
+            order[of_row], turned[of_row] = order[of_row][sequence], turned[of_row][sequence]
+            far_m[of_row] = far_m[of_row][sequence]
+            if not beside:
+                raised[of_row] = raised[of_row][sequence]
     return order, first, turned, raised, far_m
 
 
@@ -162,19 +187,18 @@ def _jumps(
     elevation: NDArray[np.float32],
     range_m: NDArray[np.float32],
     same_line: float,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
+    beside: bool,
+) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
     """Places of the near sides, the azimuth from there to the edge, and weights; of points (N,) in the order of
     `_along_the_rows`."""
     rows, count = first.shape[0] - 1, azimuth.shape[0]
-    index, turn_rad = np.empty(count, np.int64), np.empty(count, np.float64)
+    index, turn_rad = np.empty(count, np.int32), np.empty(count, np.float32)
     weight, found = np.empty(count, np.float32), np.zeros(rows, np.int64)
-    # Where all of a row are of one line, only who is next counts: whoever has no higher neighbour is told at once.
-    beside = same_line >= math.pi
     for r in prange(rows):
         begin, end = first[r], first[r + 1]
         at = begin
         for k in range(begin, end):
-            if beside:
+            if beside:  # whoever has no farther neighbour is told at once
                 before = range_m[k - 1] if k > begin else np.float32(0.0)
                 behind = range_m[k + 1] if k + 1 < end else np.float32(0.0)
                 if (before if before > behind else behind) - range_m[k] <= MIN_JUMP_M:
@@ -186,7 +210,7 @@ def _jumps(
                     j = k + step * ahead
                     if j < begin or j >= end or abs(azimuth[j] - azimuth[k]) > NEIGHBOUR_RAD:
                         break
-                    if abs(elevation[j] - elevation[k]) < same_line:
+                    if beside or abs(elevation[j] - elevation[k]) < same_line:
                         jump = range_m[j] - range_m[k]
                         if jump > least:
                             highest = max(highest, jump)
@@ -201,7 +225,8 @@ def _jumps(
                 at += 1
         found[r] = at - begin
     total, kept = found.sum(), 0
-    index_kept, turn_kept, weight_kept = np.empty(total, np.int64), np.empty(total), np.empty(total, np.float32)
+    index_kept, turn_kept = np.empty(total, np.int32), np.empty(total, np.float32)
+    weight_kept = np.empty(total, np.float32)
     for r in range(rows):
         for at in range(first[r], first[r] + found[r]):
             index_kept[kept], turn_kept[kept], weight_kept[kept] = index[at], turn_rad[at], weight[at]
@@ -209,9 +234,9 @@ def _jumps(
     return index_kept, turn_kept, weight_kept
 
 
-def _about_the_axis(xyz_m: NDArray[np.float32], turn_rad: NDArray[np.float64]) -> NDArray[np.float32]:
+def _about_the_axis(xyz_m: NDArray[np.float32], turn_rad: NDArray[np.float32]) -> NDArray[np.float32]:
     """(E, 3) by how much points (E, 3) move when they are turned about the sensor's axis, each by its own angle."""
-    sine, less = np.sin(turn_rad), 1.0 - np.cos(turn_rad)
+    sine, less = np.sin(turn_rad, dtype=np.float64), 1.0 - np.cos(turn_rad, dtype=np.float64)
     x_m, y_m = xyz_m[:, 0].astype(np.float64), xyz_m[:, 1].astype(np.float64)
     shift_m = np.zeros(xyz_m.shape, np.float32)
     shift_m[:, 0] = -x_m * less - y_m * sine
