@@ -80,6 +80,11 @@ class Keys:
         """Queryable: effective configuration without secrets."""
         return f"{self.root}/config"
 
+    @property
+    def rig(self) -> str:
+        """Queryable, and published on change: all sensors of the vehicle together."""
+        return f"{self.root}/rig"
+
     def extrinsic(self, pair: str) -> str:
         """Queryable, and published on change."""
         return f"{self.root}/{pair}/extrinsic"
@@ -152,7 +157,7 @@ class Keys:
         if not key.startswith(head) or not all(chunks):
             raise UsageError(f"the key is not below {self.root}")
         match chunks:
-            case [("status" | "metrics" | "config") as resource]:
+            case [("status" | "metrics" | "config" | "rig") as resource]:
                 return Address(None, resource)
             case [
                 pair,
