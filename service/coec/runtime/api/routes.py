@@ -18,6 +18,7 @@ from coec.runtime.api import metrics as metrics_text
 from coec.runtime.api.awaited import AwaitedAnswers
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception
+from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.snapshots import Snapshot, answer_of
 from coec.runtime.timings import QUICK_S, Histogram
 from coec.schemas.keys import (
@@ -54,6 +55,7 @@ class VehicleAnswers:
         status: Callable[[], Snapshot],
         metrics: Callable[[], bytes],
         config: Callable[[], Snapshot],
+        rig: RigAnswers,
     ) -> None:
         """`status()` and `config()` are serialised before; `metrics()` is rendered when asked."""
         self.took = Histogram(QUICK_S)
@@ -63,6 +65,7 @@ class VehicleAnswers:
         self._vehicle_routes = {
             keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
             keys.config: Route(keys.config, lambda request: config().answer(_format(request)), Lane.AT_ONCE),
+            keys.rig: Route(keys.rig, lambda request: rig.answer(_format(request)), Lane.AT_ONCE),
             keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), Lane.FILES),
         }
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
