@@ -3,14 +3,14 @@
 A knocked LiDAR moves the edges to all its cameras alike, a knocked camera its own alone: which sensors moved since the
 rig was last consistent is asked again every few seconds (`moves`), of steps at some times back (`steps`).
 
-A sensor is named by two answers in a row, with a look at a pair of it in between: what one run of bad looks, or a pair
-that has not been looked at yet, says of the others is denied by what comes next.
+A sensor is named by two answers in a row, with a look in between: what a run of bad looks says of one pair, or one
+pair that was looked at before the others, the next look denies.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import degrees
 
@@ -93,8 +93,7 @@ class RigState:
         posterior: who moved, as of when that was last asked; None before the first look.
         asked_ns: stamp of the look at which it was.
         stepped_ns: the step in question lies before looks from this stamp on.
-        claimed: sensors as probable as those that are named, and whether a look at a pair of theirs came since that was
-            first so.
+        claimed: sensors as probable as those that are named, by the last answer.
         named: those that moved.
     """
 
@@ -102,7 +101,7 @@ class RigState:
     posterior: Posterior | None = None
     asked_ns: int = BEFORE_ALL_NS
     stepped_ns: int = BEFORE_ALL_NS
-    claimed: Mapping[str, bool] = field(default_factory=dict)
+    claimed: frozenset[str] = frozenset()
     named: frozenset[str] = frozenset()
 
     @property
@@ -159,21 +158,18 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
         # Whoever looks has a bias of its own on this rig, however well the pose is known that is served.
         history = History.at(history.origin, np.hypot(np.nan_to_num(history.sigma), BIAS_TIMES * look.rig))
     histories = {**state.histories, look.edge: history.after(look, state.calm)}
-    ends = (graph.edge[look.edge].a, graph.edge[look.edge].b)
-    claimed = {name: looked or name in ends for name, looked in state.claimed.items()}
     if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
-        return replace(state, histories=histories, claimed=claimed)
+        return replace(state, histories=histories)
     times_ns = _times_ns(histories)
     posterior = _posterior(histories, times_ns, graph)
-    probable = [name for name, p in posterior.sensors.items() if p >= NAMED_AT]
-    named = frozenset(name for name in probable if name in state.named or claimed.get(name, False))
+    claimed = frozenset(name for name, p in posterior.sensors.items() if p >= NAMED_AT)
     return RigState(
         histories,
         posterior,
         asked_ns=look.stamp_ns,
         stepped_ns=times_ns[posterior.when],
-        claimed={name: claimed.get(name, False) for name in probable},
-        named=named,
+        claimed=claimed,
+        named=claimed & (state.claimed | state.named),
     )
 
 
@@ -216,7 +212,7 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
     elif max(probability, disturbed) > 1.0 - NAMED_AT:
         health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
         if probability >= NAMED_AT:
-            text = f"It seems to have moved ({100.0 * probability:.1f} %); the next look at a pair of it decides."
+            text = f"It seems to have moved ({100.0 * probability:.1f} %); the next look decides."
             reasons = (Reason("one_more_look", text), *reasons[1:])
     else:
         health = SensorHealth.CALIBRATED

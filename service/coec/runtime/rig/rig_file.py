@@ -107,7 +107,8 @@ class RigFile:
         """Keep what is known; on the disk with the next `flush`."""
         edges = {}
         for name, edge in rig.graph.edge.items():
-            history = rig.believed.histories[name]
+            kept = rig.believed.histories[name]
+            history = kept.counted() if rig.believed.calm else kept
             sigma = [float(value) if 0.0 < value < MOST_SIGMA else None for value in history.sigma.tolist()]
             edges[name] = {"nominal": edge.T_a_b.tolist(), "T_camera_lidar": history.pose.tolist(), "sigma": sigma}
         event = rig.event
