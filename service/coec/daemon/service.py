@@ -476,6 +476,7 @@ class Daemon:
                 else ros.PairTold(answers.health_reply, serials[answers.name], None, None)
                 for answers in self._answering()
             ),
+            self._rig_answers.reply if len(self._pairs) > 1 else None,
         )
 
     def _health(self) -> dict[str, replies.HealthReply]:
@@ -495,7 +496,8 @@ class Daemon:
             metrics.JOB: [Took((), self._worker.jobs_took)],
             metrics.WORK: [Took((), self._worker.work_took)],
         }
-        view = View(self._status_reply, self._health(), resident_bytes(), self._worker.status().rss_bytes, took)
+        memory = (resident_bytes(), self._worker.status().rss_bytes)
+        view = View(self._status_reply, self._health(), *memory, took, self._rig_answers.reply)
         return metrics.render(view)
 
 
