@@ -81,7 +81,7 @@ def test_a_correction_comes_to_all_pairs_at_one_sensor_time(
 @pytest.mark.fault("pairs of a rig are known in another order in a replay", "the same reply, to the byte")
 def test_a_replay_says_the_same_to_the_byte(tmp_path: Path) -> None:
     told = set()
-    for seed in (None, 1, 2):
+    for seed in (None, 1):
         said = SaidRig(tmp_path / str(seed))
         drive(said, KNOCKED_S + 40.0, seed)
         told.add(to_json(reply(said)))

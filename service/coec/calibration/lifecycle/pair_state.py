@@ -263,9 +263,9 @@ def kept_for_next(estimate: Estimate) -> KeptPairs | None:
 
 
 def told_by_rig(estimate: Estimate, covariance: NDArray[np.float64]) -> Estimate:
-    """An estimate as sure as all pairs of the rig together are: with a covariance (6, 6) of theirs."""
-    uncertainty = replace(estimate.uncertainty, noise=covariance, systematic={})
-    return replace(estimate, uncertainty=uncertainty, solved=np.ones(6, np.bool_), unobservable=np.zeros(6, np.bool_))
+    """An estimate as sure as all pairs of the rig together are: with a covariance (6, 6) of theirs, NaN on axes that
+    it does not tell."""
+    return replace(estimate, uncertainty=replace(estimate.uncertainty, noise=covariance, systematic={}))
 
 
 def after_joint(state: PairState, joint: Estimate, stamp_ns: int, rules: Rules) -> PairState:

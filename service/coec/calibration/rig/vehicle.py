@@ -20,6 +20,7 @@ from coec.calibration.rig.joint import JointEstimate, estimate
 from coec.calibration.rig.types import RigGraph
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
+from coec.geometry import se3
 
 ALIVE_NS = 60 * NS_PER_S
 """A pair without a look for so long is not waited for: 12 periods of the monitor."""
@@ -49,7 +50,8 @@ class Served:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """What the joint estimate says of a pair: (4, 4), and the covariance (6, 6) of its perturbation."""
+    """What the joint estimate says of a pair: (4, 4), and the covariance (6, 6) of its perturbation. Axes that the
+    window of the pair does not tell are as in that window, and NaN in the covariance."""
 
     T_a_b: Matrix4
     covariance: NDArray[np.float64]
@@ -252,7 +254,7 @@ def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -
     joint = rig.joint
     if joint is None or not (joint.consistent or joint.left_out is not None):
         return rig
-    told = {name: Told(joint.T_a_b[name], joint.between(name, name)) for name in fresh if name in joint.measured}
+    told = {name: _told(joint, name, rig.windows[name].measurement) for name in fresh if name in joint.measured}
     if len(told) < 2:
         return rig
     return replace(rig, correction=Correction(stamp_ns, event.sensors, told))
@@ -274,6 +276,13 @@ def _begun_or_grown(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     stepped_ns = min(after, default=stamp_ns) if event is None else event.stepped_ns
     since_ns = stamp_ns if event is None else event.since_ns
     return _without_stale(replace(rig, event=Event(sensors, since_ns, stepped_ns)))
+
+
+def _told(joint: JointEstimate, edge: str, own: Measurement) -> Told:
+    axes = np.isin(np.arange(6), own.told_axes())
+    apart = np.where(axes, se3.difference(joint.T_a_b[edge], own.T_camera_lidar), 0.0)
+    covariance = np.where(axes[:, None] & axes, joint.between(edge, edge), np.nan)
+    return Told(se3.perturb(own.T_camera_lidar, apart), covariance)
 
 
 def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:
