@@ -42,6 +42,7 @@ from coec.runtime.api.pages import pages
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.rig import RigAnswers
+from coec.runtime.api.rig_commands import RigCommands
 from coec.runtime.api.router_watch import RouterWatch
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
@@ -146,7 +147,8 @@ class Daemon:
             **{name: pair.commands for name, pair in self._pairs.items()},
             **{name: answers.commands for name, answers in awaited.items()},
         }
-        self._reception = Reception(self._rules, self._commands)
+        of_rig = RigCommands(config.vehicle, self._commands, lambda: self._rig_answers.reply)
+        self._reception = Reception(self._rules, self._commands, of_rig)
         self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
         self._answers = VehicleAnswers(
             self._keys,
