@@ -77,7 +77,7 @@ class SaidRig:
         self.pairs: dict[str, PairOfRig] = {}
         for camera in cameras:
             known = state(camera, poses)
-            self.pairs[camera] = self.keeper.join(pair_config(camera), pose(camera, POSES), known)
+            self.pairs[camera] = self.keeper.join(pair_config(camera), pose(camera, POSES), known, lambda: True)
         self.keeper.listen(self.told.append, lambda: None)
         self.settle()
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from coec.adapters.files.scribe import Scribe
 from coec.adapters.zenoh.ros_topics import Topics
 from coec.calibration.lifecycle import HealthState
 from coec.config import Config
+from coec.errors import NotFoundError
 from coec.runtime import pair as runtime_pair
 from coec.runtime.api.rig import RigAnswers
+from coec.runtime.api.rig_commands import RigCommands
 from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.inbox import Call
@@ -27,7 +30,7 @@ from coec.runtime.rig.keeper import RigKeeper
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.base import to_json
 from coec.schemas.keys import Keys
-from coec.schemas.replies import HistoryEntry
+from coec.schemas.replies import Acknowledgement, HistoryEntry
 from coec.schemas.rig_state import RigReply
 from pair_bench import AFTER, STEP_S, InstantRecorder, InstantScribe, KnowingWorker, S, configuration, pair_at
 
@@ -108,6 +111,17 @@ class RigBench:
                     going |= self.rig.work(0.0)
             going |= self.rig.work(0.0)
 
+    def do(self, name: str, **arguments: Any) -> Acknowledgement:
+        """A command for the rig."""
+        commands = {name: pair.commands for name, pair in self.pairs.items()}
+        rig = RigCommands("test", commands, lambda: self.reply)
+        with ThreadPoolExecutor(1) as other:
+            told = other.submit(rig.carry_out, name, arguments, "the test")
+            while not told.done():
+                self.settle()
+        self.settle()
+        return told.result()
+
     @property
     def reply(self) -> RigReply:
         return self.answers.reply
@@ -164,3 +178,21 @@ def test_where_people_decide_the_correction_waits_for_them(tmp_path: Path) -> No
         state = bench.pairs[name].answers._store.state
         assert state.pending is not None
         assert not np.allclose(state.T_camera_lidar, AFTER, atol=1e-3)
+
+
+def test_a_command_for_a_sensor_is_one_for_each_of_its_pairs(tmp_path: Path) -> None:
+    bench = RigBench(tmp_path / "state")
+    bench.drive(STEP_S - 20, STEP_S - 10)
+    held = bench.do("hold", sensor="left")
+    assert (held.accepted, held.code, held.pair) == (True, "held", "rig")
+    assert [bench.pairs[name].answers.extrinsic_reply.held for name in CAMERAS] == [False, True, False]
+    assert bench.do("hold", sensor="roof").accepted
+    assert all(bench.pairs[name].answers.extrinsic_reply.held for name in CAMERAS)
+    refused = bench.do("reset", sensor="roof")
+    assert (refused.accepted, refused.code) == (False, "held")
+    assert all(f"{name}: " in refused.text for name in CAMERAS)
+    assert bench.do("hold", sensor="left", release=True).accepted
+    in_part = bench.do("reset")
+    assert (in_part.accepted, in_part.code) == (False, "in_part")
+    with pytest.raises(NotFoundError, match="the rig has front, left, rear, roof"):
+        bench.do("hold", sensor="trunk")

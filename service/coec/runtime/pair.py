@@ -46,7 +46,7 @@ class Pair:
         losses = LossCounter(_log, pair.name)
         mailbox, queue = Mailbox(), DecisionQueue()
         store = PairStore(rig, config.vehicle, config.state, outside.store, outside.scribe, folder, losses)
-        of_rig = outside.rig.join(pair, rig.T_camera_lidar_nominal, store.state)
+        of_rig = outside.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.is_answered)
         questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, of_rig, outside.show)
         baseline = RigBaseline(pair, rig, config.state.directory)
         self._rig, self._vehicle = rig, config.vehicle

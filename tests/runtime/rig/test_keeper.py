@@ -12,7 +12,7 @@ import pytest
 
 from coec.adapters.files.state_file import StateFile
 from coec.runtime.api.rig import INCONSISTENT, RigAnswers, reply_of, troubles_of
-from coec.runtime.rig.keeper import LAG_NS
+from coec.runtime.rig.keeper import LAG_NS, QUIET_TICKS
 from coec.runtime.rig.rig_file import FILE
 from coec.schemas.base import from_json, to_json
 from coec.schemas.keys import Keys
@@ -224,3 +224,16 @@ def test_a_single_lidar_closes_no_loop_and_no_pair_is_inconsistent(tmp_path: Pat
     assert joint is not None
     assert joint.freedom == 0
     assert INCONSISTENT not in str(joint)
+
+
+@pytest.mark.fault("all cameras of a vehicle stop", "what they said last is put together all the same")
+def test_once_all_streams_have_stopped_nothing_waits_any_more(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    for camera in CAMERAS:
+        said.at(camera, 10.0)
+        said.put(camera, 15.0, look(camera, POSES, 10.0, np.zeros(6)))
+    said.settle()
+    assert reply(said).looks == {}
+    taken = [said.keeper.work(0.001) for _ in range(QUIET_TICKS + 2)]
+    assert taken == [False] * (QUIET_TICKS - 1) + [True] * 3
+    assert reply(said).looks == {"front-roof": 1, "left-roof": 1, "rear-roof": 1}

@@ -81,6 +81,12 @@ class DecisionQueue:
             self._take_answered()
         return len(late)
 
+    @property
+    def is_answered(self) -> bool:
+        """Whether every answer has come and was taken."""
+        with self._lock:
+            return not self._untaken
+
     def waits(self, stamp_ns: int) -> bool:
         """Whether an answer has yet to come before a pair of this sensor time is looked at."""
         with self._lock:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,8 +37,9 @@ LAG_NS = 15 * NS_PER_S
 """Sensor time from what the pairs say to what they are told: a pair that is slower by that than another, for its
 windows take the worker so long, holds the other up."""
 
-QUIET_S = 3.0
-"""Without a frame of any pair, after which what was said is taken as it came: nothing earlier can come."""
+QUIET_TICKS = 4
+"""Looks at the clock without a frame of any pair, after which, once every question is answered, what was said is taken
+as it came: nothing earlier can come. Looks, not seconds: a process that slept has samples to take first."""
 
 TICK_S = 1.0
 
@@ -81,6 +81,7 @@ class _Joined:
     nominal: Matrix4
     serves: Served
     window: Windowed | None
+    has_all_answers: Callable[[], bool]
 
 
 class RigKeeper:
@@ -98,7 +99,7 @@ class RigKeeper:
         self._corrections: dict[str, deque[Correction]] = {}
         self._pairs: dict[str, _Joined] = {}
         self._count = 0
-        self._moved_s = time.monotonic()
+        self._quiet_ticks = 0
         self._rig: VehicleRig | None = None
         self._graph: RigGraph | None = None
         self._why: tuple[Reason, ...] = ()
@@ -116,11 +117,15 @@ class RigKeeper:
 
     # --- on any thread ----------------------------------------------------------------------------------------------
 
-    def join(self, pair: PairConfig, nominal: Matrix4, state: PairState) -> PairOfRig:
-        """A pair is of the rig from now on: its nominal calibration (4, 4), and its state at the start."""
+    def join(
+        self, pair: PairConfig, nominal: Matrix4, state: PairState, has_all_answers: Callable[[], bool]
+    ) -> PairOfRig:
+        """A pair is of the rig from now on: its nominal calibration (4, 4), its state at the start, and whether
+        whatever it asked is answered."""
         accepted = state.accepted
         window = None if accepted is None else Windowed(Measurement.of(accepted), start_ns_of(accepted.window_id))
-        joined = _Joined(pair, nominal, served_by(state, prior_sigma(pair.tracker)), window)
+        serves = served_by(state, prior_sigma(pair.tracker))
+        joined = _Joined(pair, nominal, serves, window, has_all_answers)
         with self._condition:
             self._count += 1
             self._order.put(pair.name, None, joined)
@@ -141,7 +146,7 @@ class RigKeeper:
         with self._condition:
             if self._count < 2:
                 return False
-            self._moved_s = time.monotonic()
+            self._quiet_ticks = 0
             self._order.at(pair, stamp_ns, waits=waits)
             if self._order.is_ready:
                 self._condition.notify_all()
@@ -190,9 +195,10 @@ class RigKeeper:
     def work(self, timeout_s: float) -> bool:
         """Take what comes next, waiting for it for so long; whether something came."""
         with self._condition:
-            if not self._order.is_ready:
-                self._condition.wait(timeout_s)
-        return self._take_one(silent=time.monotonic() - self._moved_s > QUIET_S)
+            if not self._order.is_ready and timeout_s > 0.0 and not self._condition.wait(timeout_s):
+                self._quiet_ticks += 1
+            quiet = self._quiet_ticks >= QUIET_TICKS
+        return self._take_one(silent=quiet and all(pair.has_all_answers() for pair in self._pairs.values()))
 
     def _take_one(self, *, silent: bool) -> bool:
         with self._condition:
