@@ -17,7 +17,7 @@ from coec.runtime.rig.rig_file import FILE
 from coec.schemas.base import from_json, to_json
 from coec.schemas.keys import Keys
 from coec.schemas.rig_state import RigReply
-from rig_said import CAMERAS, SaidRig, look, pose, serves, window
+from rig_said import CAMERAS, SaidRig, look, pair_config, pose, serves, state, window
 from rigs import NS, POSES, SIGMA, with_moved
 
 KNOCKED_S = 45.0
@@ -237,3 +237,17 @@ def test_once_all_streams_have_stopped_nothing_waits_any_more(tmp_path: Path) ->
     taken = [said.keeper.work(0.001) for _ in range(QUIET_TICKS + 2)]
     assert taken == [False] * (QUIET_TICKS - 1) + [True] * 3
     assert reply(said).looks == {"front-roof": 1, "left-roof": 1, "rear-roof": 1}
+
+
+def test_a_pair_that_joins_later_finds_what_the_first_has_come_to(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path, ("front",))
+    said.put("front", 5.0, window("front", POSES, 1.0))
+    said.put("front", 5.0, serves("front", POSES, 1.0))
+    said.settle()
+    said.pairs["left"] = said.keeper.join(pair_config("left"), pose("left", POSES), state("left"), lambda: True)
+    said.settle()
+    rig = said.known.rig
+    assert rig is not None
+    assert rig.serves["front-roof"].start_ns == NS
+    assert list(rig.windows) == ["front-roof"]
+    assert {sensor.state for sensor in reply(said).sensors} == {"unknown"}

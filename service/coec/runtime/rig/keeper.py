@@ -11,7 +11,7 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from coec.adapters.files.scribe import Scribe
@@ -42,6 +42,9 @@ QUIET_TICKS = 4
 as it came: nothing earlier can come. Looks, not seconds: a process that slept has samples to take first."""
 
 TICK_S = 1.0
+
+MOST_CORRECTIONS = 4
+"""Of one pair that wait for its frames: of a pair without frames the newest ones are the truth."""
 
 SAVE_NS = 60 * NS_PER_S
 """Sensor time between two savings while nothing happens: what is lost by a kill is a minute of looks."""
@@ -136,7 +139,9 @@ class RigKeeper:
         """See `pair_side.Keeps`."""
         with self._condition:
             if self._count < 2:
-                return
+                if isinstance(said, Look):
+                    return
+                due_ns = None  # there is nobody whose word it could overtake
             self._order.put(pair, due_ns, said)
             if self._order.is_ready:
                 self._condition.notify_all()
@@ -224,7 +229,7 @@ class RigKeeper:
             self._pairs[pair] = what
             self._grow()
         elif self._rig is None:
-            return
+            self._meanwhile(pair, what)
         elif isinstance(what, _SteppedBack):
             self._rig = vehicle.forgotten(self._rig)
         elif isinstance(what, Look):
@@ -233,6 +238,13 @@ class RigKeeper:
             self._rig = vehicle.after_window(self._rig, pair, what, due_ns)
         else:
             self._rig = vehicle.after_served(self._rig, pair, what, due_ns)
+
+    def _meanwhile(self, pair: str, what: Said | _SteppedBack) -> None:
+        """There is no rig yet: what a pair comes to until there is one."""
+        if isinstance(what, Served):
+            self._pairs[pair] = replace(self._pairs[pair], serves=what)
+        elif isinstance(what, Windowed):
+            self._pairs[pair] = replace(self._pairs[pair], window=what)
 
     def _grow(self) -> None:
         """There is one more pair."""
@@ -263,7 +275,9 @@ class RigKeeper:
             "a move of a sensor is put right", extra={"fields": {"sensors": sensors, "pairs": [*correction.pairs]}}
         )
         for name, told in correction.pairs.items():
-            self._corrections.setdefault(name, deque()).append(Correction(told, stamp_ns, self._from_ns, text))
+            self._corrections.setdefault(name, deque(maxlen=MOST_CORRECTIONS)).append(
+                Correction(told, stamp_ns, self._from_ns, text)
+            )
 
     # --- telling ----------------------------------------------------------------------------------------------------
 
