@@ -3,8 +3,8 @@
 A knocked LiDAR moves the edges to all its cameras alike, a knocked camera its own alone: which sensors moved since the
 rig was last consistent is asked again every few seconds (`moves`), of steps at some times back (`steps`).
 
-A sensor is named by two answers in a row, with a look in between: what a run of bad looks says of one pair, or one
-pair that was looked at before the others, the next look denies.
+A sensor is named by two answers in a row, with a look in between, and by two of its pairs where it has as many: what a
+run of bad looks says of one pair, or one pair that was looked at before the others, the next look denies.
 """
 
 from __future__ import annotations
@@ -162,15 +162,25 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
         return replace(state, histories=histories)
     times_ns = _times_ns(histories)
     posterior = _posterior(histories, times_ns, graph)
-    claimed = frozenset(name for name, p in posterior.sensors.items() if p >= NAMED_AT)
+    stepped_ns = times_ns[posterior.when]
+    probable = [name for name, p in posterior.sensors.items() if p >= NAMED_AT]
+    claimed = frozenset(name for name in probable if _seen_by_two(name, graph, histories, stepped_ns))
     return RigState(
         histories,
         posterior,
         asked_ns=look.stamp_ns,
-        stepped_ns=times_ns[posterior.when],
+        stepped_ns=stepped_ns,
         claimed=claimed,
         named=claimed & (state.claimed | state.named),
     )
+
+
+def _seen_by_two(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:
+    """Whether two pairs of a sensor were looked at since a stamp, or it has one only. What a single one of several says
+    may be its own, such as a clock of one driver; another would deny it."""
+    pairs = [histories[edge.name] for edge in graph.edges if name in (edge.a, edge.b)]
+    looked = sum(bool(history.looks) and history.looks[-1].stamp_ns >= since_ns for history in pairs)
+    return len(pairs) == 1 or looked >= 2
 
 
 def _times_ns(histories: Mapping[str, History]) -> list[int]:
@@ -212,7 +222,7 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
     elif max(probability, disturbed) > 1.0 - NAMED_AT:
         health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
         if probability >= NAMED_AT:
-            text = f"It seems to have moved ({100.0 * probability:.1f} %); the next look decides."
+            text = f"It seems to have moved ({100.0 * probability:.1f} %); the next looks at its pairs decide."
             reasons = (Reason("one_more_look", text), *reasons[1:])
     else:
         health = SensorHealth.CALIBRATED
