@@ -47,6 +47,7 @@ from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import RecordingPlan
 from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.rig.keeper import RigKeeper
 from coec.runtime.worker.costs import Cost, cost_of
 from coec.runtime.worker.jobs import Answer, Checked, Drawn, Fate, Job, JobOutcome, Kind, Solved
 from coec.runtime.worker.messages import unpack_pairs
@@ -314,14 +315,16 @@ class Bench:
         self.intake = Intake(self.config.limits)
         self.published: list[str] = []
         self.shown: list[str] = []
+        scribe = InstantScribe(self.folder)
         self.outside = Outside(
             Keys("coec", self.config.vehicle),
             self.intake,
             store,
-            InstantScribe(self.folder),
+            scribe,
             windows,
             cast("Worker", self.worker),
             self.budget,
+            RigKeeper(self.folder, (), scribe),
             lambda key, _: self.published.append(key),
             lambda: (),
             lambda pair, _drawn, _pose: self.shown.append(pair.name),

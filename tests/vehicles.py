@@ -16,6 +16,7 @@ from coec.config import AuthorityConfig, LimitsConfig, ZenohConfig
 from coec.runtime.api.authority import Authority
 from coec.runtime.api.configuration import shown
 from coec.runtime.api.reception import Reception, Rules
+from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.schemas.keys import Keys
@@ -62,9 +63,15 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
         told = a_status(vehicle=VEHICLE, pairs=(pair.answers.status(),))
         return Snapshot.of(told)
 
-    VehicleAnswers(KEYS, {pair.name: pair.answers}, reception, status, lambda: b"# EOF\n", lambda: document).declare(
-        bus
-    )
+    VehicleAnswers(
+        KEYS,
+        {pair.name: pair.answers},
+        reception,
+        status,
+        lambda: b"# EOF\n",
+        lambda: document,
+        RigAnswers(KEYS, bus.publish),
+    ).declare(bus)
     for name, answer in (("extrinsic", pair.answers.extrinsic), ("health", pair.answers.health)):
         bus.publish(f"{KEYS.root}/{pair.name}/{name}", answer("msgpack"))
     bus.declare_alive(KEYS.alive(pair.name))

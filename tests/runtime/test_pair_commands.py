@@ -22,6 +22,7 @@ from coec.geometry import se3
 from coec.runtime.api import commands, rate_limit
 from coec.runtime.api.authority import Authority
 from coec.runtime.api.reception import Reception, Rules
+from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
@@ -170,9 +171,15 @@ def route_of(bench: Bench, command: str) -> Route:
     keys, pair, unasked = Keys("coec", "test"), bench.pair, Snapshot(b"", b"")
     bus = create_autospec(Bus, instance=True)
     reception = Reception(Rules(Authority(AuthorityConfig(), lambda: None), None), {pair.name: pair.commands})
-    VehicleAnswers(keys, {pair.name: pair.answers}, reception, lambda: unasked, lambda: b"", lambda: unasked).declare(
-        bus
-    )
+    VehicleAnswers(
+        keys,
+        {pair.name: pair.answers},
+        reception,
+        lambda: unasked,
+        lambda: b"",
+        lambda: unasked,
+        RigAnswers(keys, lambda *_: None),
+    ).declare(bus)
     finders = {call.args[0]: call.args[1] for call in bus.serve.call_args_list}
     (route,) = finders[f"{keys.root}/{pair.name}/**"](keys.command(pair.name, command))
     assert isinstance(route, Route)

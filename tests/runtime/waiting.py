@@ -74,6 +74,7 @@ class World:
             nothing,
             nothing,
             nothing,
+            nothing,
             lambda key, answer: self.published.append((key, answer)),
             lambda: self.troubles,
             lambda *_: None,

@@ -43,7 +43,7 @@ from coec.schemas.base import from_json
 from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, VERSION_CHUNK, Keys
 from coec.schemas.replies import StatusReply, WindowInfo, WindowsReply
 
-VEHICLE_KEYS = ("status", "config", "metrics")
+VEHICLE_KEYS = ("status", "rig", "config", "metrics")
 PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
 PLAIN_KEYS = (*PAIR_KEYS, "overlay", *VEHICLE_KEYS)
 WITH_ARGUMENT = {"windows": "ID", "evidence": "ID", "command": "NAME"}

@@ -16,6 +16,7 @@ from coec.config.pair import OpenPairConfig, PairConfig
 from coec.config.rig import MAX_LINKS, MAX_SENSORS
 from coec.config.ros import RosConfig
 from coec.config.service import BudgetConfig, LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
+from coec.schemas.keys import RIG
 from coec.schemas.ros_names import ros_name
 
 MAX_PAIRS = 32
@@ -87,6 +88,8 @@ class Config(Stage):
         names = [pair.name for pair in self.every_pair]
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
+        if RIG in names:
+            raise ValueError(f"pairs: all of them together are called `{RIG}`: give the pair of this name another one")
         return self
 
     @model_validator(mode="after")

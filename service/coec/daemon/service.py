@@ -41,6 +41,8 @@ from coec.runtime.api.metrics import Took, View
 from coec.runtime.api.pages import pages
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception, Rules
+from coec.runtime.api.rig import RigAnswers
+from coec.runtime.api.rig_commands import RigCommands
 from coec.runtime.api.router_watch import RouterWatch
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
@@ -55,6 +57,7 @@ from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.reload import reload_of, settings_hash
+from coec.runtime.rig.keeper import RigKeeper
 from coec.runtime.ros import told as ros
 from coec.runtime.ros.outputs import RosOutputs
 from coec.runtime.waiting_room import WaitingRoom
@@ -86,7 +89,7 @@ STALLED_S = 20.0
 """A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed."""
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
-INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 1.5
+INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, RIG_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 0.5, 1.5
 QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LOOK_OUT_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
 
 
@@ -128,17 +131,24 @@ class Daemon:
         self._ros_outputs = RosOutputs(publishers, config, self._worker)
         store = StateStore(config.state.directory, config.vehicle)
         self._scribe = Scribe(config.state.directory)
-        own = (self._worker, self._budget, self._publish, self._troubles, self._ros_outputs.show)
+        self._rig = RigKeeper(config.state.directory, config.links, self._scribe)
+        self._rig_answers = RigAnswers(self._keys, self._publish)
+        own = (self._worker, self._budget, self._rig, self._publish, self._troubles, self._ros_outputs.show)
         of_ros = (self._ros_side.topics, self._room.nominal)
         self._intake = Intake(config.limits)
-        self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *own, *of_ros)
+        told = (*own, *of_ros, self._rig_answers.troubles)
+        self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *told)
         self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
+        self._rig.listen(self._rig_answers.hear, self._intake.inbox.wake)
+        while self._rig.work(0.0):  # a reply exists before the first question
+            pass
         awaited = self._room.open(config, self._outside)
         self._commands: dict[str, Commands | AwaitedCommands] = {
             **{name: pair.commands for name, pair in self._pairs.items()},
             **{name: answers.commands for name, answers in awaited.items()},
         }
-        self._reception = Reception(self._rules, self._commands)
+        of_rig = RigCommands(config.vehicle, self._commands, lambda: self._rig_answers.reply)
+        self._reception = Reception(self._rules, self._commands, of_rig)
         self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
         self._answers = VehicleAnswers(
             self._keys,
@@ -147,6 +157,7 @@ class Daemon:
             lambda: self._status,
             self._metrics,
             lambda: self._shown,
+            self._rig_answers,
         )
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
@@ -178,7 +189,13 @@ class Daemon:
     # --- start, tick, stop ------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
-        for thread in (self._scribe.thread, self._presence.thread, self._intake.thread, *self._bus.threads):
+        for thread in (
+            self._scribe.thread,
+            self._rig.thread,
+            self._presence.thread,
+            self._intake.thread,
+            *self._bus.threads,
+        ):
             thread.start()
         self._ros_outputs.start(self._told)
         self._worker.start()
@@ -279,6 +296,7 @@ class Daemon:
             ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
             ("end the deciders", lambda: self._end(pairs, lambda pair: pair.decider, DECIDER_STOP_S)),
+            ("end the rig", self._end_rig),
             ("write all books", self._end_scribe),
             ("end the answers", lambda: stopped(self._bus.threads, QUERIES_STOP_S)),
             ("close the door of HTTP", lambda: self._door.close(HTTP_STOP_S)),
@@ -303,6 +321,10 @@ class Daemon:
     def _end_intake(self) -> None:
         self._intake.request_stop()
         joined([self._intake.thread], INGEST_STOP_S)
+
+    def _end_rig(self) -> None:
+        self._rig.request_stop()
+        joined([self._rig.thread], RIG_STOP_S)
 
     def _end_scribe(self) -> None:
         self._scribe.request_stop()
@@ -402,7 +424,7 @@ class Daemon:
     def _prompt_threads(self) -> list[ServiceThread]:
         """Those that never wait for a disk. One that does stands still for as long as it takes, which `health` says; no
         restart would make it quicker, and none is asked for."""
-        own = [self._intake.thread, *(pair.decider.thread for pair in self._pairs.values())]
+        own = [self._intake.thread, self._rig.thread, *(pair.decider.thread for pair in self._pairs.values())]
         of_ros = (*self._room.threads, *self._ros_outputs.threads)
         return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *of_ros, *own]
 
@@ -456,6 +478,7 @@ class Daemon:
                 else ros.PairTold(answers.health_reply, serials[answers.name], None, None)
                 for answers in self._answering()
             ),
+            self._rig_answers.reply if len(self._pairs) > 1 else None,
         )
 
     def _health(self) -> dict[str, replies.HealthReply]:
@@ -475,7 +498,8 @@ class Daemon:
             metrics.JOB: [Took((), self._worker.jobs_took)],
             metrics.WORK: [Took((), self._worker.work_took)],
         }
-        view = View(self._status_reply, self._health(), resident_bytes(), self._worker.status().rss_bytes, took)
+        memory = (resident_bytes(), self._worker.status().rss_bytes)
+        view = View(self._status_reply, self._health(), *memory, took, self._rig_answers.reply)
         return metrics.render(view)
 
 

@@ -25,6 +25,10 @@ STATE_STYLES = {
     "degraded": "bold yellow",
     "failed": "bold red",
     "miscalibrated": "bold red",
+    "calibrated": "bold green",
+    "undecided": "bold yellow",
+    "camera_moved": "bold red",
+    "lidar_moved": "bold red",
 }
 """What is not here is neither good nor bad."""
 

@@ -9,7 +9,7 @@ from typing import Final
 from rich.text import Text
 
 from coec.reports import console
-from coec.schemas import replies
+from coec.schemas import replies, rig_state
 from coec.schemas.base import from_json
 
 NS_PER_S = 1_000_000_000
@@ -180,6 +180,49 @@ def status(payload: bytes) -> None:
     _losses({"worker": worker.losses, "storage": storage.losses})
 
 
+def rig(payload: bytes) -> None:
+    """All sensors of a vehicle."""
+    reply = from_json(rig_state.RigReply, payload)
+    until = (
+        "nothing was looked at yet"
+        if reply.stamp_ns is None
+        else f"by all that was seen until {_instant(reply.stamp_ns)}"
+    )
+    console.show(f"{reply.vehicle}  {until}")
+    for reason in reply.reasons:
+        console.show(f"  {reason.code}: {reason.text}", "yellow")
+    table = console.table("sensor", "kind", "state", "moved, %", "since", "why", right=(3,))
+    for sensor in reply.sensors:
+        share = "-" if sensor.probability is None else f"{100.0 * sensor.probability:.1f}"
+        since = "-" if sensor.since_ns is None else _instant(sensor.since_ns)
+        why = "; ".join(reason.text for reason in sensor.reasons)
+        table.add_row(sensor.name, sensor.kind, console.styled(sensor.state), share, since, why)
+    console.out.print(table)
+    if reply.joint is not None:
+        _joint(reply.joint)
+    if reply.correction is not None:
+        named, pairs = " and ".join(reply.correction.sensors), ", ".join(reply.correction.pairs)
+        console.show(f"last put right: {named}, in {pairs}, since {_instant(reply.correction.from_ns)}")
+    _losses({"rig": reply.losses})
+
+
+def _joint(joint: rig_state.JointReply) -> None:
+    """Where everything is, and how well the pairs fit each other."""
+    table = console.table("pair", *(f"{name} ± σ" for name in console.AXES), right=range(1, 7))
+    for pair in joint.pairs:
+        steps = [f"{step:+.3f} ± {sigma:.3f}" for step, sigma in zip(pair.step, pair.sigma, strict=True)]
+        table.add_row(pair.pair if pair.measured else f"{pair.pair} (by the others)", *steps)
+    console.show(f"all pairs together, from what each serves (deg, m), data until {_instant(joint.stamp_ns)}")
+    console.out.print(table)
+    if joint.freedom:
+        fit = "fit each other" if joint.consistent else "do not fit each other"
+        figures = f"χ² {joint.chi2:.1f} at {joint.freedom} degrees of freedom, p {joint.p_value:.2g}"
+        console.show(f"the pairs {fit}: {figures}", "" if joint.consistent else "bold red")
+    for loop in joint.open_loops:
+        shift = "" if loop.translation_m is None else f", {100.0 * loop.translation_m:.1f} cm"
+        console.show(f"  does not close: {', '.join(loop.names)}: {loop.rotation_deg:.2f}°{shift}", "bold red")
+
+
 def command(payload: bytes) -> None:
     """The answer to a command."""
     reply = from_json(replies.Acknowledgement, payload)
@@ -197,6 +240,7 @@ BY_KIND: Final[Mapping[str, Callable[[bytes], None]]] = {
     "evidence": evidence,
     "event": event,
     "status": status,
+    "rig": rig,
     "command": command,
 }
 """What shows a reply, by the name of its key. The others are shown as they come."""

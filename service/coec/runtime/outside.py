@@ -15,6 +15,7 @@ from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.intake import Intake
 from coec.runtime.nominal.watch import Nominal
 from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.rig.keeper import RigKeeper
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.keys import Keys
 
@@ -23,6 +24,12 @@ def given(pair: str) -> Nominal:
     """Of a pair whose configuration gives its nominal calibration."""
     del pair
     return Nominal()
+
+
+def fits(pair: str) -> tuple[Reason, ...]:
+    """Of a pair that has nothing against any other."""
+    del pair
+    return ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +41,7 @@ class Outside:
         show: `show(pair, drawn, pose)` tells of a pair of the stream that is being checked at an extrinsic (4, 4).
         topics: those that the vehicle's ROS publishes now.
         nominal: where a pair's nominal calibration comes from.
+        rig_troubles: what does not fit between a pair and the others of the vehicle, by its name.
     """
 
     keys: Keys
@@ -43,8 +51,10 @@ class Outside:
     folder: WindowStore
     worker: Worker
     budget: Budget
+    rig: RigKeeper
     publish: Callable[[str, Answer], None]
     vehicle_troubles: Callable[[], tuple[Reason, ...]]
     show: Callable[[PairConfig, FramePair, Matrix4], None]
     topics: Callable[[], Topics]
     nominal: Callable[[str], Nominal] = given
+    rig_troubles: Callable[[str], tuple[Reason, ...]] = fits

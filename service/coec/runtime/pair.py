@@ -45,8 +45,9 @@ class Pair:
         rig, folder = rig_of(pair), outside.folder
         losses = LossCounter(_log, pair.name)
         mailbox, queue = Mailbox(), DecisionQueue()
-        questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, outside.show)
         store = PairStore(rig, config.vehicle, config.state, outside.store, outside.scribe, folder, losses)
+        of_rig = outside.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.unanswered == 0)
+        questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, of_rig, outside.show)
         baseline = RigBaseline(pair, rig, config.state.directory)
         self._rig, self._vehicle = rig, config.vehicle
         plan = self._plan(pair, baseline.calibration)
@@ -68,6 +69,7 @@ class Pair:
             queue,
             pictures,
             self.stream,
+            of_rig,
             mailbox,
             losses,
             self.recorder.use,

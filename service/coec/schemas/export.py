@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import checks, commands, doctor, evaluation, fleet, frames, matrix, replies, rig
+from coec.schemas import checks, commands, doctor, evaluation, fleet, frames, matrix, replies, rig, rig_state
 from coec.schemas.base import Message
 
 SENT: tuple[type[Message], ...] = (
@@ -42,6 +42,7 @@ MESSAGES: tuple[type[Message], ...] = (
     checks.CheckedDrive,
     checks.ChecksReport,
     rig.RigMovesReport,
+    rig_state.RigReply,
     doctor.DoctorReport,
     fleet.WindowRow,
     fleet.BatchReport,

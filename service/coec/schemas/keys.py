@@ -12,6 +12,9 @@ from coec.errors import UsageError
 VERSION_CHUNK: Final = "@v1"
 """A chunk that starts with `@` is not matched by `**`: the version never leaks into wildcards."""
 
+RIG: Final = "rig"
+"""What all pairs of a vehicle together are called, in the place of a pair."""
+
 MAX_LIMIT: Final = 10_000
 """Most results in one reply of `history`, as many as the state keeps at most (config.StateConfig.history)."""
 
@@ -80,6 +83,11 @@ class Keys:
         """Queryable: effective configuration without secrets."""
         return f"{self.root}/config"
 
+    @property
+    def rig(self) -> str:
+        """Queryable, and published on change: all sensors of the vehicle together."""
+        return f"{self.root}/{RIG}"
+
     def extrinsic(self, pair: str) -> str:
         """Queryable, and published on change."""
         return f"{self.root}/{pair}/extrinsic"
@@ -113,7 +121,8 @@ class Keys:
         return f"{self.root}/{pair}/evidence/{event_id}"
 
     def command(self, pair: str, name: str) -> str:
-        """Queryable with payload; `name` may be `*`."""
+        """Queryable with payload; `name` may be `*`. Of `RIG`: for all pairs, or for those of the sensor that the
+        payload names."""
         return f"{self.root}/{pair}/command/{name}"
 
     def alive(self, pair: str) -> str:
@@ -152,7 +161,7 @@ class Keys:
         if not key.startswith(head) or not all(chunks):
             raise UsageError(f"the key is not below {self.root}")
         match chunks:
-            case [("status" | "metrics" | "config") as resource]:
+            case [("status" | "metrics" | "config" | "rig") as resource]:
                 return Address(None, resource)
             case [
                 pair,

@@ -28,6 +28,11 @@ def overlay_topic(pair: str) -> str:
     return f"/coec/{ros_name(pair)}/overlay/compressed"
 
 
+def sensor_status_name(sensor: str) -> str:
+    """Of a sensor among the diagnostics."""
+    return f"{NODE}: {sensor}_mount"
+
+
 def status_name(pair: str) -> str:
     """Of a pair among the diagnostics: `node: name`, as aggregators and Autoware's graph take it apart."""
     return f"{NODE}: {pair}_calibration"

@@ -106,3 +106,17 @@ def test_a_proven_name_is_one_short_harmless_line(name: str) -> None:
     assert line.isascii()
     assert line.isprintable()
     assert len(line) <= MAX_SENDER + len(" (certificate)")
+
+
+def test_a_command_for_the_rig_may_name_a_sensor_and_no_window() -> None:
+    assert parse("hold", b'{"sensor":"roof","release":true}', for_rig=True) == {
+        "sensor": "roof",
+        "release": True,
+    }
+    for name, payload, for_rig in (
+        ("hold", b'{"sensor":"roof"}', False),
+        ("hold", b'{"sensor":5}', True),
+        ("rollback", b'{"to":"x"}', True),
+    ):
+        with pytest.raises(UsageError):
+            parse(name, payload, for_rig=for_rig)

@@ -9,7 +9,8 @@ from typing import Final, Literal
 
 from coec.schemas import replies
 from coec.schemas.replies import ROS_LEVELS, CalibrationResult, HealthReply, MetricReply
-from coec.schemas.ros_names import status_name
+from coec.schemas.rig_state import SensorReply, SensorState
+from coec.schemas.ros_names import sensor_status_name, status_name
 
 Service = Literal["starting", "running", "stopping", "failing"]
 """State of the whole service, as `status` tells it."""
@@ -64,6 +65,32 @@ def of_health(health: HealthReply, service: Service, serial: str | None, more: M
         hardware_id(health.vehicle, health.pair, serial),
         {**_values(health), "service": service, **more},
     )
+
+
+SENSOR_LEVELS: Final[Mapping[SensorState, Level]] = {
+    "calibrated": Level.OK,
+    "undecided": Level.WARN,
+    "camera_moved": Level.ERROR,
+    "lidar_moved": Level.ERROR,
+    "unknown": Level.STALE,
+}
+
+
+def of_sensor(sensor: SensorReply, vehicle: str, service: Service) -> Status:
+    """The status of a sensor of a rig now. Nothing is known any more of one whose service stops."""
+    level = Level.STALE if service == "stopping" else SENSOR_LEVELS[sensor.state]
+    text = ": ".join([sensor.state, *(reason.text for reason in sensor.reasons[:1])])
+    values = {"state": sensor.state, "kind": sensor.kind, "pairs": ", ".join(sensor.pairs), "service": service}
+    values |= {f"reason {reason.code}": reason.text for reason in sensor.reasons}
+    if sensor.probability is not None:
+        values["probability of a move"] = f"{sensor.probability:.4g}"
+    if sensor.since_ns is not None:
+        values["since_ns"] = str(sensor.since_ns)
+    if sensor.moved is not None:
+        told = zip(AXES, sensor.moved.by, sensor.moved.sigma, UNITS, strict=True)
+        values["moved"] = ", ".join(f"{axis} {by:.3g} ± {sigma:.2g} {unit}" for axis, by, sigma, unit in told)
+    name = sensor_status_name(sensor.name)
+    return Status(level, name, text[:MAX_MESSAGE], hardware_id(vehicle, sensor.name, None), values)
 
 
 def of_result(result: CalibrationResult) -> Status:

@@ -15,6 +15,7 @@ from coec.calibration.lifecycle.pair_state import (
     after_commissioning,
     after_estimate,
     after_failure,
+    after_joint,
     after_observation,
     aged,
     agrees,
@@ -30,6 +31,7 @@ from coec.calibration.lifecycle.pair_state import (
     restored,
     rolled_back,
     time_stepped_back,
+    told_by_rig,
     window_wanted_since,
 )
 from coec.calibration.lifecycle.policy import Change
@@ -51,6 +53,7 @@ __all__ = [
     "after_commissioning",
     "after_estimate",
     "after_failure",
+    "after_joint",
     "after_observation",
     "aged",
     "agrees",
@@ -67,5 +70,6 @@ __all__ = [
     "restored",
     "rolled_back",
     "time_stepped_back",
+    "told_by_rig",
     "window_wanted_since",
 ]

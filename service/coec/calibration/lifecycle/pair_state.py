@@ -270,6 +270,21 @@ def kept_for_next(estimate: Estimate) -> KeptPairs | None:
     return KeptPairs(estimate.window_id, moved.first_after_ns, estimate.data_stamp_ns, moved.pairs_after)
 
 
+def told_by_rig(estimate: Estimate, covariance: NDArray[np.float64]) -> Estimate:
+    """An estimate as sure as all pairs of the rig together are: with a covariance (6, 6) of theirs, NaN on axes that
+    it does not tell."""
+    return replace(estimate, uncertainty=replace(estimate.uncertainty, noise=covariance, systematic={}))
+
+
+def after_joint(state: PairState, joint: Estimate, stamp_ns: int, rules: Rules) -> PairState:
+    """A sensor of the pair has moved, and the windows of all of its pairs together say where it is: the track starts
+    again from that. Decided at a sensor time. The policy, and a person who holds the extrinsic, are heard."""
+    pose = joint.optimum.T_camera_lidar
+    track = Track.initial(pose, prior_sigma(rules.tracker), stamp_ns)
+    track = absorb(track, replace(Measurement.of(joint), stamp_ns=stamp_ns), rules.tracker)
+    return _applied_or_waiting(replace(state, track=track), pose, joint, rules.policy)
+
+
 def after_failure(state: PairState, reason: Reason) -> PairState:
     """A window from which no estimate could be made: the served extrinsic stays, and so does its health, of which that
     says nothing."""

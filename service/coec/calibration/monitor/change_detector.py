@@ -198,11 +198,8 @@ class MonitorState:
 def after_observation(state: MonitorState, observation: Observation, levels: AlarmLevels) -> MonitorState:
     """The state after one more check. It counts by the share of its pairs that the last one did not hold; while the
     vehicle stands, only the first says something new of the mount."""
-    counted, standing = set(state.last_stamps_ns), set(observation.standing_stamps_ns)
-    fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
-    stands = observation.pair_stamps_ns[-1] in standing
-    # Of one place there is one independent check, however long the vehicle stands there.
-    told_before = state.stood and standing.issuperset(observation.pair_stamps_ns)
+    fresh, told_before = _fresh(state, observation)
+    stands = observation.pair_stamps_ns[-1] in set(observation.standing_stamps_ns)
     dirt = _dirt_after(state.dirt, observation, fresh)
     codes = {cause.code for cause in observation.causes}
     if sum(run >= DIRTY_CHECKS for run in dirt.values()) > DIRTY_SHARE * max(observation.textured, 1):
@@ -226,6 +223,20 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
 def doubtful_after(doubtful: float, weak: bool, fresh: float) -> float:
     """How many checks to come count as faint, after one more that counts by `fresh`, 0 to 1."""
     return DOUBTFUL_CHECKS if weak else max(doubtful - fresh, 0.0)
+
+
+def share_told(state: MonitorState, observation: Observation) -> float:
+    """How far a check says something that those before it did not, 0 to 1; see `after_observation`."""
+    fresh, told_before = _fresh(state, observation)
+    return 0.0 if told_before else fresh
+
+
+def _fresh(state: MonitorState, observation: Observation) -> tuple[float, bool]:
+    """Share of the pairs that the last check did not hold, and whether they are of a place where the vehicle stood then
+    and stands still: of one place there is one independent check, however long the vehicle stands there."""
+    counted, standing = set(state.last_stamps_ns), set(observation.standing_stamps_ns)
+    fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
+    return fresh, state.stood and standing.issuperset(observation.pair_stamps_ns)
 
 
 def _weighed(state: MonitorState, observation: Observation, fresh: float, levels: AlarmLevels) -> MonitorState:

@@ -1,7 +1,10 @@
 """What several pairs of one vehicle say together of each of its sensors, look after look.
 
 A knocked LiDAR moves the edges to all its cameras alike, a knocked camera its own alone: which sensors moved since the
-rig was last consistent is asked again at every look (`moves`), of steps at some times back (`steps`).
+rig was last consistent is asked again every few seconds (`moves`), of steps at some times back (`steps`).
+
+A sensor is named by two answers in a row, with a look in between, and by two of its pairs where it has as many: what a
+run of bad looks says of one pair, or one pair that was looked at before the others, the next look denies.
 """
 
 from __future__ import annotations
@@ -14,14 +17,17 @@ from math import degrees
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.rig.evidence import Look
-from coec.calibration.rig.moves import Moved, Posterior, who_moved
+from coec.calibration.rig.moves import SEEN, Moved, Posterior, who_moved
 from coec.calibration.rig.steps import History, steps_at
 from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
 from coec.calibration.types import Matrix4, Reason
+from coec.geometry import dense
 
 NAMED_AT = 0.95
-"""Probability from which a sensor is named, and below whose complement it is called calibrated. Between: undecided."""
+"""Probability from which a sensor is named, if it was before, and below whose complement it is called calibrated.
+Between: undecided."""
 
 CALM_AT = 0.5
 """Probability of nobody, from which looks that grow old are taken for such of a right rig."""
@@ -37,6 +43,9 @@ are kept."""
 BIAS_TIMES = 2.0
 """Times the bias that looks of a rig usually have, to which the first of them are trusted: that of the next rig may be
 larger than those of the few which are known, and a bias is no move."""
+
+STEPPED2 = chi2_quantile(0.999, 6)
+"""Squared distance in standard deviations, from which an edge has stepped: one in a thousand does so by chance."""
 
 EVERY_S = 4.0
 """Between two times that it is asked who moved: it takes 0.03 to 0.1 s of a core, and looks come faster than they
@@ -83,11 +92,17 @@ class RigState:
         histories: of every edge, by name.
         posterior: who moved, as of when that was last asked; None before the first look.
         asked_ns: stamp of the look at which it was.
+        stepped_ns: the step in question lies before looks from this stamp on.
+        claimed: sensors as probable as those that are named, by the last answer.
+        named: those that moved.
     """
 
     histories: Mapping[str, History]
     posterior: Posterior | None = None
     asked_ns: int = BEFORE_ALL_NS
+    stepped_ns: int = BEFORE_ALL_NS
+    claimed: frozenset[str] = frozenset()
+    named: frozenset[str] = frozenset()
 
     @property
     def calm(self) -> bool:
@@ -113,6 +128,23 @@ def served(state: RigState, edge: str, T_a_b: Matrix4, sigma: NDArray[np.float64
     return replace(state, histories={**state.histories, edge: History.at(T_a_b, sigma)})
 
 
+def settled(state: RigState) -> RigState:
+    """What was in question is answered for by what is served now: who moved is asked anew with the next look."""
+    return RigState(state.histories)
+
+
+def stepped(state: RigState) -> tuple[str, ...]:
+    """Edges that lie elsewhere than before `stepped_ns`, by more than chance."""
+    found = []
+    for name, history in state.histories.items():
+        if history.looks:
+            step = steps_at(history, [state.stepped_ns])
+            apart = float(dense.squared(dense.inverse(step.covariance[0]), step.xi[0]))
+            if step.looks[0] >= SEEN and apart > STEPPED2:
+                found.append(name)
+    return tuple(found)
+
+
 def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
     """The state after one more look.
 
@@ -128,14 +160,38 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
     histories = {**state.histories, look.edge: history.after(look, state.calm)}
     if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
         return replace(state, histories=histories)
-    return RigState(histories, _posterior(histories, graph), look.stamp_ns)
+    times_ns = _times_ns(histories)
+    posterior = _posterior(histories, times_ns, graph)
+    stepped_ns = times_ns[posterior.when]
+    probable = [name for name, p in posterior.sensors.items() if p >= NAMED_AT]
+    claimed = frozenset(name for name in probable if _seen_by_two(name, graph, histories, stepped_ns))
+    return RigState(
+        histories,
+        posterior,
+        asked_ns=look.stamp_ns,
+        stepped_ns=stepped_ns,
+        claimed=claimed,
+        named=claimed & (state.claimed | state.named),
+    )
 
 
-def _posterior(histories: Mapping[str, History], graph: RigGraph) -> Posterior:
+def _seen_by_two(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:
+    """Whether two pairs of a sensor were looked at since a stamp, or it has one only. What a single one of several says
+    may be its own, such as a clock of one driver; another would deny it."""
+    pairs = [histories[edge.name] for edge in graph.edges if name in (edge.a, edge.b)]
+    looked = sum(bool(history.looks) and history.looks[-1].stamp_ns >= since_ns for history in pairs)
+    return len(pairs) == 1 or looked >= 2
+
+
+def _times_ns(histories: Mapping[str, History]) -> list[int]:
+    """Stamps from which looks may lie after a step, the newest first."""
     last_ns = sorted({history.looks[-1].stamp_ns for history in histories.values() if history.looks}, reverse=True)
     aged_ns = [last_ns[0] - round(age_s * NS_PER_S) for age_s in AGES_S]
     just_after = (stamp_ns + 1 for stamp_ns in last_ns[1:NEWEST])
-    times_ns = sorted({last_ns[0], *just_after, *aged_ns, BEFORE_ALL_NS}, reverse=True)
+    return sorted({last_ns[0], *just_after, *aged_ns, BEFORE_ALL_NS}, reverse=True)
+
+
+def _posterior(histories: Mapping[str, History], times_ns: list[int], graph: RigGraph) -> Posterior:
     # Levers and axes as they were before: what was built may be far from it.
     edges = [Edge(edge.name, edge.a, edge.b, histories[edge.name].pose) for edge in graph.edges]
     current = RigGraph.of(graph.sensors, edges, graph.links)
@@ -151,22 +207,32 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
     edges = [edge.name for edge in graph.edges if sensor.name in (edge.a, edge.b)]
     looked = [name for name in edges if state.histories[name].looks]
     of = state.posterior
+    if of is None and sensor.name in state.named:
+        text = "It had moved when the service was stopped; no pair of it was looked at since."
+        return SensorState(sensor.name, sensor.kind, _moved(sensor), 1.0, None, (Reason("last_known", text),))
     if of is None or not looked:
         text = "No pair of it was looked at yet." if edges else "No pair has it: nothing can tell where it is."
         return SensorState(sensor.name, sensor.kind, SensorHealth.UNKNOWN, 0.0, None, (Reason("not_looked_at", text),))
     probability = of.sensors[sensor.name]
     disturbed = max((of.disturbed[name] for name in edges), default=0.0)
     moved = of.steps.get(sensor.name) if probability > 1.0 - NAMED_AT else None
-    if probability >= NAMED_AT:
-        health = SensorHealth.CAMERA_MOVED if sensor.kind is Kind.CAMERA else SensorHealth.LIDAR_MOVED
+    if sensor.name in state.named:
+        health = _moved(sensor)
         reasons: tuple[Reason, ...] = (_named(sensor, probability, moved, looked, of),)
     elif max(probability, disturbed) > 1.0 - NAMED_AT:
         health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
+        if probability >= NAMED_AT:
+            text = f"It seems to have moved ({100.0 * probability:.1f} %); the next looks at its pairs decide."
+            reasons = (Reason("one_more_look", text), *reasons[1:])
     else:
         health = SensorHealth.CALIBRATED
         text = f"What was looked at fits without a move of it: {', '.join(looked)}."
         reasons = (Reason("fits", text),)
     return SensorState(sensor.name, sensor.kind, health, probability, moved, reasons)
+
+
+def _moved(sensor: Sensor) -> SensorHealth:
+    return SensorHealth.CAMERA_MOVED if sensor.kind is Kind.CAMERA else SensorHealth.LIDAR_MOVED
 
 
 def _named(sensor: Sensor, probability: float, moved: Moved | None, looked: list[str], of: Posterior) -> Reason:

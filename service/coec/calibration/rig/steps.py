@@ -95,6 +95,17 @@ class History:
         """(4, 4) where it was before the looks that are kept."""
         return se3.perturb(self.origin, self.mean)
 
+    def counted(self) -> History:
+        """With all looks that are kept counted together with those before: of a rig at which nothing has happened."""
+        if not self.looks:
+            return self
+        whole = _Stack.of(self.origin, self.looks).mean(
+            np.ones((1, len(self.looks)), np.bool_), self.information, self.moment
+        )
+        return History.at(
+            se3.perturb(self.origin, whole.offset[0]), np.sqrt(np.maximum(whole.covariance[0].diagonal(), 0.0))
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:

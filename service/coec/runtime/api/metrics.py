@@ -10,12 +10,13 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
-from typing import Literal
+from typing import Literal, get_args
 
 from coec.calibration.lifecycle import HealthState
 from coec.runtime.api.extrinsic import AXES, UNITS
 from coec.runtime.timings import Histogram
 from coec.schemas.replies import BudgetStatus, CheckReply, HealthReply, Maybe6, PairStatus, StatusReply, StreamStatus
+from coec.schemas.rig_state import RigReply, SensorState
 
 ENCODING = "application/openmetrics-text"
 
@@ -40,6 +41,7 @@ class View:
         health: of each pair.
         memory_bytes, worker_memory_bytes: resident, of the service and of its worker.
         took: durations, by the name of their family.
+        rig: what all pairs say together.
     """
 
     status: StatusReply
@@ -47,6 +49,7 @@ class View:
     memory_bytes: int = 0
     worker_memory_bytes: int = 0
     took: Mapping[str, Sequence[Took]] = field(default_factory=dict)
+    rig: RigReply | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +157,20 @@ def _states(view: View) -> Iterable[Sample]:
             yield (pair, state.value), float(state == reply.state)
 
 
+def _sensor_states(view: View) -> Iterable[Sample]:
+    for sensor in () if view.rig is None else view.rig.sensors:
+        for state in get_args(SensorState):
+            yield (sensor.name, state), float(state == sensor.state)
+
+
+def _of_rig(value: Callable[[RigReply], Mapping[tuple[str, ...], float | None]]) -> Callable[[View], Iterable[Sample]]:
+    def samples(view: View) -> Iterable[Sample]:
+        told = {} if view.rig is None else value(view.rig)
+        return tuple((labels, figure) for labels, figure in told.items() if figure is not None)
+
+    return samples
+
+
 def _reasons(view: View) -> Iterable[Sample]:
     for pair, reply in view.health.items():
         for code in sorted({reason.code for reason in reply.reasons}):
@@ -254,6 +271,28 @@ FAMILIES: tuple[Family, ...] = (
     Family("coec_uptime_seconds", "gauge", "Time since the start.", (), _one(lambda view: view.status.uptime_s)),
     Family("coec_memory_bytes", "gauge", "Resident memory of the service.", (), _one(lambda view: view.memory_bytes)),
     Family("coec_health", "stateset", "State of each pair.", ("pair", "coec_health"), _states),
+    Family("coec_sensor", "stateset", "State of each sensor.", ("sensor", "coec_sensor"), _sensor_states),
+    Family(
+        "coec_sensor_moved_probability",
+        "gauge",
+        "That a sensor has moved.",
+        ("sensor",),
+        _of_rig(lambda rig: {(sensor.name,): sensor.probability for sensor in rig.sensors}),
+    ),
+    Family(
+        "coec_rig_p_value",
+        "gauge",
+        "Chance that pairs which fit each other miss each other by so much.",
+        (),
+        _of_rig(lambda rig: {(): None if rig.joint is None else rig.joint.p_value}),
+    ),
+    Family(
+        "coec_rig_losses",
+        "counter",
+        "What pairs said and was not put together in its order, by cause.",
+        ("cause",),
+        _of_rig(lambda rig: {(cause,): count for cause, count in rig.losses.items()}),
+    ),
     Family("coec_reason", "gauge", "1 for each reason that health gives, by its code.", ("pair", "code"), _reasons),
     Family("coec_check_age_seconds", "gauge", "Since data were last judged.", _PAIR, _of_health(lambda one: one.age_s)),
     Family("coec_diagnosis", "gauge", "Figures of self-diagnosis.", ("pair", "metric"), _figures("value")),

@@ -81,7 +81,7 @@ class PairAnswers:
         topics, arrivals = self._outside.topics(), self._stream.arrivals()
         changed = self._outside.nominal(self.name).changed
         ailing = (*streams.troubles_of(report.streams, self._pair, topics), *(() if changed is None else (changed,)))
-        troubles = (*own, *ailing, *self._outside.vehicle_troubles())
+        troubles = (*own, *ailing, *self._outside.rig_troubles(self.name), *self._outside.vehicle_troubles())
         missed = streams.missed_of(arrivals, self._pair, topics)
         health = health_of(known, report, self._stream.losses(), troubles, missed, self._pair, rig, self._vehicle)
         self._known, self._health = known, Told(health, time.monotonic())

@@ -15,6 +15,12 @@ from coec.schemas.commands import NAMES
 ARGUMENTS: Final[Mapping[str, Mapping[str, type]]] = {"rollback": {"to": str}, "hold": {"release": bool}}
 """What a payload may hold, by command; the others take none."""
 
+OF_RIG: Final[Mapping[str, type]] = {"sensor": str}
+"""What that of a command for the rig may hold beside it."""
+
+OF_ONE_PAIR: Final = frozenset({"to"})
+"""What it may not: other pairs have other windows."""
+
 MAX_SENDER: Final = 96
 """Characters of a sender in log and history."""
 
@@ -30,8 +36,8 @@ ANONYMOUS: Final = "anonymous"
 _HARMLESS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789 ._:/@+-=,")
 
 
-def parse(name: str, payload: bytes) -> dict[str, Any]:
-    """The arguments of a command: nothing, or a map in msgpack or JSON.
+def parse(name: str, payload: bytes, *, for_rig: bool = False) -> dict[str, Any]:
+    """The arguments of a command for a pair, or for the rig: nothing, or a map in msgpack or JSON.
 
     Raises:
         UsageError: no such command, or its payload is not what it takes.
@@ -39,6 +45,8 @@ def parse(name: str, payload: bytes) -> dict[str, Any]:
     if name not in NAMES:
         raise UsageError(f"no such command; known: {', '.join(NAMES)}")
     known = ARGUMENTS.get(name, {})
+    if for_rig:
+        known = {key: kind for key, kind in {**known, **OF_RIG}.items() if key not in OF_ONE_PAIR}
     document = _document(payload)
     for key, value in document.items():
         if key not in known:

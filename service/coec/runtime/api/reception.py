@@ -14,10 +14,11 @@ from coec.runtime.api import payloads
 from coec.runtime.api.authority import Authority, NotAllowedError
 from coec.runtime.api.awaited import AwaitedCommands
 from coec.runtime.api.commands import Commands
+from coec.runtime.api.rig_commands import RigCommands
 from coec.runtime.api.snapshots import answer_of
 from coec.schemas.base import from_json
 from coec.schemas.commands import ProvenCommand
-from coec.schemas.keys import CommandSelector, parse_command_selector
+from coec.schemas.keys import RIG, CommandSelector, parse_command_selector
 
 SEALED = "application/octet-stream"
 """Bytes of a TLS conversation."""
@@ -38,17 +39,20 @@ class Rules:
 
 
 class Reception:
-    """Of all pairs of a vehicle."""
+    """Of all pairs of a vehicle, and of their rig."""
 
-    def __init__(self, rules: Rules, commands: Mapping[str, Commands | AwaitedCommands]) -> None:
-        """`commands` of a pair may be replaced while queries come."""
-        self._commands = commands
+    def __init__(
+        self, rules: Rules, commands: Mapping[str, Commands | AwaitedCommands], rig: RigCommands | None = None
+    ) -> None:
+        """`commands` of a pair may be replaced while queries come; `rig` are those for all of them."""
+        self._pairs = commands
+        self._rig = rig
         self.use(rules)
 
     def use(self, rules: Rules) -> None:
         """Hold every command to these rules from the next one on. For any thread."""
         proven = [payloads.proven_sender(name) for name in rules.authority.senders]
-        for commands in self._commands.values():
+        for commands in self._pairs.values():
             commands.reserve_for(proven)
         self._rules = rules
 
@@ -73,9 +77,12 @@ class Reception:
         try:
             heard = rules.listener.hear(chosen.conversation, request.payload)
         except NotProvenError as error:
-            self._commands[pair].note_refused(name, payloads.sender_of(request.attachment), error)
+            self._of(pair).note_refused(name, payloads.sender_of(request.attachment), error)
             raise
         return Answer(heard, SEALED) if isinstance(heard, bytes) else self._proven(rules, pair, name, heard, request)
+
+    def _of(self, pair: str) -> Commands | AwaitedCommands | RigCommands:
+        return self._rig if pair == RIG and self._rig is not None else self._pairs[pair]
 
     def _proven(self, rules: Rules, pair: str, name: str, heard: Heard, request: Request) -> Answer:
         call = from_json(ProvenCommand, heard.said)
@@ -98,8 +105,8 @@ class Reception:
         received_s: float,
         chosen: CommandSelector,
     ) -> BaseModel:
-        commands = self._commands[pair]
-        arguments = payloads.parse(name, payload)
+        commands = self._of(pair)
+        arguments = payloads.parse(name, payload, for_rig=pair == RIG)
         try:
             rules.authority.require(proven, name)
         except NotAllowedError as error:

@@ -18,9 +18,11 @@ from coec.runtime.api import metrics as metrics_text
 from coec.runtime.api.awaited import AwaitedAnswers
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception
+from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.snapshots import Snapshot, answer_of
 from coec.runtime.timings import QUICK_S, Histogram
 from coec.schemas.keys import (
+    RIG,
     Format,
     Keys,
     parse_evidence_selector,
@@ -54,6 +56,7 @@ class VehicleAnswers:
         status: Callable[[], Snapshot],
         metrics: Callable[[], bytes],
         config: Callable[[], Snapshot],
+        rig: RigAnswers,
     ) -> None:
         """`status()` and `config()` are serialised before; `metrics()` is rendered when asked."""
         self.took = Histogram(QUICK_S)
@@ -63,6 +66,7 @@ class VehicleAnswers:
         self._vehicle_routes = {
             keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
             keys.config: Route(keys.config, lambda request: config().answer(_format(request)), Lane.AT_ONCE),
+            keys.rig: Route(keys.rig, lambda request: rig.answer(_format(request)), Lane.AT_ONCE),
             keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), Lane.FILES),
         }
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
@@ -78,6 +82,7 @@ class VehicleAnswers:
             bus.serve(key, _always(self._timed(route, key.rpartition("/")[2])))
         for name in self._pairs:
             bus.serve(f"{self._keys.root}/{name}/**", self._finder(name))
+        bus.serve(f"{self._keys.rig}/**", self._find_of_rig)
         bus.serve(f"{self._keys.root}/**", self._find_unknown, complete=False)
 
     def _finder(self, pair: str) -> Callable[[str], Sequence[Route]]:
@@ -124,6 +129,20 @@ class VehicleAnswers:
             return [Route(key, self._evidence(self._pairs[pair], address.argument), Lane.FILES)]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
+    def _find_of_rig(self, key: str) -> Sequence[Route]:
+        """Who answers a key, or a key expression, below that of the rig; which itself has a route of its own.
+
+        Raises:
+            UsageError: nobody.
+        """
+        if key == self._keys.rig or _has_wildcard(key):
+            return []
+        address = self._keys.parse(key)
+        if address.resource != "command":
+            raise UsageError("the rig takes commands; what all pairs say together is `rig` itself")
+        command = Route(key, partial(self._reception.take, RIG, str(address.argument)), Lane.COMMANDS)
+        return [self._timed(command, "command")]
+
     def _find_unknown(self, key: str) -> Sequence[Route]:
         """Nobody, in silence where another queryable answers: a session hands a query to all that match.
 
@@ -131,7 +150,7 @@ class VehicleAnswers:
             UsageError: the key names no pair of this vehicle.
         """
         pair = key.removeprefix(f"{self._keys.root}/").partition("/")[0]
-        if _has_wildcard(key) or key in self._vehicle_routes or pair in self._pairs:
+        if _has_wildcard(key) or key in self._vehicle_routes or pair in (*self._pairs, RIG):
             return []
         raise UsageError(f"no such pair or resource; pairs served here: {', '.join(self._pairs)}")
 

@@ -30,6 +30,23 @@ TROUBLES: Mapping[str, Trouble] = {
         "Messages of a stream have no stamp; the time at which they were sent, not that of the sensor, stands for it.",
         "Have the driver stamp its messages by the clock of the sensors.",
     ),
+    "inconsistent_rig": Trouble(
+        "The pairs of the vehicle do not agree where its sensors are; `coec query rig` tells what does not close.",
+        "Nothing while windows come: one from before a move fits again with the next. If it stays, see to what a pair "
+        "has of its own: intrinsics, clocks, masks; and to `links`.",
+    ),
+    "one_pair": Trouble(
+        "Said of `rig`: the vehicle has one pair, which cannot tell its camera from its LiDAR.",
+        "Nothing: `health` of the pair says whether either moved. A second camera on that LiDAR would tell them apart.",
+    ),
+    "no_rig": Trouble(
+        "Said of `rig`: its pairs are not put together, as the vehicle has more sensors than that is made for.",
+        "Nothing: every pair is calibrated by itself. Leave pairs out that are of no use, to have the others together.",
+    ),
+    "rig_state_damaged": Trouble(
+        "Said of `rig`: what was known of it before the restart cannot be read; it is kept aside and learnt anew.",
+        "See to the disk of `state.directory`. A sensor that was knocked meanwhile is told by its pairs only.",
+    ),
     "insecure": Trouble(
         "The service listens where whoever comes is let in without a certificate.",
         "Listen on loopback or on TLS with client certificates, and take `zenoh.insecure` out.",

@@ -35,6 +35,7 @@ from coec.runtime.ingest.chooser import Served
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import start_ns_of
+from coec.runtime.rig.pair_side import Correction, PairOfRig
 from coec.runtime.worker.jobs import Checked, Commissioned, JobOutcome, Solved, WrittenFile
 from coec.runtime.worker.queue import STOPPING
 from coec.schemas.replies import CalibrationResult, CheckReply
@@ -113,6 +114,7 @@ class Decider:
         queue: DecisionQueue,
         pictures: IncidentPictures,
         stream: StreamSide,
+        rig: PairOfRig,
         mailbox: Mailbox,
         losses: LossCounter,
         calibrate_with: Callable[[CalibrationConfig], None],
@@ -128,6 +130,7 @@ class Decider:
         self._queue = queue
         self._pictures = pictures
         self._stream = stream
+        self._rig = rig
         self._mailbox = mailbox
         self._losses = losses
         self._calibrate_with = calibrate_with
@@ -221,13 +224,13 @@ class Decider:
 
     def checked(self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> None:
         """A check has ended; it was of the extrinsic of `epoch`, and some of its pairs were taken standing."""
-        self._queue.answer(question, partial(self._take_check, epoch, standing_ns, outcome))
+        self._queue.answer(question, partial(self._take_check, question, epoch, standing_ns, outcome))
 
     def solved(self, window_id: str, outcome: JobOutcome, *, live: bool) -> None:
         """The solve of a window has ended."""
         question = self._queue.about(window_id) if live else None
         take: Take = (
-            partial(self._take_result, outcome.answer, live)
+            partial(self._take_result, question, outcome.answer, live)
             if isinstance(outcome.answer, Solved)
             else partial(self._take_failure, outcome.reason or _NO_ANSWER, live)
         )
@@ -242,6 +245,10 @@ class Decider:
         question = self._queue.about(window_id)
         if question is not None:
             self._queue.answer(question, partial(self._take_failure, _NOT_RECORDED, True))
+
+    def corrected(self, question: Question, correction: Correction) -> None:
+        """The rig has a correction for the pair."""
+        self._queue.answer(question, partial(self._take_correction, question, correction))
 
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
@@ -258,6 +265,7 @@ class Decider:
         """A person has replaced the extrinsic: nothing that was seen is of it."""
         self._latest_check = None
         served = self._store.served
+        self._rig.serves(None, self._store.state)
 
         def start_over() -> None:
             self._stream.adopt(served)
@@ -285,23 +293,28 @@ class Decider:
 
     # --- taking them, in order --------------------------------------------------------------------------------------
 
-    def _take_check(self, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome) -> Effect | None:
+    def _take_check(
+        self, question: Question, epoch: int, standing_ns: tuple[int, ...], outcome: JobOutcome
+    ) -> Effect | None:
         answer = outcome.answer
         if not isinstance(answer, Checked):
             self._check_in_vain(outcome.reason or _NO_ANSWER)
             return None
         refused = answer.baseline_not_used is not None and self._baseline.refuse(answer.baseline_not_used)
         observation = replace(answer.observation, standing_stamps_ns=standing_ns)
+        before = self._store.state
         effect = self._step(
             lambda state: lifecycle.after_observation(state, observation, self._rules),
             observation.stamp_ns,
             completed=True,
+            question=question,
             epoch=epoch,
             by_check=True,
         )
         if effect is None:
             self._losses.add("monitor", "check_overtaken")
         else:
+            self._rig.looked(question.due_ns, before, observation)
             self._check_attempts.succeeded()
             self._checks += 1
             self._latest_check = check_of(observation, self._store.state)
@@ -313,7 +326,7 @@ class Decider:
         self._progress.failed(reason)
         self._check_attempts.failed(reason)
 
-    def _take_result(self, answer: Solved, live: bool) -> Effect | None:
+    def _take_result(self, question: Question | None, answer: Solved, live: bool) -> Effect | None:
         result = answer.result
         fields = {"window": result.window_id, "decision": result.verdict.decision}
         _log.info("a window was solved", extra={"fields": fields})
@@ -331,7 +344,7 @@ class Decider:
         # A window of an earlier run is old news when a newer one has been evaluated.
         effect = None
         if live or latest is None or latest.data_stamp_ns <= result.data_stamp_ns:
-            effect = self._judge(result)
+            effect = self._judge(question, result)
         else:
             self._store.save()
         return effect if fits else self._calibrating_anew(effect)
@@ -346,19 +359,23 @@ class Decider:
         )
         self._store.note_window(result.window_id, version)
 
-    def _judge(self, result: CalibrationResult) -> Effect | None:
+    def _judge(self, question: Question | None, result: CalibrationResult) -> Effect | None:
         estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)
         told = estimate.verdict.decision is not Decision.FAILED
+        if told:
+            self._rig.accepted(_due_ns(question), estimate)
         self._step(
             lambda state: lifecycle.before_estimate(state, estimate, start_ns, self._rules),
             result.data_stamp_ns,
             completed=False,
+            question=question,
         )
         self._add_window_after(result.window_id)
         effect = self._step(
             lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules),
             result.data_stamp_ns,
             completed=told,
+            question=question,
         )
         kept = lifecycle.kept_for_next(estimate)
         return effect if kept is None or effect is None else partial(self._keep_and_go_on, kept, effect)
@@ -373,6 +390,23 @@ class Decider:
                 effect()
 
         return both
+
+    def _take_correction(self, question: Question, correction: Correction) -> Effect | None:
+        """Serve what all pairs of a sensor that moved are told at once, as far as the policy goes."""
+        state = self._store.state
+        latest = state.latest
+        estimate = latest if latest is not None and latest.verdict.decision is Decision.ACCEPTED else state.accepted
+        if estimate is None:
+            self._losses.add("monitor", "correction_of_nothing")
+            return None
+        joint = lifecycle.told_by_rig(self._baseline.moved(estimate, correction.told.T_a_b), correction.told.covariance)
+        self._store.note_command("rig", "corrected", correction.text, "service", accepted=True)
+        return self._step(
+            lambda state: lifecycle.after_joint(state, joint, correction.stamp_ns, self._rules),
+            correction.stamp_ns,
+            completed=False,
+            question=question,
+        )
 
     def _take_failure(self, reason: Reason, live: bool) -> Effect | None:
         if reason.code == STOPPING.code:
@@ -398,11 +432,12 @@ class Decider:
         stamp_ns: int | None,
         *,
         completed: bool,
+        question: Question | None = None,
         epoch: int | None = None,
         by_check: bool = False,
     ) -> Effect | None:
-        """Take the step, draw what a red event needs. What it changes for the pairs to come; None when the step was
-        meant for another extrinsic."""
+        """Take the step, the answer to a question, draw what a red event needs. What it changes for the pairs to come;
+        None when the step was meant for another extrinsic."""
         taken = self._store.update(step, stamp_ns, completed=completed, epoch=epoch)
         if taken is None:
             return None
@@ -411,6 +446,7 @@ class Decider:
         before, after = taken.before, taken.after
         if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
             self._latest_check = None
+            self._rig.serves(_due_ns(question), after)
         red, event = HealthState.MISCALIBRATED, self._store.incidents.newest
         if after.health is red and before.health is not red and event is not None:
             self._pictures.draw_both(event)
@@ -457,6 +493,12 @@ class Decider:
         said = {reason.code for reason in self._store.state.reasons}
         held = Reason(HELD, "The extrinsic is held by command.") if self._store.state.frozen else None
         return tuple(reason for reason in (*own, held) if reason is not None and reason.code not in said)
+
+
+def _due_ns(question: Question | None) -> int | None:
+    """Sensor time from which the answer to a question counts; None: whatever was not asked by a stream counts from
+    now on."""
+    return None if question is None else question.due_ns
 
 
 HELD = "held"

@@ -18,6 +18,7 @@ from coec.runtime.decisions.queue import DecisionQueue, Question
 from coec.runtime.ingest.chooser import Served
 from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.rig.pair_side import Correction, PairOfRig
 from coec.runtime.worker import jobs
 from coec.runtime.worker.jobs import JobOutcome
 from coec.runtime.worker.supervisor import Worker
@@ -45,6 +46,9 @@ class Decides(Protocol):
     def lost(self, window_id: str) -> None:
         """A window ended and came to nothing."""
 
+    def corrected(self, question: Question, correction: Correction) -> None:
+        """The rig has a correction for the pair."""
+
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
 
@@ -60,12 +64,14 @@ class Questions:
         budget: Budget,
         mailbox: Mailbox,
         windows: WindowStore,
+        rig: PairOfRig,
         show: Callable[[PairConfig, FramePair, Matrix4], None],
     ) -> None:
         """`show(pair, drawn, pose)` is told of a pair of every check, and of the extrinsic (4, 4) that is checked."""
         self._pair = pair
         self._show = show
         self._windows = windows
+        self._rig = rig
         self._queue = queue
         self._worker = worker
         self._budget = budget
@@ -123,8 +129,15 @@ class Questions:
         return self._queue.unanswered
 
     def waits(self, stamp_ns: int) -> bool:
-        """Whether an answer is due before a pair of this stamp, and has not come."""
-        return self._queue.waits(stamp_ns)
+        """Whether an answer is due before a pair of this stamp, and has not come; of the worker, or of the rig."""
+        waits = self._queue.waits(stamp_ns)
+        if self._rig.must_wait(stamp_ns, for_own=waits) or waits:
+            return True
+        corrections = self._rig.corrections(stamp_ns)
+        for correction in corrections:
+            question = self._queue.ask(correction.from_ns, time.monotonic() + GRACE_S)
+            self._mailbox.post(partial(self._decides.corrected, question, correction))
+        return bool(corrections) and self._queue.waits(stamp_ns)
 
     def settle(self, stamp_ns: int) -> None:
         """Let the answers take effect that are due before a pair of this stamp."""
@@ -136,6 +149,7 @@ class Questions:
 
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
+        self._rig.time_stepped_back(stamp_ns)
         self._mailbox.post(partial(self._decides.time_stepped_back, stamp_ns))
 
     # --- for the recorder, and for whoever wants a window solved again -----------------------------------------------

@@ -77,6 +77,10 @@ class RigBaseline:
             return estimate
         return lifecycle.moved(estimate, self._baseline.unbiased(estimate.optimum.T_camera_lidar), self._rig)
 
+    def moved(self, estimate: Estimate, pose: Matrix4) -> Estimate:
+        """An estimate that says another pose (4, 4), of which the estimator's bias has been taken out."""
+        return lifecycle.moved(estimate, pose, self._rig)
+
     def drift(self, T_camera_lidar: Matrix4, sigma: NDArray[np.float64] | None) -> Drift | None:
         """From the commissioned calibration to a pose (4, 4) that has had its bias taken out, of which `sigma` (6,) is
         known; None before commissioning."""

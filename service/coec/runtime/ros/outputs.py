@@ -141,6 +141,12 @@ class RosOutputs:
                 diagnostics.of_health(pair.health, view.service, pair.serial, words[pair.health.pair])
                 for pair in view.pairs
             ]
+            sensors = () if view.rig is None else view.rig.sensors
+            statuses += [
+                diagnostics.of_sensor(sensor, view.rig.vehicle, view.service)
+                for sensor in sensors
+                if view.rig is not None
+            ]
             self._diagnostics.put(outgoing.encode_diagnostics(now_ns, statuses), now_ns)
 
     def _tell_frames(self, topic: RosPublisher, view: View, now_ns: int, words: Mapping[str, dict[str, str]]) -> None:

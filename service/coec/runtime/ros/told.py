@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from coec.adapters.ros.diagnostics import Service
 from coec.calibration.types import Rig
 from coec.schemas.replies import ExtrinsicReply, HealthReply
+from coec.schemas.rig_state import RigReply
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,7 +22,8 @@ class PairTold:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The service and its pairs at one moment."""
+    """The service, its pairs and their rig at one moment; `rig` is None where there is only one pair."""
 
     service: Service
     pairs: tuple[PairTold, ...]
+    rig: RigReply | None = None

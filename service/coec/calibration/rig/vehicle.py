@@ -1,0 +1,318 @@
+"""The rig of one vehicle, step by step: checks, accepted windows and what its pairs serve, put together.
+
+A move of a sensor is one event. It begins when the sensor is named (`attribution`). It is put right when every pair of
+it that is alive has an accepted window of after the move: the joint estimate (`joint`) then tells all of these pairs at
+once. It is over when they all serve what they were told or found since: their looks are counted from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.rig import attribution
+from coec.calibration.rig.attribution import NS_PER_S, RigState, SensorHealth, SensorState
+from coec.calibration.rig.evidence import Look
+from coec.calibration.rig.joint import JointEstimate, estimate
+from coec.calibration.rig.types import RigGraph
+from coec.calibration.tracker import Measurement
+from coec.calibration.types import Matrix4
+from coec.geometry import se3
+
+ALIVE_NS = 60 * NS_PER_S
+"""A pair without a look for so long is not waited for: 12 periods of the monitor."""
+
+OVER_NS = 900 * NS_PER_S
+"""After which an event is over whose sensors are not thought to have moved any more, whatever its pairs serve: five
+slices."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windowed:
+    """An accepted window of a pair: what it says, and the stamp of its first pair of frames."""
+
+    measurement: Measurement
+    start_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Served:
+    """What a pair serves (4, 4), known to `sigma` (6,), by frames since `start_ns`; None: not by frames, but as the
+    vehicle was built or a person wants it."""
+
+    T_a_b: Matrix4
+    sigma: NDArray[np.float64]
+    start_ns: int | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """What the joint estimate says of a pair: (4, 4), and the covariance (6, 6) of its perturbation. Axes that the
+    window of the pair does not tell are as in that window, and NaN in the covariance."""
+
+    T_a_b: Matrix4
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """One for all pairs of the sensors that moved, decided at a stamp."""
+
+    stamp_ns: int
+    sensors: tuple[str, ...]
+    pairs: Mapping[str, Told]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Sensors that were named, since a stamp; their move lies before another. `corrected`: their pairs were told."""
+
+    sensors: tuple[str, ...]
+    since_ns: int
+    stepped_ns: int
+    corrected: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VehicleRig:
+    """All that is known.
+
+    Attributes:
+        believed: who moved.
+        windows: the newest of each edge, as far as it is of the rig as it is now.
+        serves: what each pair serves.
+        event: the one that is going on; None while all is calm.
+        joint: the rig by these windows; None before the first, and while two windows of an edge are awaited.
+        sensors: what is believed of each, by name.
+        since_ns: since when each is in its state, by name.
+        correction: the latest.
+        looks: that were counted, by edge.
+    """
+
+    graph: RigGraph
+    believed: RigState
+    serves: Mapping[str, Served]
+    windows: Mapping[str, Windowed] = field(default_factory=dict)
+    event: Event | None = None
+    joint: JointEstimate | None = None
+    sensors: tuple[SensorState, ...] = ()
+    since_ns: Mapping[str, int] = field(default_factory=dict)
+    correction: Correction | None = None
+    looks: Mapping[str, int] = field(default_factory=dict)
+
+
+def begun(graph: RigGraph, serves: Mapping[str, Served], windows: Mapping[str, Windowed]) -> VehicleRig:
+    """Nothing was looked at; every edge is where its pair serves it, as well as that is known. `windows` are those that
+    this rests on."""
+    believed = attribution.begun(graph)
+    for name in graph.edge:
+        believed = attribution.served(believed, name, serves[name].T_a_b, serves[name].sigma)
+    told = attribution.sensors(believed, graph)
+    return _combined(VehicleRig(graph, believed, dict(serves), dict(windows), sensors=told))
+
+
+def going_on(rig: VehicleRig, event: Event) -> VehicleRig:
+    """With an event of before a restart: windows of its edges from before the move are of no use."""
+    told = attribution.sensors(rig.believed, rig.graph)
+    since_ns = {sensor.name: event.since_ns for sensor in told if sensor.name in rig.believed.named}
+    return _without_stale(replace(rig, event=event, sensors=told, since_ns=since_ns))
+
+
+def grown(rig: VehicleRig, fresh: VehicleRig) -> VehicleRig:
+    """With the pairs of another rig, of which nothing was looked at yet, beside its own."""
+    histories = {**fresh.believed.histories, **rig.believed.histories}
+    believed = replace(rig.believed, histories=histories, posterior=None)
+    rig = replace(
+        rig,
+        graph=fresh.graph,
+        believed=believed,
+        serves={**fresh.serves, **rig.serves},
+        windows={**fresh.windows, **rig.windows},
+        sensors=attribution.sensors(believed, fresh.graph),
+    )
+    return _combined(rig)
+
+
+def after_look(rig: VehicleRig, look: Look) -> VehicleRig:
+    """A check, or whatever else looked, says where an edge is.
+
+    Raises:
+        ValueError: it is of no edge of the rig.
+    """
+    believed = attribution.after_look(rig.believed, rig.graph, look)
+    asked = believed.asked_ns != rig.believed.asked_ns
+    looks = {**rig.looks, look.edge: rig.looks.get(look.edge, 0) + 1}
+    rig = replace(rig, believed=believed, looks=looks)
+    if not asked:
+        return rig
+    return _followed(_noted(rig, look.stamp_ns), look.stamp_ns)
+
+
+def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) -> VehicleRig:
+    """A window of an edge was accepted; `stamp_ns` is when that was known. One that began before a move of its sensors
+    tells of neither mount.
+
+    Raises:
+        ValueError: it is of no edge of the rig, or its pose or covariance are none.
+    """
+    event = rig.event
+    if event is not None and window.start_ns < event.stepped_ns and edge in pairs_of(rig.graph, event.sensors):
+        return rig
+    return _followed(_combined(replace(rig, windows={**rig.windows, edge: window})), stamp_ns)
+
+
+def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> VehicleRig:
+    """A pair serves something else. The first that rests on frames tells where the edge is; later ones, while all is
+    calm, are corrections of what looks tell as well."""
+    before = rig.serves[edge]
+    rig = replace(rig, serves={**rig.serves, edge: serves})
+    if rig.event is None and before.start_ns is None and serves.start_ns is not None and rig.believed.calm:
+        rig = replace(rig, believed=attribution.served(rig.believed, edge, serves.T_a_b, serves.sigma))
+    return _followed(rig, stamp_ns)
+
+
+def forgotten(rig: VehicleRig) -> VehicleRig:
+    """Sensor time stepped back: looks of the old time are none of the new. What went before them stays."""
+    histories = {name: replace(history, looks=()) for name, history in rig.believed.histories.items()}
+    believed = RigState(histories)
+    rig = replace(rig, believed=believed, windows={}, joint=None, event=None, since_ns={})
+    return replace(rig, sensors=attribution.sensors(believed, rig.graph))
+
+
+def pairs_of(graph: RigGraph, sensors: tuple[str, ...]) -> tuple[str, ...]:
+    """Edges that end at any of these sensors, and not with both ends."""
+    return tuple(edge.name for edge in graph.edges if (edge.a in sensors) != (edge.b in sensors))
+
+
+def inconsistent(rig: VehicleRig) -> tuple[str, ...]:
+    """Edges that do not fit the others: the one that alone does not, else all on loops that do not close."""
+    joint = rig.joint
+    if joint is None or joint.consistent:
+        return ()
+    if joint.left_out is not None:
+        return (joint.left_out,)
+    named = {name for loop in joint.open_loops for name in loop.names} or set(joint.measured)
+    return tuple(name for name in rig.graph.edge if name in named)
+
+
+def _noted(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
+    """What is believed of the sensors now, and since when."""
+    told = attribution.sensors(rig.believed, rig.graph)
+    before = {sensor.name: sensor.health for sensor in rig.sensors}
+    since_ns = {
+        sensor.name: rig.since_ns[sensor.name]
+        if sensor.name in rig.since_ns and before.get(sensor.name) is sensor.health
+        else stamp_ns
+        for sensor in told
+        if sensor.health is not SensorHealth.UNKNOWN
+    }
+    return replace(rig, sensors=told, since_ns=since_ns)
+
+
+def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
+    """The event that is going on, if one is: does it begin, may it be put right, is it over?"""
+    rig = _begun_or_grown(rig, stamp_ns)
+    event = rig.event
+    if event is None:
+        return _settled_unnamed(rig, stamp_ns)
+    pairs = pairs_of(rig.graph, event.sensors)
+    alive = [name for name in pairs if _last_ns(rig, name) > stamp_ns - ALIVE_NS]
+    fresh = [name for name in pairs if name in rig.windows]
+    if not event.corrected:
+        if fresh and set(alive) <= set(fresh):
+            return _followed(_corrected(rig, event, fresh, stamp_ns), stamp_ns)
+    elif alive and all(_renewed(rig, name, event.stepped_ns) for name in alive):
+        return _over(rig, pairs, stamp_ns)
+    if stamp_ns - event.since_ns > OVER_NS and not rig.believed.named:
+        return _over(rig, pairs, stamp_ns)
+    return rig
+
+
+def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
+    """Something moved, and nothing tells what: that is over when every pair that stepped serves what it found since."""
+    if rig.believed.calm:
+        return rig
+    pairs = attribution.stepped(rig.believed)
+    if not pairs or not all(_renewed(rig, name, rig.believed.stepped_ns) for name in pairs):
+        return rig
+    return _over(rig, pairs, stamp_ns)
+
+
+def _renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
+    """Whether a pair serves what frames since then told."""
+    start_ns = rig.serves[edge].start_ns
+    return start_ns is not None and start_ns >= since_ns
+
+
+def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -> VehicleRig:
+    """All pairs of an event have a window of after it. What one pair tells by itself needs nobody to tell it, and where
+    the pairs do not fit each other nobody is told."""
+    rig = replace(rig, event=replace(event, corrected=True))
+    joint = rig.joint
+    if joint is None or not (joint.consistent or joint.left_out is not None):
+        return rig
+    told = {name: _told(joint, name, rig.windows[name].measurement) for name in fresh if name in joint.measured}
+    if len(told) < 2:
+        return rig
+    return replace(rig, correction=Correction(stamp_ns, event.sensors, told))
+
+
+def _begun_or_grown(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
+    """A sensor that was not named before is: windows of its edges from before the move are of no use any more."""
+    named, event = rig.believed.named, rig.event
+    if not named or (event is not None and named <= set(event.sensors)):
+        return rig
+    sensors = tuple(sorted(named if event is None else named | set(event.sensors)))
+    pairs = pairs_of(rig.graph, sensors)
+    after = [
+        look.stamp_ns
+        for name in pairs
+        for look in rig.believed.histories[name].looks
+        if look.stamp_ns >= rig.believed.stepped_ns
+    ]
+    stepped_ns = min(after, default=stamp_ns) if event is None else event.stepped_ns
+    since_ns = stamp_ns if event is None else event.since_ns
+    return _without_stale(replace(rig, event=Event(sensors, since_ns, stepped_ns)))
+
+
+def _told(joint: JointEstimate, edge: str, own: Measurement) -> Told:
+    axes = np.isin(np.arange(6), own.told_axes())
+    apart = np.where(axes, se3.difference(joint.T_a_b[edge], own.T_camera_lidar), 0.0)
+    covariance = np.where(axes[:, None] & axes, joint.between(edge, edge), np.nan)
+    return Told(se3.perturb(own.T_camera_lidar, apart), covariance)
+
+
+def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:
+    """What the pairs of an event were told, or serve, is where their edges are from now on."""
+    believed, event, last = rig.believed, rig.event, rig.correction
+    told = last.pairs if last is not None and event is not None and last.stamp_ns >= event.since_ns else {}
+    for name in pairs:
+        T_a_b, sigma = rig.serves[name].T_a_b, rig.serves[name].sigma
+        if name in told:
+            T_a_b, sigma = told[name].T_a_b, np.sqrt(told[name].covariance.diagonal())
+        believed = attribution.served(believed, name, T_a_b, sigma)
+    return _noted(replace(rig, believed=attribution.settled(believed), event=None), stamp_ns)
+
+
+def _without_stale(rig: VehicleRig) -> VehicleRig:
+    """Without the windows of an event's edges that began before the move."""
+    event = rig.event
+    if event is None:
+        return rig
+    pairs = pairs_of(rig.graph, event.sensors)
+    kept = {name: one for name, one in rig.windows.items() if name not in pairs or one.start_ns >= event.stepped_ns}
+    return _combined(replace(rig, windows=kept))
+
+
+def _combined(rig: VehicleRig) -> VehicleRig:
+    """The joint estimate by the windows as they are now."""
+    told = {name: window.measurement for name, window in rig.windows.items() if window.measurement.told_axes()}
+    return replace(rig, joint=estimate(rig.graph, told) if told else None)
+
+
+def _last_ns(rig: VehicleRig, edge: str) -> int:
+    looks = rig.believed.histories[edge].looks
+    return looks[-1].stamp_ns if looks else attribution.BEFORE_ALL_NS

@@ -1,0 +1,207 @@
+"""What is answered about the rig: from a snapshot that its thread made. Any thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import degrees, isfinite, sqrt
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.adapters.files.conversions import transform_of
+from coec.adapters.zenoh.bus import Answer
+from coec.calibration.rig.attribution import SensorHealth, SensorState
+from coec.calibration.rig.joint import JointEstimate
+from coec.calibration.rig.types import Kind, RigGraph
+from coec.calibration.rig.vehicle import VehicleRig, inconsistent, pairs_of
+from coec.calibration.types import Reason
+from coec.geometry import se3
+from coec.runtime.api.health import reasons_of
+from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.rig.keeper import ONE_PAIR, RigKnown
+from coec.schemas import rig_state
+from coec.schemas.keys import Format, Keys
+from coec.schemas.replies import Maybe6x6, Vector6
+
+INCONSISTENT = "inconsistent_rig"
+"""Code of the reason that a pair does not fit the others of its vehicle."""
+
+
+class RigAnswers:
+    """Of one vehicle. `hear` is for the rig's thread, everything else for any."""
+
+    def __init__(self, keys: Keys, publish: Callable[[str, Answer], None]) -> None:
+        self._keys = keys
+        self._publish = publish
+        self._essence: object = None
+        self._troubles: dict[str, tuple[Reason, ...]] = {}
+        self.hear(RigKnown())
+
+    def hear(self, known: RigKnown) -> None:
+        """Serialise what is served anew, and publish it if it says something else of a sensor, or of all together."""
+        self.reply = reply_of(self._keys.vehicle, known)
+        self._snapshot = Snapshot.of(self.reply)
+        self._troubles = {} if known.rig is None else troubles_of(known.rig)
+        joint = self.reply.joint
+        essence = (
+            tuple((sensor.name, sensor.state, tuple(r.code for r in sensor.reasons)) for sensor in self.reply.sensors),
+            None if joint is None else (joint.stamp_ns, joint.consistent),
+            self.reply.correction,
+            self.reply.reasons,
+        )
+        if essence != self._essence:
+            first, self._essence = self._essence is None, essence
+            if not first:
+                self._publish(self._keys.rig, self._snapshot.answer("msgpack"))
+
+    def answer(self, form: Format) -> Answer:
+        """The reply, serialised before."""
+        return self._snapshot.answer(form)
+
+    def troubles(self, pair: str) -> tuple[Reason, ...]:
+        """Why a pair cannot be called healthy, though it may be so by itself."""
+        return self._troubles.get(pair, ())
+
+
+def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
+    """The wire form of what is known."""
+    rig = known.rig
+    if rig is None:
+        return rig_state.RigReply(
+            vehicle=vehicle,
+            stamp_ns=None,
+            sensors=() if known.graph is None else _untold(known.graph, known.why),
+            nobody=None,
+            disturbed={},
+            joint=None,
+            correction=None,
+            reasons=reasons_of(known.why),
+            looks={},
+            losses=dict(known.losses),
+        )
+    posterior, last = rig.believed.posterior, rig.correction
+    return rig_state.RigReply(
+        vehicle=vehicle,
+        stamp_ns=known.stamp_ns,
+        sensors=tuple(_sensor(rig, sensor) for sensor in rig.sensors),
+        nobody=None if posterior is None else _share(posterior.nobody),
+        disturbed={} if posterior is None else {name: _share(p) for name, p in posterior.disturbed.items()},
+        joint=None if rig.joint is None else _joint(rig, rig.joint),
+        correction=None
+        if last is None or known.from_ns is None
+        else rig_state.RigCorrection(
+            stamp_ns=last.stamp_ns, from_ns=known.from_ns, sensors=last.sensors, pairs=tuple(last.pairs)
+        ),
+        reasons=reasons_of(known.why),
+        looks=dict(rig.looks),
+        losses=dict(known.losses),
+    )
+
+
+def troubles_of(rig: VehicleRig) -> dict[str, tuple[Reason, ...]]:
+    """What does not fit, by pair."""
+    joint, pairs = rig.joint, inconsistent(rig)
+    if joint is None or not pairs:
+        return {}
+    if joint.left_out is not None:
+        why = f"its latest window does not fit those of the others, which fit each other without it ({_odds(joint)})"
+    elif joint.open_loops:
+        loop = joint.open_loops[0]
+        shift = "" if not isfinite(loop.translation_m) else f" and {100.0 * loop.translation_m:.1f} cm"
+        off = f"{degrees(loop.rotation_rad):.2f}°{shift}" if isfinite(loop.rotation_rad) else "more than chance"
+        why = (
+            f"the latest windows of {', '.join(loop.names)} should close a loop, and miss it by {off} ({_odds(joint)})"
+        )
+    else:
+        why = f"the latest windows of the pairs do not fit each other ({_odds(joint)})"
+    reason = Reason(INCONSISTENT, f"The pairs of the vehicle do not agree where its sensors are: {why}.")
+    return dict.fromkeys(pairs, (reason,))
+
+
+def _odds(joint: JointEstimate) -> str:
+    return f"χ² {joint.chi2:.1f} at {joint.freedom} degrees of freedom, p {joint.chance:.1g}"
+
+
+def _untold(graph: RigGraph, why: tuple[Reason, ...]) -> tuple[rig_state.SensorReply, ...]:
+    """Sensors of which nothing can be told."""
+    undecided = ONE_PAIR in why
+    return tuple(
+        rig_state.SensorReply(
+            name=sensor.name,
+            kind="camera" if sensor.kind is Kind.CAMERA else "lidar",
+            state="undecided" if undecided else "unknown",
+            probability=None,
+            since_ns=None,
+            moved=None,
+            pairs=pairs_of(graph, (sensor.name,)),
+            reasons=reasons_of(why),
+        )
+        for sensor in graph.sensors
+    )
+
+
+def _sensor(rig: VehicleRig, sensor: SensorState) -> rig_state.SensorReply:
+    unknown = sensor.health is SensorHealth.UNKNOWN
+    moved = sensor.moved
+    return rig_state.SensorReply(
+        name=sensor.name,
+        kind="camera" if sensor.kind is Kind.CAMERA else "lidar",
+        state=sensor.health.value,
+        probability=None if unknown else _share(sensor.probability),
+        since_ns=rig.since_ns.get(sensor.name),
+        moved=None
+        if moved is None
+        else rig_state.SensorMove(by=_degrees(moved.x), sigma=_degrees(np.sqrt(moved.covariance.diagonal()))),
+        pairs=pairs_of(rig.graph, (sensor.name,)),
+        reasons=reasons_of(sensor.reasons),
+    )
+
+
+def _joint(rig: VehicleRig, joint: JointEstimate) -> rig_state.JointReply:
+    pairs = []
+    for edge in rig.graph.edges:
+        pose, covariance = joint.T_a_b[edge.name], joint.between(edge.name, edge.name)
+        pairs.append(
+            rig_state.JointPair(
+                pair=edge.name,
+                camera=edge.a,
+                lidar=edge.b,
+                measured=edge.name in joint.measured,
+                camera_from_lidar=transform_of(pose),
+                sigma=_degrees(np.array([sqrt(max(value, 0.0)) for value in covariance.diagonal().tolist()])),
+                covariance=cast("Maybe6x6", tuple(tuple(row) for row in covariance.tolist())),
+                step=_degrees(se3.difference(pose, rig.serves[edge.name].T_a_b)),
+            )
+        )
+    loops = tuple(
+        rig_state.OpenLoop(
+            names=loop.names,
+            rotation_deg=degrees(loop.rotation_rad),
+            translation_m=loop.translation_m if isfinite(loop.translation_m) else None,
+            p_value=_share(loop.chance),
+        )
+        for loop in joint.open_loops
+        if isfinite(loop.rotation_rad)
+    )
+    return rig_state.JointReply(
+        stamp_ns=joint.stamp_ns,
+        pairs=tuple(pairs),
+        chi2=max(joint.chi2, 0.0),
+        freedom=joint.freedom,
+        p_value=_share(joint.chance),
+        consistent=joint.consistent,
+        left_out=joint.left_out,
+        open_loops=loops,
+        widened=max(joint.widened, 1.0),
+    )
+
+
+def _degrees(values: NDArray[np.float64]) -> Vector6:
+    numbers = values.tolist()
+    return cast("Vector6", (*(degrees(value) for value in numbers[:3]), *numbers[3:]))
+
+
+def _share(probability: float) -> float:
+    """A probability, whatever rounding did to it."""
+    return min(max(probability, 0.0), 1.0)

@@ -1,0 +1,78 @@
+"""Commands for a sensor, or for the whole rig: each is given to all of its pairs. Any thread.
+
+A sensor is served by its pairs, and what is held, put back or accepted is what they serve: a command for it is one for
+each of them, carried out by the thread that decides about the pair, one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from coec.errors import CoecError, NotFoundError
+from coec.runtime.api.awaited import AwaitedCommands
+from coec.runtime.api.commands import EXPIRED, Commands
+from coec.schemas.keys import RIG
+from coec.schemas.replies import Acknowledgement
+from coec.schemas.rig_state import RigReply
+
+Given = Commands | AwaitedCommands
+
+
+class RigCommands:
+    """Of one vehicle. `pairs` may gain pairs while commands come."""
+
+    def __init__(self, vehicle: str, pairs: Mapping[str, Given], rig: Callable[[], RigReply]) -> None:
+        """`rig()` says which pairs a sensor has."""
+        self._vehicle = vehicle
+        self._pairs = pairs
+        self._rig = rig
+
+    def reserve_for(self, proven: Iterable[str]) -> None:
+        """Every pair does so for itself."""
+
+    def carry_out(
+        self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = math.inf
+    ) -> Acknowledgement:
+        """Give a command to every pair of `arguments["sensor"]`, or of the vehicle where that is not named.
+
+        Raises:
+            NotFoundError: there is no such sensor.
+        """
+        told = dict(arguments)
+        chosen = self._chosen(told.pop("sensor", None))
+        done = []
+        for pair in chosen:
+            if time.monotonic() > deadline_s:
+                done.append(Acknowledgement(
+                    vehicle=self._vehicle, pair=pair, command=name, accepted=False, code="expired", text=EXPIRED
+                ))  # fmt: skip
+            else:
+                done.append(self._pairs[pair].carry_out(name, dict(told), sender, deadline_s))
+        refused = [one for one in done if not one.accepted]
+        code = refused[0].code if refused else done[0].code
+        durable = [one.durable for one in done if one.durable is not None]
+        return Acknowledgement(
+            vehicle=self._vehicle,
+            pair=RIG,
+            command=name,
+            accepted=not refused,
+            code=code if len(refused) in (0, len(done)) else "in_part",
+            text=" ".join(f"{one.pair}: {one.text}" for one in done),
+            durable=all(durable) if durable else None,
+        )
+
+    def note_refused(self, name: str, sender: str, why: CoecError) -> None:
+        """Of every pair: it was meant for all of them."""
+        for commands in self._pairs.values():
+            commands.note_refused(name, sender, why)
+
+    def _chosen(self, sensor: str | None) -> tuple[str, ...]:
+        if sensor is None:
+            return tuple(self._pairs)
+        sensors = {one.name: one.pairs for one in self._rig().sensors}
+        if sensor not in sensors:
+            raise NotFoundError(f"no such sensor; the rig has {', '.join(sensors)}")
+        return tuple(pair for pair in sensors[sensor] if pair in self._pairs)

@@ -1,0 +1,40 @@
+"""The sensors of a vehicle, by the configuration of its pairs: nodes and edges of its rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import radians
+
+import numpy as np
+
+from coec.calibration.rig.types import Edge, Kind, Link, RigGraph, Sensor
+from coec.calibration.types import Matrix4
+from coec.config import LinkConfig, PairConfig
+
+
+def graph_of(pairs: Mapping[str, tuple[PairConfig, Matrix4]], links: Sequence[LinkConfig]) -> RigGraph:
+    """Of pairs by name, each with its nominal calibration (4, 4). Links of sensors that are not there yet are left out.
+
+    Raises:
+        ValueError: more sensors than a rig may have.
+    """
+    sensors: dict[str, Sensor] = {}
+    edges = []
+    for name, (pair, T_camera_lidar) in pairs.items():
+        camera, lidar = sensors_of(pair)
+        sensors |= {camera: Sensor(camera, Kind.CAMERA), lidar: Sensor(lidar, Kind.LIDAR)}
+        edges.append(Edge(name, camera, lidar, T_camera_lidar))
+    rigid = [_link(link) for link in links]
+    return RigGraph.of(list(sensors.values()), edges, [link for link in rigid if {link.a, link.b} <= set(sensors)])
+
+
+def sensors_of(pair: PairConfig) -> tuple[str, str]:
+    """What its camera and its LiDAR are called, whatever other pairs they are of."""
+    camera, lidar = pair.camera.sensor, pair.lidar.sensor
+    return camera, f"{lidar} (LiDAR)" if lidar == camera else lidar
+
+
+def _link(link: LinkConfig) -> Link:
+    a, b = link.ends
+    sigma = np.array([radians(link.sigma_deg)] * 3 + [link.sigma_m] * 3)
+    return Link(f"link {a} {b}", a, b, np.array(link.T_a_b), sigma)

@@ -1,0 +1,303 @@
+"""The thread that puts together what the pairs of a vehicle say: it alone changes what is known of the rig.
+
+Pairs hand in what they say from their own threads; here it is taken in one order (`order`). What the rig has to tell a
+pair counts `LAG_NS` later in the choice of the pair's frames, which wait for it: as what a pair asks of the worker, it
+then changes the same things at the same sensor time, however long it takes to be known.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from coec.adapters.files.scribe import Scribe
+from coec.adapters.system.threads import ServiceThread
+from coec.calibration.lifecycle import PairState
+from coec.calibration.rig import vehicle
+from coec.calibration.rig.evidence import Look
+from coec.calibration.rig.types import RigGraph
+from coec.calibration.rig.vehicle import Served, VehicleRig, Windowed
+from coec.calibration.tracker import Measurement, prior_sigma
+from coec.calibration.types import Matrix4, Reason
+from coec.config import LinkConfig, PairConfig
+from coec.runtime.ingest.sensor_clock import NS_PER_S
+from coec.runtime.recording.window_store import start_ns_of
+from coec.runtime.rig import order
+from coec.runtime.rig.graph import graph_of
+from coec.runtime.rig.pair_side import Correction, PairOfRig, Said, served_by
+from coec.runtime.rig.rig_file import RigFile
+
+_log = logging.getLogger(__name__)
+
+LAG_NS = 15 * NS_PER_S
+"""Sensor time from what the pairs say to what they are told: a pair that is slower by that than another, for its
+windows take the worker so long, holds the other up."""
+
+QUIET_TICKS = 4
+"""Looks at the clock without a frame of any pair, after which, once every question is answered, what was said is taken
+as it came: nothing earlier can come. Looks, not seconds: a process that slept has samples to take first."""
+
+TICK_S = 1.0
+
+MOST_CORRECTIONS = 4
+"""Of one pair that wait for its frames: of a pair without frames the newest ones are the truth."""
+
+SAVE_NS = 60 * NS_PER_S
+"""Sensor time between two savings while nothing happens: what is lost by a kill is a minute of looks."""
+
+ONE_PAIR = Reason("one_pair", "One pair cannot tell its camera from its LiDAR: its `health` says whether either moved.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigKnown:
+    """All that is known at one moment, for whoever tells it.
+
+    Attributes:
+        graph: the sensors and pairs; None before the first pair.
+        rig: None while there is no rig to speak of; `why` not, then.
+        stamp_ns: all that counts up to this sensor time is in it; None before any.
+        correction: the latest, and from when it counts.
+        losses: by cause.
+    """
+
+    graph: RigGraph | None = None
+    rig: VehicleRig | None = None
+    why: tuple[Reason, ...] = ()
+    stamp_ns: int | None = None
+    from_ns: int | None = None
+    losses: Mapping[str, int] = field(default_factory=dict)
+
+
+class _SteppedBack:
+    """Sensor time did."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Joined:
+    """A pair that is new."""
+
+    config: PairConfig
+    nominal: Matrix4
+    serves: Served
+    window: Windowed | None
+    has_all_answers: Callable[[], bool]
+
+
+class RigKeeper:
+    """Of one vehicle. `put`, `at`, `step_back`, `corrections` and `join` are for any thread; everything else belongs to
+    `thread`."""
+
+    def __init__(self, folder: Path, links: Sequence[LinkConfig], scribe: Scribe) -> None:
+        """`listen` is to be called before anything is told."""
+        self.thread = ServiceThread("rig", self._run)
+        self._links = tuple(links)
+        self._scribe = scribe
+        self._file = RigFile(folder)
+        self._condition = threading.Condition()
+        self._order: order.Order[Said | _Joined | _SteppedBack] = order.Order()
+        self._corrections: dict[str, deque[Correction]] = {}
+        self._pairs: dict[str, _Joined] = {}
+        self._count = 0
+        self._quiet_ticks = 0
+        self._rig: VehicleRig | None = None
+        self._graph: RigGraph | None = None
+        self._why: tuple[Reason, ...] = ()
+        self._from_ns: int | None = None
+        self._losses: Counter[str] = Counter({"state_damaged": len(self._file.damage)} if self._file.damage else {})
+        self._saved_ns = order.NEVER_NS
+        self._tell: Callable[[RigKnown], None] = lambda _: None
+        self._wake: Callable[[], None] = lambda: None
+
+    def listen(self, tell: Callable[[RigKnown], None], wake: Callable[[], None]) -> None:
+        """`tell` hears what is known whenever it has changed, now for the first time; `wake` is called when frames that
+        wait for the rig may be looked at."""
+        self._tell, self._wake = tell, wake
+        self._tell_now()
+
+    # --- on any thread ----------------------------------------------------------------------------------------------
+
+    def join(
+        self, pair: PairConfig, nominal: Matrix4, state: PairState, has_all_answers: Callable[[], bool]
+    ) -> PairOfRig:
+        """A pair is of the rig from now on: its nominal calibration (4, 4), its state at the start, and whether
+        whatever it asked is answered."""
+        accepted = state.accepted
+        window = None if accepted is None else Windowed(Measurement.of(accepted), start_ns_of(accepted.window_id))
+        serves = served_by(state, prior_sigma(pair.tracker))
+        joined = _Joined(pair, nominal, serves, window, has_all_answers)
+        with self._condition:
+            self._count += 1
+            self._order.put(pair.name, None, joined)
+            self._condition.notify_all()
+        return PairOfRig(pair, self)
+
+    def put(self, pair: str, due_ns: int | None, said: Said) -> None:
+        """See `pair_side.Keeps`."""
+        with self._condition:
+            if self._count < 2:
+                if isinstance(said, Look):
+                    return
+                due_ns = None  # there is nobody whose word it could overtake
+            self._order.put(pair, due_ns, said)
+            if self._order.is_ready:
+                self._condition.notify_all()
+
+    def at(self, pair: str, stamp_ns: int, *, waits: bool) -> bool:
+        """See `pair_side.Keeps`."""
+        with self._condition:
+            if self._count < 2:
+                return False
+            self._quiet_ticks = 0
+            self._order.at(pair, stamp_ns, waits=waits)
+            if self._order.is_ready:
+                self._condition.notify_all()
+            return self._order.taken_ns < stamp_ns - LAG_NS
+
+    def step_back(self, pair: str, stamp_ns: int) -> None:
+        """See `pair_side.Keeps`."""
+        del pair
+        with self._condition:
+            if self._count < 2:
+                return
+            self._order.step_back(stamp_ns, _SteppedBack())
+            for waiting in self._corrections.values():
+                waiting.clear()
+            self._condition.notify_all()
+
+    def corrections(self, pair: str, stamp_ns: int) -> list[Correction]:
+        """See `pair_side.Keeps`."""
+        with self._condition:
+            waiting = self._corrections.get(pair)
+            found = []
+            while waiting and waiting[0].from_ns <= stamp_ns:
+                found.append(waiting.popleft())
+            return found
+
+    def request_stop(self) -> None:
+        """Take what was said, and end the thread."""
+        self.thread.request_stop()
+        with self._condition:
+            self._condition.notify_all()
+
+    # --- the thread -------------------------------------------------------------------------------------------------
+
+    def _run(self, thread: ServiceThread) -> None:
+        while not thread.stopping:
+            thread.beat()
+            self.work(TICK_S)
+        self.finish()
+
+    def finish(self) -> None:
+        """Take all that was said, in its order, and put what is known on the disk; for the end of the service."""
+        while self._take_one(silent=True):
+            pass
+        self._save()
+
+    def work(self, timeout_s: float) -> bool:
+        """Take what comes next, waiting for it for so long; whether something came."""
+        with self._condition:
+            if not self._order.is_ready and timeout_s > 0.0 and not self._condition.wait(timeout_s):
+                self._quiet_ticks += 1
+            quiet = self._quiet_ticks >= QUIET_TICKS
+        return self._take_one(silent=quiet and all(pair.has_all_answers() for pair in self._pairs.values()))
+
+    def _take_one(self, *, silent: bool) -> bool:
+        with self._condition:
+            said = self._order.take(all_are_silent=silent)
+        if said is None:
+            return False
+        before = self._rig
+        try:
+            self._after(said.pair, said.due_ns, said.what)
+        except ValueError as error:  # numbers that are no evidence: of an estimate that went wrong
+            self._losses["refused"] += 1
+            _log.warning(f"the rig does without what {said.pair} said: {error}")
+        with self._condition:
+            self._tell_pairs(before, said.due_ns)
+            self._order.took(said)
+        self._wake()
+        self._save_in_time(before, said.due_ns)
+        self._tell_now()
+        return True
+
+    def _after(self, pair: str, due_ns: int, what: Said | _Joined | _SteppedBack) -> None:
+        if isinstance(what, _Joined):
+            self._pairs[pair] = what
+            self._grow()
+        elif self._rig is None:
+            self._meanwhile(pair, what)
+        elif isinstance(what, _SteppedBack):
+            self._rig = vehicle.forgotten(self._rig)
+        elif isinstance(what, Look):
+            self._rig = vehicle.after_look(self._rig, what)
+        elif isinstance(what, Windowed):
+            self._rig = vehicle.after_window(self._rig, pair, what, due_ns)
+        else:
+            self._rig = vehicle.after_served(self._rig, pair, what, due_ns)
+
+    def _meanwhile(self, pair: str, what: Said | _SteppedBack) -> None:
+        """There is no rig yet: what a pair comes to until there is one."""
+        if isinstance(what, Served):
+            self._pairs[pair] = replace(self._pairs[pair], serves=what)
+        elif isinstance(what, Windowed):
+            self._pairs[pair] = replace(self._pairs[pair], window=what)
+
+    def _grow(self) -> None:
+        """There is one more pair."""
+        try:
+            told = {name: (joined.config, joined.nominal) for name, joined in self._pairs.items()}
+            self._graph = graph_of(told, self._links)
+        except ValueError as error:
+            self._rig, self._why = None, (Reason("no_rig", f"The pairs are not put together: {error}."),)
+            return
+        if len(self._pairs) < 2:
+            self._why = (ONE_PAIR,)
+            return
+        self._why = self._file.damage
+        serves = {name: joined.serves for name, joined in self._pairs.items()}
+        windows = {name: joined.window for name, joined in self._pairs.items() if joined.window is not None}
+        fresh = self._file.recalled(vehicle.begun(self._graph, serves, windows))
+        self._rig = fresh if self._rig is None else vehicle.grown(self._rig, fresh)
+
+    def _tell_pairs(self, before: VehicleRig | None, stamp_ns: int) -> None:
+        """Hand a new correction to the pairs that it is for. With the lock."""
+        rig = self._rig
+        if rig is None or rig.correction is None or (before is not None and before.correction is rig.correction):
+            return
+        correction, self._from_ns = rig.correction, stamp_ns + LAG_NS
+        sensors = " and ".join(correction.sensors)
+        text = f"{sensors} moved: all its pairs, {', '.join(correction.pairs)}, are put right by the windows of all."
+        _log.info(
+            "a move of a sensor is put right", extra={"fields": {"sensors": sensors, "pairs": [*correction.pairs]}}
+        )
+        for name, told in correction.pairs.items():
+            self._corrections.setdefault(name, deque(maxlen=MOST_CORRECTIONS)).append(
+                Correction(told, stamp_ns, self._from_ns, text)
+            )
+
+    # --- telling ----------------------------------------------------------------------------------------------------
+
+    def _tell_now(self) -> None:
+        with self._condition:
+            stamp_ns = self._order.taken_ns
+            losses = {**self._losses, **self._order.losses}
+        known = stamp_ns if stamp_ns > order.NEVER_NS // 2 else None
+        self._tell(RigKnown(self._graph, self._rig, self._why, known, self._from_ns, losses))
+
+    def _save_in_time(self, before: VehicleRig | None, stamp_ns: int) -> None:
+        rig = self._rig
+        if rig is None or rig is before:
+            return
+        same = before is not None and before.event is rig.event and before.serves is rig.serves
+        if not same or stamp_ns - self._saved_ns > SAVE_NS or stamp_ns < self._saved_ns:
+            self._saved_ns = stamp_ns
+            self._save()
+
+    def _save(self) -> None:
+        if self._rig is not None:
+            self._file.remember(self._rig)
+            self._scribe.write(self._file)

@@ -1,0 +1,107 @@
+"""One pair of a rig, as the threads of the pair see it: what it says, and what it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.lifecycle import PairState
+from coec.calibration.monitor.change_detector import Observation, share_told
+from coec.calibration.rig.evidence import Look, of_check
+from coec.calibration.rig.vehicle import Served, Told, Windowed
+from coec.calibration.tracker import Measurement, prior_sigma
+from coec.calibration.types import Estimate, Matrix4
+from coec.config import PairConfig
+from coec.runtime.recording.window_store import start_ns_of
+
+Said = Look | Windowed | Served
+"""What a pair may say."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What a pair is told of itself, decided at a sensor time with all others; it counts `from_ns` on.
+
+    Attributes:
+        text: why, in one sentence.
+    """
+
+    told: Told
+    stamp_ns: int
+    from_ns: int
+    text: str
+
+
+class Keeps(Protocol):
+    """The rig; see `keeper`."""
+
+    def put(self, pair: str, due_ns: int | None, said: Said) -> None:
+        """A pair says something that counts from a sensor time on; None: from now on."""
+
+    def at(self, pair: str, stamp_ns: int, *, waits: bool) -> bool:
+        """A pair has frames of this sensor time; it `waits` for answers of its own, or has said all that counts up to
+        there. Whether the rig may still have something to tell it that counts by then."""
+
+    def step_back(self, pair: str, stamp_ns: int) -> None:
+        """Sensor time has stepped back for a pair, to this stamp."""
+
+    def corrections(self, pair: str, stamp_ns: int) -> list[Correction]:
+        """Those that count from this sensor time on, or from an earlier one, each told once."""
+
+
+class PairOfRig:
+    """Of one pair. What it says is for the thread that decides about the pair, what it is told for that of its
+    stream."""
+
+    def __init__(self, pair: PairConfig, rig: Keeps) -> None:
+        self._name = pair.name
+        self._prior = prior_sigma(pair.tracker)
+        self._rig = rig
+
+    # --- on the thread that decides ---------------------------------------------------------------------------------
+
+    def looked(self, due_ns: int, before: PairState, observation: Observation) -> None:
+        """A check of what was served `before` was completed."""
+        share = share_told(before.monitor, observation)
+        look = of_check(self._name, before.T_camera_lidar, observation, share)
+        if look is not None:
+            self._rig.put(self._name, due_ns, look)
+
+    def accepted(self, due_ns: int | None, estimate: Estimate) -> None:
+        """A window was accepted."""
+        self._rig.put(self._name, due_ns, Windowed(Measurement.of(estimate), start_ns_of(estimate.window_id)))
+
+    def serves(self, due_ns: int | None, state: PairState) -> None:
+        """Another extrinsic is served from now on."""
+        self._rig.put(self._name, due_ns, served_by(state, self._prior))
+
+    # --- on the thread of the stream --------------------------------------------------------------------------------
+
+    def must_wait(self, stamp_ns: int, *, for_own: bool) -> bool:
+        """Whether the rig may still have something to tell that counts before a pair of frames of this stamp is looked
+        at. `for_own`: answers of this pair are awaited anyway."""
+        return self._rig.at(self._name, stamp_ns, waits=for_own)
+
+    def corrections(self, stamp_ns: int) -> list[Correction]:
+        """Those that count before a pair of frames of this stamp is looked at, each told once."""
+        return self._rig.corrections(self._name, stamp_ns)
+
+    def time_stepped_back(self, stamp_ns: int) -> None:
+        """The clock of the sensors has stepped back, to this stamp."""
+        self._rig.step_back(self._name, stamp_ns)
+
+
+Joins = Callable[[PairConfig, PairState], PairOfRig]
+"""How a pair becomes one of the rig, with what it serves at its start."""
+
+
+def served_by(state: PairState, prior: NDArray[np.float64]) -> Served:
+    """What a pair serves; `prior` (6,) is how far the nominal calibration may be off (rad, m)."""
+    pose: Matrix4 = state.T_camera_lidar
+    if state.accepted is None:
+        return Served(pose, prior, None)
+    return Served(pose, state.accepted.sigma, start_ns_of(state.accepted.window_id))

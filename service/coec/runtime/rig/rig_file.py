@@ -1,0 +1,157 @@
+"""What is known of a rig over a restart, `sensors.json`: where its pairs were, and which of its sensors had moved.
+
+A sensor that is knocked while the service is down is told by the first looks after it.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from coec.adapters.files.state_file import StateFile
+from coec.calibration.rig import attribution, vehicle
+from coec.calibration.rig.attribution import RigState
+from coec.calibration.rig.evidence import MOST_SIGMA
+from coec.calibration.rig.steps import History
+from coec.calibration.rig.types import MOST_SENSORS
+from coec.calibration.rig.vehicle import Event, VehicleRig
+from coec.calibration.types import Matrix4, Reason
+from coec.errors import StateError
+from coec.geometry import se3
+from coec.schemas.base import Part
+from coec.schemas.replies import Row4
+
+FILE = "sensors.json"
+
+MOST_PAIRS = 64
+"""In a file that is looked at: twice as many as a vehicle may have."""
+
+Rows = tuple[Row4, Row4, Row4, Row4]
+Sigma = Annotated[float, Field(gt=0, lt=MOST_SIGMA)]
+Stamp = Annotated[int, Field(gt=-(2**63), lt=2**63)]
+Name = Annotated[str, Field(max_length=256)]
+
+
+class StoredEdge(Part):
+    """A pair: its nominal calibration, and where it was before the looks that were kept, as well as that was known."""
+
+    nominal: Rows
+    T_camera_lidar: Rows
+    sigma: tuple[Sigma | None, Sigma | None, Sigma | None, Sigma | None, Sigma | None, Sigma | None]
+
+
+class StoredEvent(Part):
+    """A move that was not over."""
+
+    sensors: tuple[Name, ...] = Field(min_length=1, max_length=MOST_SENSORS)
+    since_ns: Stamp
+    stepped_ns: Stamp
+    named: tuple[Name, ...] = Field(max_length=MOST_SENSORS)
+
+
+class StoredRig(Part):
+    """The file."""
+
+    edges: dict[Name, StoredEdge] = Field(max_length=MOST_PAIRS)
+    event: StoredEvent | None = None
+
+
+class RigFile:
+    """`recalled` and `remember` belong to the rig's thread, `flush` to the one that waits for the disk.
+
+    Attributes:
+        damage: what was wrong with the file that was found; empty when nothing was.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._file = StateFile(folder / FILE)
+        self._lock = threading.Lock()
+        self._body: dict[str, Any] | None = None
+        loaded = self._file.load()
+        damage = [*loaded.damage]
+        self._found = StoredRig(edges={})
+        if loaded.body is not None:
+            try:
+                self._found = _sound(StoredRig.model_validate(loaded.body))
+            except (ValidationError, ValueError):
+                self._file.distrust()
+                damage.append(f"{FILE}: it has another form, or a pose in it is none")
+        text = (
+            f"What was known of the rig cannot be used: {'; '.join(damage)}. It is kept aside; the rig is learnt anew."
+        )
+        self.damage = (Reason("rig_state_damaged", text),) if damage else ()
+
+    def recalled(self, rig: VehicleRig) -> VehicleRig:
+        """A rig of which nothing was looked at, with what was known before the restart."""
+        histories = dict(rig.believed.histories)
+        for name, edge in rig.graph.edge.items():
+            stored = self._found.edges.get(name)
+            # Of another nominal calibration it is another mount.
+            if stored is not None and np.array_equal(_pose(stored.nominal), edge.T_a_b):
+                sigma = np.array([np.nan if value is None else value for value in stored.sigma])
+                histories[name] = History.at(_pose(stored.T_camera_lidar), sigma)
+        event = self._found.event
+        if event is None or not set(event.sensors) <= set(rig.graph.place):
+            return replace(rig, believed=RigState(histories))
+        named = frozenset(event.named) & frozenset(event.sensors)
+        going_on = Event(event.sensors, event.since_ns, event.stepped_ns)
+        believed = RigState(histories, stepped_ns=event.stepped_ns, named=named)
+        return vehicle.going_on(replace(rig, believed=believed), going_on)
+
+    def remember(self, rig: VehicleRig) -> None:
+        """Keep what is known; on the disk with the next `flush`."""
+        edges = {}
+        for name, edge in rig.graph.edge.items():
+            kept = rig.believed.histories[name]
+            history = kept.counted() if rig.believed.calm else kept
+            sigma = [float(value) if 0.0 < value < MOST_SIGMA else None for value in history.sigma.tolist()]
+            edges[name] = {"nominal": edge.T_a_b.tolist(), "T_camera_lidar": history.pose.tolist(), "sigma": sigma}
+        event = rig.event
+        told = None
+        if event is not None:
+            told = {
+                "sensors": list(event.sensors),
+                "since_ns": event.since_ns,
+                "stepped_ns": max(event.stepped_ns, attribution.BEFORE_ALL_NS),
+                "named": sorted(rig.believed.named),
+            }
+        with self._lock:
+            self._body = {"edges": edges, "event": told}
+
+    def flush(self) -> None:
+        """Put it on the disk.
+
+        Raises:
+            StateError: it is not possible; the next call tries again.
+        """
+        with self._lock:
+            body, self._body = self._body, None
+        if body is None:
+            return
+        try:
+            self._file.save(body)
+        except StateError:
+            with self._lock:
+                self._body = body if self._body is None else self._body
+            raise
+
+
+def _sound(stored: StoredRig) -> StoredRig:
+    """A checksum tells that a file is as it was written, not that who wrote it was this service.
+
+    Raises:
+        ValueError: a pose is no rigid transform.
+    """
+    for edge in stored.edges.values():
+        if not (se3.is_rigid(_pose(edge.nominal)) and se3.is_rigid(_pose(edge.T_camera_lidar))):
+            raise ValueError("a pose is no rigid transform")
+    return stored
+
+
+def _pose(rows: Rows) -> Matrix4:
+    return np.array(rows, dtype=np.float64)

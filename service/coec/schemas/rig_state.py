@@ -1,0 +1,101 @@
+"""The reply of `rig`: what all pairs of a vehicle say together. Which of its sensors moved, and where they all are.
+
+A sensor that moved by x has moved about its own axes: x (deg, then m) is on the left of the pose of the rig in its
+frame. Sensor time throughout; a number that could not be computed is null.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from coec.schemas.base import Message, Part
+from coec.schemas.replies import Count, Counts, Maybe6x6, Reason, Transform, Vector6
+
+SensorKind = Literal["camera", "lidar"]
+SensorState = Literal["calibrated", "camera_moved", "lidar_moved", "undecided", "unknown"]
+Probability = Annotated[float, Field(ge=0, le=1)]
+
+
+class SensorMove(Part):
+    """By how much a sensor moved, about its own axes."""
+
+    by: Vector6 = Field(description="rx ry rz (deg), tx ty tz (m)")
+    sigma: Vector6 = Field(description="standard deviations (deg, m)")
+
+
+class SensorReply(Part):
+    """A camera or a LiDAR of the vehicle, whatever pairs it is of."""
+
+    name: str
+    kind: SensorKind
+    state: SensorState = Field(
+        description="`undecided`: something moved or is disturbed, and this may be it; `unknown`: nothing looked. "
+        "One that moved is so called until every pair of it serves another extrinsic"
+    )
+    probability: Probability | None = Field(description="that it moved; null where nothing can tell")
+    since_ns: int | None = Field(description="sensor time since which it is in this state, ns; null before any look")
+    moved: SensorMove | None = Field(description="set where it moved, or may have")
+    pairs: tuple[str, ...] = Field(description="that have it")
+    reasons: tuple[Reason, ...] = Field(description="why it is in this state; the first one says most")
+
+
+class JointPair(Part):
+    """A pair, as all pairs together put it."""
+
+    pair: str
+    camera: str
+    lidar: str
+    measured: bool = Field(description="whether a window of its own is in it; else the others put it there")
+    camera_from_lidar: Transform
+    sigma: Vector6 = Field(description="standard deviations (deg, m)")
+    covariance: Maybe6x6 = Field(description="about the axes of the camera (rad, m), exact")
+    step: Vector6 = Field(description="from what the pair serves to this: rx ry rz (deg), tx ty tz (m)")
+
+
+class OpenLoop(Part):
+    """A way along pairs and links that should end where it begins, and does not."""
+
+    names: tuple[str, ...] = Field(description="of the pairs and links, in their order")
+    rotation_deg: float = Field(description="by which it does not close")
+    translation_m: float | None = Field(description="likewise; null where a pair on it does not tell")
+    p_value: Probability = Field(description="chance of one as large")
+
+
+class JointReply(Part):
+    """Where everything is, by the latest windows of all pairs."""
+
+    stamp_ns: int = Field(description="of the newest window in it, ns")
+    pairs: tuple[JointPair, ...]
+    chi2: float = Field(ge=0, description="sum of squares of what the pairs miss each other by")
+    freedom: Count = Field(description="its degrees of freedom: six for each loop; 0 where no loop closes")
+    p_value: Probability = Field(description="chance of a sum as large")
+    consistent: bool = Field(description="whether the pairs fit each other; else they say `inconsistent_rig`")
+    left_out: str | None = Field(description="the pair that alone did not fit, if one did")
+    open_loops: tuple[OpenLoop, ...] = Field(description="loops that do not close, the least likely first")
+    widened: float = Field(ge=1, description="factor on all standard deviations, for what the loops miss")
+
+
+class RigCorrection(Part):
+    """A move of one or two sensors, put right in all of their pairs at once."""
+
+    stamp_ns: int = Field(description="sensor time at which it was decided, ns")
+    from_ns: int = Field(description="sensor time from which the pairs are looked at with it, ns")
+    sensors: tuple[str, ...]
+    pairs: tuple[str, ...]
+
+
+class RigReply(Message):
+    """All sensors of a vehicle. A reply exists before the first look: all `unknown`."""
+
+    vehicle: str
+    stamp_ns: int | None = Field(description="all that was asked up to this sensor time is in it, ns; null: nothing is")
+    sensors: tuple[SensorReply, ...]
+    nobody: Probability | None = Field(description="that no sensor moved; null before the first look")
+    disturbed: dict[str, Probability] = Field(description="that something else lastingly disturbs a pair, by pair")
+    joint: JointReply | None = Field(description="null before the first accepted window, or of a single pair")
+    correction: RigCorrection | None = Field(description="the latest; null before the first")
+    reasons: tuple[Reason, ...] = Field(default=(), description="what keeps the pairs from being put together")
+    looks: Counts = Field(description="checks that were put together, by pair")
+    losses: Counts = Field(description="what was not, or out of order, by cause")

@@ -1,0 +1,177 @@
+"""A move of a sensor is one event: named, put right in all of its pairs at once, and over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from coec.calibration.rig import vehicle
+from coec.calibration.rig.attribution import SensorHealth
+from coec.calibration.rig.types import Edge, RigGraph
+from coec.calibration.rig.vehicle import Served, VehicleRig, Windowed
+from coec.calibration.tracker import Measurement
+from coec.calibration.types import Matrix4, Uncertainty
+from coec.geometry import se3
+from rigs import NS, POSES, SIGMA, TURN, graph, look, with_moved
+
+STAR = (("front", "roof"), ("left", "roof"), ("rear", "roof"))
+LOOPS = (*STAR, ("front", "bumper"), ("left", "bumper"))
+Poses = Mapping[str, Matrix4]
+
+
+def _pose(edge: Edge, poses: Poses) -> Matrix4:
+    return np.asarray(poses[edge.a] @ se3.inverse(poses[edge.b]))
+
+
+def _windowed(edge: Edge, poses: Poses, start_s: float, error: NDArray[np.float64]) -> Windowed:
+    pose = se3.perturb(_pose(edge, poses), error)
+    stamp_ns = round((start_s + 10.0) * NS)
+    return Windowed(Measurement(pose, Uncertainty.independent(SIGMA), stamp_ns), round(start_s * NS))
+
+
+class Drive:
+    """A rig as it is driven: looks of all pairs every 5 s, and windows that pairs serve at once."""
+
+    def __init__(self, rig: RigGraph, seed: int = 1) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.at_s = 0.0
+        serves = {edge.name: Served(_pose(edge, POSES), SIGMA, 0) for edge in rig.edges}
+        windows = {edge.name: _windowed(edge, POSES, -30.0, self._error()) for edge in rig.edges}
+        self.state: VehicleRig = vehicle.begun(rig, serves, windows)
+
+    def _error(self) -> NDArray[np.float64]:
+        return np.asarray(SIGMA * self.rng.normal(size=6))
+
+    def looks(self, poses: Poses, rounds: int, blind: tuple[str, ...] = ()) -> None:
+        for _ in range(rounds):
+            for place, edge in enumerate(self.state.graph.edges):
+                if edge.name not in blind:
+                    seen = look(edge, poses, self.at_s + 0.5 * place, self._error())
+                    self.state = vehicle.after_look(self.state, seen)
+            self.at_s += 5.0
+
+    def window(self, name: str, poses: Poses, start_s: float, *, serves: bool = True) -> Matrix4:
+        window = _windowed(self.state.graph.edge[name], poses, start_s, self._error())
+        stamp_ns = round(self.at_s * NS)
+        self.state = vehicle.after_window(self.state, name, window, stamp_ns)
+        pose = window.measurement.T_camera_lidar
+        if serves:
+            self.state = vehicle.after_served(self.state, name, Served(pose, SIGMA, window.start_ns), stamp_ns)
+        return pose
+
+    def health(self) -> dict[str, SensorHealth]:
+        return {sensor.name: sensor.health for sensor in self.state.sensors}
+
+
+@pytest.mark.fault("the LiDAR of a rig is knocked by 1°", "one event, one correction for all of its cameras")
+def test_a_knocked_lidar_is_put_right_in_all_its_pairs_at_once(
+    record_property: Callable[[str, object], None],
+) -> None:
+    drive, after = Drive(graph(STAR)), with_moved("roof")
+    drive.looks(POSES, 8)
+    knocked_s = drive.at_s
+    drive.looks(after, 4)
+    assert drive.health() == {
+        "front": SensorHealth.CALIBRATED,
+        "left": SensorHealth.CALIBRATED,
+        "rear": SensorHealth.CALIBRATED,
+        "roof": SensorHealth.LIDAR_MOVED,
+    }
+    assert drive.state.correction is None
+    for name in ("front-roof", "left-roof"):
+        drive.window(name, after, knocked_s + 6.0)
+    assert drive.state.correction is None
+    drive.window("rear-roof", after, knocked_s + 6.0)
+    correction = drive.state.correction
+    assert correction is not None
+    assert correction.sensors == ("roof",)
+    assert set(correction.pairs) == {"front-roof", "left-roof", "rear-roof"}
+    for name, told in correction.pairs.items():
+        away = se3.difference(told.T_a_b, _pose(drive.state.graph.edge[name], after))
+        assert float(away @ np.linalg.solve(told.covariance, away)) < 22.5  # 99.9 % of six axes
+    drive.looks(after, 3)
+    assert drive.state.event is None
+    assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
+    assert drive.state.correction is correction
+    record_property("figure", f"{len(correction.pairs)} pairs")
+
+
+def test_windows_that_began_before_the_move_put_nothing_right() -> None:
+    drive, after = Drive(graph(STAR)), with_moved("roof")
+    drive.looks(POSES, 8)
+    knocked_s = drive.at_s
+    drive.looks(after, 4)
+    for edge in drive.state.graph.edges:
+        drive.window(edge.name, POSES, knocked_s - 20.0)
+    assert drive.state.correction is None
+    assert drive.health()["roof"] is SensorHealth.LIDAR_MOVED
+    assert not drive.state.windows
+
+
+def test_it_stays_moved_for_as_long_as_a_pair_serves_what_was_before() -> None:
+    drive, after = Drive(graph(STAR)), with_moved("roof")
+    drive.looks(POSES, 8)
+    knocked_s = drive.at_s
+    drive.looks(after, 4)
+    for edge in drive.state.graph.edges:
+        drive.window(edge.name, after, knocked_s + 6.0, serves=edge.name != "left-roof")
+    assert drive.state.correction is not None
+    drive.looks(after, 6)
+    assert drive.health()["roof"] is SensorHealth.LIDAR_MOVED
+    told = drive.state.correction.pairs["left-roof"]
+    served = Served(told.T_a_b, SIGMA, round((knocked_s + 6.0) * NS))
+    drive.state = vehicle.after_served(drive.state, "left-roof", served, round(drive.at_s * NS))
+    drive.looks(after, 1)
+    assert drive.health()["roof"] is SensorHealth.CALIBRATED
+
+
+def test_a_pair_that_is_blind_is_not_waited_for() -> None:
+    drive, after = Drive(graph(STAR)), with_moved("roof")
+    drive.looks(POSES, 8)
+    drive.looks(POSES, 13, blind=("rear-roof",))
+    knocked_s = drive.at_s
+    drive.looks(after, 4, blind=("rear-roof",))
+    for name in ("front-roof", "left-roof"):
+        drive.window(name, after, knocked_s + 6.0)
+    assert drive.state.correction is not None
+    assert set(drive.state.correction.pairs) == {"front-roof", "left-roof"}
+
+
+def test_what_nobody_can_attribute_is_over_when_its_pair_serves_what_it_found() -> None:
+    drive, after = Drive(graph(STAR[:1])), with_moved("front", xi=3.0 * TURN)
+    drive.looks(POSES, 8)
+    knocked_s = drive.at_s
+    drive.looks(after, 4)
+    assert set(drive.health().values()) == {SensorHealth.UNDECIDED}
+    drive.window("front-roof", after, knocked_s + 6.0)
+    drive.looks(after, 2)
+    assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
+
+
+@pytest.mark.fault("a window of one pair of a rig is 1° off", "`inconsistent_rig` on its loop, nothing is corrected")
+def test_a_window_that_does_not_fit_the_others_is_said_of_the_pairs_of_its_loop() -> None:
+    drive = Drive(graph(LOOPS))
+    drive.looks(POSES, 4)
+    assert vehicle.inconsistent(drive.state) == ()
+    edge = drive.state.graph.edge["left-roof"]
+    drive.state = vehicle.after_window(drive.state, edge.name, _windowed(edge, POSES, 5.0, TURN), 20 * NS)
+    assert set(vehicle.inconsistent(drive.state)) == {"front-roof", "left-roof", "front-bumper", "left-bumper"}
+    assert drive.state.correction is None
+
+
+def test_a_first_calibration_far_from_nominal_is_no_move() -> None:
+    rig = graph(STAR)
+    wide = np.array([np.radians(3.0)] * 3 + [0.2] * 3)
+    built = {edge.name: Served(se3.perturb(_pose(edge, POSES), TURN), wide, None) for edge in rig.edges}
+    drive = Drive(rig)
+    drive.state = vehicle.begun(rig, built, {})
+    drive.looks(POSES, 6)
+    assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
+    for edge in rig.edges:
+        drive.window(edge.name, POSES, 10.0)
+    drive.looks(POSES, 4)
+    assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
+    assert drive.state.correction is None

@@ -1,0 +1,253 @@
+"""The rig's thread: what is put together is told to the pairs at one sensor time, kept, and the same every time."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coec.adapters.files.state_file import StateFile
+from coec.runtime.api.rig import INCONSISTENT, RigAnswers, reply_of, troubles_of
+from coec.runtime.rig.keeper import LAG_NS, QUIET_TICKS
+from coec.runtime.rig.rig_file import FILE
+from coec.schemas.base import from_json, to_json
+from coec.schemas.keys import Keys
+from coec.schemas.rig_state import RigReply
+from rig_said import CAMERAS, SaidRig, look, pair_config, pose, serves, state, window
+from rigs import NS, POSES, SIGMA, with_moved
+
+KNOCKED_S = 45.0
+AFTER = with_moved("roof")
+
+
+def drive(said: SaidRig, until_s: float, seed: int | None = None, begin_s: float = 0.0) -> None:
+    """Checks every 5 s, the LiDAR knocked at `KNOCKED_S`, a window of each pair 12 s after it. A seed draws which of
+    the pairs comes first, and how long it is in front."""
+    errors, rng = np.random.default_rng(5), random.Random(seed)
+    stamps = np.arange(begin_s, until_s, 1.0).tolist()
+    for at_s in stamps:
+        cameras = list(CAMERAS)
+        if seed is not None:
+            rng.shuffle(cameras)
+        drawn = {camera: SIGMA * errors.normal(size=6) for camera in CAMERAS}
+        for camera in cameras:
+            poses = POSES if at_s - 5.0 < KNOCKED_S else AFTER
+            due = at_s >= 5.0 and at_s % 5.0 == CAMERAS.index(camera)
+            said.at(camera, at_s, waits=due)
+            if due:
+                said.put(camera, at_s, look(camera, poses, at_s - 5.0, drawn[camera]))
+            if at_s == KNOCKED_S + 30.0:
+                said.put(camera, at_s, window(camera, AFTER, KNOCKED_S + 12.0))
+                said.put(camera, at_s, serves(camera, AFTER, KNOCKED_S + 12.0))
+            said.at(camera, at_s)
+            if seed is None or rng.random() < 0.5:
+                said.settle()
+    said.settle()
+
+
+def reply(said: SaidRig) -> RigReply:
+    return reply_of("vehicle", said.known)
+
+
+def states(said: SaidRig) -> dict[str, str]:
+    return {sensor.name: sensor.state for sensor in reply(said).sensors}
+
+
+@pytest.mark.fault("the LiDAR of a vehicle is knocked", "named, and told to all pairs from one sensor time on")
+def test_a_correction_comes_to_all_pairs_at_one_sensor_time(
+    tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    said = SaidRig(tmp_path)
+    drive(said, KNOCKED_S + 25.0)
+    assert states(said) == {"front": "calibrated", "left": "calibrated", "rear": "calibrated", "roof": "lidar_moved"}
+    drive(said, KNOCKED_S + 32.0, begin_s=KNOCKED_S + 25.0)
+    last = reply(said).correction
+    assert last is not None
+    assert last.sensors == ("roof",)
+    assert last.from_ns == round((KNOCKED_S + 30.0) * NS) + LAG_NS
+    for camera in CAMERAS:
+        assert said.pairs[camera].corrections(last.from_ns - 1) == []
+        (correction,) = said.pairs[camera].corrections(last.from_ns)
+        assert "roof" in correction.text
+        assert correction.told.T_a_b == pytest.approx(pose(camera, AFTER), abs=1e-4)
+        assert said.pairs[camera].corrections(last.from_ns) == []
+    record_property("figure", f"{LAG_NS / NS:.0f} s")
+
+
+@pytest.mark.fault("pairs of a rig are known in another order in a replay", "the same reply, to the byte")
+def test_a_replay_says_the_same_to_the_byte(tmp_path: Path) -> None:
+    told = set()
+    for seed in (None, 1):
+        said = SaidRig(tmp_path / str(seed))
+        drive(said, KNOCKED_S + 40.0, seed)
+        told.add(to_json(reply(said)))
+    assert len(told) == 1
+
+
+def test_frames_wait_until_the_rig_has_decided_what_counts_for_them(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    for camera in CAMERAS:
+        said.at(camera, 10.0)
+    said.at("left", 11.0, waits=True)
+    assert not said.at("front", 10.0 + LAG_NS / NS)
+    assert said.at("front", 10.1 + LAG_NS / NS)
+    said.at("rear", 20.0)
+    said.put("left", 11.0, look("left", POSES, 6.0, np.zeros(6)))
+    said.at("left", 11.0)
+    said.at("left", 20.0)
+    said.settle()
+    assert not said.at("front", 10.1 + LAG_NS / NS)
+
+
+def test_a_vehicle_of_one_pair_has_no_rig_and_waits_for_none(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path, ("front",))
+    assert not said.at("front", 10.0)
+    assert not said.at("front", 1000.0)
+    said.put("front", 5.0, look("front", POSES, 5.0, np.zeros(6)))
+    said.settle()
+    assert len(said.told) == 2
+    assert states(said) == {"front": "undecided", "roof": "undecided"}
+    assert [sensor.probability for sensor in reply(said).sensors] == [None, None]
+
+
+@pytest.mark.fault("a LiDAR is knocked while the service is down", "named by the first checks after the restart")
+def test_what_was_known_outlives_a_restart(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    drive(said, 44.0)
+    said.keeper.finish()
+    said.scribe.write_due()
+    again = SaidRig(tmp_path)
+    drive(again, KNOCKED_S + 25.0, begin_s=KNOCKED_S + 5.0)
+    assert states(again)["roof"] == "lidar_moved"
+
+
+def test_a_sensor_that_had_moved_is_so_after_a_restart(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    drive(said, KNOCKED_S + 25.0)
+    said.keeper.finish()
+    said.scribe.write_due()
+    again = SaidRig(tmp_path)
+    assert states(again) == {"front": "unknown", "left": "unknown", "rear": "unknown", "roof": "lidar_moved"}
+    (sensor,) = [one for one in reply(again).sensors if one.name == "roof"]
+    assert [reason.code for reason in sensor.reasons] == ["last_known"]
+
+
+BAD_EDGE = {"nominal": np.eye(4).tolist(), "T_camera_lidar": np.ones((4, 4)).tolist(), "sigma": [None] * 6}
+
+
+@pytest.mark.fault("the file of the rig was written by somebody else", "refused, counted, kept aside; learnt anew")
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"edges": {"front-roof": BAD_EDGE}},
+        {"edges": {"front-roof": {**BAD_EDGE, "T_camera_lidar": np.eye(4).tolist(), "sigma": [-1.0] * 6}}},
+        {"edges": {str(number): BAD_EDGE for number in range(100)}},
+        {"edges": {}, "event": {"sensors": ["x"] * 40, "since_ns": 0, "stepped_ns": 0, "named": []}},
+        {"edges": {}, "event": {"sensors": ["x"], "since_ns": 2**70, "stepped_ns": 0, "named": []}},
+        {"edges": [1, 2]},
+    ],
+)
+def test_a_hostile_file_is_refused(tmp_path: Path, body: dict[str, object]) -> None:
+    StateFile(tmp_path / FILE).save(body)
+    said = SaidRig(tmp_path)
+    assert [reason.code for reason in said.known.why] == ["rig_state_damaged"]
+    assert said.known.losses == {"state_damaged": 1}
+    said.keeper.finish()
+    said.scribe.write_due()
+    assert (tmp_path / f"{FILE}.broken").exists()
+    assert SaidRig(tmp_path).known.why == ()
+
+
+@pytest.mark.fault("the file of the rig is damaged", "refused, counted; learnt anew")
+def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_text(json.dumps({"body": {"edges": {}}, "checksum": "0", "schema_version": 1}))
+    assert SaidRig(tmp_path).known.losses == {"state_damaged": 1}
+
+
+def test_sensors_of_an_event_that_the_vehicle_has_no_more_are_forgotten(tmp_path: Path) -> None:
+    event = {"sensors": ["trunk"], "since_ns": 5, "stepped_ns": 4, "named": ["trunk"]}
+    StateFile(tmp_path / FILE).save({"edges": {}, "event": event})
+    assert set(states(SaidRig(tmp_path)).values()) == {"unknown"}
+
+
+def test_numbers_that_are_no_evidence_are_counted_and_harm_nothing(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    bad = window("front", POSES, 1.0)
+    bad.measurement.uncertainty.noise[:] = np.ones((6, 6))
+    said.put("front", 5.0, bad)
+    for camera in CAMERAS:
+        said.at(camera, 6.0)
+    said.settle()
+    assert said.known.losses == {"refused": 1}
+    drive(said, 30.0, begin_s=10.0)
+    assert set(states(said).values()) == {"calibrated"}
+
+
+def test_the_clock_of_the_sensors_steps_back_and_the_drive_goes_on(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    drive(said, 40.0)
+    said.pairs["front"].time_stepped_back(0)
+    said.pairs["left"].time_stepped_back(0)
+    said.pairs["rear"].time_stepped_back(0)
+    drive(said, KNOCKED_S + 25.0)
+    assert states(said)["roof"] == "lidar_moved"
+    assert said.known.losses == {"time_stepped_back": 3}
+
+
+def test_the_reply_survives_the_wire_and_is_published_on_change(tmp_path: Path) -> None:
+    published: list[str] = []
+    answers = RigAnswers(Keys("coec", "vehicle"), lambda key, _: published.append(key))
+    said = SaidRig(tmp_path)
+    said.keeper.listen(answers.hear, lambda: None)
+    drive(said, 20.0)
+    assert set(published) == {"coec/@v1/vehicle/rig"}
+    count = len(published)
+    drive(said, 40.0, begin_s=20.0)
+    assert len(published) == count
+    told = answers.reply
+    assert from_json(RigReply, to_json(told)) == told
+    assert told.looks == {"front-roof": 7, "left-roof": 7, "rear-roof": 7}
+    assert answers.troubles("front-roof") == ()
+
+
+def test_a_single_lidar_closes_no_loop_and_no_pair_is_inconsistent(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    drive(said, KNOCKED_S + 40.0)
+    rig = said.known.rig
+    assert rig is not None
+    assert troubles_of(rig) == {}
+    joint = reply(said).joint
+    assert joint is not None
+    assert joint.freedom == 0
+    assert INCONSISTENT not in str(joint)
+
+
+@pytest.mark.fault("all cameras of a vehicle stop", "what they said last is put together all the same")
+def test_once_all_streams_have_stopped_nothing_waits_any_more(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    for camera in CAMERAS:
+        said.at(camera, 10.0)
+        said.put(camera, 15.0, look(camera, POSES, 10.0, np.zeros(6)))
+    said.settle()
+    assert reply(said).looks == {}
+    taken = [said.keeper.work(0.001) for _ in range(QUIET_TICKS + 2)]
+    assert taken == [False] * (QUIET_TICKS - 1) + [True] * 3
+    assert reply(said).looks == {"front-roof": 1, "left-roof": 1, "rear-roof": 1}
+
+
+def test_a_pair_that_joins_later_finds_what_the_first_has_come_to(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path, ("front",))
+    said.put("front", 5.0, window("front", POSES, 1.0))
+    said.put("front", 5.0, serves("front", POSES, 1.0))
+    said.settle()
+    said.pairs["left"] = said.keeper.join(pair_config("left"), pose("left", POSES), state("left"), lambda: True)
+    said.settle()
+    rig = said.known.rig
+    assert rig is not None
+    assert rig.serves["front-roof"].start_ns == NS
+    assert list(rig.windows) == ["front-roof"]
+    assert {sensor.state for sensor in reply(said).sensors} == {"unknown"}

@@ -1,0 +1,198 @@
+"""Three pairs of one LiDAR, without threads: it is knocked, and that is one event with one correction."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from coec.adapters.files.scribe import Scribe
+from coec.adapters.zenoh.ros_topics import Topics
+from coec.calibration.lifecycle import HealthState
+from coec.config import Config
+from coec.errors import NotFoundError
+from coec.runtime import pair as runtime_pair
+from coec.runtime.api.rig import RigAnswers
+from coec.runtime.api.rig_commands import RigCommands
+from coec.runtime.budget.budget import Budget
+from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.ingest.inbox import Call
+from coec.runtime.ingest.intake import Intake
+from coec.runtime.outside import Outside
+from coec.runtime.pair import Pair
+from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.rig.keeper import RigKeeper
+from coec.runtime.worker.supervisor import Worker
+from coec.schemas.base import to_json
+from coec.schemas.keys import Keys
+from coec.schemas.replies import Acknowledgement, HistoryEntry
+from coec.schemas.rig_state import RigReply
+from pair_bench import AFTER, STEP_S, InstantRecorder, InstantScribe, KnowingWorker, S, configuration, pair_at
+
+CAMERAS = ("front", "left", "rear")
+
+
+def _configuration(folder: Path, apply: str) -> Config:
+    config = configuration(folder, apply)
+    (pair,) = config.pairs
+    lidar = pair.lidar.model_copy(update={"name": "roof"})
+    cameras = [pair.camera.model_copy(update={"name": name, "key": f"in/{name}"}) for name in CAMERAS]
+    pairs = [pair.model_copy(update={"name": camera.name, "camera": camera, "lidar": lidar}) for camera in cameras]
+    return config.model_copy(update={"pairs": tuple(pairs)})
+
+
+class RigBench:
+    """All pairs of a vehicle, driven in an order that a seed draws."""
+
+    def __init__(self, folder: Path, seed: int = 0, apply: str = "within_limits") -> None:
+        folder.mkdir(parents=True)
+        config = _configuration(folder, apply)
+        self.rng = random.Random(seed)
+        self.intake = Intake(config.limits)
+        self.keys = Keys("coec", config.vehicle)
+        scribe: Scribe = InstantScribe(folder)
+        self.rig = RigKeeper(folder, (), scribe)
+        self.answers = RigAnswers(self.keys, lambda *_: None)
+        windows = WindowStore(folder / "windows", config.state)
+        outside = Outside(
+            self.keys,
+            self.intake,
+            StateStore(folder, config.vehicle),
+            scribe,
+            windows,
+            cast("Worker", None),
+            Budget(config.budget, lambda: 0.0),
+            self.rig,
+            lambda *_: None,
+            lambda: (),
+            lambda *_: None,
+            Topics,
+            rig_troubles=self.answers.troubles,
+        )
+        self.pairs: dict[str, Pair] = {}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(runtime_pair, "Recorder", InstantRecorder)
+            for pair in config.pairs:
+                worker = KnowingWorker()
+                object.__setattr__(outside, "worker", worker)
+                self.pairs[pair.name] = Pair(pair, config, outside)
+                cast("InstantRecorder", self.pairs[pair.name].recorder).worker = worker
+        self.rig.listen(self.answers.hear, lambda: None)
+        self.settle()
+
+    def drive(self, begin_s: int, end_s: int) -> None:
+        """Pairs of frames, twice a second, of each pair in turn; each is settled some time later."""
+        for stamp_ns in range(begin_s * S, end_s * S, S // 2):
+            for name in self.rng.sample(CAMERAS, 3):
+                self.pairs[name].stream.take([pair_at(stamp_ns)])
+                if self.rng.random() < 0.7:
+                    self.settle()
+        self.settle()
+
+    def settle(self) -> None:
+        """What the threads do until there is nothing more that they may do."""
+        going = True
+        while going:
+            going = False
+            while isinstance(item := self.intake.inbox.take(0.0), Call):
+                item.run()
+                going = True
+            for name in self.rng.sample(CAMERAS, 3):
+                pair = self.pairs[name]
+                going |= pair.stream.choose_next()
+                pair.stream.tell()
+                going |= pair.decider.work(0.0)
+                if self.rng.random() < 0.5:
+                    going |= self.rig.work(0.0)
+            going |= self.rig.work(0.0)
+
+    def do(self, name: str, **arguments: Any) -> Acknowledgement:
+        """A command for the rig."""
+        commands = {name: pair.commands for name, pair in self.pairs.items()}
+        rig = RigCommands("test", commands, lambda: self.reply)
+        with ThreadPoolExecutor(1) as other:
+            told = other.submit(rig.carry_out, name, arguments, "the test")
+            while not told.done():
+                self.settle()
+        self.settle()
+        return told.result()
+
+    @property
+    def reply(self) -> RigReply:
+        return self.answers.reply
+
+    def entries(self, name: str, *kinds: str) -> list[HistoryEntry]:
+        store = self.pairs[name].answers._store
+        return [kept.entry for kept in store.history.entries() if kept.entry.kind in kinds]
+
+    def told(self) -> dict[str, bytes]:
+        """All that a replay must come to again."""
+        extrinsics = {name: to_json(pair.answers.extrinsic_reply) for name, pair in self.pairs.items()}
+        return {**extrinsics, "rig": to_json(self.reply)}
+
+    def decisions(self) -> dict[str, list[tuple[str, str, int | None]]]:
+        return {
+            name: [(entry.kind, entry.code, entry.stamp_ns) for entry in self.entries(name, "extrinsic", "state")]
+            for name in CAMERAS
+        }
+
+
+@pytest.mark.fault("a knocked LiDAR, three cameras, policy `within_limits`", "one correction, served by all pairs")
+def test_a_knocked_lidar_is_corrected_once_for_all_pairs_and_the_same_in_a_replay(
+    tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    bench = RigBench(tmp_path / "one")
+    bench.drive(STEP_S - 45, STEP_S + 65)
+    reply = bench.reply
+    assert reply.losses == {}
+    assert reply.correction is not None
+    assert reply.correction.sensors == ("roof",)
+    assert set(reply.correction.pairs) == set(CAMERAS)
+    assert {sensor.state for sensor in reply.sensors} == {"calibrated"}
+    for name in CAMERAS:
+        (corrected,) = [entry for entry in bench.entries(name, "command") if entry.code == "corrected"]
+        assert "roof" in corrected.text
+        state = bench.pairs[name].answers._store.state
+        assert state.health is HealthState.HEALTHY
+        assert state.T_camera_lidar == pytest.approx(AFTER, abs=2e-3)
+        served = [entry for entry in bench.entries(name, "extrinsic") if entry.stamp_ns == reply.correction.stamp_ns]
+        assert len(served) == 1
+    again = RigBench(tmp_path / "two", seed=1)
+    again.drive(STEP_S - 45, STEP_S + 65)
+    assert again.told() == bench.told()
+    assert again.decisions() == bench.decisions()
+    record_property("figure", f"{(reply.correction.stamp_ns / S) - STEP_S:.0f} s after the knock")
+
+
+def test_where_people_decide_the_correction_waits_for_them(tmp_path: Path) -> None:
+    bench = RigBench(tmp_path / "state", apply="never")
+    bench.drive(STEP_S - 45, STEP_S + 50)
+    assert bench.reply.correction is None or set(bench.reply.correction.pairs) == set(CAMERAS)
+    assert {sensor.name: sensor.state for sensor in bench.reply.sensors}["roof"] == "lidar_moved"
+    for name in CAMERAS:
+        state = bench.pairs[name].answers._store.state
+        assert state.pending is not None
+        assert not np.allclose(state.T_camera_lidar, AFTER, atol=1e-3)
+
+
+def test_a_command_for_a_sensor_is_one_for_each_of_its_pairs(tmp_path: Path) -> None:
+    bench = RigBench(tmp_path / "state")
+    bench.drive(STEP_S - 20, STEP_S - 10)
+    held = bench.do("hold", sensor="left")
+    assert (held.accepted, held.code, held.pair) == (True, "held", "rig")
+    assert [bench.pairs[name].answers.extrinsic_reply.held for name in CAMERAS] == [False, True, False]
+    assert bench.do("hold", sensor="roof").accepted
+    assert all(bench.pairs[name].answers.extrinsic_reply.held for name in CAMERAS)
+    refused = bench.do("reset", sensor="roof")
+    assert (refused.accepted, refused.code) == (False, "held")
+    assert all(f"{name}: " in refused.text for name in CAMERAS)
+    assert bench.do("hold", sensor="left", release=True).accepted
+    in_part = bench.do("reset")
+    assert (in_part.accepted, in_part.code) == (False, "in_part")
+    with pytest.raises(NotFoundError, match="the rig has front, left, rear, roof"):
+        bench.do("hold", sensor="trunk")
