@@ -87,7 +87,7 @@ DIRECTIONS = (
 )
 SIM_DRIVE = "coec sim drive --seed 3 --seconds 60 --fault step:30:rx=3 --output drive.mcap"
 RIG_DRIVE = "coec sim drive --rig four-fisheyes --seconds 4 --camera fisheye350 --fault front:step:2:ry=1 --output rig"
-RIG_LIDARS = 'coec lidars "sim:rig=four-fisheyes&pair=front-roof&seconds=4" roof near_left'
+RIG_LIDARS = 'coec lidars "sim:rig=four-fisheyes&seconds=4" roof near_left'
 RIG_MOVES = "coec sim rig-moves --drives 5 --rigs 5"
 SIM_CALIBRATE = 'coec calibrate "sim:seed=3&seconds=60&camera_hz=0.4&lidar_hz=0.4" --perturb 3,-3,2'
 COMMISSION = "coec commission SOURCE... --output rig.json"
