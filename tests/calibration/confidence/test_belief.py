@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.calibration.confidence.belief import ANYWHERE_M, in_centre, in_doubt
+from coec.calibration.confidence.belief import CENTRE_EVEN, in_centre, in_doubt
 
 KNOWN_M = 0.01
 """What a rule leaves."""
@@ -27,7 +27,7 @@ def spread_of_told(measured_m: float, off_m: float, rng: np.random.Generator) ->
     return float(np.mean(along)), in_centre(off_m / (2.0 * measured_m), off_m, KNOWN_M) * off_m
 
 
-@pytest.mark.parametrize(("measured_m", "off_m"), [(0.003, 0.015), (0.01, 0.03), (0.02, 0.04), (0.03, 0.06)])
+@pytest.mark.parametrize(("measured_m", "off_m"), [(0.003, 0.006), (0.01, 0.02), (0.02, 0.04), (0.03, 0.06)])
 def test_a_centre_that_was_told_right_counts_by_what_is_off_in_truth(
     measured_m: float, off_m: float, rng: np.random.Generator
 ) -> None:
@@ -53,7 +53,8 @@ def test_what_a_window_cannot_tell_of_a_centre_is_not_believed() -> None:
 
 
 def test_where_nobody_knew_the_centre_what_is_measured_counts() -> None:
-    assert in_centre(1.5, 0.05, 3.0 * ANYWHERE_M) > 0.95
+    assert in_centre(CENTRE_EVEN, 0.05, 0.5) > 0.95
+    assert in_centre(CENTRE_EVEN, 0.05, 0.0) ** 2 == pytest.approx(0.5)
 
 
 @given(certainty=st.floats(-4.0, 6.0), off_m=st.floats(0.001, 0.5), known_m=st.sampled_from([0.0, 0.003, KNOWN_M, 0.1]))
