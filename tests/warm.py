@@ -1,7 +1,7 @@
 """Makes what many test files need, before several processes start that would each make it at the same time: compiled
 kernels and drawn drives. Nothing depends on it: what is not there is made by whoever needs it first.
 
-`python tests/warm.py`; takes a second where all is there.
+`python tests/warm.py`; takes four seconds of a core where all is there.
 """
 
 from __future__ import annotations
