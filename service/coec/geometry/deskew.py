@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 
 from coec.geometry.compiler import njit
 
+SMALL_RAD = 0.01
+"""A turn below which two terms of a series do for sines: the next is a ten-thousandth of a millionth of the first. A
+sweep turns by less in all but sharp bends, and a sine takes as long as all the rest."""
+
 
 @njit(cache=True)
 def deskew(
@@ -40,10 +44,11 @@ def deskew(
     for i in range(xyz_m.shape[0]):
         t = dt_s[i]
         angle = rate * t
-        if abs(angle) < 1e-4:  # series: the next terms are below 1e-12 relative
-            a = t
-            b = 0.5 * t * t
-            c = t * t * t / 6.0
+        if abs(angle) < SMALL_RAD:
+            square = angle * angle
+            a = t * (1.0 - square / 6.0)
+            b = 0.5 * t * t * (1.0 - square / 12.0)
+            c = t * t * t / 6.0 * (1.0 - square / 20.0)
         else:
             a = math.sin(angle) / rate
             b = (1.0 - math.cos(angle)) / (rate * rate)

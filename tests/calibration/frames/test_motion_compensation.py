@@ -22,7 +22,7 @@ def test_deskew_is_the_exponential_of_the_twist(rng: np.random.Generator) -> Non
     np.testing.assert_allclose(deskew(xyz, dt, TWIST[:3], TWIST[3:]), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("rate", [0.0, 1e-9, 1e-5, 3e-3, 1.0])
+@pytest.mark.parametrize("rate", [0.0, 1e-9, 1e-5, 3e-3, 0.199, 0.201, 1.0])
 def test_deskew_is_smooth_where_the_series_takes_over(rate: float) -> None:
     twist = np.array([0.0, 0.0, rate, 10.0, 0.0, 0.0])
     point = np.array([[30.0, 5.0, 1.0]], np.float32)
