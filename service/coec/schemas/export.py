@@ -42,6 +42,8 @@ MESSAGES: tuple[type[Message], ...] = (
     checks.CheckedDrive,
     checks.ChecksReport,
     rig.RigMovesReport,
+    rig.RigDriveRow,
+    rig.RigDrivesReport,
     doctor.DoctorReport,
 )
 
