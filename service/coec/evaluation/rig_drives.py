@@ -34,8 +34,8 @@ from coec.simulation.rig_instants import Instant, instants, pair_of
 LIDAR = "roof"
 """Of four fisheyes and one LiDAR of 64 beams."""
 
-AT_S = (20.0, 30.0)
-"""Within which sensors are knocked, seconds of the drive: after one or two looks at every pair."""
+AT_S = (16.0, 22.0)
+"""Within which sensors are knocked, seconds of the drive: after two or three looks at every pair."""
 
 AFTER_S = 60.5
 """Of driving after that: as long as an alarm may take, and the last pair is begun."""

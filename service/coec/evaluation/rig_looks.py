@@ -24,8 +24,8 @@ from coec.geometry.se3 import inverse
 from coec.simulation.aboard import product
 from coec.simulation.rig_drive import RigDrive
 
-PERIOD_S = 10.0
-"""Between two looks at one pair of a rig that is drawn for it; pairs take turns."""
+PERIOD_S = 5.0
+"""Between two looks at one pair, as the monitor takes them; pairs take turns."""
 
 TURN_S = PERIOD_S / CHECK_PAIRS
 """Between two instants that are drawn."""
@@ -35,7 +35,7 @@ ROWS = (0.34, 0.70)
 local mean reaches 40 pixels further. A third of the height takes a third of the time."""
 
 TURNS = (0, 1, 3, 4)
-"""By how many instants the looks at each pair are later than those at the first: 1.7 to 3.3 s apart."""
+"""By how many instants the looks at each pair are later than those at the first: 0.8 to 1.7 s apart."""
 
 
 def due(instants: int, pairs: Sequence[str]) -> tuple[str, ...]:

@@ -123,7 +123,7 @@ def page(pictures: Sequence[Path], acts: Sequence[Performance]) -> str:
     """One HTML file that needs no other."""
     parts = [
         html.head(TITLE),
-        "<p>Four fisheyes look at what one LiDAR measures, and each of the four pairs is looked at every ten seconds. "
+        "<p>Four fisheyes look at what one LiDAR measures, and each of the four pairs is looked at every five seconds. "
         "A camera that is knocked puts its own pair wrong; a LiDAR that is knocked puts all pairs wrong, and alike. "
         "Which sensor explains all looks with the fewest moves is asked after each of them. Vehicle and street are "
         f"simulated, with pictures of {story.CAMERA_PX} pixels a side, of which those rows are drawn that the LiDAR "

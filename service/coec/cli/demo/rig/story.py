@@ -20,13 +20,13 @@ pixels leave open, and a single camera that is off by it stays undecided."""
 LIDAR = "roof"
 """That all four cameras see: the short-range ones of the rig are left out."""
 
-KNOCK_S = 26.0
+KNOCK_S = 16.0
 """Of driving: every pair has been looked at twice."""
 
 LONGEST_S = KNOCK_S + 60.0
 """Of driving, should nobody be named: an alarm has to come within a minute."""
 
-REST_S = 10.0
+REST_S = 6.0
 """Of driving after it was told who moved: every pair is looked at once more."""
 
 
