@@ -924,9 +924,9 @@ def _sim_rig_drives(
     """Tell how well the sensors of a rig that moved are named, and no others, on rendered drives.
 
     A drive is a minute and a half of a street with four fisheyes and a LiDAR, drawn as the rig was built and with two
-    cameras and the LiDAR knocked by 1°; it takes a minute of one core. Of the pictures those rows are drawn that the
-    LiDAR sees. What is done is kept in DIR: call again, with more drives, to go on. A DIR holds results of one state of
-    the code.
+    cameras and the LiDAR knocked by 1°; it takes some minutes of one core. Of the pictures those rows are drawn that
+    the LiDAR sees. What is done is kept in DIR: call again, with more drives, to go on. A DIR holds results of one
+    state of the code.
     """
     from coec.cli import sim_rig_drives as command
 

@@ -32,7 +32,7 @@ TURN_S = PERIOD_S / CHECK_PAIRS
 
 ROWS = (0.34, 0.70)
 """Of the pictures that are drawn: what the LiDAR sees lies between 0.40 and 0.64 of their height on a street, and a
-local mean reaches 40 pixels further. A third of the height takes a third of the time."""
+local mean reaches 40 pixels further."""
 
 TURNS = (0, 1, 3, 4)
 """By how many instants the looks at each pair are later than those at the first: 0.8 to 1.7 s apart."""
