@@ -1,11 +1,11 @@
-"""What `coec sim rig-moves` says in tables."""
+"""What `coec sim rig-moves` and `coec sim rig-drives` say in tables."""
 
 from __future__ import annotations
 
 from statistics import median
 
 from coec.reports import console
-from coec.schemas.rig import RigMovesReport
+from coec.schemas.rig import RigDrivesReport, RigMovesReport
 
 
 def show(report: RigMovesReport) -> None:
@@ -16,8 +16,7 @@ def show(report: RigMovesReport) -> None:
     )  # fmt: skip
     for row in report.moves:
         counts = (row.drives, row.right, row.undecided, row.wrong)
-        late = (f"{median(row.delay_s):.0f} s", f"{max(row.delay_s):.0f} s") if row.delay_s else ("-", "-")
-        table.add_row(row.rig, row.fault, *map(str, counts), *late)
+        table.add_row(row.rig, row.fault, *map(str, counts), *_late(row.delay_s))
     console.out.print(table)
     joint = console.table(
         "windows combined", "pairs", "rigs", "rms error, of single pairs", "NEES", "consistent", "1° off: found",
@@ -33,3 +32,27 @@ def show(report: RigMovesReport) -> None:
             *map(str, (of.consistent, of.biased_found, of.biased_missed)),
         )
     console.out.print(joint)
+
+
+def show_drives(report: RigDrivesReport) -> None:
+    """Who moved on rendered drives, by fault; then each drive that did not end right."""
+    table = console.table(
+        "rendered", "drives", f"right in {report.allowed_s:g} s", "undecided", "wrong", "named: median", "latest",
+        "a pair alarmed: drives", "median", "latest", right=range(1, 10),
+    )  # fmt: skip
+    for row in report.moves:
+        counts = map(str, (row.drives, row.right, row.undecided, row.wrong))
+        table.add_row(row.fault, *counts, *_late(row.delay_s), str(len(row.alarms_s)), *_late(row.alarms_s))
+    console.out.print(table)
+    for row in report.moves:
+        for one in row.each:
+            if one.wrong:
+                console.show(f"  {one.name}, {row.fault}: {', '.join(one.wrong)} named {one.wrong_s:+.0f} s after it")
+            elif one.named_s is None:
+                console.show(f"  {one.name}, {row.fault}: {' and '.join(one.moved)} not named")
+    of = f"{report.looks} looks on {report.drives} drives with {report.camera}"
+    console.show(f"{of}: {report.faint} faint, {report.blind} blind; {report.failed} drives failed")
+
+
+def _late(seconds: tuple[float, ...]) -> tuple[str, str]:
+    return (f"{median(seconds):.0f} s", f"{max(seconds):.0f} s") if seconds else ("-", "-")

@@ -43,6 +43,8 @@ MESSAGES: tuple[type[Message], ...] = (
     checks.ChecksReport,
     rig.RigMovesReport,
     rig_state.RigReply,
+    rig.RigDriveRow,
+    rig.RigDrivesReport,
     doctor.DoctorReport,
     fleet.WindowRow,
     fleet.BatchReport,

@@ -3,6 +3,8 @@ rig knows its pairs than they do by themselves."""
 
 from __future__ import annotations
 
+from enum import StrEnum
+
 from pydantic import Field
 
 from coec.schemas.base import Message, Part
@@ -41,3 +43,69 @@ class RigMovesReport(Message):
     allowed_s: float
     moves: tuple[MovesRow, ...]
     joint: tuple[JointRow, ...]
+
+
+class Mounts(StrEnum):
+    """Which sensor of a pair is not where it was built."""
+
+    AS_BUILT = "as_built"
+    CAMERA = "camera"
+    LIDAR = "lidar"
+
+
+class RigLook(Part):
+    """One look at one pair of a rendered rig: see `Observation`, of which it holds what attribution and the change
+    detector take. Radians and metres; axes rx ry rz tx ty tz about and along the camera axes."""
+
+    edge: str
+    mounts: Mounts
+    pair_stamps_ns: tuple[int, ...] = Field(min_length=1)
+    offset: Vector6
+    sigma: Vector6
+    noise: Vector6
+    place: Vector6
+    distance2: float
+    flagged: bool
+    weak: bool
+    causes: tuple[str, ...]
+
+
+class RigDriveRow(Message):
+    """All looks of one rendered drive of a rig, in the order of their stamps."""
+
+    name: str
+    seed: Count
+    camera: str = Field(description="of every camera of the rig, as `fisheye350`")
+    looks: tuple[RigLook, ...]
+    failure: str | None = Field(default=None, description="why the drive has no result")
+
+
+class RigDriveMoves(Part):
+    """What was said of one fault on one rendered drive; seconds of driving after the fault, null where it was not."""
+
+    name: str
+    moved: tuple[str, ...] = Field(description="sensors that were knocked")
+    named_s: float | None = Field(description="when exactly these were named")
+    alarm_s: float | None = Field(description="when the first pair that has one of them was sure that its mount moved")
+    wrong: tuple[str, ...] = Field(description="sensors that were ever named and had not been knocked")
+    wrong_s: float | None = Field(description="when the first of these was, of a drive that begins at the fault")
+
+
+class RigDrivesRow(MovesRow):
+    """Of all rendered drives with one fault."""
+
+    alarms_s: tuple[float, ...] = Field(description="of those with an alarm, see `alarm_s`, in order")
+    each: tuple[RigDriveMoves, ...]
+
+
+class RigDrivesReport(Message):
+    """What `coec sim rig-drives --json` prints."""
+
+    allowed_s: float
+    camera: str
+    drives: Count = Field(description="that were drawn and have a result")
+    failed: Count = Field(description="that have none")
+    looks: Count
+    faint: Count = Field(description="looks with faint edges")
+    blind: Count = Field(description="looks with a cause in their data")
+    moves: tuple[RigDrivesRow, ...]

@@ -184,7 +184,11 @@ def _past(own_body: Solid, T_ego_lidar: Matrix4, found: Sweep) -> Sweep:
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """How a camera takes its pictures: see `drive.DriveConfig`."""
+    """How a camera takes its pictures: see `drive.DriveConfig`.
+
+    Attributes:
+        rows: shares of the height between which there is a picture; beyond, as where the lens shows nothing.
+    """
 
     camera: Camera
     half_view_deg: float
@@ -192,6 +196,17 @@ class Optics:
     rolling_shutter_s: float = 0.0
     depth: bool = False
     lens: Lens = field(default_factory=Lens)
+    rows: tuple[float, float] = (0.0, 1.0)
+
+    @property
+    def first_row(self) -> int:
+        """Of the picture."""
+        return round(self.rows[0] * self.camera.height)
+
+    @property
+    def end_row(self) -> int:
+        """After its last one."""
+        return round(self.rows[1] * self.camera.height)
 
 
 class CameraAboard:
@@ -210,6 +225,8 @@ class CameraAboard:
         seen = np.zeros(camera.height * camera.width, bool)
         seen[self._rays.pixel] = True
         self._seen = seen.reshape(camera.height, camera.width)
+        self._seen[: optics.first_row] = False
+        self._seen[optics.end_row :] = False
         self._hidden: tuple[bytes, NDArray[np.bool_]] | None = None
         self._dirt: dict[float, Floats] = {}
         self._repeated: tuple[int, CameraFrame] | None = None
@@ -268,8 +285,10 @@ class CameraAboard:
 
     def _rows(self, time_s: float, T_ego_camera: Matrix4) -> list[Exposure]:
         """Where the camera is while it takes its rows."""
-        height, readout_s = self._optics.camera.height, self._optics.rolling_shutter_s
-        bounds = np.linspace(0, height, (min(ROW_PARTS, height) if readout_s else 1) + 1).round().astype(int)
+        optics = self._optics
+        height, readout_s = optics.camera.height, optics.rolling_shutter_s
+        parts = min(ROW_PARTS, height) if readout_s else 1
+        bounds = np.linspace(optics.first_row, optics.end_row, parts + 1).round().astype(int)
         times = time_s + readout_s * ((bounds[:-1] + bounds[1:]) / 2 / height - 0.5)
         poses = self._journey.trip.poses(times)
         return [

@@ -43,6 +43,7 @@ class RigConfig:
         faults: of a sensor, its own; a step or drift turns it about its own axes: T_sensor_ego becomes
             exp(ξ)·T_sensor_ego.
         workshop: by sensor, (6,) ξ, degrees and metres about its own axes, by which its nominal pose is wrong.
+        rows: of every camera, see `Optics`: who compares edges of pictures with a LiDAR's needs what the LiDAR sees.
     """
 
     layout: RigLayout = FOUR_FISHEYES
@@ -60,6 +61,7 @@ class RigConfig:
     workshop: tuple[tuple[str, Vector6], ...] = ()
     depth: bool = False
     lens: Lens = field(default_factory=Lens)
+    rows: tuple[float, float] = (0.0, 1.0)
 
     def drive(self) -> RigDrive:
         """Which it describes."""
@@ -110,8 +112,9 @@ class RigDrive:
             )  # fmt: skip
         for camera in layout.cameras:
             optics = Optics(
-                self.camera, layout.half_view_deg, camera.phase / config.camera_hz, depth=config.depth, lens=config.lens
-            )
+                self.camera, layout.half_view_deg, camera.phase / config.camera_hz,
+                depth=config.depth, lens=config.lens, rows=config.rows,
+            )  # fmt: skip
             self._eyes[camera.name] = CameraAboard(
                 self._journey, self._wire(camera.name, config.camera_hz), optics, self._mount(camera.name), self._body
             )

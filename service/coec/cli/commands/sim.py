@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from coec.cli.commands import sim_checks, sim_drive, sim_matrix, sim_rig_moves, sim_view
+from coec.cli.commands import sim_checks, sim_drive, sim_matrix, sim_rig_drives, sim_rig_moves, sim_view
 from coec.cli.declaring import taking
 
 app = typer.Typer(no_args_is_help=True, help="A vehicle that does not exist (optional extra `sim`).")
@@ -13,3 +13,4 @@ app.command("view")(taking(sim_view.run))
 app.command("matrix")(taking(sim_matrix.run))
 app.command("checks")(taking(sim_checks.run))
 app.command("rig-moves")(taking(sim_rig_moves.run))
+app.command("rig-drives")(taking(sim_rig_drives.run))

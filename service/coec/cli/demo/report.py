@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -16,7 +15,7 @@ from coec.adapters.images.codec import decode_bgr, encode_png
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Matrix4, Window
-from coec.cli.demo import story
+from coec.cli.demo import html, story
 from coec.cli.demo.outcome import ALARM, Ending, is_repaired
 from coec.cli.demo.watch import Moment, Seen, Watch
 from coec.config import LimitsConfig
@@ -27,14 +26,6 @@ from coec.reports.timeline_plot import STATE_COLOURS, timeline
 from coec.schemas import replies
 from coec.schemas.base import to_json
 from coec.sources import windows
-
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-h1 { margin-bottom: 0 } figure { margin: 1rem 0 } img { width: 100% } figcaption { color: #555 }
-table { border-collapse: collapse; margin: 1rem 0 } th, td { padding: .2rem .8rem; border-bottom: 1px solid #ddd }
-th { text-align: left } td.n { text-align: right; font-variant-numeric: tabular-nums }
-.state { border-radius: .6rem; padding: 0 .6rem }
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,22 +178,22 @@ def page(
     """One HTML file that needs no other."""
     verdict = "The knock was noticed and repaired." if outcome.passed else " ".join(outcome.objections())
     parts = [
-        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
-        "<title>coec demo</title>",
-        f"<style>{STYLE}</style><h1>{escape(_title())}</h1>",
+        html.head(_title()),
         f"<p><b>{escape(verdict)}</b> The vehicle, its street and its sensors are simulated, so the truth is "
         "known; the service is the one that runs on a vehicle, in a process of its own, and has seen the frames alone. "
         "Its depth network is the one that comes with it, trained on other streets of the same simulation.",
-        _table(("", ""), [(escape(name), escape(value)) for name, value in _summary(outcome, moments)]),
-        _figure(
+        html.table(("", ""), [(escape(name), escape(value)) for name, value in _summary(outcome, moments)]),
+        html.figure(
             shown["timeline"],
             "Error of the extrinsic that is served, which the service cannot know; the "
             "ground is what it says of its calibration.",
         ),
     ]
     if "closeup_before" in shown:
-        parts.append(_figure(shown["closeup_before"], "LiDAR points where the service put them before the repair …"))
-        parts.append(_figure(shown["closeup_after"], "… and after it, on the same picture. Colours are ranges."))
+        parts.append(
+            html.figure(shown["closeup_before"], "LiDAR points where the service put them before the repair …")
+        )
+        parts.append(html.figure(shown["closeup_after"], "… and after it, on the same picture. Colours are ranges."))
     parts += ["<h2>What the service said</h2>", _timeline(moments, outcome)]
     if result is not None:
         parts += ["<h2>The window that repaired it</h2>", _result(result)]
@@ -226,7 +217,7 @@ def _timeline(moments: Sequence[Moment], outcome: Ending) -> str:
         )
         for moment, what in zip(moments, _happenings(moments, outcome), strict=True)
     ]
-    return _table(("elapsed", "drive", "health", "extrinsic", "error", ""), rows, numbers=(0, 1, 4))
+    return html.table(("elapsed", "drive", "health", "extrinsic", "error", ""), rows, numbers=(0, 1, 4))
 
 
 def _result(result: replies.CalibrationResult) -> str:
@@ -238,24 +229,7 @@ def _result(result: replies.CalibrationResult) -> str:
         f"{result.pairs} pairs, verdict {result.verdict.decision}, configuration {result.config_hash}. The figures of "
         "its self-diagnosis, without the truth; a result is accepted if it keeps all limits:"
     )
-    return f"<p>{escape(told)}</p>" + _table(("figure", "value", "limit", ""), rows, numbers=(1,))
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """Cells are HTML."""
-    lines = ["<table>", "<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
-    for row in rows:
-        cells = (f"<td{' class=n' if i in numbers else ''}>{cell}</td>" for i, cell in enumerate(row))
-        lines.append("<tr>" + "".join(cells) + "</tr>")
-    return "\n".join([*lines, "</table>"])
-
-
-def _figure(path: Path, caption: str) -> str:
-    data = base64.b64encode(path.read_bytes()).decode()
-    return (
-        f'<figure><img alt="{escape(path.stem)}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
+    return f"<p>{escape(told)}</p>" + html.table(("figure", "value", "limit", ""), rows, numbers=(1,))
 
 
 def _colour(health: str) -> str:

@@ -1,0 +1,55 @@
+"""Whether an act came true: the sensor that was knocked is named, and no other ever."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from coec.cli.demo.rig import story
+from coec.cli.demo.rig.story import Act
+from coec.cli.demo.rig.told import Told
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Of one act.
+
+    Attributes:
+        named_s: second of the drive at which the knocked sensor alone was named; None: never, or it did not stay so.
+        wrong: sensors that were named at any time and had not moved.
+    """
+
+    act: Act
+    named_s: float | None
+    wrong: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether it came true."""
+        return not self.objections()
+
+    def objections(self) -> tuple[str, ...]:
+        """What did not, one sentence each."""
+        said = [f"{name} was said to have moved, and had not." for name in self.wrong]
+        if self.named_s is None:
+            said.append(f"{self.act.sensor} was knocked, and is not named at the end.")
+        return tuple(said)
+
+
+def outcome_of(act: Act, heard: Sequence[Told]) -> Outcome:
+    """Of all that was told, in order."""
+    wrong: set[str] = set()
+    named_s: float | None = None
+    for told in heard:
+        moved = {act.sensor} if told.second >= story.KNOCK_S else set()
+        wrong |= told.named - moved
+        if told.named != {act.sensor}:
+            named_s = None
+        elif named_s is None:
+            named_s = told.second
+    return Outcome(act, named_s, tuple(sorted(wrong)))
+
+
+def is_over(outcome: Outcome, told: Told) -> bool:
+    """Whether nothing more is to be seen: what was told has lasted."""
+    return outcome.named_s is not None and told.second >= outcome.named_s + story.REST_S

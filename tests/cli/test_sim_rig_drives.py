@@ -1,0 +1,38 @@
+"""`coec sim rig-drives`: from its words to its tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+from cli.conftest import Coec
+from coec.evaluation import rig_drives
+from coec.evaluation.rig_drives import FIRST_SEED, KnockedDrive
+from coec.schemas.rig import RigDriveRow, RigDrivesReport
+
+
+def test_what_was_drawn_is_kept_and_what_is_damaged_is_drawn_again(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[str] = []
+
+    def looked_at(drive: KnockedDrive) -> RigDriveRow:
+        drawn.append(drive.name)
+        return RigDriveRow(name=drive.name, seed=FIRST_SEED + drive.number, camera=drive.camera, looks=())
+
+    monkeypatch.setattr(rig_drives, "looked_at", looked_at)
+    words = ("sim", "rig-drives", "--output", tmp_path, "--camera", "fisheye128")
+    report = RigDrivesReport.model_validate(coec(*words, "--drives", 1, "--json").document)
+    assert report.drives == 1
+    assert [(row.fault, row.right, row.undecided, row.wrong) for row in report.moves] == [
+        ("nobody", 1, 0, 0), ("one camera 1°", 0, 1, 0), ("the LiDAR 1°", 0, 1, 0), ("two cameras 1°", 0, 1, 0)
+    ]  # fmt: skip
+    told = coec(*words, "--drives", 2).out
+    assert "roof not named" in told
+    assert len(drawn) == 2, "the first was kept"
+    (tmp_path / "drives" / f"{drawn[0]}.json").write_text("{")
+    assert coec(*words, "--drives", 2).status == 0
+    assert drawn == [drawn[0], drawn[1], drawn[0]]

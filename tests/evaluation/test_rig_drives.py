@@ -1,0 +1,140 @@
+"""Rendered drives of a rig: which looks are taken, and what is made of them."""
+
+from __future__ import annotations
+
+from math import radians
+
+import numpy as np
+import pytest
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+from coec.calibration.types import Matrix4
+from coec.evaluation import rig_drives
+from coec.evaluation.check_drives import CHECK_PAIRS
+from coec.evaluation.rig_drive_statistics import KNOCKS, Knock, moves_of, report
+from coec.evaluation.rig_drives import FIRST_SEED, LIDAR, KnockedDrive, looked_at
+from coec.evaluation.rig_looks import PERIOD_S, TURN_S, due
+from coec.geometry import se3
+from coec.schemas.replies import Vector6
+from coec.schemas.rig import Mounts, RigDriveRow, RigLook
+from coec.simulation.journey import START_NS
+from coec.simulation.rig_drive import RigDrive
+
+CAMERA = "fisheye1400"
+NOISE = np.array([radians(0.05)] * 3 + [0.015] * 3)
+SIGMA = np.array([radians(0.14)] * 3 + [0.033] * 3)
+PLACE = np.array([radians(0.06)] * 3 + [0.01] * 3)
+NOBODY, ONE_CAMERA, THE_LIDAR, TWO_CAMERAS = KNOCKS
+
+
+def six(values: np.ndarray) -> Vector6:
+    rx, ry, rz, tx, ty, tz = (float(value) for value in values)
+    return rx, ry, rz, tx, ty, tz
+
+
+def truth(drive: KnockedDrive, camera: str, mounts: Mounts, stamp_ns: int) -> Matrix4:
+    def pose(sensor: str, mount: Mounts) -> Matrix4:
+        of: RigDrive = drive.knocked if mounts is mount else drive.right
+        return of.T_sensor_ego(sensor, stamp_ns)
+
+    return np.asarray(pose(camera, Mounts.CAMERA) @ se3.inverse(pose(LIDAR, Mounts.LIDAR)))
+
+
+def drawn(number: int) -> RigDriveRow:
+    """Looks as those of a drive that was rendered: at the truth, but for noise."""
+    drive, rng, looks = KnockedDrive(number, CAMERA), np.random.default_rng(number), []
+    for turn in range(CHECK_PAIRS, round((drive.at_s + 30.0) / TURN_S)):
+        stamps_ns = tuple(START_NS + round((turn - k) * TURN_S * 1e9) for k in range(CHECK_PAIRS, 0, -1))
+        for camera in due(turn, drive.right.cameras):
+            served, noise = drive.served[f"{camera}-{LIDAR}"], NOISE * rng.normal(size=6)
+            for mounts in Mounts:
+                if mounts is Mounts.CAMERA and camera not in drive.cameras:
+                    continue
+                offset = se3.difference(truth(drive, camera, mounts, stamps_ns[-1]), served) + noise
+                looks.append(
+                    RigLook(
+                        edge=f"{camera}-{LIDAR}", mounts=mounts, pair_stamps_ns=stamps_ns, offset=six(offset),
+                        sigma=six(SIGMA), noise=six(NOISE), place=six(PLACE), distance2=0.5, flagged=False, weak=False,
+                        causes=(),
+                    )
+                )  # fmt: skip
+    return RigDriveRow(name=drive.name, seed=FIRST_SEED + number, camera=CAMERA, looks=tuple(looks))
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[RigDriveRow]:
+    return [drawn(1)]
+
+
+def test_pairs_take_turns_and_each_is_looked_at_once_in_a_period() -> None:
+    turns = [(turn, pair) for turn in range(60) for pair in due(turn, ("a", "b", "c", "d"))]
+    assert {pair for turn, pair in turns if turn < 2 * CHECK_PAIRS} == {"a", "b", "c", "d"}
+    assert len({turn for turn, _ in turns}) == len(turns), "never two at once: who moved is asked of each"
+    for name in "abcd":
+        own = [turn for turn, pair in turns if pair == name]
+        assert own[0] >= CHECK_PAIRS
+        assert set(np.diff(own)) == {round(PERIOD_S / TURN_S)}
+
+
+def test_those_that_were_knocked_are_named_fault_by_fault(rows: list[RigDriveRow]) -> None:
+    told = report([*rows, rows[0].model_copy(update={"looks": (), "failure": "CalibrationError: no"})], CAMERA)
+    assert (told.drives, told.failed, told.faint, told.blind) == (1, 1, 0, 0)
+    assert told.looks == sum(len(row.looks) for row in rows)
+    by_fault = {row.fault: row for row in told.moves}
+    for fault, row in by_fault.items():
+        assert (row.drives, row.undecided) == (1, 0), fault
+        assert (row.right, row.wrong) == ((0, 1) if row.each[0].wrong else (1, 0)), fault
+        assert row.each[0].named_s is not None, "at some time exactly those that were knocked are named"
+    assert by_fault[NOBODY.name].right == by_fault[ONE_CAMERA.name].right == 1
+    for knock, moved in ((NOBODY, 0), (ONE_CAMERA, 1), (THE_LIDAR, 1), (TWO_CAMERAS, 2)):
+        row = by_fault[knock.name]
+        assert all(len(one.moved) == moved for one in row.each)
+        assert all(0.0 <= one.named_s <= 30.0 for one in row.each if one.named_s is not None)
+    assert by_fault[THE_LIDAR.name].each[0].moved == (LIDAR,)
+    assert by_fault[NOBODY.name].alarms_s == ()
+    assert len(by_fault[TWO_CAMERAS.name].alarms_s) == 1
+
+
+def test_a_sensor_that_stood_still_and_is_named_counts_as_wrong(rows: list[RigDriveRow]) -> None:
+    """The looks of a knocked camera, told as those of a drive on which nobody was."""
+    drive = KnockedDrive(1, CAMERA)
+    edge = f"{drive.cameras[0]}-{LIDAR}"
+    swapped = tuple(
+        look.model_copy(update={"mounts": Mounts.AS_BUILT})
+        for look in rows[0].looks
+        if look.mounts is (Mounts.CAMERA if look.edge == edge else Mounts.AS_BUILT)
+    )
+    told = moves_of(rows[0].model_copy(update={"looks": swapped}), NOBODY)
+    assert told.wrong == (drive.cameras[0],)
+    assert told.wrong_s is not None
+    assert told.wrong_s >= 0.0
+
+
+def test_one_that_nothing_tells_of_is_not_named(rows: list[RigDriveRow]) -> None:
+    drive = KnockedDrive(1, CAMERA)
+    blind = tuple(look for look in rows[0].looks if not look.edge.startswith(drive.cameras[0]))
+    told = moves_of(rows[0].model_copy(update={"looks": blind}), Knock("one camera", cameras=1))
+    assert (told.named_s, told.wrong) == (None, ())
+
+
+@pytest.mark.slow
+def test_a_drive_is_drawn_and_looked_at_pair_by_pair(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As small and short as it goes: what the looks say of so few pixels is of no interest."""
+    monkeypatch.setattr(rig_drives, "AT_S", (6.5, 6.6))
+    monkeypatch.setattr(rig_drives, "AFTER_S", 2.0)
+    drive = KnockedDrive(0, "fisheye64")
+    row = looked_at(drive)
+    assert row.failure is None
+    assert (row.name, row.seed) == (f"fisheye64_{FIRST_SEED}", FIRST_SEED)
+    as_built = [look for look in row.looks if look.mounts is Mounts.AS_BUILT]
+    assert sorted(look.edge for look in as_built) == [f"{camera}-{LIDAR}" for camera in sorted(drive.right.cameras)]
+    assert all(len(look.pair_stamps_ns) == CHECK_PAIRS for look in row.looks)
+    last = [look.pair_stamps_ns[-1] for look in row.looks]
+    assert last == sorted(last)
+    for look in row.looks:
+        moved = look.mounts is not Mounts.AS_BUILT
+        assert not moved or look.pair_stamps_ns[-1] + 50_000_000 >= START_NS + drive.at_s * 1e9
+        assert look.mounts is not Mounts.CAMERA or look.edge.split("-")[0] in drive.cameras
+    late = {look.edge for look in as_built if look.pair_stamps_ns[-1] - START_NS > (drive.at_s + 0.1) * 1e9}
+    assert late == {look.edge for look in row.looks if look.mounts is Mounts.LIDAR}
