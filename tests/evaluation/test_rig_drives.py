@@ -55,8 +55,8 @@ def drawn(number: int) -> RigDriveRow:
                 looks.append(
                     RigLook(
                         edge=f"{camera}-{LIDAR}", mounts=mounts, pair_stamps_ns=stamps_ns, offset=six(offset),
-                        sigma=six(SIGMA), noise=six(NOISE), place=six(PLACE), distance2=0.5, flagged=False, weak=False,
-                        causes=(),
+                        sigma=six(SIGMA), noise=six(NOISE), place=six(PLACE), dispersion=1.0, distance2=0.5,
+                        flagged=False, weak=False, causes=(),
                     )
                 )  # fmt: skip
     return RigDriveRow(name=drive.name, seed=FIRST_SEED + number, camera=CAMERA, looks=tuple(looks))

@@ -132,6 +132,6 @@ def observation_of(look: RigLook) -> Observation:
     offset, sigma, noise, place = (np.array(six) for six in (look.offset, look.sigma, look.noise, look.place))
     return Observation(
         stamp_ns=look.pair_stamps_ns[-1], pair_stamps_ns=look.pair_stamps_ns, metrics=(), offset=offset, sigma=sigma,
-        noise=noise, place=place, distance2=look.distance2, flagged=look.flagged, weak=look.weak,
-        flagged_by_paper=None, causes=tuple(CAUSES[code] for code in look.causes),
+        noise=noise, place=place, dispersion=look.dispersion, distance2=look.distance2, flagged=look.flagged,
+        weak=look.weak, flagged_by_paper=None, causes=tuple(CAUSES[code] for code in look.causes),
     )  # fmt: skip

@@ -145,8 +145,9 @@ def _looks_of(drive: KnockedDrive, camera: str, kept: list[dict[tuple[str, Mount
         told = look_at(rig, drive.served[rig.pair], pairs)
         yield RigLook(
             edge=rig.pair, mounts=mounts, pair_stamps_ns=told.pair_stamps_ns, offset=_six(told.offset),
-            sigma=_six(told.sigma), noise=_six(told.noise), place=_six(told.place), distance2=told.distance2,
-            flagged=told.flagged, weak=told.weak, causes=tuple(cause.code for cause in told.causes),
+            sigma=_six(told.sigma), noise=_six(told.noise), place=_six(told.place), dispersion=told.dispersion,
+            distance2=told.distance2, flagged=told.flagged, weak=told.weak,
+            causes=tuple(cause.code for cause in told.causes),
         )  # fmt: skip
 
 

@@ -64,6 +64,7 @@ class RigLook(Part):
     sigma: Vector6
     noise: Vector6
     place: Vector6
+    dispersion: float
     distance2: float
     flagged: bool
     weak: bool
