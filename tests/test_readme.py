@@ -88,6 +88,7 @@ DIRECTIONS = (
 SIM_DRIVE = "coec sim drive --seed 3 --seconds 60 --fault step:30:rx=3 --output drive.mcap"
 RIG_DRIVE = "coec sim drive --rig four-fisheyes --seconds 4 --camera fisheye350 --fault front:step:2:ry=1 --output rig"
 RIG_LIDARS = 'coec lidars "sim:rig=four-fisheyes&seconds=4" roof near_left'
+RIG_DEMO = "coec demo --rig"
 RIG_MOVES = "coec sim rig-moves --drives 5 --rigs 5"
 SIM_CALIBRATE = 'coec calibrate "sim:seed=3&seconds=60&camera_hz=0.4&lidar_hz=0.4" --perturb 3,-3,2'
 COMMISSION = "coec commission SOURCE... --output rig.json"
@@ -104,6 +105,8 @@ FORMS = {
     SIM_DRIVE: Form(f"{SIM_DRIVE} --camera fisheye200".replace("60", "0.5").replace("step:30", "step:0.2")),
     RIG_DRIVE: Form(RIG_DRIVE.replace("fisheye350", "fisheye100").replace("4", "0.3").replace("step:2", "step:0.1")),
     RIG_LIDARS: Form("coec lidars --help > help.txt"),
+    # What it shows is tested in tests/cli/test_demo_rig.py.
+    RIG_DEMO: Form("coec demo --help > help.txt && grep -q -e --rig help.txt"),
     RIG_MOVES: Form(RIG_MOVES.replace("5", "1")),
     # Two frames are too few for an uncertainty: the verdict is negative.
     SIM_CALIBRATE: Form(f"{SIM_CALIBRATE} --frames 2", status=1),
