@@ -79,6 +79,7 @@ _OBSERVATION = {
     "sigma": _array([6], [0.5] * 6),
     "noise": _array([6], [0.4] * 6),
     "place": _array([6], [0.3] * 6),
+    "dispersion": 1.0,
     "distance2": 0.125,
     "flagged": False,
     "weak": False,

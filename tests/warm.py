@@ -1,12 +1,14 @@
 """Makes what many test files need, before several processes start that would each make it at the same time: compiled
-kernels and drawn drives. Nothing depends on it: what is not there is made by whoever needs it first.
+kernels and drawn drives, in two processes. Nothing depends on it: what is not there is made by whoever needs it first.
 
 `python tests/warm.py`; takes four seconds of a core where all is there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 
 from calibration.conftest import SHARP_STREET, STREET
 from cli.conftest import SMALL
@@ -43,10 +45,10 @@ LENSES = (
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def pairs() -> Iterator[PairConfig]:
-    """One of each lens."""
+def pairs(lenses: Sequence[CameraIntrinsics]) -> Iterator[PairConfig]:
+    """One of each."""
     calibration = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(dof=6))
-    for camera in LENSES:
+    for camera in lenses:
         yield PairConfig(
             name=camera.model,
             camera=CameraConfig(key=f"{camera.model}/camera", intrinsics=camera),
@@ -57,11 +59,24 @@ def pairs() -> Iterator[PairConfig]:
         )
 
 
-def main() -> None:
-    """Draws, then compiles."""
+def draw() -> None:
+    """The drives of many files."""
     for source in (SMALL, STREET, SHARP_STREET):
         drawn_source(source)
-    Solver(Config(pairs=tuple(pairs())), 1).warm_up()
+
+
+def compile_for(lenses: Sequence[CameraIntrinsics]) -> None:
+    """What calibrates with these."""
+    Solver(Config(pairs=tuple(pairs(lenses))), 1).warm_up()
+
+
+def main() -> None:
+    """What all lenses have in common is compiled with the first."""
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as processes:
+        for done in (processes.submit(draw), processes.submit(compile_for, LENSES[:1])):
+            done.result()
+        for done in [processes.submit(compile_for, lenses) for lenses in (LENSES[1:3], LENSES[3:])]:
+            done.result()
 
 
 if __name__ == "__main__":

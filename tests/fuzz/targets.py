@@ -725,6 +725,7 @@ def _worker_seeds() -> list[bytes]:
         "flagged": True, "weak": False, "flagged_by_paper": None,
         "metrics": [{"name": "mi", "value": 0.3, "limit": 1.0, "at_least": True}],
         "causes": [{"code": "dark", "text": "It is dark."}], "distance2": 0.1, "drift": None, "dirty": [3],
+        "dispersion": 1.5,
         **{name: msgpack.ExtType(1, msgpack.packb([[6], bytes(48)])) for name in
            ("offset", "sigma", "noise", "place", "first_derivative", "second_derivative")},
     }  # fmt: skip

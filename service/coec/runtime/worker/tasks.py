@@ -254,10 +254,12 @@ class _Ramp:
 
 
 def _small(rig: Rig) -> Rig:
-    """The rig with a camera of fewer pixels, and of as large a field of view."""
+    """The rig with a camera of fewer pixels, and of as large a field of view; masked at a corner, so that what looks at
+    borders of masks finds one."""
     scale = min(1.0, WARM_UP_CAMERA_PX / max(rig.camera.width, rig.camera.height))
     camera = scaled(rig.camera, scale, scale)
-    mask = None if rig.mask is None else np.ones((camera.height, camera.width), np.bool_)
+    mask = np.ones((camera.height, camera.width), np.bool_)
+    mask[0, 0] = False
     return replace(rig, camera=camera, mask=mask)
 
 
