@@ -10,7 +10,7 @@ from coec.fleet import questions, report
 from coec.reports import console, fleet_page
 from coec.reports.console import figure
 from coec.schemas.base import to_json
-from coec.schemas.fleet import FleetReport
+from coec.schemas.fleet import AXES, FleetReport
 
 SHOWN = 15
 """Pairs in the table on the screen; the page has all."""
@@ -47,7 +47,7 @@ def _show(told: FleetReport) -> None:
         "vehicle", "pair", "windows", "accepted", "worst axis", "drift", "urgency", right=(2, 3, 5, 6)
     )
     for pair in told.pairs[:SHOWN]:
-        axis = None if pair.worst is None else fleet_page.AXES.index(pair.worst)
+        axis = None if pair.worst is None else AXES.index(pair.worst)
         table.add_row(
             pair.vehicle,
             pair.pair,

@@ -8,11 +8,10 @@ from pathlib import Path
 from coec.adapters.files import output
 from coec.calibration.commissioning.baseline import Baseline
 from coec.cli.commands.sim_checks import Options
-from coec.errors import CalibrationError, DecodeError
+from coec.errors import CalibrationError
 from coec.evaluation import check_drives, check_run, check_statistics
-from coec.evaluation.check_drives import CheckDrive
 from coec.reports import check_tables, console
-from coec.schemas.base import from_json, to_json
+from coec.schemas.base import to_json
 from coec.schemas.checks import CheckedDrive
 from coec.simulation.source import require_extra
 
@@ -27,7 +26,11 @@ def run(options: Options) -> int:
     require_extra()
     outings = list(check_drives.drives(options.rounds))
     drives = [drive for outing in outings for drive in outing]
-    rows = {drive.name: row for drive in drives if (row := _kept(options.output, drive)) is not None}
+    rows = {
+        drive.name: row
+        for drive in drives
+        if (row := output.kept(_path(options.output, drive.name), CheckedDrive)) is not None
+    }
     baselines: dict[str, Baseline | None] = {}
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
@@ -61,11 +64,3 @@ def _commissioned(rig: str) -> Baseline | None:
 
 def _path(folder: Path, name: str) -> Path:
     return folder / "drives" / f"{name}.json"
-
-
-def _kept(folder: Path, drive: CheckDrive) -> CheckedDrive | None:
-    """The row of a drive that was checked before; a damaged one is checked again."""
-    try:
-        return from_json(CheckedDrive, _path(folder, drive.name).read_bytes())
-    except (OSError, DecodeError):
-        return None

@@ -13,12 +13,12 @@ from coec.adapters.files import output
 from coec.adapters.system.cores import one_thread_each
 from coec.cli.commands.sim_matrix import Options
 from coec.config import CalibrationConfig
-from coec.errors import CoecError, DecodeError, UsageError
+from coec.errors import CoecError, UsageError
 from coec.evaluation import matrix, matrix_drives, matrix_run
 from coec.evaluation.matrix_drives import MatrixDrive
 from coec.evaluation.matrix_run import CHECK_PAIRS, WINDOWS, Settings
 from coec.reports import console, matrix_plots, matrix_tables
-from coec.schemas.base import from_json, to_json
+from coec.schemas.base import to_json
 from coec.schemas.matrix import MatrixRow
 from coec.simulation.source import require_extra
 
@@ -71,11 +71,8 @@ def _path(folder: Path, name: str) -> Path:
 
 def _kept(folder: Path, drive: MatrixDrive, settings: Settings) -> MatrixRow | None:
     """The row of a drive that was run before with these settings; a damaged one is run again."""
-    try:
-        row = from_json(MatrixRow, _path(folder, drive.name).read_bytes())
-    except (OSError, DecodeError):
-        return None
-    return row if row.settings == settings.fingerprint else None
+    row = output.kept(_path(folder, drive.name), MatrixRow)
+    return row if row is not None and row.settings == settings.fingerprint else None
 
 
 def _run(drives: Sequence[MatrixDrive], settings: Settings, jobs: int) -> Iterator[MatrixRow]:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from coec.adapters.files import output
 from coec.cli.commands.sim_rig_drives import Options
-from coec.errors import DecodeError
 from coec.reports import console, rig_tables
-from coec.schemas.base import from_json, to_json
+from coec.schemas.base import to_json
 from coec.schemas.rig import RigDriveRow
 from coec.simulation.source import require_extra
 
@@ -30,7 +27,7 @@ def run(options: Options) -> int:
         task = bars.add_task("drives", total=len(drives), note="")
         for drive in drives:
             path = options.output / "drives" / f"{drive.name}.json"
-            row = _kept(path)
+            row = output.kept(path, RigDriveRow)
             if row is None:
                 bars.update(task, note=drive.name)
                 row = rig_drives.looked_at(drive)
@@ -44,11 +41,3 @@ def run(options: Options) -> int:
     else:
         rig_tables.show_drives(report)
     return 0
-
-
-def _kept(path: Path) -> RigDriveRow | None:
-    """The row of a drive that was drawn before; a damaged one is drawn again."""
-    try:
-        return from_json(RigDriveRow, path.read_bytes())
-    except (OSError, DecodeError):
-        return None

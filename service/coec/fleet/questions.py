@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.errors import UsageError
-from coec.fleet.extra import duckdb
+from coec.fleet.extra import library
 
 WINDOWS = "windows"
 """The view: a row a window, with `date` and `vehicle` from the folders."""
@@ -42,7 +42,7 @@ def ask(folder: Path) -> Any:
         UsageError: there are none.
         SourceError: the optional extra is not installed.
     """
-    connection = duckdb().connect(":memory:", config={"autoinstall_known_extensions": "false"})
+    connection = library("duckdb").connect(":memory:", config={"autoinstall_known_extensions": "false"})
     view(connection, WINDOWS, folder)
     return connection
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from coec.fleet.questions import WINDOWS, ask, view
-from coec.fleet.tables import AXES, NAMELESS
-from coec.schemas.fleet import ChangedWindow, DayOfPair, FigureOfFleet, FleetChanges, FleetReport, PairOfFleet
+from coec.fleet.tables import NAMELESS
+from coec.schemas.fleet import AXES, ChangedWindow, DayOfPair, FigureOfFleet, FleetChanges, FleetReport, PairOfFleet
 from coec.schemas.replies import Maybe6
 
 READ, BEFORE = "read", "before"

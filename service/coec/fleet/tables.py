@@ -12,8 +12,8 @@ from urllib.parse import quote
 
 from coec.adapters.files import output
 from coec.errors import SourceError
-from coec.fleet.extra import pyarrow
-from coec.schemas.fleet import WindowRow
+from coec.fleet.extra import library
+from coec.schemas.fleet import AXES, WindowRow
 from coec.schemas.replies import Maybe6, Maybe6x6
 
 NS_PER_S = 1_000_000_000
@@ -22,12 +22,10 @@ UNDATED, NAMELESS = "unknown", "unknown"
 """Date and vehicle of windows that could not be read; a vehicle cannot be called so, as a folder's name, by accident:
 its rows still hold its own."""
 
-AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
-
 
 def schema() -> Any:
     """Columns of the table (a `pyarrow.Schema`); `date` and `vehicle` are the folders."""
-    pa = pyarrow()
+    pa = library("pyarrow")
     text, number, whole = pa.string(), pa.float64(), pa.int64()
     six = pa.list_(number, 6)
     return pa.schema(
@@ -95,8 +93,7 @@ def urls(folder: Path) -> set[str]:
     Raises:
         SourceError: a file is damaged.
     """
-    pyarrow()
-    from pyarrow import parquet
+    parquet = library("pyarrow.parquet")
 
     found: set[str] = set()
     for path in sorted(folder.glob("date=*/vehicle=*/*.parquet")):
@@ -117,8 +114,7 @@ def _time(stamp_ns: int) -> datetime:
 
 
 def _parquet(rows: Sequence[WindowRow]) -> bytes:
-    pa = pyarrow()
-    from pyarrow import parquet
+    pa, parquet = library("pyarrow"), library("pyarrow.parquet")
 
     table = pa.Table.from_pylist([_values(row) for row in sorted(rows, key=lambda row: row.url)], schema())
     stream = io.BytesIO()

@@ -7,19 +7,11 @@ from datetime import UTC, datetime
 from html import escape
 
 from coec.reports.console import figure
-from coec.schemas.fleet import DayOfPair, FleetChanges, FleetReport, PairOfFleet
+from coec.schemas.fleet import AXES, DayOfPair, FleetChanges, FleetReport, PairOfFleet
 
 NS_PER_S = 1_000_000_000
 
-AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
-NAMES = {
-    "rx_deg": "pitch",
-    "ry_deg": "yaw",
-    "rz_deg": "roll",
-    "tx_m": "right",
-    "ty_m": "down",
-    "tz_m": "forward",
-}
+NAMES = dict(zip(AXES, ("pitch", "yaw", "roll", "right", "down", "forward"), strict=True))
 LEAST = {"deg": 0.1, "m": 0.02}
 """Half of the least height of a plot: what is smaller is no drift, and shall not look like one."""
 

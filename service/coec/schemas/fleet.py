@@ -10,6 +10,9 @@ from pydantic import Field
 from coec.schemas.base import Message, Part
 from coec.schemas.replies import CalibrationResult, Count, Counts, Maybe6
 
+AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
+"""Columns of a correction, in its order; `sigma_` before them is its standard deviation."""
+
 
 class WindowRow(Message):
     """A window of a batch, as it is kept until it becomes a row of a table. It holds a result or an error."""

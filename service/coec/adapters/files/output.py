@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from coec.adapters.files import durable
-from coec.errors import CoecError
+from coec.errors import CoecError, DecodeError
+from coec.schemas.base import M, from_json
 
 
 class OutputError(CoecError):
@@ -45,3 +46,11 @@ def replace(path: Path, data: bytes) -> Path:
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
     return path
+
+
+def kept(path: Path, model: type[M]) -> M | None:
+    """A document that `to_json` made and that was written before; None where there is none, or a damaged one."""
+    try:
+        return from_json(model, path.read_bytes())
+    except (OSError, DecodeError):
+        return None
