@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.conversions import result_of
+from coec.adapters.files.conversions import comparable, result_of
 from coec.adapters.images.codec import GreyImages
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.calibrator import calibrate
@@ -32,10 +32,7 @@ def run(path: Path, *, depth: str | None, as_json: bool) -> int:
     limits = LimitsConfig()
     with console.progress() as bars:
         estimate = calibrate(window, open_depth(network, limits), GreyImages(limits), configuration, StageTimes(bars))
-    # What an earlier version of the program recorded says so of itself; that is no difference in the decision.
-    reached = result_of(estimate, window.rig, recorded.vehicle).model_copy(
-        update={"schema_version": recorded.schema_version}
-    )
+    reached = comparable(result_of(estimate, window.rig, recorded.vehicle), recorded)
     identical = to_json(reached) == to_json(recorded)
     differences = _differences(recorded.model_dump(mode="json"), reached.model_dump(mode="json"))
     if as_json:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from coec import __version__
 from coec.adapters.depth.maps import open_depth
-from coec.adapters.files.conversions import result_of
+from coec.adapters.files.conversions import comparable, result_of
 from coec.adapters.images.codec import GreyImages
 from coec.adapters.mcap.windows import read_result, read_vehicle, read_window
 from coec.calibration.calibrator import calibrate
@@ -76,8 +76,7 @@ class Desk:
         network = self._network(self._terms.network(configuration.depth))
         result = result_of(calibrate(window, network, self._images, configuration, Silence()), window.rig, vehicle)
         if recorded is not None:
-            # What an earlier version of the program recorded says so of itself; that is no difference in the decision.
-            result = result.model_copy(update={"schema_version": recorded.schema_version})
+            result = comparable(result, recorded)
         return {
             "vehicle": vehicle,
             "result": result,
