@@ -5,6 +5,7 @@ from __future__ import annotations
 from html.parser import HTMLParser
 from pathlib import Path
 
+import duckdb
 import numpy as np
 import pytest
 
@@ -138,6 +139,14 @@ def test_every_example_of_a_query_answers(results: Path) -> None:
         rows = connection.execute(query).fetchall()
         assert rows or "otherwise" in question, question
     assert dict(questions.columns(results))["correlation"] == "DOUBLE[]"
+
+
+def test_the_view_that_is_printed_is_the_one_that_is_asked(rows: list[WindowRow], tmp_path: Path) -> None:
+    """A vehicle whose name is a number keeps its zeros."""
+    tables.write(tmp_path, [row.model_copy(update={"vehicle": "007"}) for row in rows[:2]], "part-1")
+    connection = duckdb.connect()
+    connection.execute(questions.statement("mine", tmp_path))
+    assert connection.execute("SELECT DISTINCT vehicle FROM mine").fetchall() == [("007",)]
 
 
 def test_a_folder_without_tables_is_told(tmp_path: Path) -> None:

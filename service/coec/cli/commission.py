@@ -117,6 +117,11 @@ def show(baseline: Baseline) -> None:
         f"{baseline.pair}: commissioned from {baseline.pairs} pairs of {baseline.windows} "
         f"window{'s' if baseline.windows > 1 else ''}, hash {baseline_hash(baseline)}"
     )
+    show_learned(baseline)
+
+
+def show_learned(baseline: Baseline) -> None:
+    """Bias, limits, and what they detect, as tables."""
     table = console.table("axis", "bias", "± σ", "σ of a check at 6 pairs", "unit", right=(1, 2, 3))
     bias, known = _in_degrees(baseline.pose.bias), _in_degrees(baseline.pose.bias_sigma)
     of_check = _in_degrees(baseline.pose.sigma(6))

@@ -71,10 +71,7 @@ def _show(told: FleetReport) -> None:
 
 def _show_sql(results: Path) -> None:
     console.raw(f"-- the view `{questions.WINDOWS}` of the examples below\n")
-    pattern = results / "date=*" / "vehicle=*" / "*.parquet"
-    console.raw(
-        f"CREATE VIEW {questions.WINDOWS} AS SELECT * FROM read_parquet('{pattern}', hive_partitioning = true);\n\n"
-    )
+    console.raw(f"{questions.statement(questions.WINDOWS, results)};\n\n")
     for name, kind in questions.columns(results):
         console.raw(f"--   {name:<22} {kind}\n")
     for question, query in questions.EXAMPLES.items():

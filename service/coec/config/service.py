@@ -32,6 +32,11 @@ class StateConfig(Stage):
     """The state directory; deleting it returns the vehicle to nominal."""
 
     directory: FilePath = Path("coec-state")
+    model: FilePath | None = Field(
+        default=None,
+        description="baselines of this model of vehicle (`coec fleet commission`): a pair that is not commissioned "
+        "itself starts from them",
+    )
     max_bytes: int = Field(default=4 * 2**30, ge=2**20, description="windows kept, bytes; the oldest go first")
     max_age_days: float = Field(default=90.0, gt=0)
     min_free_bytes: int = Field(

@@ -55,8 +55,13 @@ def view(connection: Any, name: str, folder: Path) -> None:
     """
     if next(folder.glob("date=*/vehicle=*/*.parquet"), None) is None:
         raise UsageError(f"{folder} holds no tables of a batch (date=.../vehicle=.../*.parquet): coec batch makes them")
+    connection.execute(statement(name, folder))
+
+
+def statement(name: str, folder: Path) -> str:
+    """SQL that creates a view over the tables of a batch. A vehicle called 007 stays text."""
     pattern = str(folder / "date=*" / "vehicle=*" / "*.parquet").replace("'", "''")
-    connection.execute(
+    return (
         f"CREATE VIEW {name} AS SELECT * FROM read_parquet('{pattern}', hive_partitioning = true, "
         "hive_types = {'date': VARCHAR, 'vehicle': VARCHAR})"
     )

@@ -48,7 +48,7 @@ class Pair:
         store = PairStore(rig, config.vehicle, config.state, outside.store, outside.scribe, folder, losses)
         of_rig = outside.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.unanswered == 0)
         questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, of_rig, outside.show)
-        baseline = RigBaseline(pair, rig, config.state.directory)
+        baseline = RigBaseline(pair, rig, config.state)
         self._rig, self._vehicle = rig, config.vehicle
         plan = self._plan(pair, baseline.calibration)
         self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost)

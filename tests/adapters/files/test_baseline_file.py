@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 
 from baselines import a_baseline
+from boards import LENSES, rig_with
 from coec.adapters.files.baseline_file import (
     baseline_from_json,
     baseline_hash,
+    baseline_of,
     baseline_to_json,
     load_baseline,
     save_baseline,
 )
+from coec.config import StateConfig
 from coec.errors import StateError
 
 
@@ -93,3 +96,30 @@ def test_a_scene_of_other_parts_than_the_monitor_looks_at_is_refused(part: str, 
     document["scene"][part] = short
     with pytest.raises(StateError, match=part):
         baseline_from_json(document)
+
+
+class TestOfModel:
+    rig = rig_with(LENSES["pinhole"])
+
+    def test_a_rig_that_is_not_commissioned_starts_from_its_model(self, tmp_path: Path) -> None:
+        save_baseline(tmp_path / "model.json", a_baseline())
+        taken = baseline_of(self.rig, StateConfig(directory=tmp_path / "state", model=tmp_path / "model.json"))
+        assert taken is not None
+        assert taken.limits == a_baseline().limits
+        np.testing.assert_array_equal(taken.T_camera_lidar, self.rig.T_camera_lidar_nominal)
+
+    def test_its_own_comes_first(self, tmp_path: Path) -> None:
+        save_baseline(tmp_path / "model.json", a_baseline())
+        own = replace(a_baseline(), limits={"min_edge_contrast": 7.0})
+        save_baseline(tmp_path / "rig.json", own)
+        taken = baseline_of(self.rig, StateConfig(directory=tmp_path, model=tmp_path / "model.json"))
+        assert taken is not None
+        assert_same(taken, own)
+
+    def test_there_is_none_where_none_is_named(self, tmp_path: Path) -> None:
+        assert baseline_of(self.rig, StateConfig(directory=tmp_path)) is None
+
+    def test_a_model_that_knows_nothing_of_the_pair_is_told(self, tmp_path: Path) -> None:
+        save_baseline(tmp_path / "model.json", replace(a_baseline(), pair="rear"))
+        with pytest.raises(StateError, match=r"state\.model.*no baseline of the pair front"):
+            baseline_of(self.rig, StateConfig(directory=tmp_path, model=tmp_path / "model.json"))

@@ -21,8 +21,10 @@ from coec.adapters.files import durable
 from coec.adapters.files.rig import matrix_rows, rigid_matrix
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.commissioning.baseline import Accuracy, Baseline, MonitorLimits
+from coec.calibration.commissioning.of_model import for_rig
 from coec.calibration.monitor.sensor_faults import BANDS, BLOCK_COLUMNS, BLOCK_ROWS, SECTORS, SceneBaseline
-from coec.config import Matrix4x4, describe
+from coec.calibration.types import Rig
+from coec.config import Matrix4x4, StateConfig, describe
 from coec.errors import ConfigError, StateError
 
 Maybe6 = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
@@ -115,11 +117,33 @@ def load_baseline(path: Path, pair: str) -> Baseline | None:
     Raises:
         StateError: the file and its previous copy are damaged.
     """
-    found = StateFile(path).load()
-    if found.body is None and found.damage:
-        raise StateError(f"{path} cannot be used: {'; '.join(found.damage)}; commission again")
-    document = _pairs_of(found.body).get(pair)
+    document = _documents(path).get(pair)
     return None if document is None else baseline_from_json(document)
+
+
+def load_baselines(path: Path) -> dict[str, Baseline]:
+    """All of a file, by pair; none where there is no file.
+
+    Raises:
+        StateError: as `load_baseline`.
+    """
+    return {pair: baseline_from_json(document) for pair, document in _documents(path).items()}
+
+
+def baseline_of(rig: Rig, state: StateConfig) -> Baseline | None:
+    """What is known of a rig: what was learned when it was commissioned, else what commissioned vehicles of its model
+    tell, if the configuration names that; None where there is neither.
+
+    Raises:
+        StateError: a file is damaged, or that of the model has nothing of this pair.
+    """
+    own = load_baseline(state.directory / BASELINES, rig.pair)
+    if own is not None or state.model is None:
+        return own
+    model = load_baseline(state.model, rig.pair)
+    if model is None:
+        raise StateError(f"{state.model} (state.model) has no baseline of the pair {rig.pair}: coec fleet commission")
+    return for_rig(model, rig)
 
 
 def baseline_hash(baseline: Baseline) -> str:
@@ -217,6 +241,13 @@ def baseline_from_json(values: object) -> Baseline:
         depth_identity=document.depth_identity,
         config_hash=document.config_hash,
     )
+
+
+def _documents(path: Path) -> dict[str, Any]:
+    found = StateFile(path).load()
+    if found.body is None and found.damage:
+        raise StateError(f"{path} cannot be used: {'; '.join(found.damage)}; commission again")
+    return _pairs_of(found.body)
 
 
 def _pairs_of(body: dict[str, Any] | None) -> dict[str, Any]:

@@ -1,17 +1,16 @@
-"""The baseline of a commissioned rig, as long as it fits: its limits, its bias, and why it is not used."""
+"""The baseline of a rig, its own or that of its model, as long as it fits: its limits, its bias, and why it is not
+used."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.files.baseline_file import BASELINES, load_baseline
+from coec.adapters.files.baseline_file import baseline_of
 from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Baseline, Drift, drift, learned_hash, mismatch
 from coec.calibration.types import Estimate, Matrix4, Reason, Rig
-from coec.config import CalibrationConfig, PairConfig
+from coec.config import CalibrationConfig, PairConfig, StateConfig
 from coec.errors import StateError
 from coec.geometry import se3
 
@@ -23,10 +22,10 @@ class RigBaseline:
         trouble: why there is a baseline that is not used; None otherwise.
     """
 
-    def __init__(self, pair: PairConfig, rig: Rig, state_folder: Path) -> None:
+    def __init__(self, pair: PairConfig, rig: Rig, state: StateConfig) -> None:
         self._pair = pair
         self._rig = rig
-        self._path = state_folder / BASELINES
+        self._state = state
         self._baseline: Baseline | None = None
         self.trouble: Reason | None = None
         self.load()
@@ -35,7 +34,7 @@ class RigBaseline:
         """Read it from the disk, where the worker puts it."""
         self._baseline, self.trouble = None, None
         try:
-            baseline = load_baseline(self._path, self._pair.name)
+            baseline = baseline_of(self._rig, self._state)
         except StateError as error:
             self.trouble = Reason("baseline_damaged", f"The baseline of the rig cannot be used: {error}")
             return

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from coec.adapters.depth.maps import CachedDepth, open_depth
-from coec.adapters.files.baseline_file import BASELINES, load_baseline, save_baseline
+from coec.adapters.files.baseline_file import BASELINES, baseline_of, save_baseline
 from coec.adapters.files.rig import rig_of
 from coec.adapters.frames.msgpack_frames import decode_camera
 from coec.adapters.images.codec import CachedGreys, GreyImages, decode_bgr, encode_jpeg
@@ -225,7 +225,7 @@ class Solver:
     ) -> tuple[Baseline | None, str | None]:
         """What was learned of the rig, if it holds for this configuration and network; else why it does not."""
         try:
-            learned = load_baseline(self._config.state.directory / BASELINES, pair)
+            learned = baseline_of(self._rigs[pair], self._config.state)
         except StateError as error:
             return None, str(error)
         if learned is None:
