@@ -11,15 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import CompressionType, Writer
-
-from coec import __version__
 from coec.adapters.files import durable
+from coec.adapters.mcap.chunk_writer import ChunkWriter
 from coec.adapters.mcap.files import Schema
+from coec.adapters.mcap.ros_channels import CDR, SHRINK, RosChannel
 from coec.errors import RecordingError
-
-CHUNK_BYTES = 64 * 1024
-"""A chunk is closed at the first message past this size, so that a killed recorder loses a pair at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +30,7 @@ class FinishedFile:
 
 
 class _HashingFile(io.BufferedWriter):
-    """Hashes what passes: the library only ever appends."""
+    """Hashes what passes: it is only ever appended."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path, "wb"))
@@ -49,54 +45,63 @@ class _HashingFile(io.BufferedWriter):
 class WholeFile:
     """An MCAP file that appears under its final name when it is complete and on the disk, or not at all."""
 
-    def __init__(self, temporary: Path, final: Path) -> None:
-        """Opens `temporary`, which becomes `final`.
+    def __init__(self, temporary: Path, final: Path, *, packed: bool) -> None:
+        """Opens `temporary`, which becomes `final`; what shrinks is compressed if the file is to be `packed`.
 
         Raises:
             RecordingError: the file cannot be written. So does everything below, and the temporary file is gone then.
         """
         self._temporary, self._final = temporary, final
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._packed = packed
         self._channels: dict[str, int] = {}
         with failing_as_recording_error(final):
             self._file = _HashingFile(temporary)
         with self._guarded():
             durable.sync_folder(temporary.parent)
-            # The CRC over the data section also covers what lies outside the chunks.
-            self._mcap = Writer(self._file, CHUNK_BYTES, CompressionType.NONE, enable_crcs=True, enable_data_crcs=True)
-            self._mcap.start(profile="ros2", library=f"coec/{__version__}")
+            self._mcap = ChunkWriter(self._file)
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
         """Adds an attachment, dated 0: it belongs to no instant."""
         with self._guarded():
-            self._mcap.add_attachment(0, 0, name, media_type, data)
+            self._mcap.attach(name, media_type, data)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Adds a metadata record."""
         with self._guarded():
-            self._mcap.add_metadata(name, dict(values))
+            self._mcap.metadata(name, values)
+
+    def ros(self, channel: RosChannel, stamp_ns: int, sequence: int, data: bytes) -> None:
+        """Adds a message of ROS."""
+        self.message(channel.topic, CDR, channel.schema, channel.metadata, stamp_ns, sequence, data)
 
     def message(
-        self, topic: str, schema: Schema | None, encoding: str, stamp_ns: int, sequence: int, data: bytes
+        self,
+        topic: str,
+        encoding: str,
+        schema: Schema | None,
+        metadata: Mapping[str, str],
+        stamp_ns: int,
+        sequence: int,
+        data: bytes,
     ) -> None:
-        """Adds a message; channel and schema are registered at their first use, under an id of this file."""
+        """Adds a message of any kind; its channel is that of the first message on the topic."""
+        packed = self._packed and schema is not None and schema.name in SHRINK
         with self._guarded():
-            channel = self._channels.get(topic)
-            if channel is None:
-                channel = self._mcap.register_channel(topic, encoding, self._schema_id(schema))
-                self._channels[topic] = channel
-            self._mcap.add_message(channel, stamp_ns, data, stamp_ns, sequence)
+            if topic not in self._channels:
+                self._channels[topic] = self._mcap.channel(topic, encoding, schema, metadata)
+            self._mcap.message(self._channels[topic], stamp_ns, sequence, data, packed=packed)
 
     def sync(self) -> None:
         """Puts what was added on the disk: a little at a time, so that the end of a window does not wait for it all."""
         with self._guarded():
+            self._mcap.close_chunk()
             self._file.flush()
             os.fdatasync(self._file.fileno())
 
     def finish(self) -> FinishedFile:
         """Writes the index, and makes file and name durable."""
         with self._guarded():
-            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._mcap.finish()
             self._file.flush()
             status = os.fstat(self._file.fileno())
             durable.publish(self._file, self._temporary, self._final)
@@ -108,14 +113,6 @@ class WholeFile:
             self._file.close()
         with suppress(OSError):
             self._temporary.unlink(missing_ok=True)
-
-    def _schema_id(self, schema: Schema | None) -> int:
-        if schema is None:
-            return 0
-        key = (schema.name, schema.encoding, schema.data)
-        if key not in self._schemas:
-            self._schemas[key] = self._mcap.register_schema(*key)
-        return self._schemas[key]
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:

@@ -26,6 +26,7 @@ from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder
+from coec.runtime.recording.snippet_store import SNIPPET
 from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
 from coec.schemas.keys import Format
@@ -166,16 +167,21 @@ class PairAnswers:
         )
 
     def windows(self) -> replies.WindowsReply:
-        """The recorded windows."""
-        return replies.WindowsReply(vehicle=self._vehicle, pair=self.name, windows=self._folder.listing(self.name))
+        """The recorded windows, and what was kept of the seconds around events."""
+        kept, windows = self._outside.snippets, self._folder.listing(self.name)
+        snippets = () if kept is None else kept.listing(self.name)
+        return replies.WindowsReply(vehicle=self._vehicle, pair=self.name, windows=windows, snippets=snippets)
 
     def read_window(self, window_id: str, offset: int, length: int) -> bytes:
-        """Bytes of one window's file.
+        """Bytes of the file of a window, or of a snippet.
 
         Raises:
             NotFoundError: no such window of this pair.
             UsageError: the offset lies behind its end.
         """
+        snippets = self._outside.snippets
+        if snippets is not None and window_id.endswith(SNIPPET):
+            return snippets.read(self.name, window_id, offset, length)
         return self._folder.read(self.name, window_id, offset, length)
 
     def events(self) -> replies.EvidenceReply:

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from coec.adapters.mcap.files import Attachment, Channel, Message, Metadata, Record, Schema
 from coec.adapters.mcap.windows import rig_attachment
-from coec.adapters.mcap.windows.names import CONFIGURATION, DEPTH, KEPT, MASK, METADATA, RIG
+from coec.adapters.mcap.windows.names import CONFIGURATION, DEPTH, KEPT, MASK, METADATA, OVERLAY, RIG
 from coec.adapters.ros import incoming, messages
 from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
@@ -96,6 +96,8 @@ class Content:
         channel = self.channels.get(message.channel_id)
         schema = None if channel is None else self.schemas.get(channel.schema_id)
         if channel is None or schema is None or schema.name not in _FRAME_TYPES:
+            return None
+        if channel.topic.endswith(f"/{OVERLAY}"):
             return None
         try:
             frame = incoming.decode(schema.name, message.data, _LIMITS, point_time=WRITTEN_TIME)

@@ -19,8 +19,12 @@ JSON = "application/json"
 METADATA, KEPT = "coec", "coec_kept"
 """Metadata: what the window is, and of which other window it holds pairs."""
 
+PACKING, LZ4 = "packing", "lz4"
+"""Among the metadata: how chunks are compressed that shrink; empty: not at all. Whoever writes the window again does
+the same."""
+
 IMAGE, COMPRESSED, DEPTH = "camera/image", "camera/image/compressed", "camera/depth/compressed"
-POINTS, CAMERA_INFO, RESULT_TOPIC = "lidar/points", "camera/camera_info", "result"
+POINTS, CAMERA_INFO, RESULT_TOPIC, OVERLAY = "lidar/points", "camera/camera_info", "result", "overlay"
 ODOMETRY, IMU = "odometry", "imu"
 """Topics below `/coec/<pair>/`."""
 

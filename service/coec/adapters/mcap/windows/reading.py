@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from coec.adapters.mcap.chunk_writer import CHUNK_BYTES
 from coec.adapters.mcap.files import McapDamaged, Message, Metadata, Record, read_attachment, read_records
-from coec.adapters.mcap.whole_file import CHUNK_BYTES
 from coec.adapters.mcap.windows.content import Content
 from coec.adapters.mcap.windows.names import METADATA, RESULT, RIG
 from coec.calibration.search.mount_prior import MOUNT_RAD
@@ -78,13 +78,22 @@ def read_vehicle(path: Path) -> str:
     Raises:
         WindowError: unreadable or damaged at its beginning.
     """
+    return metadata_of(path).get("vehicle", "")
+
+
+def metadata_of(path: Path) -> dict[str, str]:
+    """What a window says of itself before its first message; empty where it says nothing.
+
+    Raises:
+        WindowError: unreadable or damaged at its beginning.
+    """
     for record in records_of(path):
         match record:
             case Metadata() if record.name == METADATA:
-                return record.values.get("vehicle", "")
+                return record.values
             case Message():
                 break
-    return ""
+    return {}
 
 
 def is_window(path: Path) -> bool:

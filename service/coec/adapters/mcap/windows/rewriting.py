@@ -5,11 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from coec.adapters.mcap.files import Attachment, Channel, Message, Metadata, Schema
+from coec.adapters.mcap.ros_channels import RosChannel
 from coec.adapters.mcap.whole_file import WholeFile
 from coec.adapters.mcap.windows.names import (
     COMPRESSED,
     IMAGE,
     JSON,
+    LZ4,
+    OVERLAY,
+    PACKING,
     RESULT,
     RESULT_TOPIC,
     REWRITE_SUFFIX,
@@ -17,8 +21,8 @@ from coec.adapters.mcap.windows.names import (
     beside,
     topic,
 )
-from coec.adapters.mcap.windows.reading import records_of
-from coec.adapters.mcap.windows.writer import RecordedWindow, ros_schema
+from coec.adapters.mcap.windows.reading import metadata_of, records_of
+from coec.adapters.mcap.windows.writer import RecordedWindow
 from coec.adapters.ros import diagnostics, messages, outgoing
 from coec.errors import WindowError
 from coec.schemas.base import to_json
@@ -26,20 +30,26 @@ from coec.schemas.replies import CalibrationResult
 from coec.schemas.ros_names import DIAGNOSTICS
 
 
-def write_result(path: Path, result: CalibrationResult) -> RecordedWindow:
+def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | None = None) -> RecordedWindow:
     """Writes the window again with its result (an earlier one is replaced): as `/diagnostics`, JSON message and
-    attachment. The file is replaced at once; a reader sees the one or the other.
+    attachment, and a picture of the points at the result, if there is one. The file is replaced at once; a reader sees
+    the one or the other.
 
     Raises:
         WindowError: the window is damaged.
         RecordingError: it could not be written; the file is as it was.
     """
-    file = WholeFile(beside(path, REWRITE_SUFFIX), path)
+    packed = metadata_of(path).get(PACKING) == LZ4
+    file = WholeFile(beside(path, REWRITE_SUFFIX), path, packed=packed)
+    told, overlay = topic(result.pair, RESULT_TOPIC), topic(result.pair, OVERLAY)
     try:
-        window_id, pairs = _copy(path, file, without=(DIAGNOSTICS, topic(result.pair, RESULT_TOPIC)))
+        window_id, pairs = _copy(path, file, without=(DIAGNOSTICS, told, overlay))
         stamp_ns, document = result.data_stamp_ns, to_json(result)
-        file.message(DIAGNOSTICS, ros_schema(messages.DIAGNOSTICS), "cdr", stamp_ns, 0, _diagnostics(result))
-        file.message(topic(result.pair, RESULT_TOPIC), None, "json", stamp_ns, 0, document)
+        if overlay_jpeg is not None:
+            picture = outgoing.encode_jpeg(stamp_ns, result.camera_frame, overlay_jpeg)
+            file.ros(RosChannel(overlay, messages.COMPRESSED_IMAGE), stamp_ns, 0, picture)
+        file.ros(RosChannel(DIAGNOSTICS, messages.DIAGNOSTICS), stamp_ns, 0, _diagnostics(result))
+        file.message(told, "json", None, {}, stamp_ns, 0, document)
         file.attach(RESULT, JSON, document)
     except WindowError:
         file.abandon()
@@ -71,8 +81,9 @@ def _copy(path: Path, file: WholeFile, without: tuple[str, ...]) -> tuple[str, i
                     continue
                 file.message(
                     channel.topic,
-                    schemas.get(channel.schema_id),
                     channel.message_encoding,
+                    schemas.get(channel.schema_id),
+                    channel.metadata,
                     record.log_time_ns,
                     record.sequence,
                     record.data,

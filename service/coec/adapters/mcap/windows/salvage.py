@@ -9,7 +9,7 @@ from pathlib import Path
 from coec.adapters.files import durable
 from coec.adapters.mcap.whole_file import failing_as_recording_error
 from coec.adapters.mcap.windows.content import Content
-from coec.adapters.mcap.windows.names import PART_SUFFIX, REWRITE_SUFFIX, beside
+from coec.adapters.mcap.windows.names import LZ4, PACKING, PART_SUFFIX, REWRITE_SUFFIX, beside
 from coec.adapters.mcap.windows.reading import records_of
 from coec.adapters.mcap.windows.writer import RecordedWindow, WindowWriter
 from coec.errors import WindowError
@@ -67,7 +67,13 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> Rec
 def _writer_like(content: Content, part_path: Path, final: Path) -> WindowWriter:
     rig, T_camera_lidar_start, window_id = content.head(part_path)
     configuration = content.parsed_configuration(part_path)
-    temporary = beside(final, REWRITE_SUFFIX)
     return WindowWriter(
-        final, rig, T_camera_lidar_start, window_id, configuration, content.metadata, temporary=temporary
+        final,
+        rig,
+        T_camera_lidar_start,
+        window_id,
+        configuration,
+        content.metadata,
+        packed=content.metadata.get(PACKING) == LZ4,
+        temporary=beside(final, REWRITE_SUFFIX),
     )

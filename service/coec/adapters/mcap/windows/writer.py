@@ -9,7 +9,7 @@ A window may hold pairs of an earlier one that were kept for it. They come last,
 metadata `coec_kept` name the window that they are from. A reader sorts pairs by their stamps.
 
 The sender's own sequence numbers are not kept: the pairs of a window were chosen, so gaps between them mean nothing.
-Chunks are not compressed: images are encoded already, clouds shrink by an eighth, lz4 costs a fifth of the throughput.
+Chunks of clouds and raw images are compressed if it is asked for, others never: encoded images shrink by nothing.
 Equal pairs give equal bytes: nothing in the file tells when or where it was written.
 """
 
@@ -17,11 +17,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 from coec.adapters.files.rig import mask_to_png
-from coec.adapters.mcap.files import Schema
+from coec.adapters.mcap.ros_channels import RosChannel, check_stamp
 from coec.adapters.mcap.whole_file import FinishedFile, WholeFile
 from coec.adapters.mcap.windows import rig_attachment
 from coec.adapters.mcap.windows.names import (
@@ -33,9 +32,11 @@ from coec.adapters.mcap.windows.names import (
     IMU,
     JSON,
     KEPT,
+    LZ4,
     MASK,
     METADATA,
     ODOMETRY,
+    PACKING,
     PART_SUFFIX,
     POINTS,
     RIG,
@@ -48,9 +49,6 @@ from coec.config import CalibrationConfig
 from coec.errors import RecordingError
 from coec.schemas.base import to_json
 from coec.schemas.ros_names import TF_STATIC
-
-MAX_STAMP_NS = 2**31 * 1_000_000_000
-"""ROS 2 time has signed 32-bit seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +81,7 @@ class WindowWriter:
         configuration: CalibrationConfig,
         metadata: Mapping[str, str],
         *,
+        packed: bool = False,
         temporary: Path | None = None,
     ) -> None:
         """Opens `<path_final>.part` (or `temporary`) and writes what must not be lost.
@@ -94,18 +93,19 @@ class WindowWriter:
             window_id: of the window.
             configuration: with which the window will be calibrated.
             metadata: what else a reader may want to know, for example `vehicle`. It becomes part of the bytes.
+            packed: compress what shrinks by it.
 
         Raises:
             RecordingError: the file cannot be written.
         """
         self.pairs = 0
         self._rig, self._T_start, self._window_id = rig, T_camera_lidar_start, window_id
-        self._file = WholeFile(temporary or beside(path_final, PART_SUFFIX), path_final)
+        self._file = WholeFile(temporary or beside(path_final, PART_SUFFIX), path_final, packed=packed)
         self._file.attach(RIG, JSON, rig_attachment.encoded(rig, T_camera_lidar_start, window_id))
         self._file.attach(CONFIGURATION, JSON, to_json(configuration))
         if rig.mask is not None:
             self._file.attach(MASK, "image/png", mask_to_png(rig.mask))
-        self._file.metadata(METADATA, {"window_id": window_id, **metadata})
+        self._file.metadata(METADATA, {"window_id": window_id, PACKING: LZ4 if packed else "", **metadata})
         self._file.sync()
 
     def note_kept(self, from_window_id: str, since_ns: int) -> None:
@@ -128,10 +128,13 @@ class WindowWriter:
                 removed.
         """
         stamp_ns = pair.stamp_ns
-        for frame in (pair.camera, pair.lidar, pair.motion):
-            if frame is not None and not 0 <= frame.stamp_ns < MAX_STAMP_NS:
-                self.abandon()
-                raise RecordingError(f"stamp {frame.stamp_ns} ns does not fit the 32-bit seconds of ROS 2")
+        try:
+            for frame in (pair.camera, pair.lidar, pair.motion):
+                if frame is not None:
+                    check_stamp(frame.stamp_ns)
+        except RecordingError:
+            self.abandon()
+            raise
         if self.pairs == 0:
             self._cdr(TF_STATIC, messages.TF, stamp_ns, outgoing.encode_tf_static(self._rig, self._T_start, stamp_ns))
         self._cdr(self._topic(POINTS), messages.POINT_CLOUD, pair.lidar.stamp_ns, outgoing.encode_cloud(pair.lidar))
@@ -170,10 +173,4 @@ class WindowWriter:
         return topic(self._rig.pair, name)
 
     def _cdr(self, topic_name: str, type_name: str, stamp_ns: int, data: bytes) -> None:
-        self._file.message(topic_name, ros_schema(type_name), "cdr", stamp_ns, self.pairs, data)
-
-
-@lru_cache(maxsize=16)
-def ros_schema(type_name: str) -> Schema:
-    """The definition of a ROS message, as readers that do not know it need it."""
-    return Schema(0, type_name, "ros2msg", messages.definition(type_name).encode())
+        self._file.ros(RosChannel(topic_name, type_name), stamp_ns, self.pairs, data)
