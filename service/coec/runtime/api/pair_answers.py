@@ -20,6 +20,7 @@ from coec.runtime.api.health import Told, health_of, reasons_of, with_troubles
 from coec.runtime.api.overlays import Overlays
 from coec.runtime.api.snapshots import Snapshot, answer_of
 from coec.runtime.api.status import pair_status_of
+from coec.runtime.api.windows_list import WindowsList
 from coec.runtime.decisions.decider import Known
 from coec.runtime.decisions.incidents import NO_EVENT, Side
 from coec.runtime.decisions.pair_store import PairStore
@@ -59,6 +60,7 @@ class PairAnswers:
         self._outside = outside
         self._commands = commands
         self._overlays = Overlays(pair.name, outside.worker)
+        self._windows = WindowsList(config.vehicle, pair.name, folder, outside.snippets)
         self.rig = rig
         self.extrinsic_reply: replies.ExtrinsicReply
         """What `extrinsic` serves."""
@@ -166,11 +168,9 @@ class PairAnswers:
             checks=tuple(check for check in told.checks if since_ns <= check.stamp_ns <= until_ns)[-limit:],
         )
 
-    def windows(self) -> replies.WindowsReply:
+    def windows(self, form: Format) -> Answer:
         """The recorded windows, and what was kept of the seconds around events."""
-        kept, windows = self._outside.snippets, self._folder.listing(self.name)
-        snippets = () if kept is None else kept.listing(self.name)
-        return replies.WindowsReply(vehicle=self._vehicle, pair=self.name, windows=windows, snippets=snippets)
+        return self._windows.answer(form)
 
     def read_window(self, window_id: str, offset: int, length: int) -> bytes:
         """Bytes of the file of a window, or of a snippet.
