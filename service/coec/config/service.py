@@ -58,8 +58,8 @@ class SnippetsConfig(Stage):
         default=0,
         ge=0,
         le=64 * 2**30,
-        description="of the frames of all pairs that are kept for them: a quarter for the time before, a quarter for the "
-        "time after, half for what is being written. 0: none are recorded",
+        description="of the frames of all pairs that are kept for them: a quarter for the time before, a quarter for "
+        "the time after, half for what is being written. 0: none are recorded",
     )
     before_s: float = Field(
         default=15.0, gt=0, le=600, description="what is kept of the time before, as far as it fits"
