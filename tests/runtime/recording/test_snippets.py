@@ -207,11 +207,16 @@ def test_a_full_disk_costs_the_snippet(
     record_property("figure", f"{points} points")
 
 
-def test_a_stop_keeps_what_is_written(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("stop_s", "sweeps"), [(60.0, 10), (0.0, 2)])
+def test_a_stop_keeps_what_can_be_written_in_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_s: float, sweeps: int
+) -> None:
+    monkeypatch.setattr("coec.runtime.recording.snippets.STOP_S", stop_s)
+    monkeypatch.setattr("coec.runtime.recording.snippets.ROUND_S", 60.0)
     bench = Bench(tmp_path)
-    bench.recorder.give(snippet(count=10, points=150_000))
+    bench.recorder.give(snippet(count=10, points=200_000))  # a round are two sweeps
     bench.recorder.write()
     bench.recorder.close()
-    assert bench.losses.snapshot() == {("window", "snippet_cut_short"): 1}
+    assert bench.losses.snapshot() == ({("window", "snippet_cut_short"): 1} if sweeps < 10 else {})
     (name,) = bench.ids
-    assert 0 < opened(bench.store.path(name)).counts["/front/lidar/points"] < 10
+    assert opened(bench.store.path(name)).counts["/front/lidar/points"] == sweeps

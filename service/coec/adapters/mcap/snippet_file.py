@@ -14,7 +14,7 @@ from coec.adapters.files import durable
 from coec.adapters.mcap.files import Channel, McapDamaged, Message, Metadata, Schema, read_records
 from coec.adapters.mcap.ros_channels import RosChannel, check_stamp
 from coec.adapters.mcap.whole_file import FinishedFile, WholeFile, failing_as_recording_error
-from coec.adapters.mcap.windows.names import PART_SUFFIX, REWRITE_SUFFIX, beside
+from coec.adapters.mcap.windows.names import LZ4, PACKING, PART_SUFFIX, REWRITE_SUFFIX, beside
 from coec.adapters.ros.topics import Frame, FrameTopics, PairTopics
 from coec.calibration.types import Matrix4, Rig
 from coec.errors import WindowError
@@ -50,7 +50,7 @@ class SnippetFile:
         self.frames = 0
         self._topics = FrameTopics(rig, T_camera_lidar, PairTopics.default(rig.pair))
         self._file = WholeFile(beside(path, PART_SUFFIX), path, packed=packed)
-        self._file.metadata(METADATA, metadata)
+        self._file.metadata(METADATA, {**metadata, PACKING: LZ4 if packed else ""})
         self._file.sync()
         self._unsynced = 0
 
@@ -92,16 +92,19 @@ def salvage_snippet(part_path: Path, progress: Callable[[], None]) -> FinishedFi
     """
     final = part_path.with_name(part_path.name.removesuffix(PART_SUFFIX))
     with failing_as_recording_error(final):
-        finished = None if final.exists() else _salvaged(part_path, final, progress)
+        finished = None
+        with suppress(WindowError):  # damaged before the first message
+            packed = metadata_of(part_path).get(PACKING) == LZ4
+            finished = None if final.exists() else _salvaged(part_path, final, progress, packed=packed)
         durable.remove(part_path)
     return finished
 
 
-def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> FinishedFile | None:
+def _salvaged(part_path: Path, final: Path, progress: Callable[[], None], *, packed: bool) -> FinishedFile | None:
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     messages = 0
-    file = WholeFile(beside(final, REWRITE_SUFFIX), final, packed=True)
+    file = WholeFile(beside(final, REWRITE_SUFFIX), final, packed=packed)
     try:
         # The error that ends the file also ends the loop; whatever came before it was sound.
         with suppress(McapDamaged), part_path.open("rb") as stream:

@@ -29,6 +29,9 @@ ROUND_S = 0.1
 ROUND_BYTES = 4 * 2**20
 """The same, of frames: 30 ms at 150 MB/s."""
 
+STOP_S = 2.0
+"""For what is left when the service ends: some 200 MB on a disk that is well."""
+
 OVERHEAD = 1.1
 """Bytes of a file to those of its frames, at most: headers, camera info, odometry, index."""
 
@@ -96,8 +99,11 @@ class SnippetRecorder:
         return True
 
     def close(self) -> None:
-        """Finish the file with the frames that are in it; for the end of the service."""
-        if self._given or (self._open is not None and self._open.left):
+        """Write what there is, for a while, and finish the file; for the end of the service."""
+        end_s = time.monotonic() + STOP_S
+        while time.monotonic() < end_s and self.write():
+            pass
+        if self._given or self._open is not None:
             self._losses.add("window", "snippet_cut_short", detail="the service was stopped")
         if self._open is not None:
             try:
