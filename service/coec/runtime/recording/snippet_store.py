@@ -29,6 +29,9 @@ SNIPPET = ".snippet"
 
 TOLD = ".json"
 
+TOLD_BYTES = 4096
+"""Of what is said of a snippet, at most: some 250 are written."""
+
 PIECE_BYTES = 2**20
 """Read at once of a file whose digest is not known."""
 
@@ -151,6 +154,8 @@ class SnippetStore:
 
     def _read_told(self, path: Path) -> SnippetInfo | None:
         name = path.name.removesuffix(TOLD)
+        if path.stat().st_size > TOLD_BYTES:
+            return None
         try:
             info = from_json(SnippetInfo, path.read_bytes())
         except DecodeError:
