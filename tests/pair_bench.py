@@ -46,6 +46,7 @@ from coec.runtime.ingest.intake import Intake
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import RecordingPlan
+from coec.runtime.recording.snippets import SnippetRecorder
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.rig.keeper import RigKeeper
 from coec.runtime.worker.costs import Cost, cost_of
@@ -211,8 +212,9 @@ class InstantRecorder:
         losses: LossCounter,
         on_recorded: Callable[[str, Path, bool], None],
         on_lost: Callable[[str], None],
+        snippets: SnippetRecorder | None,
     ) -> None:
-        del losses
+        del losses, snippets
         self.plan, self.configuration = plan, plan.configuration
         self.trouble = None
         self.has_room = True

@@ -16,7 +16,7 @@ from rich.progress import Progress
 from cli.conftest import SMALL, Coec
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.cli import bench
-from coec.cli.bench import live, rig, rows, scene, worker
+from coec.cli.bench import live, recording, rig, rows, scene, worker
 from coec.cli.bench.process import ProcessReading
 from coec.geometry import se3
 
@@ -106,6 +106,15 @@ def test_a_daemon_is_measured_under_load(
     # In a second and a half of a busy machine a stream may be silent.
     assert min(per_second.values()) >= 0.0
     assert max(per_second.values()) > 0.0
+
+
+@pytest.mark.usefixtures("_small")
+def test_writing_windows_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "PAIRS", 2)
+    monkeypatch.setattr(recording, "WINDOWS", 1)
+    document = recording.measure(lambda _: None)
+    assert set(document) == {row.key for row in rows.ROWS if row.key.startswith("recording_")}
+    assert document["recording_cpu_percent"] > 0.0
 
 
 @pytest.mark.slow

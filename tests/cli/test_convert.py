@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from rosbags.highlevel import AnyReader
 
 from cli.conftest import SMALL, Coec
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.sources import open_source
+from readers import opened
 
 
 def test_bag_reads_back_to_the_same_frames(coec: Coec, tmp_path: Path) -> None:
@@ -35,14 +35,19 @@ def test_bag_reads_back_to_the_same_frames(coec: Coec, tmp_path: Path) -> None:
 def test_bag_opens_in_ros_tools(coec: Coec, tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     coec("convert", SMALL, path)
-    with AnyReader([path]) as reader:
-        assert {connection.topic for connection in reader.connections} == {
+    bag = opened(path)
+    assert (
+        bag.types.keys()
+        == bag.counts.keys()
+        == {
             "/tf_static",
             "/sim/camera/camera_info",
             "/sim/camera/image/compressed",
             "/sim/lidar/points",
             "/sim/odometry",
         }
+    )
+    assert bag.latched == {"/tf_static"}
 
 
 def test_other_endings_are_refused(coec: Coec, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import re
 import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,6 +22,7 @@ from coec.schemas.keys import Keys, parse_command_selector, parse_range_selector
 from coec.schemas.replies import (
     Acknowledgement,
     PairStatus,
+    SnippetInfo,
     WindowInfo,
     WindowsReply,
 )
@@ -49,10 +51,11 @@ def vehicle() -> Iterator[str]:
     for thread in bus.threads:
         thread.start()
     serve_status(bus, "front")
-    info = WindowInfo(
-        window_id="front-1", size_bytes=len(WINDOW), sha256=hashlib.sha256(WINDOW).hexdigest(), pairs=1, decision=None
-    )
-    serve_document(bus, KEYS.windows("front"), WindowsReply(vehicle="vehicle", pair="front", windows=(info,)))
+    file: dict[str, Any] = {"size_bytes": len(WINDOW), "sha256": hashlib.sha256(WINDOW).hexdigest()}
+    info = WindowInfo(window_id="front-1", pairs=1, decision=None, kept_for="red_event", **file)
+    snippet = SnippetInfo(snippet_id="front-7.snippet", event="suspect", stamp_ns=7, recorded_ns=8, **file)
+    listed = WindowsReply(vehicle="vehicle", pair="front", windows=(info,), snippets=(snippet,))
+    serve_document(bus, KEYS.windows("front"), listed)
     bus.serve(KEYS.window("front", "*"), window_routes)
     bus.serve(KEYS.evidence_of("front", "*"), no_event)
     bus.serve(KEYS.command("front", "*"), acknowledging)
@@ -183,9 +186,19 @@ def test_a_router_without_a_service_says_what_to_check(coec: Coec, endpoint: str
     assert "nobody answered coec/@v1/vehicle/*/health: check that `coec run` is up" in outcome.err
 
 
-def test_a_window_is_downloaded_and_verified(coec: Coec, vehicle: str, tmp_path: Path) -> None:
+def test_the_list_says_what_a_window_is_kept_for_and_names_snippets(coec: Coec, vehicle: str) -> None:
+    outcome = coec("query", "windows", "--connect", vehicle)
+    assert "vehicle/front  1 windows, 1 snippets" in outcome.out
+    (window,) = (line for line in outcome.out.splitlines() if "front-1" in line)
+    assert "red event" in window
+    (snippet,) = (line for line in outcome.out.splitlines() if "front-7.snippet" in line)
+    assert "suspect" in snippet
+
+
+@pytest.mark.parametrize("name", ["front-1", "front-7.snippet"])
+def test_a_window_or_snippet_is_downloaded_and_verified(coec: Coec, vehicle: str, tmp_path: Path, name: str) -> None:
     path = tmp_path / "w.mcap"
-    outcome = coec("query", "windows/front-1", "--output", path, "--connect", vehicle)
+    outcome = coec("query", f"windows/{name}", "--output", path, "--connect", vehicle)
     assert outcome.status == 0
     assert path.read_bytes() == WINDOW
     assert "verified" in outcome.out

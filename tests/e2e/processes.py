@@ -195,6 +195,11 @@ class Service:
         found: list[Any] = self.ask(self.keys.windows(self.pair))["windows"]
         return found
 
+    def snippets(self) -> list[Any]:
+        """What is kept of the seconds around events."""
+        found: list[Any] = self.ask(self.keys.windows(self.pair))["snippets"]
+        return found
+
     def status(self) -> Any:
         """Of the service."""
         return self.ask(self.keys.status)

@@ -99,7 +99,7 @@ def held(running: Service, *, release: bool) -> tuple[Any, float]:
 @pytest.mark.fault(
     "a disk that is full, read-only or gives 100 kB/s for 16 s",
     "health names it within 5 s; commands are answered within 100 ms and say that they are not on the disk; the beat "
-    "never stops; afterwards all is written, and a kill then loses nothing",
+    "never stops; afterwards all is written, windows are recorded again, and a kill then loses nothing",
 )
 @pytest.mark.parametrize(
     ("state", "points"),
@@ -134,6 +134,8 @@ def test_a_broken_disk_is_named_keeps_nobody_waiting_and_loses_nothing(
             longest_s = beats.longest_s(broken_s)
             disk.becomes(WELL)
             running.until(lambda: codes(running), lambda found: not named(found), "a disk that is well")
+            recorded = running.counters()["windows"]
+            running.until(running.counters, lambda pair: pair["windows"] > recorded, "another window")
             running.until(lambda: held(running, release=False)[0], lambda told: told["durable"], "a durable command")
             before = running.history()
             running.kill()

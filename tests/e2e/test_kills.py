@@ -17,7 +17,16 @@ import pytest
 from coec.adapters.mcap.windows import read_window
 from coec.adapters.zenoh.cadence import repeated
 from coec.adapters.zenoh.player import Player, Streams, shifted
-from coec.config import CalibrationConfig, DepthConfig, MonitorConfig, WindowConfig
+from coec.config import (
+    CalibrationConfig,
+    Config,
+    DepthConfig,
+    MonitorConfig,
+    SnippetsConfig,
+    WindowConfig,
+    load_config,
+)
+from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, STEPPED, Drive, rendered
 from e2e.processes import Router, Service, service, write_configuration
 
@@ -34,6 +43,9 @@ ANSWER_S = 10.0
 """Bound for the restart to the first answer in the long form; 2 s are promised of two idle cores."""
 
 ASK_PERIOD_S = 0.1
+
+SNIPPET_BYTES = 64 * 2**20
+"""Of memory; some seconds of the drive."""
 
 DAMAGE = {"state_damaged", "history_damaged"}
 """Reasons of health, and losses, that only a disk or a stranger may bring about."""
@@ -52,7 +64,7 @@ class Told:
         keys, pair = running.keys, running.pair
         self.answers["extrinsic"] = running.extrinsic()
         self.answers["history"] = running.history()
-        self.answers["windows"] = running.windows()
+        self.answers["windows"], self.answers["snippets"] = running.windows(), running.snippets()
         events = running.ask(keys.evidence(pair))["events"]
         self.answers["events"] = [running.ask(keys.evidence_of(pair, event["event_id"])) for event in events]
 
@@ -118,6 +130,9 @@ def _check_nothing_is_lost(running: Service, told: Told, folder: Path) -> None:
     fresh = new["entries"][len(old["entries"]) :]
     assert not [one for one in new["entries"] if one["entry"]["kind"] == "chain"]
     _check_windows(before["windows"], {window["window_id"]: window for window in after["windows"]}, folder)
+    snippets = {one["snippet_id"]: one for one in after["snippets"]}
+    for one in before["snippets"]:
+        assert snippets[one["snippet_id"]] == one
     events = {event["event_id"]: event for event in after["events"]}
     for event in before["events"]:
         assert len(events[event["event_id"]]["metrics"]) >= len(event["metrics"])
@@ -139,8 +154,8 @@ def _check_windows(before: list[Any], now: dict[str, Any], folder: Path) -> None
 
 @pytest.fixture
 def config(tmp_path: Path, router: Router) -> Path:
-    """Short windows, so that there is always something to be written."""
-    return write_configuration(
+    """Short windows, and snippets of red events, so that there is always something to be written."""
+    path = write_configuration(
         tmp_path,
         rendered(STEPPED).recording,
         router.endpoint,
@@ -148,6 +163,9 @@ def config(tmp_path: Path, router: Router) -> Path:
         monitor=MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0),
         calibration=CalibrationConfig(depth=DepthConfig(model="stereo")),
     )
+    document = {**load_config(path).model_dump(), "snippets": SnippetsConfig(memory_bytes=SNIPPET_BYTES)}
+    path.write_text(commented_yaml(Config.model_validate(document)))
+    return path
 
 
 @pytest.mark.fault(

@@ -13,10 +13,13 @@ from certificates import TestAuthority
 from coec.adapters.tls.conversation import Credentials, Speaker
 from coec.adapters.zenoh.client import JSON, RemoteError, Reply, ask_one
 from coec.adapters.zenoh.proven import give
-from coec.config import DepthConfig
+from coec.cli.query import download_window
+from coec.config import Config, DepthConfig, SnippetsConfig, load_config
+from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
 from e2e.planted import plant, said, written
 from e2e.processes import PATIENCE_S, Router, Service, service
+from readers import opened
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -24,6 +27,9 @@ NOTICED_S = 60.0
 """Of driving."""
 
 MAX_ERROR_DEG = 0.35
+
+SNIPPET_BYTES = 256 * 2**20
+"""Of memory; several seconds of the drive."""
 
 MAPS = DepthConfig(model="stereo")
 """Depth from the maps that come with the frames."""
@@ -130,8 +136,16 @@ def test_a_step_is_noticed_corrected_and_remembered(
     record_property("figure", f"{len(secrets)} secrets, {len(replies)} replies, {len(disk)} texts on the disk")
 
 
+def with_snippets(path: Path) -> Path:
+    """The configuration, with memory for the seconds around events."""
+    document = {**load_config(path).model_dump(), "snippets": SnippetsConfig(memory_bytes=SNIPPET_BYTES)}
+    path.write_text(commented_yaml(Config.model_validate(document)))
+    return path
+
+
 def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path, drive: Drive, router: Router) -> None:
-    with service(stepped_configuration(tmp_path, router, MAPS, apply="never"), router) as running:
+    config = with_snippets(stepped_configuration(tmp_path, router, MAPS, apply="never"))
+    with service(config, router) as running:
         running.send(drive.between(0, STEP_S))
         running.rest()
         before = running.extrinsic()
@@ -145,6 +159,20 @@ def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path,
         assert running.health()["state"] == "miscalibrated"
         assert after["pending"] is not None
         assert drive.error_deg(after["pending"], SECONDS) < MAX_ERROR_DEG
+
+        events = running.ask(running.keys.evidence(running.pair))["events"]
+        evidence = {window for event in events for window in (event["window_before"], event["window_after"])}
+        kept = {window["window_id"] for window in running.windows() if window["kept_for"] == "red_event"}
+        assert kept == evidence - {None}
+        snippet, *_ = running.until(running.snippets, bool, "the seconds around the step")
+        fetched = tmp_path / f"{snippet['snippet_id']}.mcap"
+        names = (running.pair, snippet["snippet_id"])
+        download_window(running.session, running.keys, *names, fetched, PATIENCE_S, lambda *_: None)
+        bag = opened(fetched)
+        images = [topic for topic, kind in bag.types.items() if kind == "sensor_msgs/msg/CompressedImage"]
+        assert bag.counts[images[0]] > 20, "every frame of some seconds"
+        assert "/tf_static" in bag.latched
+
         assert running.command("apply")["code"] == "applied"
         applied = running.extrinsic()
         assert applied["camera_from_lidar"] == after["pending"]["camera_from_lidar"]

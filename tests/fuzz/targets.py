@@ -27,6 +27,8 @@ from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import camera_of, rig_of, rig_to_json
 from coec.adapters.frames.msgpack_frames import decode_camera, decode_ego, decode_lidar
 from coec.adapters.images.codec import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
+from coec.adapters.mcap.files import Message, read_records
+from coec.adapters.mcap.snippet_file import salvage_snippet
 from coec.adapters.mcap.windows import PART_SUFFIX, is_window, read_result, read_window, salvage
 from coec.adapters.ros import incoming, messages, outgoing
 from coec.adapters.ros.camera_info import decode_info, lens_of
@@ -413,11 +415,18 @@ def _bag_seeds() -> list[bytes]:
 
 
 def _window(data: bytes, folder: Path) -> None:
-    """Read as the worker reads it; and salvaged, as it is found after a power cut."""
+    """Read as the worker reads it; and salvaged, as it is found after a power cut, be it a window or a snippet."""
     path, part = folder / "front-1.mcap", folder / f"front-2.mcap{PART_SUFFIX}"
     path.write_bytes(data)
     part.write_bytes(data)
     (folder / "front-2.mcap").unlink(missing_ok=True)
+    snippet = folder / f"front-3.snippet.mcap{PART_SUFFIX}"
+    snippet.write_bytes(data)
+    (folder / "front-3.snippet.mcap").unlink(missing_ok=True)
+    finished = salvage_snippet(snippet, lambda: None)
+    if finished is not None:
+        with finished.path.open("rb") as stream:
+            assert any(isinstance(record, Message) for record in read_records(stream))
     salvaged = salvage(part, lambda: None)
     if salvaged is not None:
         read_window(salvaged.path)

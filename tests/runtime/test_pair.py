@@ -19,6 +19,7 @@ from coec.calibration.monitor.change_detector import alarm_levels
 from coec.calibration.types import (
     Reason,
 )
+from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.recording.window_store import start_ns_of
 from pair_bench import AFTER, BEFORE, BEGIN_S, END_S, NOMINAL, STEP_S, Bench, S, SlowWorker, pair_at
 
@@ -47,6 +48,18 @@ def test_a_step_is_noticed_within_a_minute_and_corrected_by_the_next_window(
     assert states["healthy"] < 60
     np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
     assert bench.health == "healthy"
+
+
+def test_every_event_is_told_to_whoever_keeps_the_seconds_around_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[str, float]] = []
+    monkeypatch.setattr(
+        PairStream, "event", lambda _, name, pose: told.append((name, float(np.abs(pose - AFTER).max())))
+    )
+    bench.drive(BEGIN_S, END_S)
+    assert [name for name, _ in told] == ["suspect", "miscalibrated"]
+    assert min(off for _, off in told) > 0, "with what was served when it began"
 
 
 def test_the_same_drive_gives_the_same_decisions(bench: Bench, tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.worker.jobs import Commissioned, Fate, JobOutcome
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
 from pair_bench import BEGIN_S, END_S, STEP_S, Bench
 
@@ -147,6 +148,25 @@ def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, m
     assert bench.do("rollback", to=results[-1].window_id) == "rolled_back"
     assert bench.pose.tobytes() == corrected.tobytes()
     assert bench.do("commission") == "commissioning"
+
+
+def test_windows_that_a_pair_was_commissioned_from_are_kept_for_that_across_a_restart(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "state")
+    bench.drive(BEGIN_S, BEGIN_S + 90)
+    first, *others = [result.window_id for result in bench.store.history.results()]
+    told = JobOutcome(Fate.RESULT, Commissioned(bench.pose, "0123abcd", 1, 10), None, 1.0)
+    bench.pair.decider.commissioned((first,), told)
+    bench.settle()
+
+    def kept_for() -> dict[str, str | None]:
+        bench.outside.folder.look()
+        return {info.window_id: info.kept_for for info in bench.outside.folder.listing("front")}
+
+    before = kept_for()
+    assert before[first] == "commissioning"
+    assert {before[name] for name in others} == {None}
+    bench.restart()
+    assert kept_for() == before
 
 
 @pytest.mark.fault("commands faster than a person gives them", "they are answered, and do nothing")

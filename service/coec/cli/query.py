@@ -41,7 +41,7 @@ from coec.errors import NotFoundError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, VERSION_CHUNK, Keys
-from coec.schemas.replies import StatusReply, WindowInfo, WindowsReply
+from coec.schemas.replies import SnippetInfo, StatusReply, WindowInfo, WindowsReply
 
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
 PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
@@ -53,8 +53,10 @@ DIGEST_POLL_S = 0.2
 ON_SITE = 0.9
 """Share of the time that a command's acknowledgement is waited for that the service may take; the rest is for the way
 there and back."""
-OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d+")
-"""What windows and red events are called: their pair, and a time in nanoseconds."""
+OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d+(\.snippet)?")
+"""What windows, snippets and red events are called: their pair, and a time in nanoseconds."""
+
+Recording = WindowInfo | SnippetInfo
 
 PICTURE_KEYS = ("overlay", "evidence")
 """Keys whose answer may be a picture, for `--output`."""
@@ -327,8 +329,8 @@ def download_window(
     path: Path,
     timeout_s: float,
     heard: Callable[[int, int], None],
-) -> WindowInfo:
-    """A recorded window, piece by piece, into a file that has its name only when its sha256 is right.
+) -> Recording:
+    """A recorded window or snippet, piece by piece, into a file that has its name only when its sha256 is right.
 
     A window that is rewritten on the way (its result came) is fetched once more.
 
@@ -349,7 +351,7 @@ def download_window(
     raise RemoteError("checksum", f"the bytes of window {window_id} do not have the sha256 of the list; try again")
 
 
-def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> WindowInfo:
+def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> Recording:
     """What the list says of a window; the service may still be reading it."""
     deadline_s = time.monotonic() + timeout_s
     while (info := _info(session, keys, pair, window_id, timeout_s)).sha256 is None:
@@ -360,11 +362,14 @@ def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, tim
     return info
 
 
-def _info(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> WindowInfo:
-    reply = ask_one(session, f"{keys.windows(pair)}?format=json", timeout_s)
-    for info in from_json(WindowsReply, reply.payload).windows:
-        if info.window_id == window_id:
-            return info
+def _info(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> Recording:
+    reply = from_json(WindowsReply, ask_one(session, f"{keys.windows(pair)}?format=json", timeout_s).payload)
+    recorded: dict[str, Recording] = {
+        **{info.window_id: info for info in reply.windows},
+        **{info.snippet_id: info for info in reply.snippets},
+    }
+    if window_id in recorded:
+        return recorded[window_id]
     raise RemoteError("not_found", f"pair {pair} has no window {window_id}: see `coec query windows`")
 
 

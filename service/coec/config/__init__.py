@@ -13,7 +13,15 @@ from coec.config.metrics import MetricsConfig, is_loopback
 from coec.config.pair import OpenPairConfig, PairConfig
 from coec.config.reading import config_of, load_config
 from coec.config.ros import RosConfig, RosOutput
-from coec.config.service import BudgetConfig, LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
+from coec.config.service import (
+    BudgetConfig,
+    LimitsConfig,
+    LogConfig,
+    SnippetsConfig,
+    StateConfig,
+    WorkerConfig,
+    ZenohConfig,
+)
 from coec.config.stages import (
     MAX_SLICE_S,
     CalibrationConfig,
@@ -86,6 +94,7 @@ __all__ = [
     "RosOutput",
     "SearchConfig",
     "SenderConfig",
+    "SnippetsConfig",
     "StateConfig",
     "StreamConfig",
     "SweepConfig",

@@ -42,9 +42,35 @@ class StateConfig(Stage):
     min_free_bytes: int = Field(
         default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
     )
+    max_protected_bytes: int = Field(
+        default=2 * 2**30,
+        ge=0,
+        description="windows of red events and commissionings, which outlive the others; beyond, the oldest of them "
+        "are ordinary ones",
+    )
+    packing: Literal["lz4", "none"] = Field(
+        default="lz4", description="of clouds and raw images in windows; encoded images are left as they are"
+    )
     history: int = Field(default=500, ge=1, le=10_000, description="kept per pair: results, states, commands, each")
     checks: int = Field(default=2000, ge=1, le=100_000, description="checks of the monitor kept per pair, 2 kB each")
     evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
+
+
+class SnippetsConfig(Stage):
+    """Recordings at full rate of the seconds around an event (suspect, degraded, miscalibrated), from memory."""
+
+    memory_bytes: int = Field(
+        default=0,
+        ge=0,
+        le=64 * 2**30,
+        description="of the frames of all pairs that are kept for them: a quarter for the time before, a quarter for "
+        "the time after, half for what is being written. 0: none are recorded",
+    )
+    before_s: float = Field(
+        default=15.0, gt=0, le=600, description="what is kept of the time before, as far as it fits"
+    )
+    after_s: float = Field(default=5.0, gt=0, le=600)
+    max_bytes: int = Field(default=2**30, ge=2**20, description="of all that are kept on the disk; the oldest go first")
 
 
 class BudgetConfig(Stage):

@@ -15,7 +15,15 @@ from coec.config.metrics import MetricsConfig
 from coec.config.pair import OpenPairConfig, PairConfig
 from coec.config.rig import MAX_LINKS, MAX_SENSORS
 from coec.config.ros import RosConfig
-from coec.config.service import BudgetConfig, LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
+from coec.config.service import (
+    BudgetConfig,
+    LimitsConfig,
+    LogConfig,
+    SnippetsConfig,
+    StateConfig,
+    WorkerConfig,
+    ZenohConfig,
+)
 from coec.schemas.keys import RIG
 from coec.schemas.ros_names import ros_name
 
@@ -34,6 +42,7 @@ class Config(Stage):
     ros: RosConfig = RosConfig()
     authority: AuthorityConfig = AuthorityConfig()
     state: StateConfig = StateConfig()
+    snippets: SnippetsConfig = SnippetsConfig()
     worker: WorkerConfig = WorkerConfig()
     budget: BudgetConfig = BudgetConfig()
     limits: LimitsConfig = LimitsConfig()

@@ -55,6 +55,7 @@ from coec.runtime.nominal.kept import completed
 from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.recorder import Recorder
+from coec.runtime.recording.snippet_store import SnippetStore
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.reload import reload_of, settings_hash
 from coec.runtime.rig.keeper import RigKeeper
@@ -135,9 +136,10 @@ class Daemon:
         self._rig_answers = RigAnswers(self._keys, self._publish)
         own = (self._worker, self._budget, self._rig, self._publish, self._troubles, self._ros_outputs.show)
         of_ros = (self._ros_side.topics, self._room.nominal)
-        self._intake = Intake(config.limits)
+        self._intake = Intake(config.limits, config.snippets.memory_bytes)
         told = (*own, *of_ros, self._rig_answers.troubles)
-        self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *told)
+        snippets = _snippets_of(config)
+        self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *told, snippets=snippets)
         self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
         self._rig.listen(self._rig_answers.hear, self._intake.inbox.wake)
         while self._rig.work(0.0):  # a reply exists before the first question
@@ -501,6 +503,13 @@ class Daemon:
         memory = (resident_bytes(), self._worker.status().rss_bytes)
         view = View(self._status_reply, self._health(), *memory, took, self._rig_answers.reply)
         return metrics.render(view)
+
+
+def _snippets_of(config: Config) -> SnippetStore | None:
+    """Where the seconds around events are kept; None where none are asked for."""
+    if config.snippets.memory_bytes == 0:
+        return None
+    return SnippetStore(config.state.directory / "snippets", config.snippets.max_bytes, config.state.min_free_bytes)
 
 
 def _insecure(doors: Sequence[str]) -> Reason | None:

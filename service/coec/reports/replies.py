@@ -105,16 +105,23 @@ def history(payload: bytes) -> None:
 
 
 def windows(payload: bytes) -> None:
-    """Recorded windows of a pair."""
+    """Recorded windows of a pair, and its snippets."""
     reply = from_json(replies.WindowsReply, payload)
-    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.windows)} windows")
-    table = console.table("window", "pairs", "MB", "verdict", "sha256", right=(1, 2))
+    snippets = f", {len(reply.snippets)} snippets" if reply.snippets else ""
+    console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.windows)} windows{snippets}")
+    table = console.table("window", "pairs", "MB", "verdict", "sha256", "kept for", right=(1, 2))
     for window in reply.windows:
         size = f"{window.size_bytes / 1e6:.1f}"
         verdict = console.styled(window.decision or ("not evaluated" if window.sha256 else "not read yet"))
         pairs = "?" if window.pairs is None else str(window.pairs)
-        table.add_row(window.window_id, pairs, size, verdict, (window.sha256 or "not read yet")[:16])
+        kept_for = (window.kept_for or "").replace("_", " ")
+        table.add_row(window.window_id, pairs, size, verdict, (window.sha256 or "not read yet")[:16], kept_for)
     console.out.print(table)
+    if reply.snippets:
+        table = console.table("snippet", "MB", "event", "sha256", right=(1,))
+        for one in reply.snippets:
+            table.add_row(one.snippet_id, f"{one.size_bytes / 1e6:.1f}", console.styled(one.event), one.sha256[:16])
+        console.out.print(table)
 
 
 def evidence(payload: bytes) -> None:

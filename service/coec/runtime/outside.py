@@ -14,6 +14,7 @@ from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.state_store import StateStore
 from coec.runtime.ingest.intake import Intake
 from coec.runtime.nominal.watch import Nominal
+from coec.runtime.recording.snippet_store import SnippetStore
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.rig.keeper import RigKeeper
 from coec.runtime.worker.supervisor import Worker
@@ -42,6 +43,7 @@ class Outside:
         topics: those that the vehicle's ROS publishes now.
         nominal: where a pair's nominal calibration comes from.
         rig_troubles: what does not fit between a pair and the others of the vehicle, by its name.
+        snippets: where the seconds around an event are kept; None: they are not.
     """
 
     keys: Keys
@@ -58,3 +60,4 @@ class Outside:
     topics: Callable[[], Topics]
     nominal: Callable[[str], Nominal] = given
     rig_troubles: Callable[[str], tuple[Reason, ...]] = fits
+    snippets: SnippetStore | None = None

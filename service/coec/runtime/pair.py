@@ -23,9 +23,11 @@ from coec.runtime.decisions.questions import Questions
 from coec.runtime.decisions.queue import DecisionQueue
 from coec.runtime.decisions.rig_baseline import RigBaseline
 from coec.runtime.ingest.chooser import Chooser
+from coec.runtime.ingest.frame_ring import FrameRing
 from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder, RecordingPlan
+from coec.runtime.recording.snippets import SnippetRecorder
 from coec.runtime.reload import settings_hash
 
 _log = logging.getLogger(__name__)
@@ -49,14 +51,16 @@ class Pair:
         of_rig = outside.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.unanswered == 0)
         questions = Questions(pair, queue, outside.worker, outside.budget, mailbox, folder, of_rig, outside.show)
         baseline = RigBaseline(pair, rig, config.state)
-        self._rig, self._vehicle = rig, config.vehicle
+        self._rig, self._vehicle, self._packed = rig, config.vehicle, config.state.packing == "lz4"
         plan = self._plan(pair, baseline.calibration)
-        self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost)
+        snippets = self._snippets_of(plan, outside, losses)
+        self.recorder = Recorder(plan, folder, losses, questions.solve, questions.lost, snippets)
         first_slice_s = outside.budget.join(pair.name, pair.monitor, pair.window)
         chooser = Chooser(
             pair, config.limits, rig, store.served, questions, self.recorder, losses, first_slice_s, store.kept
         )
-        self.stream = PairStream(pair, config, outside.intake, chooser, lambda: self.recorder.has_room, losses)
+        ring = None if snippets is None else FrameRing(config.snippets, _ring_bytes(config), snippets.give)
+        self.stream = PairStream(pair, config, outside.intake, chooser, lambda: self.recorder.has_room, losses, ring)
         self.answers = PairAnswers(
             pair, config, rig, store, folder, self.recorder, self.stream, outside, lambda: self.commands.counts
         )
@@ -104,9 +108,21 @@ class Pair:
 
     def _plan(self, pair: PairConfig, calibration: CalibrationConfig) -> RecordingPlan:
         metadata = {"vehicle": self._vehicle, "pair": pair.name, "settings_hash": settings_hash(pair)}
-        return RecordingPlan(self._rig, calibration, pair.window.min_pairs, metadata)
+        return RecordingPlan(self._rig, calibration, pair.window.min_pairs, metadata, self._packed)
+
+    @staticmethod
+    def _snippets_of(plan: RecordingPlan, outside: Outside, losses: LossCounter) -> SnippetRecorder | None:
+        if outside.snippets is None:
+            return None
+        return SnippetRecorder(plan.rig, plan.metadata, outside.snippets, losses, packed=plan.packed)
 
     def finish_window(self) -> None:
         """End the open window; for the end of the service, after the intake's thread has ended."""
+        self.stream.finish_snippet()
         self.stream.finish_pairs()
         self._chooser.finish()
+
+
+def _ring_bytes(config: Config) -> int:
+    """Of one pair's ring: as much again is in memory while a snippet is written."""
+    return config.snippets.memory_bytes // (2 * max(len(config.every_pair), 1))

@@ -24,6 +24,7 @@ RELOADED: Mapping[str, str] = {
     "budget.cores": "with the next check",
     "stale_after_s": "with the next look at the clocks, within a second",
     "state.max_bytes": "with the next window",
+    "state.max_protected_bytes": "with the next window",
     "state.max_age_days": "with the next window",
     "state.min_free_bytes": "with the next window",
     "pairs.*.window.*": "with the next slice; the open one ends as it began",

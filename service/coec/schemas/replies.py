@@ -359,6 +359,9 @@ class EvidenceReply(Message):
     events: tuple[EvidenceEvent, ...]
 
 
+KeptFor = Literal["red_event", "commissioning"]
+
+
 class WindowInfo(Part):
     """One recorded window."""
 
@@ -369,6 +372,20 @@ class WindowInfo(Part):
     size_bytes: Count
     pairs: Count | None = Field(description="null until the file was read, or when it cannot be")
     decision: Decision | None = Field(description="null while it is not evaluated, or `sha256` is null")
+    kept_for: KeptFor | None = Field(
+        default=None, description="why it outlives others when room is made; null: it goes when it is its turn"
+    )
+
+
+class SnippetInfo(Part):
+    """A recording at full rate of the seconds around an event; `windows/<snippet_id>` gives its bytes."""
+
+    snippet_id: str
+    event: str = Field(description="state of health that was entered; empty where its file does not say")
+    stamp_ns: int = Field(description="sensor time of the last frame before the event was told, ns")
+    recorded_ns: int = Field(description="wall clock when it was on the disk, ns")
+    size_bytes: Count
+    sha256: str = Field(description="of the whole file, hexadecimal")
 
 
 class WindowsReply(Message):
@@ -377,6 +394,7 @@ class WindowsReply(Message):
     vehicle: str
     pair: str
     windows: tuple[WindowInfo, ...]
+    snippets: tuple[SnippetInfo, ...] = Field(default=(), description="oldest first")
 
 
 class StreamStatus(Part):

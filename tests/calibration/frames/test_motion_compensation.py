@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames.motion_compensation import azimuth_offsets_s, compensate, compensation
+from coec.calibration.frames.motion_compensation import compensate, compensation
+from coec.calibration.frames.sweep_times import azimuth_offsets_s
 from coec.calibration.types import Compensation, EgoMotion, FramePair, SweepTiming, Window
 from coec.geometry import se3
 from coec.geometry.deskew import deskew

@@ -83,7 +83,7 @@ def test_health_is_published_when_its_reasons_change_and_not_otherwise(awaited: 
         lambda a: a.extrinsic("json"),
         lambda a: a.exported("urdf", Frames(None, None)),
         lambda a: a.history(0, 2**63 - 1, 10),
-        lambda a: a.windows(),
+        lambda a: a.windows("json"),
         lambda a: a.read_window("front-1", 0, 1),
         lambda a: a.events(),
         lambda a: a.event("1"),

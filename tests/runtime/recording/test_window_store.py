@@ -176,7 +176,7 @@ def test_evidence_is_the_last_to_go_and_never_for_its_age(tmp_path: Path) -> Non
     record(store, at(0), bytes(100_000), age_days=200)
     record(store, at(1), bytes(100_000), age_days=200)
     record(store, at(200), bytes(100_000))
-    store.protect("front", frozenset({at(0)}))
+    store.protect("front", {at(0): "red_event"})
     make_room(store)
     assert stems(store) == [at(0), at(200)]
     record(store, at(201), bytes(450_000))
@@ -185,6 +185,25 @@ def test_evidence_is_the_last_to_go_and_never_for_its_age(tmp_path: Path) -> Non
     record(store, at(202), bytes(550_000))
     make_room(store)
     assert stems(store) == [at(202)]
+
+
+def test_what_is_kept_is_said_and_bounded_the_oldest_first(tmp_path: Path) -> None:
+    store = store_of(tmp_path, max_bytes=2**20, max_protected_bytes=250_000)
+    for day in range(4):
+        record(store, at(day), bytes(100_000), age_days=400 - day)
+    record(store, at(400), bytes(100_000))
+
+    def kept_for() -> list[str | None]:
+        return [info.kept_for for info in store.listing("front")]
+
+    store.protect("front", {at(0): "commissioning", at(1): "commissioning", at(2): "red_event"})
+    assert kept_for() == [None, "commissioning", "red_event", None, None]
+    store.note(at(2), version_of(store.path(at(2)), decision="failed"))
+    assert kept_for() == [None, "commissioning", "red_event", None, None]
+    make_room(store)
+    assert stems(store) == [at(1), at(2), at(400)], "what is kept beyond the bound goes for its age like any other"
+    store.use(StateConfig(max_protected_bytes=0, min_free_bytes=0))
+    assert kept_for() == [None, None, None]
 
 
 def test_progress_is_told_with_every_window_that_goes(tmp_path: Path) -> None:

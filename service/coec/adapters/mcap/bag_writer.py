@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from mcap.writer import CompressionType, Writer
-
-from coec import __version__
-from coec.adapters.ros import messages
+from coec.adapters.mcap.chunk_writer import ChunkWriter
+from coec.adapters.mcap.ros_channels import CDR, RosChannel
 from coec.adapters.ros.topics import Frame, FrameTopics, PairTopics, TopicMessage
 from coec.calibration.types import Matrix4, Rig
 
@@ -55,29 +53,12 @@ def write_messages(path: Path, items: Iterable[TopicMessage]) -> None:
         OSError: the file cannot be written.
     """
     with path.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.NONE, enable_data_crcs=True)
-        writer.start(profile="ros2", library=f"coec/{__version__}")
-        topics = _Topics(writer)
-        for message in items:
-            topics.write(message.topic, message.type_name, message.stamp_ns, message.data)
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves the result open
-
-
-class _Topics:
-    """Registers a channel and its schema at the first message."""
-
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-        self._sequence = 0
-
-    def write(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
-        """Adds a message."""
-        if topic not in self._channels:
-            if type_name not in self._schemas:
-                definition = messages.definition(type_name).encode()
-                self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", definition)
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[type_name])
-        self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, self._sequence)
-        self._sequence += 1
+        writer = ChunkWriter(stream)
+        channels: dict[str, int] = {}
+        for sequence, message in enumerate(items):
+            if message.topic not in channels:
+                ros = RosChannel(message.topic, message.type_name)
+                channels[message.topic] = writer.channel(ros.topic, CDR, ros.schema, ros.metadata)
+            number = channels[message.topic]
+            writer.message(number, message.stamp_ns, sequence, message.data, packed=False)
+        writer.finish()

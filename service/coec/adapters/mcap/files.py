@@ -65,6 +65,7 @@ class Channel:
     schema_id: int
     topic: str
     message_encoding: str
+    metadata: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,16 +266,11 @@ def _parse(opcode: int, body: bytes, at: int, chunk_at: int | None) -> Iterator[
             yield Schema(schema_id, cursor.text(), cursor.text(), cursor.blob("<I"))
         case Opcode.CHANNEL:
             channel_id, schema_id = cursor.unpack(struct.Struct("<HH"))
-            yield Channel(channel_id, schema_id, cursor.text(), cursor.text())
+            yield Channel(channel_id, schema_id, cursor.text(), cursor.text(), cursor.pairs())
         case Opcode.ATTACHMENT:
             yield _attachment(body, at)
         case Opcode.METADATA:
-            name, pairs = cursor.text(), _Cursor(cursor.blob("<I"), at)
-            values: dict[str, str] = {}
-            while pairs.left:
-                key = pairs.text()
-                values[key] = pairs.text()
-            yield Metadata(name, values)
+            yield Metadata(cursor.text(), cursor.pairs())
 
 
 def _attachment(body: bytes, at: int) -> Attachment:
@@ -371,3 +367,11 @@ class _Cursor:
             return self.blob("<I").decode("utf-8")
         except UnicodeDecodeError as error:
             raise McapDamaged(f"byte {self._start}: a name is not UTF-8") from error
+
+    def pairs(self) -> dict[str, str]:
+        """Keys and values after the length of all of them."""
+        inside, values = _Cursor(self.blob("<I"), self._start), dict[str, str]()
+        while inside.left:
+            key = inside.text()
+            values[key] = inside.text()
+        return values

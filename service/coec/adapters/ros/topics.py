@@ -15,7 +15,7 @@ import numpy as np
 from coec.adapters.ros import messages, outgoing
 from coec.adapters.ros.camera_info import info_topic
 from coec.adapters.ros.wire.qos import Qos
-from coec.calibration.frames.motion_compensation import azimuth_offsets_s
+from coec.calibration.frames.sweep_times import azimuth_offsets_s
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 from coec.config import OpenPairConfig
 from coec.schemas.ros_names import TF_STATIC

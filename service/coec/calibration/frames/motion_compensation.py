@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.frames.sweep_times import azimuth_offsets_s
 from coec.calibration.types import Compensation, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, SweepTiming
 from coec.geometry import se3
 from coec.geometry.deskew import deskew
@@ -41,14 +42,6 @@ def compensation(pair: FramePair, rig: Rig, *, enabled: bool) -> Compensation:
     if pair.lidar.time_offset_s is None and rig.sweep is None:
         return Compensation.NO_POINT_TIME
     return Compensation.ROTATION_ONLY if pair.motion.linear_mps is None else Compensation.DONE
-
-
-def azimuth_offsets_s(xyz_m: NDArray[np.float32], sweep: SweepTiming) -> NDArray[np.float64]:
-    """(N,) seconds after the sweep's stamp at which each point was measured, from its azimuth (see `SweepTiming`)."""
-    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0]).astype(np.float64) - sweep.stamp_azimuth_rad
-    revolutions = azimuth / (2.0 * np.pi)
-    revolutions -= np.rint(revolutions)
-    return sweep.sign * sweep.period_s * revolutions
 
 
 def sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -26,7 +26,7 @@ from coec.calibration.calibrator import calibrate
 from coec.calibration.objective.mutual_information import MutualInformation, SearchBox
 from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import box_of, maximise
-from coec.cli.bench import live, look, rig, rows, scene, worker
+from coec.cli.bench import live, look, recording, rig, rows, scene, worker
 from coec.cli.calibrate import StageTimes
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
 from coec.geometry import se3
@@ -152,6 +152,7 @@ def measure_processes(bars: Progress) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
         document = worker.measure(Path(folder), FRAMES, heard)
+    document |= recording.measure(heard)
     with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:
         document |= live.measure(Path(folder), heard)
     with tempfile.TemporaryDirectory(prefix="coec-bench-") as folder:

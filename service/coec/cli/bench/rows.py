@@ -58,6 +58,7 @@ ROWS: tuple[Row, ...] = (
     Row("worker_window_s_fused", "worker: the same, fused", "s", 2),
     Row("solve_memory_mb_mi", "worker: memory of that above idle, MI", "MB", 0, 300.0),
     Row("solve_memory_mb_fused", "worker: memory of that above idle, fused", "MB", 0, 300.0),
+    Row("recording_cpu_percent", "writing windows at 35 MB/s with lz4, of one core", "%", 1, 20.0),
     Row("io_cpu_percent", "I/O process under load, of one core", "%", 1, 25.0),
     Row("io_resident_mb", "I/O process under load, most resident memory (RSS)", "MB", 0, 250.0),
     Row("io_proportional_mb", "I/O process under load, its share of it (PSS)", "MB", 0),

@@ -119,8 +119,9 @@ class AwaitedAnswers:
         del since_ns, until_ns, limit
         self._refuse()
 
-    def windows(self) -> replies.WindowsReply:
+    def windows(self, form: Format) -> Answer:
         """As `extrinsic`."""
+        del form
         self._refuse()
 
     def read_window(self, window_id: str, offset: int, length: int) -> bytes:

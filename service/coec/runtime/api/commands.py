@@ -219,7 +219,8 @@ class Commands:
         if not paths:
             text = "No recorded window agrees with what is served: calibrate first."
             return self._acknowledge("commission", "too_few_windows", text, accepted=False)
-        self._questions.commission(pose, paths, self._decider.commissioned)
+        done = partial(self._decider.commissioned, tuple(path.stem for path in paths))
+        self._questions.commission(pose, paths, done)
         text = f"The rig is being commissioned from {len(paths)} windows; `history` will say how it went."
         return self._acknowledge("commission", "commissioning", text, window_id=paths[-1].stem)
 

@@ -20,12 +20,14 @@ from coec.runtime.api.health import Told, health_of, reasons_of, with_troubles
 from coec.runtime.api.overlays import Overlays
 from coec.runtime.api.snapshots import Snapshot, answer_of
 from coec.runtime.api.status import pair_status_of
+from coec.runtime.api.windows_list import WindowsList
 from coec.runtime.decisions.decider import Known
 from coec.runtime.decisions.incidents import NO_EVENT, Side
 from coec.runtime.decisions.pair_store import PairStore
 from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.outside import Outside
 from coec.runtime.recording.recorder import Recorder
+from coec.runtime.recording.snippet_store import SNIPPET
 from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
 from coec.schemas.keys import Format
@@ -58,6 +60,7 @@ class PairAnswers:
         self._outside = outside
         self._commands = commands
         self._overlays = Overlays(pair.name, outside.worker)
+        self._windows = WindowsList(config.vehicle, pair.name, folder, outside.snippets)
         self.rig = rig
         self.extrinsic_reply: replies.ExtrinsicReply
         """What `extrinsic` serves."""
@@ -165,17 +168,20 @@ class PairAnswers:
             checks=tuple(check for check in told.checks if since_ns <= check.stamp_ns <= until_ns)[-limit:],
         )
 
-    def windows(self) -> replies.WindowsReply:
-        """The recorded windows."""
-        return replies.WindowsReply(vehicle=self._vehicle, pair=self.name, windows=self._folder.listing(self.name))
+    def windows(self, form: Format) -> Answer:
+        """The recorded windows, and what was kept of the seconds around events."""
+        return self._windows.answer(form)
 
     def read_window(self, window_id: str, offset: int, length: int) -> bytes:
-        """Bytes of one window's file.
+        """Bytes of the file of a window, or of a snippet.
 
         Raises:
             NotFoundError: no such window of this pair.
             UsageError: the offset lies behind its end.
         """
+        snippets = self._outside.snippets
+        if snippets is not None and window_id.endswith(SNIPPET):
+            return snippets.read(self.name, window_id, offset, length)
         return self._folder.read(self.name, window_id, offset, length)
 
     def events(self) -> replies.EvidenceReply:

@@ -160,7 +160,7 @@ class VehicleAnswers:
             Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), Lane.AT_ONCE),
             Route(keys.health(name), lambda request: pair.health(_format(request)), Lane.AT_ONCE),
             Route(keys.history(name), lambda request: _history(pair, request), Lane.FILES),
-            Route(keys.windows(name), lambda request: _in_format(request, pair.windows), Lane.FILES),
+            Route(keys.windows(name), lambda request: pair.windows(_format(request)), Lane.FILES),
             Route(keys.evidence(name), lambda request: _in_format(request, pair.events), Lane.FILES),
             Route(keys.overlay(name), lambda request: _overlay(pair, request), Lane.DRAWING),
         )

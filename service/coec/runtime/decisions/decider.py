@@ -23,7 +23,7 @@ from coec.calibration import lifecycle
 from coec.calibration.commissioning.baseline import Drift
 from coec.calibration.frames.window import KeptPairs
 from coec.calibration.lifecycle import HealthState, PairState, Rules
-from coec.calibration.types import Decision, Reason
+from coec.calibration.types import Decision, Matrix4, Reason
 from coec.config import CalibrationConfig, PairConfig
 from coec.runtime.decisions.incident_pictures import IncidentPictures
 from coec.runtime.decisions.mailbox import Mailbox
@@ -41,6 +41,9 @@ from coec.runtime.worker.queue import STOPPING
 from coec.schemas.replies import CalibrationResult, CheckReply
 
 _log = logging.getLogger(__name__)
+
+EVENTS = (HealthState.SUSPECT, HealthState.DEGRADED, HealthState.MISCALIBRATED)
+"""States whose beginning is an event: a snippet of the seconds around it is recorded, if they are."""
 
 UNTOLD_S = 0.02
 """Between two attempts to tell what the disk is about to take."""
@@ -70,6 +73,9 @@ class StreamSide(Protocol):
 
     def calm(self) -> None:
         """There is no suspicion any more."""
+
+    def event(self, name: str, T_camera_lidar: Matrix4) -> None:
+        """Something happened, while this extrinsic (4, 4) is served."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +150,7 @@ class Decider:
         self._window_attempts = Attempts("windows", "windows_in_vain")
         self._overdue: Reason | None = None
         self._untold = False
+        self._health = store.state.health
 
     def request_stop(self) -> None:
         """Take what has come, and end the thread."""
@@ -191,7 +198,15 @@ class Decider:
         now_s = time.monotonic()
         if item is not None or self._untold or now_s - self._looked_s >= TICK_S:
             self.look_at_clocks(now_s)
+        self._note_event()
         return item is not None
+
+    def _note_event(self) -> None:
+        """What enters a state that is an event has the seconds around it kept; it changes no decision."""
+        before, state = self._health, self._store.state
+        self._health = state.health
+        if state.health is not before and state.health in EVENTS:
+            self._stream.call(partial(self._stream.event, state.health.value, state.T_camera_lidar))
 
     def tell_now(self) -> None:
         """Tell what is known, whatever waits."""
@@ -273,8 +288,8 @@ class Decider:
 
         self._stream.call(start_over)
 
-    def commissioned(self, outcome: JobOutcome) -> None:
-        """A commissioning has ended."""
+    def commissioned(self, window_ids: tuple[str, ...], outcome: JobOutcome) -> None:
+        """A commissioning from these windows has ended."""
         answer = outcome.answer
         if not isinstance(answer, Commissioned):
             reason = outcome.reason or _NO_ANSWER
@@ -285,7 +300,7 @@ class Decider:
         self._baseline.load()
         self._calibrate_with(self._baseline.calibration)
         text = f"Commissioned from {answer.windows} windows, {answer.pairs} pairs; baseline {answer.baseline_hash}."
-        self._store.note_commissioned(text)
+        self._store.note_commissioned(text, window_ids)
         pose = answer.pose
         effect = self._step(lambda state: lifecycle.after_commissioning(state, pose), None, completed=False)
         if effect is not None:

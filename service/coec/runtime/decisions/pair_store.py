@@ -43,7 +43,7 @@ from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_index import WindowVersion
 from coec.runtime.recording.window_store import WindowStore
 from coec.schemas import replies
-from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, MetricsPoint
+from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent, HistoryEntry, KeptFor, MetricsPoint
 
 _log = logging.getLogger(__name__)
 
@@ -113,12 +113,13 @@ class PairStore:
         self.damage: Reason | None = None
         self.transitions: Counter[str] = Counter()
         self._epoch = 0
+        self._commissioned_from: tuple[str, ...] = ()
         remembered, heads = self._recall()
         self._state = restored(remembered)
         self.history = History(config.directory, rig.pair, config.history, heads)
         self.incidents = Incidents(config.directory / "evidence", rig.pair, config.evidence)
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
-        folder.protect(rig.pair, self.incidents.window_ids)
+        self.protect()
         if self.history.damage is not None:
             losses.add("storage", "history_damaged", detail=self.history.damage)
             text = f"The chain of the history is broken: {self.history.damage}. It is kept aside."
@@ -225,9 +226,11 @@ class PairStore:
                 return
         self.history.append(_entry("command", code, told).model_copy(update={"sender": sender}))
 
-    def note_commissioned(self, text: str) -> None:
-        """The rig has a baseline."""
+    def note_commissioned(self, text: str, window_ids: tuple[str, ...]) -> None:
+        """The rig has a baseline, learned from these windows."""
         self.history.append(_entry("commissioned", "commissioned", text))
+        self._commissioned_from = window_ids
+        self.protect()
 
     def served_before(self, name: str | None) -> tuple[Kept, CalibrationResult]:
         """A calibration that was served, as the history holds it, and the accepted result that it rested on.
@@ -271,7 +274,8 @@ class PairStore:
         age_s = self.age_s
         completed_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
         clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
-        self._store.remember(self._rig, self._state, clocks, lambda: self.history.durable_heads)
+        heads, windows = (lambda: self.history.durable_heads), self._commissioned_from
+        self._store.remember(self._rig, self._state, clocks, heads, windows)
         self._scribe.write(self.history, self.incidents, self._store)
 
     def is_on_disk(self) -> bool:
@@ -307,6 +311,7 @@ class PairStore:
             self._losses.add("storage", "state_damaged", len(damage), detail="; ".join(damage))
         if remembered is None:
             return initial_state(self._rig), {}
+        self._commissioned_from = remembered.commissioned_from
         clocks = remembered.clocks
         now_ns = time.time_ns()
         if clocks.since_wall_ns is not None and clocks.since_wall_ns <= now_ns:
@@ -380,8 +385,10 @@ class PairStore:
         self._scribe.write(self._folder)
 
     def protect(self) -> None:
-        """Tell the window folder what is evidence."""
-        self._folder.protect(self._rig.pair, self.incidents.window_ids)
+        """Tell the window folder which windows are evidence, and from which the rig was commissioned."""
+        kept: dict[str, KeptFor] = dict.fromkeys(self._commissioned_from, "commissioning")
+        kept |= dict.fromkeys(self.incidents.window_ids, "red_event")
+        self._folder.protect(self._rig.pair, kept)
 
 
 def _is_named(kept: Kept, name: str | None) -> bool:

@@ -93,6 +93,7 @@ class StoredPair(Part):
     since_wall_ns: WallNs | None = None
     completed_stamp_ns: int | None = None
     history_heads: dict[str, str] = Field(default_factory=dict)
+    commissioned_from: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +108,12 @@ class Clocks:
 
 @dataclass(frozen=True, slots=True)
 class Remembered:
-    """A pair's state as it was before the restart."""
+    """A pair's state as it was before the restart, and the windows that it was commissioned from."""
 
     state: PairState
     clocks: Clocks
     history_heads: Mapping[str, str]
+    commissioned_from: tuple[str, ...]
 
 
 class StateStore:
@@ -151,16 +153,22 @@ class StateStore:
                 )
                 return None
             clocks = Clocks(stored.completed_wall_ns, stored.completed_stamp_ns, stored.since_wall_ns)
-            return Remembered(_state_of(stored), clocks, stored.history_heads)
+            return Remembered(_state_of(stored), clocks, stored.history_heads, stored.commissioned_from)
         except (ValidationError, CoecError, ArithmeticError, LookupError, ValueError, TypeError) as error:
             self._file.distrust()
             why = "a pose in it is no rigid transform" if isinstance(error, _NoPoseError) else "it has another form"
             raise StateError(f"the state of pair {rig.pair} cannot be used: {why}") from error
 
     def remember(
-        self, rig: Rig, state: PairState, clocks: Clocks, history_heads: Callable[[], Mapping[str, str]]
+        self,
+        rig: Rig,
+        state: PairState,
+        clocks: Clocks,
+        history_heads: Callable[[], Mapping[str, str]],
+        commissioned_from: tuple[str, ...] = (),
     ) -> None:
-        """Keep the pair's state; on the disk with the next `flush`, together with what `history_heads()` says then."""
+        """Keep the pair's state, and the ids of the windows that it was commissioned from; on the disk with the next
+        `flush`, together with what `history_heads()` says then."""
         stored = StoredPair(
             rig_sha256=_rig_sha256(rig),
             T_camera_lidar=_rows(state.T_camera_lidar.tolist()),
@@ -186,6 +194,7 @@ class StateStore:
             changes=tuple(StoredChange(stamp_ns=change.stamp_ns, step=change.step) for change in state.changes),
             since_wall_ns=clocks.since_wall_ns,
             completed_stamp_ns=clocks.completed_stamp_ns,
+            commissioned_from=commissioned_from,
         )
         with self._lock:
             self._pairs[rig.pair] = stored.model_dump(mode="json")

@@ -63,15 +63,16 @@ class Intake:
         waiting_frames: those of the pairs that have come and wait to be looked at.
     """
 
-    def __init__(self, limits: LimitsConfig) -> None:
+    def __init__(self, limits: LimitsConfig, kept_bytes: int = 0) -> None:
+        """`kept_bytes`: of frames that are kept whatever becomes of them, beyond those of the limits."""
         self._limits = limits
         self._sensors: dict[tuple[str, str], SensorStream] = {}
         self._by_number: dict[str, SensorStream] = {}
         self._unheard: list[SensorStream] = []
         self.inbox = Inbox({}, limits.max_waiting_bytes, self._overrun)
         self.thread = ServiceThread("ingest", self._run)
-        budget = self._budget = FrameBudget(round(ALL_FRAMES * limits.max_held_bytes))
-        tight = round(TIGHT * limits.max_held_bytes)
+        budget = self._budget = FrameBudget(kept_bytes + round(ALL_FRAMES * limits.max_held_bytes))
+        tight = kept_bytes + round(TIGHT * limits.max_held_bytes)
         self.waiting_frames = WaitingFrames(limits.max_held_bytes, lambda: budget.bytes > tight)
         self._pairs: list[Takes] = []
         self._ticked_s = 0.0

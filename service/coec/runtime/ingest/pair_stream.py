@@ -10,11 +10,12 @@ from typing import TypeVar
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.frames.window import KeptPairs
-from coec.calibration.types import FramePair
+from coec.calibration.types import FramePair, Matrix4
 from coec.config import Config, PairConfig
 from coec.runtime.handover import Handover
 from coec.runtime.ingest.chooser import Chooser, Served
 from coec.runtime.ingest.decoder import LIDAR, Frame
+from coec.runtime.ingest.frame_ring import FrameRing
 from coec.runtime.ingest.inbox import Arrivals
 from coec.runtime.ingest.intake import Intake
 from coec.runtime.ingest.pair_buffer import PairBuffer
@@ -50,8 +51,10 @@ class PairStream:
         chooser: Chooser,
         has_room: Callable[[], bool],
         losses: LossCounter,
+        ring: FrameRing | None = None,
     ) -> None:
-        """`has_room()` says whether the recorder would take a chosen pair now; `losses` are the pair's own."""
+        """`has_room()` says whether the recorder would take a chosen pair now; `losses` are the pair's own; `ring`
+        keeps the last seconds, if they are wanted."""
         self._intake = intake
         self.sensors: Mapping[str, SensorStream] = intake.sensors_of(pair)
         self.report = StreamStatistics()
@@ -63,6 +66,7 @@ class PairStream:
         self._held = PairBuffer(intake.waiting_frames, config.worker.timeout_s)
         self._came_s: deque[float] = deque()
         self._losses = losses
+        self._ring = ring
         self._pairs = 0
         self._sync_error_s: float | None = None
         self._quiet_ticks = 0
@@ -116,6 +120,16 @@ class PairStream:
         """See `Chooser`; on this thread."""
         self._chooser.calm()
 
+    def event(self, name: str, T_camera_lidar: Matrix4) -> None:
+        """See `FrameRing`; on this thread."""
+        if self._ring is not None:
+            self._ring.event(name, T_camera_lidar)
+
+    def finish_snippet(self) -> None:
+        """Wait for nothing more that belongs to an event; on this thread, or after its end."""
+        if self._ring is not None:
+            self._ring.finish()
+
     def finish_pairs(self) -> None:
         """Look at every pair that has come, whatever it waits for. For the thread of the intake, or after its
         end."""
@@ -126,6 +140,8 @@ class PairStream:
     def push(self, frame: Frame) -> None:
         """The next frame of one of its streams came."""
         self._quiet_ticks = 0
+        if self._ring is not None:
+            self._ring.push(frame, time.monotonic())
         self._look_back(frame.stamp_ns)
         self.take(self._pairer.push(frame))
 
@@ -169,6 +185,8 @@ class PairStream:
         self._quiet_ticks = 0 if waiting else self._quiet_ticks + 1
         if self._quiet_ticks > QUIET_TICKS:
             self._end_in_silence()
+        if self._ring is not None:
+            self._ring.look(time.monotonic())
         self.tell()
 
     def _end_in_silence(self) -> None:

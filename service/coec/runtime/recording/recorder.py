@@ -20,6 +20,7 @@ from coec.calibration.types import FramePair, Matrix4, Reason, Rig
 from coec.config import CalibrationConfig
 from coec.errors import CoecError, RecordingError, WindowError
 from coec.runtime.recording.digests import DigestReader
+from coec.runtime.recording.snippets import SnippetRecorder
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.timings import QUICK_S, Histogram
 
@@ -63,12 +64,13 @@ class _Open:
 
 @dataclass(frozen=True, slots=True)
 class RecordingPlan:
-    """What every window of a pair has in common."""
+    """What every window of a pair has in common; clouds and raw images are compressed if they are to be `packed`."""
 
     rig: Rig
     configuration: CalibrationConfig
     min_pairs: int
     metadata: dict[str, str]
+    packed: bool = False
 
 
 class Recorder:
@@ -86,14 +88,17 @@ class Recorder:
         losses: LossCounter,
         on_recorded: Callable[[str, Path, bool], None],
         on_lost: Callable[[str], None],
+        snippets: SnippetRecorder | None = None,
     ) -> None:
         """`on_recorded(window_id, path, live)` is called on the recorder's thread for each finished window, and with
         `live` False for unsolved ones of earlier runs; `on_lost(window_id)` for each that ended and came to nothing.
-        A window cannot be removed before `on_recorded` returns: who needs it for longer holds it in the store."""
+        A window cannot be removed before `on_recorded` returns: who needs it for longer holds it in the store.
+        `snippets` are written between the pairs."""
         self._plan = plan
         self._configuration = plan.configuration
         self._store = store
         self._digests = DigestReader(store, plan.rig.pair)
+        self._snippets = snippets
         self._losses = losses
         self._on_recorded = on_recorded
         self._on_lost = on_lost
@@ -192,10 +197,12 @@ class Recorder:
             elif thread.stopping:
                 break
             else:
-                unread = self._read()
+                unread = (self._snippets is not None and self._snippets.write()) or self._read()
         self._digests.close()
         if self._open is not None:
             self._end(self._open.window_id, None)
+        if self._snippets is not None:
+            self._snippets.close()
 
     def _read(self) -> bool:
         """Go on with windows of which nothing is known, and see by that what others have done in the folder; False when
@@ -223,6 +230,8 @@ class Recorder:
                     unsolved.append(path)
         for path in unsolved:
             self._hand_over(path.stem, path, live=False)
+        if self._snippets is not None:
+            self._snippets.take_up(self.thread.beat)
 
     def _salvage(self, part: Path) -> None:
         try:
@@ -268,6 +277,7 @@ class Recorder:
             item.window_id,
             self._configuration,
             plan.metadata,
+            packed=plan.packed,
         )
         return _Open(item.window_id, writer, plan.min_pairs)
 

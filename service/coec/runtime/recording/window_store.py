@@ -26,7 +26,7 @@ from coec.adapters.mcap.windows import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX, Reco
 from coec.config import StateConfig
 from coec.errors import NotFoundError, RecordingError, UsageError
 from coec.runtime.recording.window_index import IndexedWindow, WindowIndex, WindowVersion
-from coec.schemas.replies import WindowInfo
+from coec.schemas.replies import KeptFor, WindowInfo
 
 _log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ class WindowStore:
         self._lock = threading.Lock()
         self._found: dict[str, _Found] = {}
         self._views: dict[str, _View] = {}
-        self._protected: dict[str, frozenset[str]] = {}
+        self._protected: dict[str, Mapping[str, KeptFor]] = {}
         self._held: Counter[str] = Counter()
         self._changed_ns: int | None = None
         self._changed_s = self._looked_s = 0.0
@@ -115,7 +115,9 @@ class WindowStore:
 
     def use(self, config: StateConfig) -> None:
         """Keep these limits from the next window on."""
-        self._config = config
+        with self._lock:
+            self._config = config
+            self._views.clear()
 
     # --- what is there ----------------------------------------------------------------------------------------------
 
@@ -209,7 +211,8 @@ class WindowStore:
                 self._index.put(IndexedWindow(window_id=window_id, order=found.order, version=version))
                 view = self._views.get(found.pair)
                 if view is not None:
-                    self._views[found.pair] = view.renewed(self._info(window_id, found))
+                    kept_for = self._kept().get(window_id)
+                    self._views[found.pair] = view.renewed(self._info(window_id, found, kept_for))
 
     def flush(self) -> None:
         """Put on the disk what was noted."""
@@ -241,11 +244,14 @@ class WindowStore:
             if self._held[window_id] <= 0:
                 del self._held[window_id]
 
-    def protect(self, pair: str, window_ids: frozenset[str]) -> None:
-        """These windows of the pair (and no others any more) are evidence: age does not remove them, and lack of room
-        only when no other window is left that may go."""
+    def protect(self, pair: str, kept_for: Mapping[str, KeptFor]) -> None:
+        """These windows of the pair (and no others any more) are kept for something: age does not remove them, and lack
+        of room only when no other window is left that may go. Where all that are kept have more than
+        `max_protected_bytes`, the oldest of them are ordinary ones."""
         with self._lock:
-            self._protected[pair] = window_ids
+            if self._protected.get(pair) != kept_for:
+                self._protected[pair] = dict(kept_for)
+                self._views.clear()
 
     def make_room(self, progress: Callable[[], None]) -> None:
         """Before a window starts: remove windows that are too old, and the oldest while there are too many bytes or
@@ -270,17 +276,17 @@ class WindowStore:
             latest = {found.pair: window_id for window_id, found in self._in_order()}
             newest = {pair: self._found[window_id] for pair, window_id in latest.items()}
             removable = [item for item in self._in_order() if item[0] != latest[item[1].pair]]
-            evidence = self._evidence()
+            kept = self._kept()
             used = sum(found.size_bytes for found in self._found.values())
             reserve = max((found.size_bytes for found in self._found.values()), default=0)
         expired = 0
-        for window_id, found in sorted(removable, key=lambda item: item[0] in evidence):
+        for window_id, found in sorted(removable, key=lambda item: item[0] in kept):
             too_much = used + reserve > self._config.max_bytes
             too_full = _free_bytes(self._folder) < self._config.min_free_bytes + reserve
             by_age = not too_much and not too_full
             if by_age and (expired == EXPIRED_AT_ONCE or not self._is_too_old(found, newest[found.pair])):
                 continue
-            if not self._remove(window_id, spare_evidence=by_age or window_id not in evidence):
+            if not self._remove(window_id, spare_kept=by_age or window_id not in kept):
                 continue
             expired += by_age
             used -= found.size_bytes
@@ -296,11 +302,11 @@ class WindowStore:
                 f"{self._config.min_free_bytes >> 20} MiB: free space"
             )
 
-    def _remove(self, window_id: str, *, spare_evidence: bool) -> bool:
+    def _remove(self, window_id: str, *, spare_kept: bool) -> bool:
         """Remove a window, unless something is under way with it by now, it has gone, or it is to be spared."""
         with self._disk:
             with self._lock:
-                spared = spare_evidence and window_id in self._evidence()
+                spared = spare_kept and window_id in self._kept()
                 if spared or window_id in self._held or window_id not in self._found:
                     return False
                 del self._found[window_id]
@@ -343,8 +349,17 @@ class WindowStore:
 
     # --- inside; the lock is held -----------------------------------------------------------------------------------
 
-    def _evidence(self) -> frozenset[str]:
-        return frozenset().union(*self._protected.values())
+    def _kept(self) -> dict[str, KeptFor]:
+        """What windows are kept for, of those that are; the latest first, as many as may be."""
+        asked = {window_id: reason for of_pair in self._protected.values() for window_id, reason in of_pair.items()}
+        there = sorted(self._found.keys() & asked.keys(), key=lambda window_id: -self._found[window_id].order)
+        left, kept = self._config.max_protected_bytes, dict[str, KeptFor]()
+        for window_id in there:
+            left -= self._found[window_id].size_bytes
+            if left < 0:
+                break
+            kept[window_id] = asked[window_id]
+        return kept
 
     def _in_order(self) -> list[tuple[str, _Found]]:
         return sorted(self._found.items(), key=lambda item: item[1].order)
@@ -386,12 +401,13 @@ class WindowStore:
         view = self._views.get(pair)
         if view is None:
             ours = [(window_id, found) for window_id, found in self._in_order() if found.pair == pair]
-            infos = tuple(self._info(window_id, found) for window_id, found in ours)
+            kept = self._kept()
+            infos = tuple(self._info(window_id, found, kept.get(window_id)) for window_id, found in ours)
             unread = tuple(info.window_id for info in reversed(infos) if info.sha256 is None)
             view = self._views[pair] = _View(infos, unread)
         return view
 
-    def _info(self, window_id: str, found: _Found) -> WindowInfo:
+    def _info(self, window_id: str, found: _Found, kept_for: KeptFor | None) -> WindowInfo:
         version, indexed = self._version(window_id, found), self._index.get(window_id)
         return WindowInfo(
             window_id=window_id,
@@ -399,6 +415,7 @@ class WindowStore:
             size_bytes=found.size_bytes,
             pairs=indexed.version.pairs if indexed else None,
             decision=version.decision if version else None,
+            kept_for=kept_for,
         )
 
 

@@ -26,6 +26,7 @@ from coec.calibration.types import (
     DepthMap,
     EgoMotion,
     EncodedImage,
+    Estimate,
     FramePair,
     ImageFormat,
     LidarFrame,
@@ -124,13 +125,24 @@ class Solver:
         window, configuration = read_window(path)
         estimate = calibrate(window, self._network(configuration.depth), self._images, configuration, Silence())
         result = result_of(estimate, window.rig, self._config.vehicle)
+        picture = self._picture_of_result(window, configuration, estimate)
         try:
-            file = write_result(path, result)
+            file = write_result(path, result, picture)
         except (RecordingError, WindowError, OSError) as error:
             _log.warning("the result could not be written into its window", extra={"fields": {"window": path.stem}})
             code = error.reply_code if isinstance(error, CoecError) else "recording_failed"
             return Solved(result, Reason(code, f"The window file does not hold the result: {error}"))
         return Solved(result, None, WrittenFile(file.bytes, file.modified_ns, file.sha256, file.pairs))
+
+    def _picture_of_result(self, window: Window, configuration: CalibrationConfig, estimate: Estimate) -> bytes | None:
+        """JPEG of the window's last pair at its result; None where it cannot be drawn: a result needs no picture."""
+        title = f"{window.window_id}  {estimate.verdict.decision.value}"
+        pose = estimate.optimum.T_camera_lidar.tolist()
+        try:
+            return self._drawn(window.rig, configuration, pose, window.pairs[-1], title).jpeg
+        except DecodeError as error:
+            _log.warning(f"the result is not drawn: {error}", extra={"fields": {"window": window.window_id}})
+            return None
 
     def observe(
         self,

@@ -1,0 +1,145 @@
+"""Reading windows: whole, pair by pair, or no more than their result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from coec.adapters.mcap.chunk_writer import CHUNK_BYTES
+from coec.adapters.mcap.files import McapDamaged, Message, Metadata, Record, read_attachment, read_records
+from coec.adapters.mcap.windows.content import Content
+from coec.adapters.mcap.windows.names import METADATA, RESULT, RIG
+from coec.calibration.search.mount_prior import MOUNT_RAD
+from coec.calibration.types import FramePair, Window
+from coec.config import CalibrationConfig
+from coec.errors import DecodeError, SourceError, WindowError
+from coec.schemas.base import from_json
+from coec.schemas.replies import CalibrationResult
+
+MAX_UNPACKED = 64
+"""A window unpacks to at most this many times its size (plus `CHUNK_BYTES`). Images and clouds do not shrink to a
+sixtieth, however a tool compresses them."""
+
+
+def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
+    """The window exactly as it was recorded, and the configuration it was recorded for.
+
+    Raises:
+        WindowError: unreadable, cut off, damaged, not a window of ours, or without a pair.
+    """
+    content = Content()
+    size = _size(path)
+    for record in records_of(path, max_unpacked_bytes=size * MAX_UNPACKED + CHUNK_BYTES):
+        content.take(record)
+    rig, T_camera_lidar_start, window_id = content.head(path)
+    written = [content.pair(path, index) for index in sorted(content.parts)]
+    pairs = tuple(sorted(written, key=lambda pair: pair.stamp_ns))
+    if not pairs:
+        raise WindowError(f"{path} holds no camera-LiDAR pair")
+    # The service began it at the extrinsic in use.
+    window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD)
+    return window, content.parsed_configuration(path)
+
+
+def pairs_since(path: Path, since_ns: int) -> Iterator[FramePair]:
+    """The pairs of a window from a stamp on, in the order in which they are in its file, one at a time in memory.
+
+    Raises:
+        WindowError: unreadable, cut off or damaged.
+    """
+    content = Content()
+    for record in records_of(path, max_unpacked_bytes=_size(path) * MAX_UNPACKED + CHUNK_BYTES):
+        index = content.take(record)
+        if index is None:
+            continue
+        pair = content.pair(path, index)
+        if pair.stamp_ns >= since_ns:
+            yield pair
+
+
+def read_result(path: Path) -> CalibrationResult | None:
+    """The result that was written into a window, None when it has none. Does not read the frames.
+
+    Raises:
+        WindowError: unreadable, cut off or damaged.
+    """
+    data = _attachment(path, RESULT)
+    if data is None:
+        return None
+    try:
+        return from_json(CalibrationResult, data)
+    except DecodeError as error:
+        raise WindowError(f"{path}: {RESULT}: {error}") from error
+
+
+def read_vehicle(path: Path) -> str:
+    """The vehicle that recorded a window, empty where the window does not say. Does not read the frames.
+
+    Raises:
+        WindowError: unreadable or damaged at its beginning.
+    """
+    return metadata_of(path).get("vehicle", "")
+
+
+def metadata_of(path: Path) -> dict[str, str]:
+    """What a window says of itself before its first message; empty where it says nothing.
+
+    Raises:
+        WindowError: unreadable or damaged at its beginning.
+    """
+    for record in records_of(path):
+        match record:
+            case Metadata() if record.name == METADATA:
+                return record.values
+            case Message():
+                break
+    return {}
+
+
+def is_window(path: Path) -> bool:
+    """Whether a sound MCAP file is a window of ours. Does not read the frames.
+
+    Raises:
+        SourceError: unreadable, cut off or damaged, so that nobody can tell.
+    """
+    try:
+        return read_attachment(path, RIG) is not None
+    except OSError as error:
+        raise SourceError(f"cannot read {path}: {error.strerror}") from error
+    except McapDamaged as error:
+        raise SourceError(error.of(path)) from error
+
+
+def records_of(path: Path, max_unpacked_bytes: int | None = None) -> Iterator[Record]:
+    """The records of a window's file; what came before an error is sound.
+
+    Raises:
+        WindowError: unreadable, cut off or damaged.
+    """
+    try:
+        with path.open("rb") as stream:
+            yield from read_records(stream, max_unpacked_bytes=max_unpacked_bytes)
+    except OSError as error:
+        raise WindowError(f"cannot read {path}: {error.strerror}") from error
+    except McapDamaged as error:
+        raise WindowError(_damage(path, error)) from error
+
+
+def _attachment(path: Path, name: str) -> bytes | None:
+    try:
+        return read_attachment(path, name)
+    except OSError as error:
+        raise WindowError(f"cannot read {path}: {error.strerror}") from error
+    except McapDamaged as error:
+        raise WindowError(_damage(path, error)) from error
+
+
+def _damage(path: Path, error: McapDamaged) -> str:
+    return f"{error.of(path)}; the daemon does so for its own at start"
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise WindowError(f"cannot read {path}: {error.strerror}") from error

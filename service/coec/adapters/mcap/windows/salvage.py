@@ -1,0 +1,79 @@
+"""A window made of what a recorder left behind that did not come to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from coec.adapters.files import durable
+from coec.adapters.mcap.whole_file import failing_as_recording_error
+from coec.adapters.mcap.windows.content import Content
+from coec.adapters.mcap.windows.names import LZ4, PACKING, PART_SUFFIX, REWRITE_SUFFIX, beside
+from coec.adapters.mcap.windows.reading import records_of
+from coec.adapters.mcap.windows.writer import RecordedWindow, WindowWriter
+from coec.errors import WindowError
+
+
+def salvage(part_path: Path, progress: Callable[[], None]) -> RecordedWindow | None:
+    """Makes a window of what a killed recorder left behind, and removes the `.part` file.
+
+    Args:
+        part_path: the `.part` file.
+        progress: called after every pair.
+
+    Returns:
+        The window with every pair that is whole, or None when there was none or the rig is lost (or when the window was
+        finished after all).
+
+    Raises:
+        RecordingError: it could not be written; the `.part` file is still there.
+    """
+    final = part_path.with_name(part_path.name.removesuffix(PART_SUFFIX))
+    window = None if final.exists() else _salvaged(part_path, final, progress)
+    with failing_as_recording_error(final):
+        durable.remove(part_path)
+    return window
+
+
+def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> RecordedWindow | None:
+    content = Content()
+    writer: WindowWriter | None = None
+    try:
+        # The error that ends the file also ends the loop; whatever came before it was sound.
+        with suppress(WindowError):
+            for record in records_of(part_path):
+                index = content.take(record)
+                if index is None:
+                    continue
+                if writer is None:
+                    writer = _writer_like(content, part_path, final)
+                writer.add(content.pair(part_path, index))
+                progress()
+    except BaseException:
+        if writer is not None:
+            writer.abandon()
+        raise
+    if writer is None:
+        return None
+    if writer.pairs == 0:
+        writer.abandon()
+        return None
+    if content.kept:
+        writer.note_of_kept(content.kept)
+    return writer.finish()
+
+
+def _writer_like(content: Content, part_path: Path, final: Path) -> WindowWriter:
+    rig, T_camera_lidar_start, window_id = content.head(part_path)
+    configuration = content.parsed_configuration(part_path)
+    return WindowWriter(
+        final,
+        rig,
+        T_camera_lidar_start,
+        window_id,
+        configuration,
+        content.metadata,
+        packed=content.metadata.get(PACKING) == LZ4,
+        temporary=beside(final, REWRITE_SUFFIX),
+    )

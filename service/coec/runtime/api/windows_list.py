@@ -1,0 +1,44 @@
+"""The list of a pair's recordings, serialised once as long as nothing comes or goes: of thousands it is a megabyte."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from coec.adapters.zenoh.bus import Answer
+from coec.runtime.api.snapshots import answer_of
+from coec.runtime.recording.snippet_store import SnippetStore
+from coec.runtime.recording.window_store import WindowStore
+from coec.schemas.keys import Format
+from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What was listed, and the answers that were made of it."""
+
+    windows: tuple[WindowInfo, ...]
+    snippets: tuple[SnippetInfo, ...]
+    answers: dict[Format, Answer] = field(default_factory=dict)
+
+
+class WindowsList:
+    """Of one pair. Any thread."""
+
+    def __init__(self, vehicle: str, pair: str, windows: WindowStore, snippets: SnippetStore | None) -> None:
+        self._vehicle, self._pair = vehicle, pair
+        self._windows, self._snippets = windows, snippets
+        self._told = _Told((), ())
+
+    def answer(self, form: Format) -> Answer:
+        """What is there now, in the encoding that is asked for."""
+        windows = self._windows.listing(self._pair)
+        snippets = () if self._snippets is None else self._snippets.listing(self._pair)
+        told = self._told
+        # The store hands out the same list until it changes; to compare thousands takes as long as to pack them.
+        if told.windows is not windows or told.snippets != snippets:
+            told = self._told = _Told(windows, snippets)
+        answer = told.answers.get(form)
+        if answer is None:
+            reply = WindowsReply(vehicle=self._vehicle, pair=self._pair, windows=windows, snippets=snippets)
+            answer = told.answers[form] = answer_of(reply, form)
+        return answer

@@ -1,0 +1,102 @@
+"""The last seconds of a pair at full rate, in memory, and what is cut out of them around an event."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from coec.calibration.types import Matrix4
+from coec.config import SnippetsConfig
+from coec.runtime.ingest.decoder import Frame
+from coec.runtime.ingest.frame_budget import frame_bytes
+
+NS_PER_S = 1_000_000_000
+
+SILENT_S = 3.0
+"""Without a frame for so long (steady clock) nothing more is to be waited for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snippet:
+    """Frames around an event, in the order in which they came.
+
+    Attributes:
+        event: what happened, as `health` calls it.
+        stamp_ns: sensor time of the frame that came last before it was told.
+        T_camera_lidar: (4, 4), what was served then.
+    """
+
+    event: str
+    stamp_ns: int
+    T_camera_lidar: Matrix4
+    frames: tuple[Frame, ...]
+
+
+@dataclass(slots=True)
+class _Open:
+    """An event whose frames are still coming."""
+
+    event: str
+    stamp_ns: int
+    T_camera_lidar: Matrix4
+
+
+class FrameRing:
+    """Belongs to the thread of the intake. Holds at most `max_bytes` of frames, of which an event leaves room for those
+    to come: half of it is for what was before."""
+
+    def __init__(self, config: SnippetsConfig, max_bytes: int, deliver: Callable[[Snippet], None]) -> None:
+        """`deliver(snippet)` takes the frames over; it must not wait."""
+        self._before_ns, self._after_ns = round(config.before_s * NS_PER_S), round(config.after_s * NS_PER_S)
+        self._max_bytes = max_bytes
+        self._deliver = deliver
+        self._frames: deque[tuple[Frame, int]] = deque()
+        self._bytes = 0
+        self._came_s = 0.0
+        self._open: _Open | None = None
+
+    @property
+    def bytes(self) -> int:
+        """Of the frames that are held."""
+        return self._bytes
+
+    def push(self, frame: Frame, monotonic_s: float) -> None:
+        """A frame came."""
+        size, self._came_s = frame_bytes(frame), monotonic_s
+        opened = self._open
+        if opened is not None:
+            later_ns = frame.stamp_ns - opened.stamp_ns  # far below zero where the time has stepped back
+            if not -self._before_ns <= later_ns <= self._after_ns or self._bytes + size > self._max_bytes:
+                self.finish()
+        self._frames.append((frame, size))
+        self._bytes += size
+        if self._open is None:
+            self._forget(frame.stamp_ns)
+
+    def event(self, name: str, T_camera_lidar: Matrix4) -> None:
+        """Something happened, while this (4, 4) is served. Another event before the end of the first belongs to it."""
+        if self._open is None and self._frames:
+            self._open = _Open(name, self._frames[-1][0].stamp_ns, T_camera_lidar)
+
+    def look(self, monotonic_s: float) -> None:
+        """Time has passed: an event after which nothing comes is over."""
+        if self._open is not None and monotonic_s - self._came_s > SILENT_S:
+            self.finish()
+
+    def finish(self) -> None:
+        """Hand over what there is of an event; nothing otherwise."""
+        opened, self._open = self._open, None
+        if opened is None:
+            return
+        frames = tuple(frame for frame, _ in self._frames)
+        self._frames.clear()
+        self._bytes = 0
+        self._deliver(Snippet(opened.event, opened.stamp_ns, opened.T_camera_lidar, frames))
+
+    def _forget(self, now_ns: int) -> None:
+        """What is too old, of another time, or too much."""
+        while self._frames and (
+            2 * self._bytes > self._max_bytes or not 0 <= now_ns - self._frames[0][0].stamp_ns <= self._before_ns
+        ):
+            self._bytes -= self._frames.popleft()[1]

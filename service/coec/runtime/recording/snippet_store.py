@@ -1,0 +1,186 @@
+"""The folder of snippets: what is there, what has to go, bytes of a file.
+
+Beside each file lies what is said of it (`.json`), so that a list opens no recording. Bounded by bytes, and nothing
+begins where the disk has too little room: windows come first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from coec.adapters.files import durable
+from coec.adapters.mcap.snippet_file import metadata_of, salvage_snippet
+from coec.adapters.mcap.windows import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX
+from coec.errors import CoecError, DecodeError, NotFoundError, RecordingError, UsageError
+from coec.schemas.base import from_json, to_json
+from coec.schemas.replies import SnippetInfo
+
+_log = logging.getLogger(__name__)
+
+SNIPPET = ".snippet"
+"""At the end of a snippet's id, where a window's has a digit."""
+
+TOLD = ".json"
+
+TOLD_BYTES = 4096
+"""Of what is said of a snippet, at most: some 250 are written."""
+
+PIECE_BYTES = 2**20
+"""Read at once of a file whose digest is not known."""
+
+
+def snippet_id(pair: str, stamp_ns: int) -> str:
+    """Id of what a pair saw around an event, by the sensor time of the event."""
+    return f"{pair}-{stamp_ns}{SNIPPET}"
+
+
+class SnippetStore:
+    """The snippets of all pairs. Safe to use from several threads; `listing` waits for no disk."""
+
+    def __init__(self, folder: Path, max_bytes: int, min_free_bytes: int) -> None:
+        """Makes the folder.
+
+        Raises:
+            RecordingError: it cannot be made or read.
+        """
+        self._folder = folder
+        self._max_bytes, self._min_free_bytes = max_bytes, min_free_bytes
+        self._lock = threading.Lock()
+        self._found: dict[str, SnippetInfo] = {}
+        try:
+            durable.make_folder(folder)
+            for leftover in folder.glob(f"*{REWRITE_SUFFIX}"):  # the original is still there
+                leftover.unlink(missing_ok=True)
+            told = [info for path in folder.glob(f"*{TOLD}") if (info := self._read_told(path)) is not None]
+        except OSError as error:
+            raise RecordingError(f"the folder {folder} cannot be made or read: {error.strerror}") from error
+        self._found = {info.snippet_id: info for info in sorted(told, key=lambda info: info.recorded_ns)}
+
+    def path(self, name: str) -> Path:
+        """Where a snippet is, or will be."""
+        return self._folder / f"{name}{SUFFIX}"
+
+    def listing(self, pair: str) -> tuple[SnippetInfo, ...]:
+        """Every snippet of the pair, oldest first."""
+        with self._lock:
+            return tuple(info for name, info in self._found.items() if _pair_of(name) == pair)
+
+    def read(self, pair: str, name: str, offset: int, length: int) -> bytes:
+        """`length` bytes of a snippet's file from `offset`; fewer at its end.
+
+        Raises:
+            NotFoundError: no such snippet of the pair.
+            UsageError: the offset lies behind the end.
+        """
+        with self._lock:
+            known = name in self._found and _pair_of(name) == pair
+        if not known:
+            raise NotFoundError(f"pair {pair} has no snippet of this id; the list is in `windows`")
+        try:
+            with self.path(name).open("rb") as stream:
+                size = os.fstat(stream.fileno()).st_size
+                if offset > size:
+                    raise UsageError(f"`offset` lies behind the end of the file ({size} bytes)")
+                stream.seek(offset)
+                return stream.read(length)
+        except OSError as error:
+            raise NotFoundError(f"the snippet cannot be read: {error.strerror}") from error
+
+    def add(self, info: SnippetInfo) -> None:
+        """A snippet was recorded: it is listed once a restart would list it, too.
+
+        Raises:
+            OSError: what is said of it could not be written; it is found by its file at the next start.
+        """
+        durable.replace(self._told(info.snippet_id), to_json(info))
+        with self._lock:
+            self._found.pop(info.snippet_id, None)
+            self._found[info.snippet_id] = info
+
+    def make_room(self, size_bytes: int) -> None:
+        """For a snippet of this size: remove the oldest while there are too many bytes.
+
+        Raises:
+            RecordingError: it is larger than all may be, or the disk has too little room.
+        """
+        if size_bytes > self._max_bytes:
+            raise RecordingError(f"a snippet of {size_bytes >> 20} MiB is more than snippets.max_bytes allows")
+        try:
+            while (oldest := self._oldest_beyond(size_bytes)) is not None:
+                durable.remove(self.path(oldest))
+                durable.remove(self._told(oldest))
+                with self._lock:
+                    self._found.pop(oldest, None)
+            free = shutil.disk_usage(self._folder).free
+        except OSError as error:
+            raise RecordingError(f"no room can be made in {self._folder}: {error.strerror}") from error
+        if free < self._min_free_bytes + size_bytes:
+            raise RecordingError(
+                f"only {free >> 20} MiB are free on the disk of {self._folder}: a snippet of {size_bytes >> 20} MiB is "
+                f"not written beside the {self._min_free_bytes >> 20} MiB of state.min_free_bytes"
+            )
+
+    def take_up(self, pair: str, progress: Callable[[], None]) -> None:
+        """Look after what earlier runs left of a pair: finish what was cut off, read what is not told. `progress` is
+        called now and then.
+
+        Raises:
+            RecordingError, OSError: the disk refuses.
+        """
+        for part in self._folder.glob(f"{pair}-*{SNIPPET}{SUFFIX}{PART_SUFFIX}"):
+            if _pair_of(part.name.removesuffix(f"{SUFFIX}{PART_SUFFIX}")) == pair:
+                salvage_snippet(part, progress)
+        for path in self._folder.glob(f"{pair}-*{SNIPPET}{SUFFIX}"):
+            name = path.name.removesuffix(SUFFIX)
+            if _pair_of(name) != pair or name in self._found:
+                continue
+            with suppress(CoecError):  # what is damaged stays for whoever wants to look into it
+                self.add(_read_anew(path, name, progress))
+
+    def _oldest_beyond(self, size_bytes: int) -> str | None:
+        with self._lock:
+            used = sum(info.size_bytes for info in self._found.values())
+            return next(iter(self._found), None) if used + size_bytes > self._max_bytes else None
+
+    def _told(self, name: str) -> Path:
+        return self._folder / f"{name}{TOLD}"
+
+    def _read_told(self, path: Path) -> SnippetInfo | None:
+        name = path.name.removesuffix(TOLD)
+        if path.stat().st_size > TOLD_BYTES:
+            return None
+        try:
+            info = from_json(SnippetInfo, path.read_bytes())
+        except DecodeError:
+            return None
+        return info if info.snippet_id == name and _pair_of(name) and self.path(name).exists() else None
+
+
+def _pair_of(name: str) -> str:
+    """The pair of a snippet's id; empty where it is none."""
+    pair, _, stamp = name.removesuffix(SNIPPET).rpartition("-")
+    return pair if name.endswith(SNIPPET) and stamp.isascii() and stamp.isdecimal() else ""
+
+
+def _read_anew(path: Path, name: str, progress: Callable[[], None]) -> SnippetInfo:
+    said, digest = metadata_of(path), hashlib.sha256()
+    with path.open("rb") as stream:
+        while data := stream.read(PIECE_BYTES):
+            digest.update(data)
+            progress()
+        status = os.fstat(stream.fileno())
+    return SnippetInfo(
+        snippet_id=name,
+        event=said.get("event", ""),
+        stamp_ns=int(name.removesuffix(SNIPPET).rpartition("-")[2]),
+        recorded_ns=status.st_mtime_ns,
+        size_bytes=status.st_size,
+        sha256=digest.hexdigest(),
+    )

@@ -1,0 +1,84 @@
+"""A recorder in a process of its own, as fast as its disk, until it is killed: `FOLDER LIFE`. What is on the disk is
+said on standard output, a line each: `window ID SHA256` or `snippet ID SHA256`."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from coec.adapters.system.logs import LossCounter
+from coec.calibration.frames.window import SliceEnded
+from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
+from coec.config import CalibrationConfig, StateConfig
+from coec.geometry.cameras import build
+from coec.runtime.ingest.frame_ring import Snippet
+from coec.runtime.recording.recorder import Recorder, RecordingPlan
+from coec.runtime.recording.snippet_store import SnippetStore
+from coec.runtime.recording.snippets import SnippetRecorder
+from coec.runtime.recording.window_store import WindowStore
+from fakes import wait_until
+
+NOMINAL = np.eye(4)
+CAMERA = build("pinhole", width=4, height=3, fx=2.0, fy=2.0, cx=1.5, cy=1.0)
+RIG = Rig("front", CAMERA, "camera", "lidar", NOMINAL, NOMINAL)
+PLAN = RecordingPlan(RIG, CalibrationConfig(), 2, {"vehicle": "test"}, packed=True)
+PAIRS, POINTS = 4, 30_000
+"""Of a window; 1.5 MB of it are packed."""
+
+S = 1_000_000_000
+
+
+def pair(stamp_ns: int) -> FramePair:
+    rng = np.random.default_rng(stamp_ns)
+    cloud = np.round(rng.normal(size=(POINTS, 3)), 2).astype(np.float32)
+    image = EncodedImage(ImageFormat.MONO8, 4, 3, bytes(range(12)))
+    return FramePair(CameraFrame(stamp_ns, "camera", image), LidarFrame(stamp_ns, "lidar", cloud))
+
+
+def stores(folder: Path) -> tuple[WindowStore, SnippetStore]:
+    limits = StateConfig(min_free_bytes=0, max_bytes=2**40)
+    return WindowStore(folder / "windows", limits), SnippetStore(folder / "snippets", 2**40, 0)
+
+
+def recorder_of(
+    windows: WindowStore, snippets: SnippetStore, recorded: list[str]
+) -> tuple[Recorder, SnippetRecorder, LossCounter]:
+    losses = LossCounter(logging.getLogger("test"), "front")
+    beside = SnippetRecorder(RIG, {"vehicle": "test"}, snippets, losses, packed=True)
+    ended = recorded.append
+    return Recorder(PLAN, windows, losses, lambda name, *_: ended(name), ended, beside), beside, losses
+
+
+def run(folder: Path, life: int) -> None:
+    windows, snippets = stores(folder)
+    ended: list[str] = []
+    recorder, beside, _ = recorder_of(windows, snippets, ended)
+    recorder.thread.start()
+    said: set[str] = set()
+    for number in itertools.count(1):
+        begin_ns = (1_700_000_000 + life * 1_000_000 + number * 10) * S
+        name, before = f"front-{begin_ns}", len(ended)
+        pairs = [pair(begin_ns + index) for index in range(PAIRS)]
+        for one in pairs:
+            recorder.add(name, one, NOMINAL)
+        recorder.end(SliceEnded(name, PAIRS, True))
+        beside.give(
+            Snippet("suspect", begin_ns, NOMINAL, tuple(frame for one in pairs for frame in (one.lidar, one.camera)))
+        )
+        wait_until(lambda: len(ended) > before, "the end of the window")  # noqa: B023 - called at once
+        for info in windows.listing("front"):
+            if info.window_id not in said and info.sha256 is not None:
+                said.add(info.window_id)
+                print(f"window {info.window_id} {info.sha256}", flush=True)
+        for snippet in snippets.listing("front"):
+            if snippet.snippet_id not in said:
+                said.add(snippet.snippet_id)
+                print(f"snippet {snippet.snippet_id} {snippet.sha256}", flush=True)
+
+
+if __name__ == "__main__":
+    run(Path(sys.argv[1]), int(sys.argv[2]))
