@@ -16,7 +16,8 @@ from coec.config.pair import OpenPairConfig, PairConfig
 from coec.config.rig import MAX_LINKS, MAX_SENSORS
 from coec.config.ros import RosConfig
 from coec.config.service import BudgetConfig, LimitsConfig, LogConfig, StateConfig, WorkerConfig, ZenohConfig
-from coec.schemas.keys import RIG
+from coec.config.uplink import UplinkConfig
+from coec.schemas.keys import LAST, RIG
 from coec.schemas.ros_names import ros_name
 
 MAX_PAIRS = 32
@@ -42,6 +43,7 @@ class Config(Stage):
     )
     log: LogConfig = LogConfig()
     metrics: MetricsConfig = MetricsConfig()
+    uplink: UplinkConfig = UplinkConfig()
     pairs: tuple[PairConfig, ...] = Field(default=(), max_length=MAX_PAIRS)
     awaited: tuple[OpenPairConfig, ...] = Field(
         default=(),
@@ -88,8 +90,9 @@ class Config(Stage):
         names = [pair.name for pair in self.every_pair]
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
-        if RIG in names:
-            raise ValueError(f"pairs: all of them together are called `{RIG}`: give the pair of this name another one")
+        for taken, whose in ((RIG, "all of them together are called"), (LAST, "their last words are kept below")):
+            if taken in names:
+                raise ValueError(f"pairs: {whose} `{taken}`: give the pair of this name another one")
         return self
 
     @model_validator(mode="after")
