@@ -14,6 +14,7 @@ from coec.schemas import (
     doctor,
     evaluation,
     fleet,
+    fleet_now,
     frames,
     last_word,
     matrix,
@@ -62,6 +63,7 @@ MESSAGES: tuple[type[Message], ...] = (
     fleet.WindowRow,
     fleet.BatchReport,
     fleet.FleetReport,
+    fleet_now.FleetNow,
 )
 
 
