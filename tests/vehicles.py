@@ -3,7 +3,7 @@ knows the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,9 +84,15 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
 
 
 @contextmanager
-def serving(folder: Path, config: ZenohConfig, authority: AuthorityConfig | None = None) -> Iterator[Vehicle]:
-    """A vehicle in a session of its own, until the end of the block."""
+def serving(
+    folder: Path,
+    config: ZenohConfig,
+    authority: AuthorityConfig | None = None,
+    before: Callable[[Bench], None] = lambda _: None,
+) -> Iterator[Vehicle]:
+    """A vehicle in a session of its own, until the end of the block; `before` is what it did before it was asked."""
     bench = Bench(folder, vehicle=VEHICLE, authority=authority)
+    before(bench)
     bus = Bus(open_session(config, LIMITS))
     threads = (*bus.threads, bench.intake.thread, bench.pair.decider.thread)
     for thread in threads:

@@ -16,6 +16,7 @@ from coec.schemas import (
     fleet,
     fleet_now,
     frames,
+    incident,
     last_word,
     matrix,
     replies,
@@ -64,6 +65,7 @@ MESSAGES: tuple[type[Message], ...] = (
     fleet.BatchReport,
     fleet.FleetReport,
     fleet_now.FleetNow,
+    incident.IncidentReport,
 )
 
 
