@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import replace
 
@@ -106,8 +107,6 @@ def chained(*texts: str) -> list[ChainedEntry]:
 
 
 def sha256(entry: HistoryEntry) -> str:
-    import hashlib
-
     return hashlib.sha256(to_json(entry)).hexdigest()
 
 
