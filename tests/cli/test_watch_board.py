@@ -82,8 +82,8 @@ def test_what_does_not_go_together_is_a_usage_error(
 
 @contextmanager
 def board_of(router: Router) -> Iterator[Board]:
-    with connected([router.endpoint], 5.0) as session:
-        words = Words(session, ALL, 2.0)
+    with connected([router.endpoint], 5.0) as session, connected([router.endpoint], 5.0) as of_tokens:
+        words = Words(session, of_tokens, ALL, 2.0)
         with words.listening(), Asking(session, "coec") as asking:
             yield Board(Roster(), words, Filter(), asking)
 

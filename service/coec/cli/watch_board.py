@@ -64,8 +64,12 @@ def run(options: Options, asked: Asked) -> int:
         UsageError: a state that is none.
     """
     chosen = Filter(of_states(options.states or (), UsageError), options.find or "")
-    with until_signal() as stop, connected_by(asked.way, options.timeout_s, MAX_MESSAGE) as session:
-        words = Words(session, Keys(asked.prefix, asked.vehicle), options.timeout_s)
+    with (
+        until_signal() as stop,
+        connected_by(asked.way, options.timeout_s, MAX_MESSAGE) as session,
+        connected_by(asked.way, options.timeout_s, MAX_MESSAGE) as of_tokens,
+    ):
+        words = Words(session, of_tokens, Keys(asked.prefix, asked.vehicle), options.timeout_s)
         with words.listening():
             board = Board(Roster(), words, chosen, Asking(session, asked.prefix))
             if options.once:
@@ -132,7 +136,12 @@ class Asking:
 
 @dataclass(slots=True)
 class Board:
-    """What is on the screen, and what keys do to it. Owned by one thread."""
+    """What is on the screen, and what keys do to it. Owned by one thread.
+
+    Attributes:
+        index: of the chosen pair among those that are shown.
+        name: of the pair that was chosen by a key, which stays chosen wherever it goes; None: the first of them is.
+    """
 
     roster: Roster
     words: Words
@@ -154,6 +163,7 @@ class Board:
     def press(self, key: str | None) -> bool:
         """Do what a key means; False: the board is left."""
         pairs = self.fleet.pairs if self.fleet is not None else ()
+        pair = pairs[self.index] if self.index < len(pairs) else None
         step = {"up": -1, "k": -1, "down": 1, "j": 1, "page up": -10, "page down": 10}.get(key or "", 0)
         if step and pairs:
             self.index = min(max(self.index + step, 0), len(pairs) - 1)
@@ -163,7 +173,8 @@ class Board:
             self.quick = (self.quick + 1) % len(QUICK_FILTERS)
         elif key in ("r", "enter"):
             self.pane = "reasons"
-        elif key in ("h", "o") and self.name is not None:
+        elif key in ("h", "o") and pair is not None:
+            self.name = _name(pair)
             self.pane = {"h": "history", "o": "overlay"}[key]
             self.asking.begin(self.pane, self.name, (console.out.width, PANE_ROWS * 2))
         return key != "q"
@@ -179,9 +190,8 @@ class Board:
         self.fleet = self.roster.now(self.clock(), chosen, max(rows, self.index + rows))
         pairs = self.fleet.pairs
         found = [index for index, pair in enumerate(pairs) if _name(pair) == self.name]
-        self.index = found[0] if found else min(self.index, max(len(pairs) - 1, 0))
+        self.index = found[0] if found else min(self.index if self.name else 0, max(len(pairs) - 1, 0))
         pair = pairs[self.index] if pairs else None
-        self.name = None if pair is None else _name(pair)
         first = max(min(self.index - rows // 2, len(pairs) - rows), 0)
         filtered = ", ".join(filter(None, (label or ", ".join(sorted(chosen.states)), chosen.text)))
         parts: list[RenderableType] = [fleet_board.board(self.fleet, self.index, first, rows, filtered)]

@@ -90,7 +90,10 @@ class VehicleAnswers:
         for name in self._pairs:
             bus.serve(f"{self._keys.root}/{name}/**", self._finder(name))
         bus.serve(f"{self._keys.rig}/**", self._find_of_rig)
-        bus.serve(self._keys.last("*"), self._find_last)
+        for name in self._pairs:
+            # Each by its own key: what a router has seen declared it finds again when it is put, however many vehicles
+            # there are; it would look for others among all of them each time (docs/fleet.md).
+            bus.serve(self._keys.last(name), self._find_last(name))
         bus.serve(f"{self._keys.root}/**", self._find_unknown, complete=False)
 
     def _finder(self, pair: str) -> Callable[[str], Sequence[Route]]:
@@ -151,18 +154,11 @@ class VehicleAnswers:
         command = Route(key, partial(self._reception.take, RIG, str(address.argument)), Lane.COMMANDS)
         return [self._timed(command, "command")]
 
-    def _find_last(self, key: str) -> Sequence[Route]:
-        """Who says the last words that a key, or a key expression, names. Of what is not served here nothing is said:
-        whoever keeps the words of a vehicle answers for pairs that it had."""
-        if key.split("/")[-2] != LAST:
-            return []
-        asked = zenoh.KeyExpr(key)
-        keys = {name: self._keys.last(name) for name in self._pairs}
-        return [
-            self._timed(Route(one, partial(self._last, name), Lane.AT_ONCE), LAST)
-            for name, one in keys.items()
-            if asked.intersects(zenoh.KeyExpr(one))
-        ]
+    def _find_last(self, pair: str) -> Callable[[str], Sequence[Route]]:
+        """Who says the last word of a pair to those who ask for it, or for those of all: not to who asks for something
+        else of a pair that happens to be called `last`."""
+        route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), Lane.AT_ONCE), LAST)
+        return lambda key: [route] if key.split("/")[-2] == LAST else []
 
     def _last(self, pair: str, request: Request) -> Answer:
         return self._last_words.answer(pair, _format(request))
