@@ -27,6 +27,7 @@ from coec.config import (
     load_config,
 )
 from coec.reports.commented_yaml import commented_yaml
+from coec.schemas import last_word
 from coec.schemas.base import from_msgpack
 from coec.schemas.replies import HealthReply
 from e2e.drives import SHORT, SHORT_PAIRS, Drive, later, rendered
@@ -34,6 +35,7 @@ from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment, rou
 from e2e.ros_listener import listening, speaking_to_ros
 from fakes import wait_until
 from ports import free_port
+from storages import Storage
 
 SHORT_S = 12
 LATER_S = 60.0
@@ -172,7 +174,12 @@ def test_a_drive_an_end_and_a_restart(tmp_path: Path, drive: Drive, router: Rout
         told = running.until(running.history, lambda told: told["total"] == 2, "the second solve")
         one, two = told["results"]
         assert one == two, "the same window and configuration give the same result"
-        assert running.terminate() == 0
+        with Storage(router.session, running.keys.last("*")) as storage:
+            assert running.terminate() == 0
+    words = {key: last_word.read(key, kept.payload.to_bytes()) for key, kept in storage.kept.items()}
+    assert {word.service for word in words.values()} == {"stopping"}, "it takes its leave"
+    front = words[running.keys.last(FRONT)]
+    assert (front.state, front.provenance, front.windows) == ("healthy", "estimated", 1)
 
     with service(config, router) as running:
         restored = running.extrinsic()

@@ -3,7 +3,7 @@ knows the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +12,15 @@ from coec.adapters.tls.conversation import Listener, credentials_of
 from coec.adapters.zenoh.bus import Bus, open_session
 from coec.adapters.zenoh.reach import Reach
 from coec.adapters.zenoh.settings import settings_of
-from coec.config import AuthorityConfig, LimitsConfig, ZenohConfig
+from coec.config import AuthorityConfig, LimitsConfig, UplinkConfig, ZenohConfig
 from coec.runtime.api.authority import Authority
 from coec.runtime.api.configuration import shown
+from coec.runtime.api.last_words import LastWords
 from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.api.uplink import Uplink
 from coec.schemas.keys import Keys
 from pair_bench import Bench
 from statuses import a_status
@@ -63,6 +65,7 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
         told = a_status(vehicle=VEHICLE, pairs=(pair.answers.status(),))
         return Snapshot.of(told)
 
+    words = LastWords(KEYS, "0", UplinkConfig(), bus.publish)
     VehicleAnswers(
         KEYS,
         {pair.name: pair.answers},
@@ -71,16 +74,25 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
         lambda: b"# EOF\n",
         lambda: document,
         RigAnswers(KEYS, bus.publish),
+        words,
+        Uplink(UplinkConfig()),
     ).declare(bus)
+    words.renew("running", "0", [pair.answers])
     for name, answer in (("extrinsic", pair.answers.extrinsic), ("health", pair.answers.health)):
         bus.publish(f"{KEYS.root}/{pair.name}/{name}", answer("msgpack"))
     bus.declare_alive(KEYS.alive(pair.name))
 
 
 @contextmanager
-def serving(folder: Path, config: ZenohConfig, authority: AuthorityConfig | None = None) -> Iterator[Vehicle]:
-    """A vehicle in a session of its own, until the end of the block."""
+def serving(
+    folder: Path,
+    config: ZenohConfig,
+    authority: AuthorityConfig | None = None,
+    before: Callable[[Bench], None] = lambda _: None,
+) -> Iterator[Vehicle]:
+    """A vehicle in a session of its own, until the end of the block; `before` is what it did before it was asked."""
     bench = Bench(folder, vehicle=VEHICLE, authority=authority)
+    before(bench)
     bus = Bus(open_session(config, LIMITS))
     threads = (*bus.threads, bench.intake.thread, bench.pair.decider.thread)
     for thread in threads:

@@ -17,14 +17,16 @@ from baselines import a_baseline
 from coec.adapters.files.baseline_file import save_baseline
 from coec.adapters.zenoh.bus import Bus, Request, Route
 from coec.calibration.commissioning.baseline import learned_hash
-from coec.config import AuthorityConfig
+from coec.config import AuthorityConfig, UplinkConfig
 from coec.geometry import se3
 from coec.runtime.api import commands, rate_limit
 from coec.runtime.api.authority import Authority
+from coec.runtime.api.last_words import LastWords
 from coec.runtime.api.reception import Reception, Rules
 from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
+from coec.runtime.api.uplink import Uplink
 from coec.runtime.worker.jobs import Commissioned, Fate, JobOutcome
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
 from pair_bench import BEGIN_S, END_S, STEP_S, Bench
@@ -199,6 +201,8 @@ def route_of(bench: Bench, command: str) -> Route:
         lambda: b"",
         lambda: unasked,
         RigAnswers(keys, lambda *_: None),
+        LastWords(keys, "0", UplinkConfig(), lambda *_: None),
+        Uplink(UplinkConfig()),
     ).declare(bus)
     finders = {call.args[0]: call.args[1] for call in bus.serve.call_args_list}
     (route,) = finders[f"{keys.root}/{pair.name}/**"](keys.command(pair.name, command))

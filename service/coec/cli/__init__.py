@@ -32,6 +32,7 @@ COMMANDS = (
     "play",
     "query",
     "watch",
+    "fetch",
     "view",
     "router",
     "batch",

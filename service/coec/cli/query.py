@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import getpass
-import hashlib
 import json
 import math
 import re
 import socket
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +18,6 @@ from coec.adapters.files.output import OutputError
 from coec.adapters.tls.conversation import Credentials, Speaker
 from coec.adapters.zenoh.bus import JSON, MSGPACK
 from coec.adapters.zenoh.client import (
-    RemoteError,
     Reply,
     Way,
     ask,
@@ -35,28 +31,28 @@ from coec.adapters.zenoh.client import (
 from coec.adapters.zenoh.proven import give
 from coec.adapters.zenoh.settings import connected_of
 from coec.adapters.zenoh.settings_file import credentials_in, read_settings
+from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.cli.commands.query import Options
 from coec.config import Config, ZenohConfig, load_config
 from coec.errors import NotFoundError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
-from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, VERSION_CHUNK, Keys
-from coec.schemas.replies import SnippetInfo, StatusReply, WindowInfo, WindowsReply
+from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, VERSION_CHUNK, Keys
+from coec.schemas.replies import StatusReply
 
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
 PAIR_KEYS = ("extrinsic", "health", "history", "windows", "evidence")
 PLAIN_KEYS = (*PAIR_KEYS, "overlay", *VEHICLE_KEYS)
 WITH_ARGUMENT = {"windows": "ID", "evidence": "ID", "command": "NAME"}
 JPEG = "image/jpeg"
-DIGEST_POLL_S = 0.2
-"""Between questions whether the service has read a window: as often as its recorder looks for one."""
+PATIENCE_S = 60.0
+"""With a window of which no piece comes; what has come waits for the next attempt."""
+
 ON_SITE = 0.9
 """Share of the time that a command's acknowledgement is waited for that the service may take; the rest is for the way
 there and back."""
-OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d+(\.snippet)?")
+OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d{1,19}(\.snippet)?", re.ASCII)
 """What windows, snippets and red events are called: their pair, and a time in nanoseconds."""
-
-Recording = WindowInfo | SnippetInfo
 
 PICTURE_KEYS = ("overlay", "evidence")
 """Keys whose answer may be a picture, for `--output`."""
@@ -305,13 +301,14 @@ def _download(options: Options, way: Way, keys: Keys, window_id: str) -> int:
         pair = _pair_of(session, options, keys, window_id)
         single_key(keys.window(pair, window_id))
         task = bars.add_task(window_id, note="")
-        info = download_window(
+        info = fetch_window(
             session,
             keys,
             pair,
             window_id,
             options.output,
             options.timeout_s,
+            PATIENCE_S,
             lambda done, total: bars.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} MB"),
         )
     if options.as_json:
@@ -319,69 +316,6 @@ def _download(options: Options, way: Way, keys: Keys, window_id: str) -> int:
     else:
         console.show(f"{options.output}  {info.size_bytes} bytes, sha256 {info.sha256} verified")
     return 0
-
-
-def download_window(
-    session: zenoh.Session,
-    keys: Keys,
-    pair: str,
-    window_id: str,
-    path: Path,
-    timeout_s: float,
-    heard: Callable[[int, int], None],
-) -> Recording:
-    """A recorded window or snippet, piece by piece, into a file that has its name only when its sha256 is right.
-
-    A window that is rewritten on the way (its result came) is fetched once more.
-
-    Raises:
-        RemoteError: no such window, or its bytes are not those that were promised.
-        OutputError: the file cannot be written.
-    """
-    info = _digested(session, keys, pair, window_id, timeout_s)
-    for attempt in (1, 2):
-        data = _pieces(session, keys.window(pair, window_id), info.size_bytes, timeout_s, heard)
-        if hashlib.sha256(data).hexdigest() == info.sha256:
-            _save(path, data)
-            return info
-        renewed = _digested(session, keys, pair, window_id, timeout_s)
-        if attempt == 2 or renewed.sha256 == info.sha256:
-            break
-        info = renewed
-    raise RemoteError("checksum", f"the bytes of window {window_id} do not have the sha256 of the list; try again")
-
-
-def _digested(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> Recording:
-    """What the list says of a window; the service may still be reading it."""
-    deadline_s = time.monotonic() + timeout_s
-    while (info := _info(session, keys, pair, window_id, timeout_s)).sha256 is None:
-        if time.monotonic() > deadline_s:
-            text = f"the service has not read window {window_id} since its start: try again in a minute"
-            raise RemoteError("checksum", text)
-        time.sleep(DIGEST_POLL_S)
-    return info
-
-
-def _info(session: zenoh.Session, keys: Keys, pair: str, window_id: str, timeout_s: float) -> Recording:
-    reply = from_json(WindowsReply, ask_one(session, f"{keys.windows(pair)}?format=json", timeout_s).payload)
-    recorded: dict[str, Recording] = {
-        **{info.window_id: info for info in reply.windows},
-        **{info.snippet_id: info for info in reply.snippets},
-    }
-    if window_id in recorded:
-        return recorded[window_id]
-    raise RemoteError("not_found", f"pair {pair} has no window {window_id}: see `coec query windows`")
-
-
-def _pieces(session: zenoh.Session, key: str, size: int, timeout_s: float, heard: Callable[[int, int], None]) -> bytes:
-    data = bytearray()
-    while len(data) < size:
-        piece = ask_one(session, f"{key}?offset={len(data)};length={MAX_LENGTH}", timeout_s).payload
-        if not piece:
-            break
-        data += piece
-        heard(len(data), size)
-    return bytes(data)
 
 
 def _save(path: Path, data: bytes) -> None:

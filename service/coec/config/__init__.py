@@ -53,6 +53,7 @@ from coec.config.streams import (
     TimeUnit,
     TopicName,
 )
+from coec.config.uplink import UplinkConfig
 from coec.config.whole import Config, config_hash
 from coec.config.yaml_text import MAX_YAML_BYTES, load_yaml, parse_yaml
 
@@ -103,6 +104,7 @@ __all__ = [
     "TimeUnit",
     "TopicName",
     "TrackerConfig",
+    "UplinkConfig",
     "VerdictConfig",
     "WindowConfig",
     "WorkerConfig",

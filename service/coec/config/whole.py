@@ -24,7 +24,8 @@ from coec.config.service import (
     WorkerConfig,
     ZenohConfig,
 )
-from coec.schemas.keys import RIG
+from coec.config.uplink import UplinkConfig
+from coec.schemas.keys import LAST, RIG
 from coec.schemas.ros_names import ros_name
 
 MAX_PAIRS = 32
@@ -51,6 +52,7 @@ class Config(Stage):
     )
     log: LogConfig = LogConfig()
     metrics: MetricsConfig = MetricsConfig()
+    uplink: UplinkConfig = UplinkConfig()
     pairs: tuple[PairConfig, ...] = Field(default=(), max_length=MAX_PAIRS)
     awaited: tuple[OpenPairConfig, ...] = Field(
         default=(),
@@ -97,8 +99,9 @@ class Config(Stage):
         names = [pair.name for pair in self.every_pair]
         if len(set(names)) != len(names):
             raise ValueError("pair names must be unique")
-        if RIG in names:
-            raise ValueError(f"pairs: all of them together are called `{RIG}`: give the pair of this name another one")
+        for taken, whose in ((RIG, "all of them together are called"), (LAST, "their last words are kept below")):
+            if taken in names:
+                raise ValueError(f"pairs: {whose} `{taken}`: give the pair of this name another one")
         return self
 
     @model_validator(mode="after")

@@ -37,6 +37,7 @@ from coec.runtime.api.commands import Commands
 from coec.runtime.api.configuration import shown
 from coec.runtime.api.health import reasons_of
 from coec.runtime.api.http_door import HttpDoor
+from coec.runtime.api.last_words import LastWords
 from coec.runtime.api.metrics import Took, View
 from coec.runtime.api.pages import pages
 from coec.runtime.api.pair_answers import PairAnswers
@@ -47,6 +48,7 @@ from coec.runtime.api.router_watch import RouterWatch
 from coec.runtime.api.routes import VehicleAnswers
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.api.status import budget_status_of, worker_status_of
+from coec.runtime.api.uplink import Uplink
 from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.state_store import StateStore
@@ -152,6 +154,8 @@ class Daemon:
         of_rig = RigCommands(config.vehicle, self._commands, lambda: self._rig_answers.reply)
         self._reception = Reception(self._rules, self._commands, of_rig)
         self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
+        self._last_words = LastWords(self._keys, __version__, config.uplink, self._bus.publish)
+        self._uplink = Uplink(config.uplink)
         self._answers = VehicleAnswers(
             self._keys,
             {**{name: pair.answers for name, pair in self._pairs.items()}, **awaited},
@@ -160,6 +164,8 @@ class Daemon:
             self._metrics,
             lambda: self._shown,
             self._rig_answers,
+            self._last_words,
+            self._uplink,
         )
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
@@ -392,6 +398,8 @@ class Daemon:
         logs.configure(config.log.level, config.log.format)
         self._folder.use(config.state)
         self._budget.use(config.budget)
+        self._uplink.use(config.uplink)
+        self._last_words.use(config.uplink)
         self._shown = self._shown_now()
         for old, new in zip(before.pairs, config.pairs, strict=True):
             if old == new and before.stale_after_s == config.stale_after_s:
@@ -434,6 +442,7 @@ class Daemon:
         self._room.renew()
         self._status_reply = self._status_now()
         self._status = Snapshot.of(self._status_reply)
+        self._last_words.renew(self._state, self._status_reply.config_hash, self._answering())
 
     def _status_now(self) -> replies.StatusReply:
         usage = self._folder.usage()
@@ -501,7 +510,7 @@ class Daemon:
             metrics.WORK: [Took((), self._worker.work_took)],
         }
         memory = (resident_bytes(), self._worker.status().rss_bytes)
-        view = View(self._status_reply, self._health(), *memory, took, self._rig_answers.reply)
+        view = View(self._status_reply, self._health(), *memory, took, self._rig_answers.reply, self._uplink)
         return metrics.render(view)
 
 

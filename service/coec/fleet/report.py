@@ -9,7 +9,16 @@ from typing import Any, cast
 
 from coec.fleet.questions import WINDOWS, ask, view
 from coec.fleet.tables import NAMELESS
-from coec.schemas.fleet import AXES, ChangedWindow, DayOfPair, FigureOfFleet, FleetChanges, FleetReport, PairOfFleet
+from coec.schemas.fleet import (
+    AXES,
+    SEEN,
+    ChangedWindow,
+    DayOfPair,
+    FigureOfFleet,
+    FleetChanges,
+    FleetReport,
+    PairOfFleet,
+)
 from coec.schemas.replies import Maybe6
 
 READ, BEFORE = "read", "before"
@@ -17,9 +26,6 @@ READ, BEFORE = "read", "before"
 
 ENDS = 5
 """Accepted windows whose median is where a pair began, and is now: one that is far off moves none of both."""
-
-SEEN = (0.5, 0.5, 0.5, 0.1, 0.1, 0.1)
-"""Steps, deg and m, that a monitor has to see: the measure of a drift."""
 
 MONTH_S = 30 * 86_400.0
 

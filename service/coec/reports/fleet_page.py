@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from html import escape
 
+from coec.reports import html
 from coec.reports.console import figure
 from coec.schemas.fleet import AXES, DayOfPair, FleetChanges, FleetReport, PairOfFleet
 
@@ -18,27 +19,11 @@ LEAST = {"deg": 0.1, "m": 0.02}
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
 """Of a plot, px."""
 
-STYLE = """
-:root{color-scheme:light dark;--line:#1769aa;--band:#1769aa33;--bad:#b3261e;--rule:#8884}
-@media(prefers-color-scheme:dark){:root{--line:#7cc4ff;--band:#7cc4ff33;--bad:#ff8a80}}
-body{font:15px/1.45 system-ui,sans-serif;margin:0 auto;max-width:1100px;padding:1rem}
-h1{font-size:1.4rem}h2{font-size:1.1rem;margin-top:2rem}
-.scroll{overflow-x:auto}table{border-collapse:collapse;width:100%}
-th,td{padding:.25rem .6rem;text-align:left;border-bottom:1px solid var(--rule);white-space:nowrap;
-font-variant-numeric:tabular-nums}
-td.n,th.n{text-align:right}.bad{color:var(--bad);font-weight:600}.quiet{opacity:.7}
-svg{display:block}polyline{fill:none;stroke:var(--line);stroke-width:1.5}polygon{fill:var(--band)}
-.zero{stroke:var(--rule);stroke-width:1}
-@media print{body{max-width:none}}
-"""
-
 
 def page(report: FleetReport, title: str) -> str:
     """The document. It loads nothing, and what vehicles call themselves is text in it."""
     parts = [
-        "<!doctype html><html lang=en><meta charset=utf-8>",
-        "<meta name=viewport content='width=device-width,initial-scale=1'>",
-        f"<title>{escape(title)}</title><style>{STYLE}</style><h1>{escape(title)}</h1>",
+        html.head(title),
         f"<p>{escape(sentence(report))}</p>",
     ]
     if report.changes is not None:
@@ -48,7 +33,7 @@ def page(report: FleetReport, title: str) -> str:
         "<p class=quiet>Drift: where the last accepted windows are from where the first were. The plot shows that"
         " axis, day by day: median, and the band that holds two thirds of the windows. Urgency 1 is a step that a"
         " monitor has to see, 0.5° or 10 cm.</p>",
-        _table(
+        html.table(
             (
                 "vehicle",
                 "pair",
@@ -69,13 +54,13 @@ def page(report: FleetReport, title: str) -> str:
         parts.append("<h2>Why windows were refused, or have no result</h2>")
         counts = [*report.refusals.items(), *((f"{code} (no result)", n) for code, n in report.errors.items())]
         counts.sort(key=lambda item: (-item[1], item[0]))
-        parts.append(_table(("code", "windows"), ((escape(code), str(n)) for code, n in counts), {1}))
+        parts.append(html.table(("code", "windows"), ((escape(code), str(n)) for code, n in counts), {1}))
     if report.figures:
         parts += [
             "<h2>Figures of accepted windows over the fleet</h2>",
             "<p class=quiet>99 of 100 windows lie between the outer two. A vehicle without a baseline of its own can be"
             " held against them.</p>",
-            _table(
+            html.table(
                 ("figure", "pair", "vehicles", "windows", "0.5 %", "median", "99.5 %"),
                 (
                     (
@@ -118,7 +103,7 @@ def _changes(changes: FleetChanges) -> Iterable[str]:
         f" {figure(changes.rotation_deg)}° and {figure(changes.translation_m)} m (root mean square).</p>"
     )
     if changes.windows:
-        yield _table(
+        yield html.table(
             ("vehicle", "window", "before", "now", "deg", "m"),
             (
                 (
@@ -179,18 +164,4 @@ def _plot(days: Sequence[DayOfPair], axis: int, least: float, title: str) -> str
         f"<svg width={WIDTH} height={HEIGHT} role=img aria-label='{escape(title)}'><title>{escape(title)}</title>"
         f"<line class=zero x1=0 x2={WIDTH} y1={HEIGHT / 2} y2={HEIGHT / 2} />"
         f"<polygon points='{' '.join((*lower, *reversed(upper)))}' /><polyline points='{line}' /></svg>"
-    )
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: set[int]) -> str:
-    """Cells are HTML already."""
-
-    def cells(tag: str, values: Sequence[str]) -> str:
-        return "".join(
-            f"<{tag}{' class=n' if index in numbers else ''}>{value}</{tag}>" for index, value in enumerate(values)
-        )
-
-    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return (
-        f"<div class=scroll><table><thead><tr>{cells('th', head)}</tr></thead><tbody>\n{body}\n</tbody></table></div>"
     )

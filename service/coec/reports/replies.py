@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Final
 
+from rich.table import Table
 from rich.text import Text
 
 from coec.reports import console
@@ -88,12 +89,7 @@ def history(payload: bytes) -> None:
     """Past results of a pair."""
     reply = from_json(replies.HistoryReply, payload)
     console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.results)} of {reply.total} results")
-    table = console.table("data until", "verdict", "pairs", *console.AXES, "window", right=range(2, 9))
-    for result in reply.results:
-        moved = [console.figure(value, sign=True) for value in result.correction]
-        verdict = console.styled(result.verdict.decision)
-        table.add_row(_instant(result.data_stamp_ns), verdict, str(result.pairs), *moved, result.window_id)
-    console.out.print(table)
+    console.out.print(results_table(reply))
     table = console.table("#", "service time", "what", "outcome", "why", "sender", "sha256", right=(0,))
     for item in reply.entries:
         entry = item.entry
@@ -102,6 +98,16 @@ def history(payload: bytes) -> None:
             row = (str(entry.sequence), _instant(entry.wall_ns), entry.kind, outcome, entry.text)
             table.add_row(*row, entry.sender or "", item.sha256[:12])
     console.out.print(table)
+
+
+def results_table(reply: replies.HistoryReply) -> Table:
+    """Past results, a row each."""
+    table = console.table("data until", "verdict", "pairs", *console.AXES, "window", right=range(2, 9))
+    for result in reply.results:
+        moved = [console.figure(value, sign=True) for value in result.correction]
+        verdict = console.styled(result.verdict.decision)
+        table.add_row(_instant(result.data_stamp_ns), verdict, str(result.pairs), *moved, result.window_id)
+    return table
 
 
 def windows(payload: bytes) -> None:

@@ -8,7 +8,21 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import checks, commands, doctor, evaluation, fleet, frames, matrix, replies, rig, rig_state
+from coec.schemas import (
+    checks,
+    commands,
+    doctor,
+    evaluation,
+    fleet,
+    fleet_now,
+    frames,
+    incident,
+    last_word,
+    matrix,
+    replies,
+    rig,
+    rig_state,
+)
 from coec.schemas.base import Message
 
 SENT: tuple[type[Message], ...] = (
@@ -23,6 +37,7 @@ MESSAGES: tuple[type[Message], ...] = (
     *SENT,
     replies.ExtrinsicReply,
     replies.HealthReply,
+    last_word.LastWord,
     replies.HistoryReply,
     replies.HistoryEntry,
     replies.EvidenceReply,
@@ -49,6 +64,8 @@ MESSAGES: tuple[type[Message], ...] = (
     fleet.WindowRow,
     fleet.BatchReport,
     fleet.FleetReport,
+    fleet_now.FleetNow,
+    incident.IncidentReport,
 )
 
 

@@ -13,6 +13,9 @@ from coec.schemas.replies import CalibrationResult, Count, Counts, Maybe6
 AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
 """Columns of a correction, in its order; `sigma_` before them is its standard deviation."""
 
+SEEN = (0.5, 0.5, 0.5, 0.1, 0.1, 0.1)
+"""Steps, deg and m, that a monitor has to see: the measure of a drift."""
+
 
 class WindowRow(Message):
     """A window of a batch, as it is kept until it becomes a row of a table. It holds a result or an error."""

@@ -15,6 +15,9 @@ VERSION_CHUNK: Final = "@v1"
 RIG: Final = "rig"
 """What all pairs of a vehicle together are called, in the place of a pair."""
 
+LAST: Final = "last"
+"""In the place of a pair: below it lies the last word of each, for whoever keeps it while the vehicle is parked."""
+
 MAX_LIMIT: Final = 10_000
 """Most results in one reply of `history`, as many as the state keeps at most (config.StateConfig.history)."""
 
@@ -87,6 +90,10 @@ class Keys:
     def rig(self) -> str:
         """Queryable, and published on change: all sensors of the vehicle together."""
         return f"{self.root}/{RIG}"
+
+    def last(self, pair: str) -> str:
+        """Queryable, and published on change and from time to time: the last word of a pair; `pair` may be `*`."""
+        return f"{self.root}/{LAST}/{pair}"
 
     def extrinsic(self, pair: str) -> str:
         """Queryable, and published on change."""
@@ -163,6 +170,8 @@ class Keys:
         match chunks:
             case [("status" | "metrics" | "config" | "rig") as resource]:
                 return Address(None, resource)
+            case ["last" as resource, pair]:
+                return Address(pair, resource)
             case [
                 pair,
                 ("extrinsic" | "health" | "history" | "windows" | "overlay" | "evidence" | "alive") as resource,

@@ -78,6 +78,9 @@ READABLE = {
     "metrics": KEYS.metrics,
     "config": KEYS.config,
     "health of all": "coec/@v1/*/*/health",
+    "rig": KEYS.rig,
+    "a last word": KEYS.last(PAIR),
+    "last words of all": "coec/@v1/*/last/*",
 }
 LOOKED_FOR = MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 COMMAND = KEYS.command(PAIR, "hold")

@@ -18,6 +18,7 @@ import numpy as np
 from coec.adapters.files import output
 from coec.adapters.files.rig import mask_to_png
 from coec.adapters.zenoh.client import connected
+from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.calibration.types import Matrix4
 from coec.cli.demo import report, story
 from coec.cli.demo.daemon import Daemon, DemoError, free_endpoint, running
@@ -26,7 +27,6 @@ from coec.cli.demo.pace import Pace
 from coec.cli.demo.screen import Screen
 from coec.cli.demo.vehicle import NS_PER_S, Vehicle
 from coec.cli.demo.watch import ASK_S, Seen, Watch
-from coec.cli.query import download_window
 from coec.config import Config
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
@@ -149,7 +149,7 @@ def _fetch(watch: Watch, seen: Seen, output: Path) -> tuple[Path | None, Matrix4
     if window_id is None:
         return None, blamed
     path = output / f"{window_id}.mcap"
-    download_window(watch.session, watch.keys, watch.pair, window_id, path, ASK_S, lambda *_: None)
+    fetch_window(watch.session, watch.keys, watch.pair, window_id, path, ASK_S, ASK_S, lambda *_: None)
     return path, blamed
 
 

@@ -14,6 +14,7 @@ from typing import Literal, get_args
 
 from coec.calibration.lifecycle import HealthState
 from coec.runtime.api.extrinsic import AXES, UNITS
+from coec.runtime.api.uplink import Uplink
 from coec.runtime.timings import Histogram
 from coec.schemas.replies import BudgetStatus, CheckReply, HealthReply, Maybe6, PairStatus, StatusReply, StreamStatus
 from coec.schemas.rig_state import RigReply, SensorState
@@ -42,6 +43,7 @@ class View:
         memory_bytes, worker_memory_bytes: resident, of the service and of its worker.
         took: durations, by the name of their family.
         rig: what all pairs say together.
+        uplink: what went out of evidence.
     """
 
     status: StatusReply
@@ -50,6 +52,7 @@ class View:
     worker_memory_bytes: int = 0
     took: Mapping[str, Sequence[Took]] = field(default_factory=dict)
     rig: RigReply | None = None
+    uplink: Uplink | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +125,14 @@ def _counts(counts: Callable[[PairStatus], Mapping[str, int]]) -> Callable[[View
 
 def _of_worker(counts: Callable[[View], Mapping[str, int]]) -> Callable[[View], Iterable[Sample]]:
     return lambda view: (((name,), float(count)) for name, count in counts(view).items())
+
+
+def _of_uplink(counts: Callable[[Uplink], Mapping[str, int]]) -> Callable[[View], Iterable[Sample]]:
+    return lambda view: (
+        ()
+        if view.uplink is None
+        else tuple(((resource,), float(count)) for resource, count in sorted(counts(view.uplink).items()))
+    )
 
 
 def _of_budget(
@@ -366,6 +377,20 @@ FAMILIES: tuple[Family, ...] = (
         "Queries that wait: `commands`, `files` for the disk, `drawing` for a picture.",
         ("queue",),
         _of_worker(lambda view: view.status.queries_waiting),
+    ),
+    Family(
+        "coec_uplink_bytes",
+        "counter",
+        "Evidence that went out, by what was asked for.",
+        ("resource",),
+        _of_uplink(lambda uplink: uplink.sent),
+    ),
+    Family(
+        "coec_uplink_refused",
+        "counter",
+        "Answers that had to wait for the uplink.",
+        ("resource",),
+        _of_uplink(lambda uplink: uplink.refused),
     ),
     Family(DECODE, "histogram", "Decoding of a sample, once for all pairs.", ("sensor", "stream")),
     Family(PAIR_WAIT, "histogram", "From a pair's last frame until it is looked at.", _PAIR),

@@ -117,6 +117,17 @@ class PairAnswers:
     # --- on any -----------------------------------------------------------------------------------------------------
 
     @property
+    def recorded(self) -> int:
+        """Windows since the start."""
+        return self._recorder.recorded
+
+    @property
+    def newest_event(self) -> str | None:
+        """Id of the newest red event that is kept; None: there is none."""
+        newest = self._store.incidents.newest
+        return None if newest is None else newest.event_id
+
+    @property
     def health_reply(self) -> replies.HealthReply:
         """What `health` serves."""
         return self._health.now()

@@ -16,12 +16,15 @@ from coec.adapters.zenoh.bus import Answer, Bus, Lane, Request, Route
 from coec.errors import UsageError
 from coec.runtime.api import metrics as metrics_text
 from coec.runtime.api.awaited import AwaitedAnswers
+from coec.runtime.api.last_words import LastWords
 from coec.runtime.api.pair_answers import PairAnswers
 from coec.runtime.api.reception import Reception
 from coec.runtime.api.rig import RigAnswers
 from coec.runtime.api.snapshots import Snapshot, answer_of
+from coec.runtime.api.uplink import Uplink
 from coec.runtime.timings import QUICK_S, Histogram
 from coec.schemas.keys import (
+    LAST,
     RIG,
     Format,
     Keys,
@@ -57,12 +60,16 @@ class VehicleAnswers:
         metrics: Callable[[], bytes],
         config: Callable[[], Snapshot],
         rig: RigAnswers,
+        last_words: LastWords,
+        uplink: Uplink,
     ) -> None:
         """`status()` and `config()` are serialised before; `metrics()` is rendered when asked."""
         self.took = Histogram(QUICK_S)
         self._keys = keys
         self._pairs = dict(pairs)
         self._reception = reception
+        self._last_words = last_words
+        self._uplink = uplink
         self._vehicle_routes = {
             keys.status: Route(keys.status, lambda request: status().answer(_format(request)), Lane.AT_ONCE),
             keys.config: Route(keys.config, lambda request: config().answer(_format(request)), Lane.AT_ONCE),
@@ -83,6 +90,10 @@ class VehicleAnswers:
         for name in self._pairs:
             bus.serve(f"{self._keys.root}/{name}/**", self._finder(name))
         bus.serve(f"{self._keys.rig}/**", self._find_of_rig)
+        for name in self._pairs:
+            # Each by its own key: what a router has seen declared it finds again when it is put, however many vehicles
+            # there are; it would look for others among all of them each time (docs/fleet.md).
+            bus.serve(self._keys.last(name), self._find_last(name))
         bus.serve(f"{self._keys.root}/**", self._find_unknown, complete=False)
 
     def _finder(self, pair: str) -> Callable[[str], Sequence[Route]]:
@@ -122,11 +133,11 @@ class VehicleAnswers:
             )
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
-            return [Route(key, self._window(self._pairs[pair], address.argument), Lane.FILES)]
+            return [self._metered(Route(key, self._window(self._pairs[pair], address.argument), Lane.FILES))]
         if address.resource == "command":
             return [Route(key, partial(self._reception.take, pair, str(address.argument)), Lane.COMMANDS)]
         if address.resource == "evidence" and address.argument is not None:
-            return [Route(key, self._evidence(self._pairs[pair], address.argument), Lane.FILES)]
+            return [self._metered(Route(key, self._evidence(self._pairs[pair], address.argument), Lane.FILES))]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_of_rig(self, key: str) -> Sequence[Route]:
@@ -143,6 +154,15 @@ class VehicleAnswers:
         command = Route(key, partial(self._reception.take, RIG, str(address.argument)), Lane.COMMANDS)
         return [self._timed(command, "command")]
 
+    def _find_last(self, pair: str) -> Callable[[str], Sequence[Route]]:
+        """Who says the last word of a pair to those who ask for it, or for those of all: not to who asks for something
+        else of a pair that happens to be called `last`."""
+        route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), Lane.AT_ONCE), LAST)
+        return lambda key: [route] if key.split("/")[-2] == LAST else []
+
+    def _last(self, pair: str, request: Request) -> Answer:
+        return self._last_words.answer(pair, _format(request))
+
     def _find_unknown(self, key: str) -> Sequence[Route]:
         """Nobody, in silence where another queryable answers: a session hands a query to all that match.
 
@@ -150,7 +170,7 @@ class VehicleAnswers:
             UsageError: the key names no pair of this vehicle.
         """
         pair = key.removeprefix(f"{self._keys.root}/").partition("/")[0]
-        if _has_wildcard(key) or key in self._vehicle_routes or pair in (*self._pairs, RIG):
+        if _has_wildcard(key) or key in self._vehicle_routes or pair in (*self._pairs, RIG, LAST):
             return []
         raise UsageError(f"no such pair or resource; pairs served here: {', '.join(self._pairs)}")
 
@@ -159,12 +179,17 @@ class VehicleAnswers:
         routes = (
             Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), Lane.AT_ONCE),
             Route(keys.health(name), lambda request: pair.health(_format(request)), Lane.AT_ONCE),
-            Route(keys.history(name), lambda request: _history(pair, request), Lane.FILES),
+            self._metered(Route(keys.history(name), lambda request: _history(pair, request), Lane.FILES)),
             Route(keys.windows(name), lambda request: pair.windows(_format(request)), Lane.FILES),
             Route(keys.evidence(name), lambda request: _in_format(request, pair.events), Lane.FILES),
-            Route(keys.overlay(name), lambda request: _overlay(pair, request), Lane.DRAWING),
+            self._metered(Route(keys.overlay(name), lambda request: _overlay(pair, request), Lane.DRAWING)),
         )
         return {route.key: route for route in routes}
+
+    def _metered(self, route: Route) -> Route:
+        """The same, as far as the uplink allows."""
+        resource = self._keys.parse(route.key).resource
+        return replace(route, answer=lambda request: self._uplink.metered(resource, lambda: route.answer(request)))
 
     def _window(self, pair: Answering, window_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:

@@ -1,0 +1,46 @@
+"""Single keys of a terminal, without waiting for the end of a line."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+NAMED = {b"\x1b[A": "up", b"\x1b[B": "down", b"\x1b[5~": "page up", b"\x1b[6~": "page down", b"\r": "enter"}
+"""What keys without a letter send (ECMA-48, as xterm and the console of Linux have it)."""
+
+MAX_BYTES = 64
+"""Read at once: somebody who leans on a key."""
+
+
+@contextmanager
+def keys() -> Iterator[Callable[[float], str | None]]:
+    """`poll(wait_s)` gives the next key that is pressed, or None. The terminal is as before afterwards. Signals
+    (Ctrl-C) work as ever. Where standard input is no terminal, nobody presses anything."""
+    if not sys.stdin.isatty():
+        yield lambda wait_s: _nothing(wait_s)
+        return
+    descriptor = sys.stdin.fileno()
+    before = termios.tcgetattr(descriptor)
+    tty.setcbreak(descriptor)
+    try:
+        yield lambda wait_s: _next(descriptor, wait_s)
+    finally:
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+
+def _next(descriptor: int, wait_s: float) -> str | None:
+    ready, _, _ = select.select([descriptor], [], [], wait_s)
+    if not ready:
+        return None
+    data = os.read(descriptor, MAX_BYTES)
+    return NAMED.get(data) or data[:1].decode("ascii", errors="ignore") or None
+
+
+def _nothing(wait_s: float) -> str | None:
+    select.select([], [], [], wait_s)
+    return None

@@ -1,0 +1,118 @@
+"""Last words of many vehicles, as they come over a router: heard, asked for, and their tokens."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import zenoh
+
+from coec.schemas.keys import Keys
+from coec.schemas.last_word import MAX_BYTES
+
+WAITING: Final = 32_768
+"""Words that may wait to be read, 1 kB each and never more than 16: a fleet that answers all at once. What comes beyond
+is counted, and said again within its period."""
+
+
+@dataclass(frozen=True, slots=True)
+class Came:
+    """One thing that came: a word as it was said, a word that was kept or asked for, or a token. `at_s` by the steady
+    clock; the payload of a token is empty where it went."""
+
+    kind: Literal["said", "kept", "token"]
+    key: str
+    payload: bytes
+    at_s: float
+
+
+class Words:
+    """Of the vehicles that an expression names. Callbacks run on Zenoh's threads, and wait for nothing."""
+
+    def __init__(self, session: zenoh.Session, of_tokens: zenoh.Session, keys: Keys, timeout_s: float) -> None:
+        """`keys.vehicle` may be `*`. Tokens come in a session of their own: each stays in its tables, which every word
+        that came in the same session would be held against (1 ms of processor for a word, with 10,000 vehicles)."""
+        self._session = session
+        self._of_tokens = of_tokens
+        self._keys = keys
+        self._timeout_s = timeout_s
+        self._waiting: queue.Queue[Came] = queue.Queue(WAITING)
+        self._lock = threading.Lock()
+        self._refused: Counter[str] = Counter()
+        self.told = threading.Event()
+        """Set when all have answered that were asked at the beginning, or their time is up."""
+
+    def take(self) -> Iterator[Came]:
+        """What has come and waits, at most as much as may."""
+        for _ in range(WAITING):
+            try:
+                yield self._waiting.get_nowait()
+            except queue.Empty:
+                return
+
+    def refused(self) -> Counter[str]:
+        """What was not taken since the last call, by cause."""
+        with self._lock:
+            refused, self._refused = self._refused, Counter()
+        return refused
+
+    def ask(self, vehicle: str, pair: str) -> None:
+        """For the word of one pair, of whoever has it; what is answered comes as what was kept."""
+        self._get(Keys(self._keys.prefix, vehicle).last(pair), threading.Event())
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether a router is there now."""
+        return bool(list(self._session.info.routers_zid()))
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Hear what is said, see who is there, and ask once what was said before."""
+        with ExitStack() as stack:
+            said = zenoh.handlers.Callback(self._said, indirect=False)
+            stack.callback(self._session.declare_subscriber(self._keys.last("*"), said).undeclare)
+            token = zenoh.handlers.Callback(self._token, indirect=False)
+            tokens = self._of_tokens.liveliness().declare_subscriber(self._keys.alive("*"), token, history=True)
+            stack.callback(tokens.undeclare)
+            self._get(self._keys.last("*"), self.told)
+            yield
+
+    def _get(self, key: str, done: threading.Event) -> None:
+        handler = zenoh.handlers.Callback(self._kept, done.set, indirect=False)
+        self._session.get(key, handler, target=zenoh.QueryTarget.ALL, timeout=self._timeout_s)
+
+    def _said(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._put("said", str(sample.key_expr), sample.payload)
+
+    def _kept(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._put("kept", str(reply.ok.key_expr), reply.ok.payload)
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        there = b"\x01" if sample.kind == zenoh.SampleKind.PUT else b""
+        self._add(Came("token", str(sample.key_expr), there, time.monotonic()))
+
+    def _put(self, kind: Literal["said", "kept"], key: str, payload: zenoh.ZBytes) -> None:
+        if len(payload) > MAX_BYTES:
+            self._refuse("word_too_large")
+            return
+        self._add(Came(kind, key, payload.to_bytes(), time.monotonic()))
+
+    def _add(self, came: Came) -> None:
+        try:
+            self._waiting.put_nowait(came)
+        except queue.Full:
+            self._refuse("too_many_at_once")
+
+    def _refuse(self, cause: str) -> None:
+        with self._lock:
+            self._refused[cause] += 1

@@ -1,0 +1,333 @@
+"""`coec fetch`: what a vehicle keeps of a red event, brought home over whatever link there is, and looked at once here.
+
+Everything that comes is what a vehicle says: names become file names only where they are names, sizes are bounded, and
+what a document says of itself is held against what was asked for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, TypeVar
+
+import zenoh
+
+from coec import __version__
+from coec.adapters.files import output
+from coec.adapters.images.codec import probe
+from coec.adapters.mcap.windows import read_result
+from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected_by, nobody
+from coec.adapters.zenoh.window_fetch import fetch_window
+from coec.cli.commands.fetch import Options
+from coec.cli.query import OF_PAIR, asked_of
+from coec.config import LimitsConfig
+from coec.errors import CoecError, DecodeError, NotFoundError, UsageError, WindowError
+from coec.reports import console, incident_page, replies
+from coec.reports.fleet_board import duration
+from coec.schemas.base import SCHEMA_VERSION, Message, from_json, to_json
+from coec.schemas.incident import Absent, FetchedFile, FetchedWindow, IncidentReport
+from coec.schemas.keys import MAX_LENGTH, Keys
+from coec.schemas.last_word import read as read_word
+from coec.schemas.replies import (
+    ChainedEntry,
+    EvidenceEvent,
+    EvidenceReply,
+    ExtrinsicReply,
+    HealthReply,
+    HistoryReply,
+    StatusReply,
+)
+
+LATEST: Final = "latest"
+VEHICLE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+
+AROUND_NS: Final = 600 * 1_000_000_000
+"""Of the history, before the first and after the last figure that is kept of the event: 10 minutes."""
+
+ENTRIES: Final = 300
+"""Of the history at most, some 6 kB each."""
+
+WAIT_S: Final = 0.5
+"""Before a vehicle whose uplink is busy is asked again."""
+
+WAITS: Final = frozenset({"uplink_busy", "busy", "not_drawn"})
+
+PICTURE: Final = LimitsConfig(max_message_bytes=16 * 2**20)
+
+PAGE = "index.html"
+REPORT = "incident.json"
+
+M = TypeVar("M", bound=Message)
+
+
+def run(options: Options) -> int:
+    """Fetches, or lists; 1 where something that the vehicle keeps could not be had.
+
+    Raises:
+        UsageError: what was typed is no name.
+        ConnectionFailedError: no router answered.
+        NotFoundError: the vehicle does not answer; says what it said last, where somebody kept that. Or no such event.
+        RemoteError: an error reply, or an answer to something else.
+        OutputError: the folder cannot be written.
+    """
+    if not VEHICLE.fullmatch(options.vehicle):
+        raise UsageError(f"{options.vehicle!a} is no name of a vehicle")
+    if options.pair is not None and not VEHICLE.fullmatch(options.pair):
+        raise UsageError(f"{options.pair!a} is no name of a pair")
+    if options.event not in (None, LATEST) and not OF_PAIR.fullmatch(str(options.event)):
+        raise UsageError(f"{options.event!a} is no red event: `coec fetch {options.vehicle}` lists them")
+    asked = asked_of(None, options.vehicle, options.prefix, options.connect, options.zenoh)
+    keys = Keys(asked.prefix, asked.vehicle)
+    with connected_by(asked.way, options.timeout_s, 2 * MAX_LENGTH) as session:
+        events = _events(session, keys, options)
+        if options.event is None:
+            return _list(events, options)
+        event = _chosen(events, options)
+        folder = options.output or Path(f"{keys.vehicle}-{event.event_id}")
+        report = _Fetch(session, keys, event.pair, folder, options).fetch(event.event_id)
+    if options.as_json:
+        console.print_json(report.model_dump(mode="json"))
+    else:
+        console.show(f"{folder / PAGE}  {incident_page.sentence(report)}")
+        for absent in report.absent:
+            console.show(f"  not here: {absent.what}: {absent.why}", "yellow")
+    return 1 if report.absent else 0
+
+
+def _events(session: zenoh.Session, keys: Keys, options: Options) -> list[EvidenceEvent]:
+    """Of the pairs that are asked about, the latest last."""
+    selector = f"{keys.evidence(options.pair or '*')}?format=json"
+    answers = ask(session, selector, options.timeout_s)
+    if not answers:
+        raise _nobody(session, keys, options, selector)
+    found: list[EvidenceEvent] = []
+    for answer in answers:
+        reply = from_json(EvidenceReply, answer.payload)
+        found += [event for event in reply.events if _is_of(event, keys.vehicle, reply.pair)]
+    return sorted(found, key=lambda event: event.wall_ns)
+
+
+def _nobody(session: zenoh.Session, keys: Keys, options: Options, selector: str) -> NotFoundError:
+    """With what the vehicle said last, where somebody kept it."""
+    for answer in ask(session, keys.last("*"), options.timeout_s):
+        try:
+            word = read_word(answer.key, answer.payload)
+        except DecodeError:
+            continue
+        ago = duration(max((time.time_ns() - word.said_ns) * 1e-9, 0.0))
+        left = "took its leave" if word.service == "stopping" else "was heard last"
+        return NotFoundError(
+            f"{word.vehicle} does not answer; it {left} {ago} ago ({word.pair}: {word.state}). What it keeps is on "
+            "board: fetch it when it is back"
+        )
+    return nobody(selector)
+
+
+def _is_of(event: EvidenceEvent, vehicle: str, pair: str) -> bool:
+    named = OF_PAIR.fullmatch(event.event_id)
+    return named is not None and (event.vehicle, event.pair, named["pair"]) == (vehicle, pair, pair)
+
+
+def _list(events: Sequence[EvidenceEvent], options: Options) -> int:
+    if options.as_json:
+        console.print_json({"events": [event.model_dump(mode="json") for event in events]})
+        return 0
+    for pair in sorted({event.pair for event in events}):
+        ours = tuple(event for event in events if event.pair == pair)
+        replies.evidence(to_json(EvidenceReply(vehicle=options.vehicle, pair=pair, events=ours)))
+    if not events:
+        console.show(f"{options.vehicle} keeps no red event")
+    return 0
+
+
+def _chosen(events: Sequence[EvidenceEvent], options: Options) -> EvidenceEvent:
+    if options.event == LATEST and events:
+        return events[-1]
+    found = next((event for event in events if event.event_id == options.event), None)
+    if found is None:
+        raise NotFoundError(f"{options.vehicle} keeps no such red event: `coec fetch {options.vehicle}` lists them")
+    return found
+
+
+@dataclass(slots=True)
+class _Fetch:
+    """One event. What cannot be had is written down with its reason, and does not keep the rest from coming."""
+
+    session: zenoh.Session
+    keys: Keys
+    pair: str
+    folder: Path
+    options: Options
+    files: dict[str, FetchedFile] = field(default_factory=dict)
+    absent: list[Absent] = field(default_factory=list)
+
+    def fetch(self, event_id: str) -> IncidentReport:
+        keys, pair = self.keys, self.pair
+        event = self._document(EvidenceEvent, keys.evidence_of(pair, event_id))
+        if event.event_id != event_id or not _is_of(event, keys.vehicle, pair):
+            raise RemoteError("malformed", f"who answered for {event_id} spoke of another event")
+        self._keep("event.json", to_json(event))
+        history = self._optional("history.json", HistoryReply, _around(keys.history(pair), event))
+        health = self._optional("health.json", HealthReply, keys.health(pair))
+        extrinsic = self._optional("extrinsic.json", ExtrinsicReply, keys.extrinsic(pair))
+        status = self._optional("status.json", StatusReply, keys.status)
+        for side in event.overlays:
+            self._try(f"{side}.jpg", lambda side=side: self._picture(event_id, side))  # type: ignore[misc]
+        windows = [
+            fetched
+            for window_id in dict.fromkeys(filter(None, (event.window_before, event.window_after)))
+            if not self.options.no_windows and (fetched := self._window(window_id, history)) is not None
+        ]
+        holds = None if history is None else chain_holds(history)
+        told = (event, history, health, extrinsic, status)
+        story = incident_page.Story(*told, tuple(windows), tuple(self.absent), holds)
+        pictures = [name for name in ("before.jpg", "after.jpg") if name in self.files]
+        self._keep(PAGE, incident_page.page(story, pictures).encode())
+        report = IncidentReport(
+            folder=str(self.folder),
+            vehicle=keys.vehicle,
+            pair=pair,
+            event_id=event_id,
+            fetched_ns=time.time_ns(),
+            version=__version__,
+            files=tuple(self.files[name] for name in sorted(self.files)),
+            windows=tuple(windows),
+            entries=0 if history is None else len(history.entries),
+            chain_holds=holds,
+            absent=tuple(self.absent),
+        )
+        output.replace(self.folder / REPORT, to_json(report))
+        return report
+
+    # --- what is asked for ------------------------------------------------------------------------------------------
+
+    def _document(self, model: type[M], selector: str) -> M:
+        joined = ";" if "?" in selector else "?"
+        return from_json(model, self._answer(f"{selector}{joined}format=json"))
+
+    def _optional(self, name: str, model: type[M], selector: str) -> M | None:
+        found: list[M] = []
+
+        def ask_for() -> None:
+            found.append(self._document(model, selector))
+            self._keep(name, to_json(found[0]))
+
+        self._try(name, ask_for)
+        return found[0] if found else None
+
+    def _picture(self, event_id: str, side: str) -> None:
+        data = self._answer(f"{self.keys.evidence_of(self.pair, event_id)}?overlay={side}")
+        probe(data, PICTURE)
+        self._keep(f"{side}.jpg", data)
+
+    def _window(self, window_id: str, history: HistoryReply | None) -> FetchedWindow | None:
+        if (named := OF_PAIR.fullmatch(window_id)) is None or named["pair"] != self.pair:
+            self.absent.append(Absent(what="a window", why="what the event calls it is no name of a window"))
+            return None
+        path = self.folder / "windows" / f"{window_id}.mcap"
+        found: list[FetchedWindow] = []
+
+        def fetch() -> None:
+            with console.progress(counted=False) as bars:
+                task = bars.add_task(window_id, note="")
+                info = fetch_window(
+                    self.session,
+                    self.keys,
+                    self.pair,
+                    window_id,
+                    path,
+                    self.options.timeout_s,
+                    self.options.patience_s,
+                    lambda done, total: bars.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} MB"),
+                )
+            sha256 = str(info.sha256)
+            name = str(path.relative_to(self.folder))
+            self.files[name] = FetchedFile(name=name, sha256=sha256, size_bytes=info.size_bytes)
+            found.append(
+                FetchedWindow(
+                    window_id=window_id,
+                    sha256=sha256,
+                    size_bytes=info.size_bytes,
+                    pairs=info.pairs,
+                    decision=info.decision,
+                    in_history=_in_history(path, window_id, history),
+                )
+            )
+
+        self._try(f"windows/{window_id}.mcap", fetch)
+        return found[0] if found else None
+
+    def _answer(self, selector: str) -> bytes:
+        deadline_s = time.monotonic() + self.options.patience_s
+        while True:
+            try:
+                return ask_one(self.session, selector, self.options.timeout_s).payload
+            except RemoteError as error:
+                if error.reply_code not in WAITS or time.monotonic() + WAIT_S > deadline_s:
+                    raise
+            time.sleep(WAIT_S)
+
+    def _try(self, what: str, fetch: Callable[[], None]) -> None:
+        try:
+            fetch()
+        except output.OutputError:
+            raise
+        except CoecError as error:
+            self.absent.append(Absent(what=what, why=str(error)))
+
+    def _keep(self, name: str, data: bytes) -> None:
+        output.replace(self.folder / name, data)
+        self.files[name] = FetchedFile(name=name, sha256=hashlib.sha256(data).hexdigest(), size_bytes=len(data))
+
+
+def chain_holds(history: HistoryReply) -> bool | None:
+    """Whether the entries that are here are what their hashes say, and each holds the hash of the one before it in its
+    book, where that is here. None: nothing can be told, as no two follow each other, or another version wrote them."""
+    linked = 0
+    last: dict[str, ChainedEntry] = {}
+    for chained in sorted(history.entries, key=lambda item: item.entry.sequence):
+        entry, before = chained.entry, last.get(chained.entry.book)
+        if entry.schema_version == SCHEMA_VERSION and _sha256(entry) != chained.sha256:
+            return False
+        if before is not None:
+            follows = entry.previous_sha256 == before.sha256
+            linked += follows
+            # Others of the book may lie between them that were not asked for, unless the numbers say that none does.
+            if not follows and entry.sequence == before.entry.sequence + 1:
+                return False
+        last[entry.book] = chained
+    return True if linked else None
+
+
+def _around(key: str, event: EvidenceEvent) -> str:
+    """The history about an event, with what was decided of the windows before and after it."""
+    stamps = [event.stamp_ns, *(point.stamp_ns for point in event.metrics)]
+    for window_id in (event.window_before, event.window_after):
+        if window_id is not None and OF_PAIR.fullmatch(window_id):
+            stamps.append(int(window_id.rpartition("-")[2]))
+    if event.resolved_stamp_ns is not None:
+        stamps.append(event.resolved_stamp_ns)
+    since_ns = max(min(stamps) - AROUND_NS, 0)
+    until_ns = min(max(stamps) + AROUND_NS, 2**63 - 1)
+    return f"{key}?since={since_ns};until={until_ns};limit={ENTRIES}"
+
+
+def _in_history(path: Path, window_id: str, history: HistoryReply | None) -> bool | None:
+    entries = () if history is None else history.entries
+    kept = [item.entry.result_sha256 for item in entries if item.entry.window_id == window_id]
+    told = [sha256 for sha256 in kept if sha256 is not None]
+    try:
+        result = read_result(path)
+    except WindowError:
+        return None
+    if result is None or not told or result.schema_version != SCHEMA_VERSION:
+        return None
+    return _sha256(result) in told
+
+
+def _sha256(message: Message) -> str:
+    return hashlib.sha256(to_json(message)).hexdigest()

@@ -1,0 +1,228 @@
+"""A fleet on one screen: what its pairs said last, and on a key what one of them says when it is asked."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import zenoh
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.text import Text
+
+from coec.adapters.system.keyboard import keys as keyboard
+from coec.adapters.zenoh.client import ask_one, connected_by
+from coec.adapters.zenoh.words import Words
+from coec.cli.commands.watch import Options
+from coec.cli.query import Asked
+from coec.cli.stopping import until_signal
+from coec.errors import CoecError, UsageError
+from coec.fleet.roster import RANKS, Filter, Name, Roster, of_states
+from coec.reports import console, fleet_board, half_blocks
+from coec.reports.replies import results_table
+from coec.schemas.base import from_msgpack
+from coec.schemas.fleet_now import FleetNow, PairNow
+from coec.schemas.keys import MAX_LENGTH, Keys
+from coec.schemas.replies import HistoryReply
+
+FRAME_S = 0.5
+"""Between two pictures of the screen: ages are told in seconds."""
+
+ASK_AGAIN_S = 10.0
+ASKED_AT_ONCE = 16
+"""Silent pairs that are asked every `ASK_AGAIN_S` whether a word of theirs was lost: 2 kB/s at most, however many there
+are."""
+
+RESULTS = 10
+"""Of the history of a pair: 50 kB."""
+
+ANSWER_S = 10.0
+"""To wait for what is asked on a key; over a bad link that is what a picture takes."""
+
+MAX_MESSAGE = 2 * MAX_LENGTH
+"""Bytes of one that is taken in."""
+
+PANE_ROWS = 16
+"""Lines for what is known of one pair."""
+
+QUICK_FILTERS: tuple[tuple[str, frozenset[str]], ...] = (
+    ("", frozenset()),
+    ("not healthy", frozenset(RANKS) - {"healthy", "parked"}),
+    ("red or suspect", frozenset({"miscalibrated", "suspect"})),
+    ("silent", frozenset({"silent"})),
+    ("parked", frozenset({"parked"})),
+)
+
+
+def run(options: Options, asked: Asked) -> int:
+    """Shows the board until it is left, or once; 1 if no pair has said anything.
+
+    Raises:
+        ConnectionFailedError: no router answered.
+        UsageError: a state that is none.
+    """
+    chosen = Filter(of_states(options.states or (), UsageError), options.find or "")
+    with (
+        until_signal() as stop,
+        connected_by(asked.way, options.timeout_s, MAX_MESSAGE) as session,
+        connected_by(asked.way, options.timeout_s, MAX_MESSAGE) as of_tokens,
+    ):
+        words = Words(session, of_tokens, Keys(asked.prefix, asked.vehicle), options.timeout_s)
+        with words.listening():
+            board = Board(Roster(), words, chosen, Asking(session, asked.prefix))
+            if options.once:
+                while not words.told.wait(FRAME_S) and not stop.is_set():
+                    pass
+                fleet = board.once()
+                if options.as_json:
+                    console.print_json(fleet.model_dump(mode="json"))
+                else:
+                    console.out.print(fleet_board.board(fleet, -1, 0, fleet.matching, ""))
+                return 0 if fleet.known else 1
+            with (
+                board.asking,
+                keyboard() as poll,
+                Live(console=console.out, screen=True, auto_refresh=False) as live,
+            ):
+                while not stop.is_set() and board.press(poll(FRAME_S)):
+                    live.update(board.frame(console.out.width, console.out.height), refresh=True)
+    return 0 if board.once().known else 1
+
+
+class Asking:
+    """Questions to one pair at a time, beside the screen; what comes is shown when it has come."""
+
+    def __init__(self, session: zenoh.Session, prefix: str) -> None:
+        self._session = session
+        self._prefix = prefix
+        self._thread = ThreadPoolExecutor(1, "asking")
+        self._future: Future[RenderableType] | None = None
+        self._what = ""
+
+    def __enter__(self) -> Asking:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    def begin(self, what: str, name: Name, size: tuple[int, int]) -> None:
+        """Ask for `history` or `overlay`, unless something is being asked; `size` in characters."""
+        if self._future is not None and not self._future.done():
+            return
+        self._what = f"{what} of {name[0]}/{name[1]}"
+        make = {"history": self._history, "overlay": self._overlay}[what]
+        self._future = self._thread.submit(make, name, size)
+
+    def shown(self) -> RenderableType:
+        """What came, or that it has not yet."""
+        if self._future is None or not self._future.done():
+            return Text(f"asking for the {self._what} …", "dim")
+        try:
+            return self._future.result()
+        except CoecError as error:
+            return Text(f"no {self._what}: {error}", "yellow")
+
+    def _history(self, name: Name, _: tuple[int, int]) -> RenderableType:
+        key = Keys(self._prefix, name[0]).history(name[1])
+        reply = from_msgpack(HistoryReply, ask_one(self._session, f"{key}?limit={RESULTS}", ANSWER_S).payload)
+        return results_table(reply)
+
+    def _overlay(self, name: Name, size: tuple[int, int]) -> RenderableType:
+        key = Keys(self._prefix, name[0]).overlay(name[1])
+        return half_blocks.drawn(ask_one(self._session, key, ANSWER_S).payload, *size)
+
+
+@dataclass(slots=True)
+class Board:
+    """What is on the screen, and what keys do to it. Owned by one thread.
+
+    Attributes:
+        index: of the chosen pair among those that are shown.
+        name: of the pair that was chosen by a key, which stays chosen wherever it goes; None: the first of them is.
+    """
+
+    roster: Roster
+    words: Words
+    given: Filter
+    asking: Asking
+    clock: Callable[[], float] = time.monotonic
+    pane: str = "reasons"
+    quick: int = 0
+    index: int = 0
+    name: Name | None = None
+    asked_s: float = field(default=-ASK_AGAIN_S)
+    fleet: FleetNow | None = None
+
+    def once(self) -> FleetNow:
+        """All that has come by now."""
+        self._hear()
+        return self.roster.now(self.clock(), self.given)
+
+    def press(self, key: str | None) -> bool:
+        """Do what a key means; False: the board is left."""
+        pairs = self.fleet.pairs if self.fleet is not None else ()
+        pair = pairs[self.index] if self.index < len(pairs) else None
+        step = {"up": -1, "k": -1, "down": 1, "j": 1, "page up": -10, "page down": 10}.get(key or "", 0)
+        if step and pairs:
+            self.index = min(max(self.index + step, 0), len(pairs) - 1)
+            self.name = _name(pairs[self.index])
+            self.pane = "reasons"
+        elif key == "f":
+            self.quick = (self.quick + 1) % len(QUICK_FILTERS)
+        elif key in ("r", "enter"):
+            self.pane = "reasons"
+        elif key in ("h", "o") and pair is not None:
+            self.name = _name(pair)
+            self.pane = {"h": "history", "o": "overlay"}[key]
+            self.asking.begin(self.pane, self.name, (console.out.width, PANE_ROWS * 2))
+        return key != "q"
+
+    def frame(self, width: int, height: int) -> RenderableType:
+        """The screen as it is now."""
+        del width
+        self._hear()
+        label, states = QUICK_FILTERS[self.quick]
+        chosen = Filter(states or self.given.states, self.given.text)
+        pane_rows = PANE_ROWS * (2 if self.pane == "overlay" else 1)
+        rows = max(height - pane_rows - 5, 3)
+        self.fleet = self.roster.now(self.clock(), chosen, max(rows, self.index + rows))
+        pairs = self.fleet.pairs
+        found = [index for index, pair in enumerate(pairs) if _name(pair) == self.name]
+        self.index = found[0] if found else min(self.index if self.name else 0, max(len(pairs) - 1, 0))
+        pair = pairs[self.index] if pairs else None
+        first = max(min(self.index - rows // 2, len(pairs) - rows), 0)
+        filtered = ", ".join(filter(None, (label or ", ".join(sorted(chosen.states)), chosen.text)))
+        parts: list[RenderableType] = [fleet_board.board(self.fleet, self.index, first, rows, filtered)]
+        if not self.words.is_connected:
+            parts.insert(0, Text("no router: nothing new comes, ages go on", "bold red"))
+        parts += [Text(fleet_board.KEYS, "dim"), self._pane(pair)]
+        return Group(*parts)
+
+    def _pane(self, pair: PairNow | None) -> RenderableType:
+        if pair is None:
+            told = self.words.told.is_set()
+            return Text("no pair has said anything" if told else "asking who is there …", "dim")
+        return fleet_board.detail(pair) if self.pane == "reasons" else self.asking.shown()
+
+    def _hear(self) -> None:
+        now_s = self.clock()
+        for came in self.words.take():
+            if came.kind == "said":
+                self.roster.hear(came.key, came.payload, came.at_s)
+            elif came.kind == "kept":
+                self.roster.recall(came.key, came.payload, came.at_s, time.time_ns())
+            else:
+                vehicle, pair = came.key.split("/")[-3:-1]
+                self.roster.present(vehicle, pair, is_there=bool(came.payload))
+        for cause, count in self.words.refused().items():
+            self.roster.refuse(cause, count)
+        if now_s - self.asked_s >= ASK_AGAIN_S and self.words.told.is_set():
+            self.asked_s = now_s
+            for vehicle, pair in self.roster.overdue(now_s, ASKED_AT_ONCE):
+                self.words.ask(vehicle, pair)
+
+
+def _name(pair: PairNow) -> Name:
+    return pair.word.vehicle, pair.word.pair

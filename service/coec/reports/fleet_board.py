@@ -1,0 +1,121 @@
+"""A fleet on one screen: the most urgent pairs, and what is known of one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from coec.reports import console
+from coec.schemas.fleet_now import FleetNow, PairNow
+
+KEYS = "↑↓ choose   r reasons   h history   o overlay   f filter   q quit"
+"""What can be pressed."""
+
+
+def board(fleet: FleetNow, chosen: int, first: int, rows: int, filtered: str) -> RenderableType:
+    """Head, and `rows` of the pairs from `first` on; the one at `chosen` is marked (-1: none)."""
+    shown = fleet.pairs[first : first + rows]
+    table = console.table(
+        "", "vehicle", "pair", "state", "said", "looked", "drift", "± σ", "why", "event", right=(4, 5, 6, 7)
+    )
+    for index, pair in enumerate(shown, first):
+        table.add_row(*_row(pair, marked=index == chosen), style="reverse" if index == chosen else "")
+    below = fleet.matching - first - len(shown)
+    foot = [Text(f"… and {below} more", "dim")] if below > 0 else []
+    return Group(head(fleet, filtered), table, *foot)
+
+
+def head(fleet: FleetNow, filtered: str) -> Text:
+    """The whole in a line."""
+    line = Text(f"{fleet.vehicles} vehicles, {fleet.known} pairs: ")
+    for index, (state, count) in enumerate(fleet.states.items()):
+        line.append(", " if index else "")
+        line.append(f"{count} {state}", console.STATE_STYLES.get(state, "bold"))
+    if filtered:
+        line.append(f"   showing {fleet.matching}: {filtered}", "cyan")
+    if fleet.refused:
+        refused = ", ".join(f"{count} {cause}" for cause, count in sorted(fleet.refused.items()))
+        line.append(f"   not taken: {refused}", "yellow")
+    return line
+
+
+def detail(pair: PairNow) -> RenderableType:
+    """Everything that a last word holds."""
+    word = pair.word
+    lines: list[RenderableType] = [
+        Text.assemble(
+            f"{word.vehicle}/{word.pair}  ",
+            told(pair),
+            f" since {duration(max(word.said_ns - word.since_ns, 0) * 1e-9 + pair.said_s)}",
+            f", said {duration(pair.said_s)} ago, by coec {_plain(word.version)}, "
+            f"configuration {_plain(word.config_hash)}, {word.windows} windows{', held' if word.held else ''}",
+        )
+    ]
+    lines += [Text(f"  {_plain(reason.code)}: {_plain(reason.text)}", "yellow") for reason in word.reasons]
+    if not word.reasons:
+        lines.append(Text("  no reasons", "dim"))
+    figures = Table(box=None, pad_edge=False, header_style="bold")
+    figures.add_column("axis")
+    for name in ("drift", "± σ", "correction", "± σ"):
+        figures.add_column(name, justify="right")
+    for axis, title in enumerate(console.AXIS_NAMES):
+        columns: tuple[Sequence[float | None] | None, ...] = (
+            word.drift,
+            word.drift_sigma,
+            word.correction,
+            word.sigma,
+        )
+        values = [None if column is None else column[axis] for column in columns]
+        signed = (True, False, True, False)
+        cells = [console.figure(value, sign=sign) for value, sign in zip(values, signed, strict=True)]
+        figures.add_row(f"{title} [{console.UNITS[axis]}]", *cells)
+    served = f"served: {word.provenance or 'nothing yet'}, latest attempt {word.status or '-'}"
+    event = f", newest red event {_plain(word.event)}" if word.event else ""
+    return Group(*lines, Text(served + event), figures)
+
+
+def told(pair: PairNow) -> Text:
+    """The state; of who says nothing now, that it was so."""
+    if pair.standing == "live":
+        return console.styled(pair.word.state)
+    style = console.STATE_STYLES["miscalibrated"] if pair.word.state == "miscalibrated" else "bold dim"
+    return Text(f"{pair.standing} ({pair.word.state})", style)
+
+
+def duration(seconds: float) -> str:
+    """In the unit that people would take."""
+    for least, divisor, unit in ((172_800.0, 86_400.0, "d"), (7200.0, 3600.0, "h"), (120.0, 60.0, "min")):
+        if seconds >= least:
+            return f"{seconds / divisor:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _row(pair: PairNow, *, marked: bool) -> tuple[RenderableType, ...]:
+    word = pair.word
+    drift = sigma = "-"
+    if pair.worst is not None and word.drift is not None:
+        axis = console.AXES.index(pair.worst)
+        unit = "°" if console.UNITS[axis] == "deg" else " m"
+        drift = f"{pair.worst} {console.figure(word.drift[axis], 2, sign=True)}{unit}"
+        deviation = None if word.drift_sigma is None else word.drift_sigma[axis]
+        sigma = "-" if deviation is None else f"{console.figure(deviation, 2)}{unit}"
+    return (
+        Text("▶" if marked else " "),
+        Text(word.vehicle),
+        Text(word.pair),
+        told(pair),
+        Text(duration(pair.said_s)),
+        Text("never" if pair.looked_s is None else duration(pair.looked_s)),
+        Text(drift, "bold red" if pair.urgency >= 1.0 else ""),
+        Text(sigma),
+        Text(", ".join(_plain(reason.code) for reason in word.reasons), overflow="ellipsis", no_wrap=True),
+        Text(_plain(word.event or "")),
+    )
+
+
+def _plain(text: str) -> str:
+    """What a vehicle calls things, without what a terminal would obey."""
+    return "".join(character if character.isprintable() else "�" for character in text)

@@ -1,0 +1,113 @@
+"""The last word of each pair, said so that it can be kept: when it changes, from time to time, and at the end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from typing import Literal
+
+from coec.adapters.zenoh.bus import Answer
+from coec.config import UplinkConfig
+from coec.errors import NotFoundError
+from coec.runtime.api.awaited import AwaitedAnswers
+from coec.runtime.api.pair_answers import PairAnswers
+from coec.runtime.api.snapshots import answer_of
+from coec.schemas.keys import Format, Keys
+from coec.schemas.last_word import MAX_REASONS, MAX_TEXT, LastWord
+from coec.schemas.replies import Maybe6, Vector6
+
+ServiceState = Literal["starting", "running", "stopping", "failing"]
+
+
+class LastWords:
+    """Of one vehicle. `renew` and `use` are for the main thread, `answer` for any."""
+
+    def __init__(
+        self,
+        keys: Keys,
+        version: str,
+        config: UplinkConfig,
+        publish: Callable[[str, Answer], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`clock` tells seconds that never go back."""
+        self._keys = keys
+        self._version = version
+        self._config = config
+        self._publish = publish
+        self._clock = clock
+        self._words: dict[str, LastWord] = {}
+        self._published: dict[str, tuple[object, float]] = {}
+
+    def use(self, config: UplinkConfig) -> None:
+        """Say them as often as this says."""
+        self._config = config
+
+    def renew(self, service: ServiceState, config_hash: str, answering: Iterable[PairAnswers | AwaitedAnswers]) -> None:
+        """Take down what each pair says now, and publish what has changed or was not said for a period."""
+        now_s = self._clock()
+        for answers in answering:
+            word = self._word_of(service, config_hash, answers)
+            self._words[word.pair] = word
+            essence = _essence(word)
+            before, said_s = self._published.get(word.pair, (None, 0.0))
+            if essence != before or now_s - said_s >= self._config.last_word_s:
+                self._published[word.pair] = (essence, now_s)
+                self._publish(self._keys.last(word.pair), answer_of(word, "msgpack"))
+
+    def answer(self, pair: str, form: Format) -> Answer:
+        """What a pair would say now.
+
+        Raises:
+            NotFoundError: there is no such pair.
+        """
+        word = self._words.get(pair)
+        if word is None:
+            raise NotFoundError("no such pair has said anything")
+        return answer_of(word, form)
+
+    def _word_of(self, service: ServiceState, config_hash: str, answers: PairAnswers | AwaitedAnswers) -> LastWord:
+        health = answers.health_reply
+        built = answers if isinstance(answers, PairAnswers) else None
+        extrinsic = None if built is None else built.extrinsic_reply
+        correction: Vector6 | None = None
+        sigma: Maybe6 | None = None
+        if extrinsic is not None:
+            axes = extrinsic.axes
+            six = (axes.rx, axes.ry, axes.rz, axes.tx, axes.ty, axes.tz)
+            a, b, c, d, e, f = (axis.correction for axis in six)
+            correction = (a, b, c, d, e, f)
+            s, t, u, v, w, x = (axis.sigma for axis in six)
+            sigma = (s, t, u, v, w, x)
+        return LastWord(
+            vehicle=health.vehicle,
+            pair=health.pair,
+            said_ns=time.time_ns(),
+            period_s=self._config.last_word_s,
+            service=service,
+            version=self._version,
+            config_hash=config_hash,
+            state=health.state,
+            level=health.level,
+            reasons=tuple(
+                reason.model_copy(update={"text": reason.text[:MAX_TEXT]}) for reason in health.reasons[:MAX_REASONS]
+            ),
+            since_ns=health.since_ns,
+            age_s=health.age_s,
+            drift=health.drift,
+            drift_sigma=health.drift_sigma,
+            provenance=None if extrinsic is None else extrinsic.provenance,
+            status=None if extrinsic is None else extrinsic.status,
+            correction=correction,
+            sigma=sigma,
+            held=extrinsic is not None and extrinsic.held,
+            windows=0 if built is None else built.recorded,
+            event=None if built is None else built.newest_event,
+        )
+
+
+def _essence(word: LastWord) -> object:
+    """What is said again as soon as it differs."""
+    codes = tuple(reason.code for reason in word.reasons)
+    served = (word.provenance, word.status, word.correction, word.held)
+    return (word.service, word.config_hash, word.state, codes, word.since_ns, served, word.event)

@@ -1,0 +1,28 @@
+"""Ten thousand vehicles on one router: nothing is lost where they say what they usually do, and memory is bounded.
+
+    tests/run --all -k fleet_scale        two to three minutes
+Figures and what follows from them for larger fleets are in docs/fleet.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from bench.fleet_scale import main
+
+VEHICLES = 10_000
+LOST = 0.005
+"""Share of words that a router may drop while it is busy: each is said again within its period."""
+
+
+def test_one_router_carries_the_words_of_ten_thousand_vehicles(
+    record_property: Callable[[str, object], None],
+) -> None:
+    told = main(VEHICLES)
+    record_property("figure", told)
+    assert told["steady"]["heard"] >= (1.0 - LOST) * VEHICLES
+    assert told["late_watcher_knows"] == VEHICLES
+    assert told["board"]["known"] == VEHICLES
+    assert told["board"]["refused"] == {}
+    for name in ("router_rss_mb_end", "keeper_rss_mb", "watcher_rss_mb"):
+        assert told[name] < 1000.0, name

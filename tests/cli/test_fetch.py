@@ -1,0 +1,289 @@
+"""`coec fetch`: a red event of a vehicle that had one, over a router; and of vehicles that say what they like."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from cli.conftest import Coec
+from coec.adapters.images.codec import encode_jpeg
+from coec.adapters.mcap.windows import WindowWriter, write_result
+from coec.adapters.zenoh.client import RemoteError, connected
+from coec.adapters.zenoh.window_fetch import PIECE_BYTES, fetch_window
+from coec.config import ZenohConfig
+from coec.errors import NotFoundError, UsageError
+from coec.runtime.recording.digests import DigestReader
+from coec.schemas.base import to_json
+from coec.schemas.incident import IncidentReport
+from coec.schemas.keys import Keys, parse_range_selector
+from coec.schemas.replies import WindowInfo, WindowsReply
+from e2e.processes import Router
+from fakes import wait_until
+from last_words import a_word, packed
+from pair_bench import BEGIN_S, END_S, NOMINAL, RIG, Bench, S, pair_at
+from storages import Storage
+from vehicles import KEYS, PAIR, Vehicle, serving
+
+VEHICLE = "vehicle"
+DATA = bytes(range(256)) * 6000
+"""Three pieces of a window."""
+
+SHA256 = hashlib.sha256(DATA).hexdigest()
+WINDOW = "front-7"
+
+
+@pytest.fixture(scope="module")
+def vehicle(router: Router, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vehicle]:
+    """Its mount was knocked, and its pair was put right again."""
+    with (
+        serving(tmp_path_factory.mktemp("state"), ZenohConfig(connect=(router.endpoint,)), before=driven) as made,
+        connected([router.endpoint], 5.0) as session,
+    ):
+        wait_until(lambda: bool(list(session.get(KEYS.health(PAIR)))), "the vehicle answers")
+        yield made
+
+
+def driven(bench: Bench) -> None:
+    """Its windows lie in the folder as recorder and worker leave them, and its pictures are pictures."""
+    bench.drive(BEGIN_S, END_S)
+    folder = bench.outside.folder
+    for result in bench.store.history.results():
+        path = folder.path(result.window_id)
+        path.unlink(missing_ok=True)
+        configuration = bench.config.pairs[0].calibration
+        writer = WindowWriter(path, RIG, NOMINAL, result.window_id, configuration, {"vehicle": VEHICLE})
+        for second in range(3):
+            writer.add(pair_at(result.data_stamp_ns + second * S))
+        writer.finish()
+        write_result(path, result)
+    reader = DigestReader(folder, PAIR)
+    while reader.read(2**20):
+        pass
+    (event,) = bench.answers.events().events
+    for side in event.overlays:
+        bench.store.incidents.add_overlay(event.event_id, side, encode_jpeg(np.full((90, 160, 3), 90, np.uint8)))
+
+
+class Page(HTMLParser):
+    """What a page loads, and what it says."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.tags: set[str] = set()
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.loads += [value or "" for name, value in attrs if name in ("src", "href")]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.mark.usefixtures("vehicle")
+def test_an_event_comes_home_as_one_folder_that_tells_its_story(coec: Coec, router: Router, tmp_path: Path) -> None:
+    folder = tmp_path / "event"
+    listed = coec("fetch", VEHICLE, "--connect", router.endpoint, "--json")
+    (event,) = listed.document["events"]
+    assert event["event_id"] in coec("fetch", VEHICLE, "--connect", router.endpoint).out
+    outcome = coec("fetch", VEHICLE, "latest", "--connect", router.endpoint, "--output", folder, "--json")
+    assert outcome.status == 0, outcome.err
+    report = IncidentReport.model_validate(outcome.document)
+    assert report == IncidentReport.model_validate_json((folder / "incident.json").read_bytes())
+    assert (report.event_id, report.absent) == (event["event_id"], ())
+    there = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert there == {file.name for file in report.files} | {"incident.json"}
+    for file in report.files:
+        data = (folder / file.name).read_bytes()
+        assert (hashlib.sha256(data).hexdigest(), len(data)) == (file.sha256, file.size_bytes)
+    assert [window.window_id for window in report.windows] == [event["window_before"], event["window_after"]]
+    assert [window.in_history for window in report.windows] == [True, True]
+    assert report.chain_holds is True
+    page = Page((folder / "index.html").read_text())
+    assert {name for name in page.loads if name != ""} <= there, "it loads nothing from anywhere else"
+    assert {"before.jpg", "after.jpg"} <= set(page.loads)
+    for told in (event["reasons"][0]["text"], event["resolution"], event["window_after"], "accepted"):
+        assert told in page.text
+    assert not {"script", "link", "iframe"} & page.tags
+
+
+def test_whoever_asks_again_fetches_no_window_twice(
+    coec: Coec, router: Router, vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, read = tmp_path / "event", []
+    existing = vehicle.bench.answers.read_window
+
+    def read_window(window_id: str, offset: int, length: int) -> bytes:
+        read.append(window_id)
+        return existing(window_id, offset, length)
+
+    monkeypatch.setattr(vehicle.bench.answers, "read_window", read_window)
+    for _ in range(2):
+        outcome = coec("fetch", VEHICLE, "latest", "--connect", router.endpoint, "--output", folder)
+        assert outcome.status == 0
+        assert "2 windows with the right sha256, 2 with the result" in outcome.out
+    assert len(read) == len(set(read)) == 2
+
+
+@pytest.mark.usefixtures("vehicle")
+def test_recordings_can_be_left_on_board(coec: Coec, router: Router, tmp_path: Path) -> None:
+    arguments = ("--no-windows", "--connect", router.endpoint, "--output", tmp_path)
+    assert coec("fetch", VEHICLE, "latest", *arguments).status == 0
+    assert not (tmp_path / "windows").exists()
+    assert "None was fetched" in (tmp_path / "index.html").read_text()
+
+
+@pytest.mark.usefixtures("vehicle")
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (("../x",), UsageError.exit_code, "is no name of a vehicle"),
+        ((VEHICLE, "../../etc/passwd"), UsageError.exit_code, "is no red event"),
+        ((VEHICLE, "front-1"), NotFoundError.exit_code, "keeps no such red event"),
+        (("nobody", "latest"), NotFoundError.exit_code, "nobody answered"),
+    ],
+)
+def test_what_is_not_there_is_said(
+    coec: Coec,
+    router: Router,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...],
+    status: int,
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = coec("fetch", *arguments, "--connect", router.endpoint)
+    assert (outcome.status, list(tmp_path.iterdir())) == (status, [])
+    assert said in outcome.err
+
+
+def test_of_a_vehicle_that_is_parked_its_last_word_is_told(coec: Coec, router: Router) -> None:
+    key = Keys("coec", "truck-3").last("front")
+    with Storage(router.session, Keys("coec", "*").last("*")) as storage, connected([router.endpoint], 5.0) as session:
+        word = a_word("truck-3", service="stopping", state="miscalibrated")
+        session.put(key, packed(word), timestamp=session.new_timestamp())
+        wait_until(lambda: bool(storage.kept), "it is kept")
+        outcome = coec("fetch", "truck-3", "latest", "--connect", router.endpoint)
+    assert outcome.status == NotFoundError.exit_code
+    assert re.search(r"truck-3 does not answer; it took its leave \d+ d ago \(front: miscalibrated\)", outcome.err)
+
+
+# ------------------------------------------------------------------------------------------------ pieces of a window
+
+
+class Sender:
+    """Has one window, and answers for its pieces as it is told to: `answer(offset, length)` gives bytes, or a code."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, answer: Callable[[int, int], bytes | str], **told: Any):
+        self.asked: list[int] = []
+        self._answer = answer
+        info = {"window_id": WINDOW, "sha256": SHA256, "size_bytes": len(DATA), "pairs": 1, "decision": None, **told}
+        listed = WindowsReply(vehicle=keys.vehicle, pair=PAIR, windows=(WindowInfo.model_validate(info),))
+        self._declared = [
+            session.declare_queryable(keys.windows(PAIR), lambda query: self._list(query, to_json(listed))),
+            session.declare_queryable(keys.window(PAIR, WINDOW), self._piece),
+        ]
+
+    def end(self) -> None:
+        for each in self._declared:
+            each.undeclare()
+
+    @staticmethod
+    def _list(query: zenoh.Query, payload: bytes) -> None:
+        with query:
+            query.reply(query.key_expr, payload)
+
+    def _piece(self, query: zenoh.Query) -> None:
+        with query:
+            chosen = parse_range_selector(str(query.parameters))
+            self.asked.append(chosen.offset)
+            answer = self._answer(chosen.offset, chosen.length)
+            if isinstance(answer, bytes):
+                query.reply(query.key_expr, answer)
+            else:
+                error = json.dumps({"code": answer, "message": "no", "schema_version": 1}).encode()
+                query.reply_err(error, encoding="application/json")
+
+
+def whole(offset: int, length: int) -> bytes:
+    return DATA[offset : offset + length]
+
+
+@pytest.fixture
+def far(request: pytest.FixtureRequest) -> Keys:
+    """Of a vehicle of each test's own."""
+    return Keys("coec", re.sub(r"[^A-Za-z0-9]", "-", request.node.name)[:60])
+
+
+def fetch(router: Router, keys: Keys, path: Path, patience_s: float = 0.3) -> WindowInfo:
+    with connected([router.endpoint], 5.0) as session:
+        return fetch_window(session, keys, PAIR, WINDOW, path, 5.0, patience_s, lambda *_: None)
+
+
+@pytest.mark.fault("the link breaks in the middle of a window", "what has come is kept, and the rest is fetched later")
+def test_a_window_goes_on_where_the_link_broke(
+    router: Router, far: Keys, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    path, broken = tmp_path / "w.mcap", [True]
+    sender = Sender(router.session, far, lambda at, n: "not_found" if at > PIECE_BYTES and broken[0] else whole(at, n))
+    with pytest.raises(RemoteError):
+        fetch(router, far, path)
+    assert not path.exists()
+    broken[0] = False
+    before = len(sender.asked)
+    assert fetch(router, far, path).sha256 == SHA256
+    sender.end()
+    assert path.read_bytes() == DATA
+    again = [offset for offset in sender.asked[before:] if offset < 2 * PIECE_BYTES]
+    record_property("figure", f"{len(again)} pieces fetched twice")
+    assert again == []
+    assert [each.name for each in tmp_path.iterdir()] == ["w.mcap"]
+
+
+@pytest.mark.fault("the vehicle's uplink is busy", "the piece is asked for again until it comes, or patience ends")
+def test_who_is_told_to_wait_waits(router: Router, far: Keys, tmp_path: Path) -> None:
+    refusals = iter(["uplink_busy", "busy"])
+    sender = Sender(router.session, far, lambda at, n: next(refusals, None) or whole(at, n))
+    fetch(router, far, tmp_path / "w.mcap", patience_s=30.0)
+    sender.end()
+    assert (tmp_path / "w.mcap").read_bytes() == DATA
+    sender = Sender(router.session, far, lambda *_: "uplink_busy")
+    with pytest.raises(RemoteError) as refused:
+        fetch(router, far, tmp_path / "x.mcap", patience_s=0.3)
+    sender.end()
+    assert refused.value.reply_code == "uplink_busy"
+
+
+@pytest.mark.fault("bytes of a window that are not those promised, or more, or none", "no file has its name")
+@pytest.mark.parametrize(
+    ("answer", "told", "code"),
+    [
+        (lambda _, n: bytes(n), {}, "checksum"),
+        (lambda at, n: whole(at, n) + b"x", {}, "checksum"),
+        (lambda *_: b"", {}, "checksum"),
+        (whole, {"size_bytes": 2**40}, "too_large"),
+        (whole, {"sha256": "../../../etc/x"}, "malformed"),
+    ],
+    ids=["others", "more", "none", "too large", "a path"],
+)
+def test_what_is_not_what_was_promised_is_no_window(
+    router: Router, far: Keys, tmp_path: Path, answer: Callable[[int, int], bytes], told: dict[str, Any], code: str
+) -> None:
+    sender = Sender(router.session, far, answer, **told)
+    with pytest.raises(RemoteError) as refused:
+        fetch(router, far, tmp_path / "in" / "w.mcap")
+    sender.end()
+    assert refused.value.reply_code == code
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []

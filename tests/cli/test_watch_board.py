@@ -1,0 +1,179 @@
+"""`coec watch` as a board: over a router, with somebody who kept the words of vehicles that have gone."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from rich.console import Console
+
+from cli.conftest import Coec
+from coec.adapters.images.codec import encode_jpeg
+from coec.adapters.system import keyboard
+from coec.adapters.zenoh.client import connected
+from coec.adapters.zenoh.words import Words
+from coec.cli.watch_board import Asking, Board
+from coec.errors import DecodeError
+from coec.fleet.roster import Filter, Roster
+from coec.reports import half_blocks
+from coec.schemas.base import to_msgpack
+from coec.schemas.keys import Keys
+from coec.schemas.replies import HistoryReply
+from e2e.processes import Router
+from fakes import wait_until
+from last_words import a_word, packed
+from storages import Storage
+
+ALL = Keys("coec", "*")
+
+
+def say(session: zenoh.Session, vehicle: str, **told: Any) -> None:
+    key = Keys("coec", vehicle).last("front")
+    session.put(key, packed(a_word(vehicle, **told)), timestamp=session.new_timestamp())
+
+
+def test_what_was_kept_is_told_once_most_urgent_first(coec: Coec, router: Router) -> None:
+    with Storage(router.session, ALL.last("*")) as storage, connected([router.endpoint], 5.0) as vehicle:
+        say(vehicle, "truck-1")
+        say(vehicle, "truck-2", state="miscalibrated", event="front-7")
+        say(vehicle, "truck-3", service="stopping")
+        wait_until(lambda: len(storage.kept) == 3, "the words are kept")
+        outcome = coec("watch", "--once", "--connect", router.endpoint, "--json")
+        told = [(pair["word"]["vehicle"], pair["standing"]) for pair in outcome.document["pairs"]]
+        assert told == [("truck-2", "silent"), ("truck-1", "silent"), ("truck-3", "parked")], "all long ago"
+        words = coec("watch", "--once", "--connect", router.endpoint, "--state", "parked", "--find", "truck")
+        assert words.status == 0
+        assert "3 vehicles, 3 pairs: 2 silent, 1 parked" in words.out
+        assert "parked (healthy)" in words.out
+        assert "truck-1" not in words.out
+        one = coec("watch", "--once", "--vehicle", "truck-2", "--connect", router.endpoint, "--json")
+        assert [pair["word"]["event"] for pair in one.document["pairs"]] == ["front-7"]
+
+
+def test_a_fleet_that_says_nothing_is_a_failure(coec: Coec, router: Router) -> None:
+    outcome = coec("watch", "--once", "--connect", router.endpoint, "--timeout", "1", "--json")
+    assert (outcome.status, outcome.document["known"]) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--once", "--lines"), "are about the board"),
+        (("--state", "healthy"), "needs a terminal"),
+        (("--once", "--state", "splendid"), "is no state"),
+    ],
+)
+def test_what_does_not_go_together_is_a_usage_error(
+    coec: Coec, router: Router, arguments: tuple[str, ...], said: str
+) -> None:
+    outcome = coec("watch", *arguments, "--connect", router.endpoint)
+    assert outcome.status == 2
+    assert said in outcome.err
+
+
+# ----------------------------------------------------------------------------------------------------- on a screen
+
+
+@contextmanager
+def board_of(router: Router) -> Iterator[Board]:
+    with connected([router.endpoint], 5.0) as session, connected([router.endpoint], 5.0) as of_tokens:
+        words = Words(session, of_tokens, ALL, 2.0)
+        with words.listening(), Asking(session, "coec") as asking:
+            yield Board(Roster(), words, Filter(), asking)
+
+
+def text(board: Board) -> str:
+    console = Console(width=160, height=50, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+    with console.file:
+        console.print(board.frame(160, 50))
+    return console.export_text()
+
+
+def test_keys_choose_a_pair_and_tell_its_reasons_history_and_overlay(router: Router) -> None:
+    keys = Keys("coec", "truck-2")
+    picture = encode_jpeg(np.full((90, 160, 3), 200, np.uint8))
+    history = to_msgpack(HistoryReply(vehicle="truck-2", pair="front", total=0, results=()))
+    with connected([router.endpoint], 5.0) as vehicle, board_of(router) as board:
+
+        def answer(payload: bytes) -> Any:
+            def reply(query: zenoh.Query) -> None:
+                with query:
+                    query.reply(query.key_expr, payload)
+
+            return reply
+
+        vehicle.declare_queryable(keys.history("front"), answer(history))
+        vehicle.declare_queryable(keys.overlay("front"), answer(picture))
+        reason = {"code": "moved", "text": "The mount has moved.\x1b[2J"}
+        say(vehicle, "truck-1")
+        say(vehicle, "truck-2", state="miscalibrated", reasons=[reason])
+        wait_until(lambda: "2 vehicles, 2 pairs: 1 miscalibrated, 1 healthy" in text(board), "both are told")
+        shown = text(board)
+        assert "moved: The mount has moved." in shown, "the most urgent is chosen"
+        assert "\x1b" not in shown.replace("�", ""), "what a terminal would obey is not passed on"
+        assert board.press("h")
+        wait_until(lambda: "verdict" in text(board), "the history is there")
+        assert board.press("o")
+        wait_until(lambda: "▀▀▀▀" in text(board), "the picture is there")
+        assert board.press("down")
+        assert "truck-1/front" in text(board)
+        assert "no reasons" in text(board)
+        say(vehicle, "truck-1", state="suspect", drift=(3.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        wait_until(lambda: "1 miscalibrated, 1 suspect" in text(board), "a change is told")
+        assert "truck-1/front" in text(board), "the chosen pair stays chosen"
+        assert board.press("f")
+        assert "showing 2: not healthy" in text(board)
+        assert not board.press("q")
+
+
+@pytest.mark.fault("a pair that does not answer what is asked of it", "the board goes on, and says so")
+def test_what_is_not_answered_is_said(router: Router) -> None:
+    with connected([router.endpoint], 5.0) as vehicle, board_of(router) as board:
+        say(vehicle, "truck-9")
+        wait_until(lambda: "1 vehicles, 1 pairs" in text(board), "it is told")
+        assert board.press("o")
+        wait_until(lambda: "no overlay of truck-9/front: nobody answered" in text(board), "nobody answers")
+
+
+def test_a_word_that_was_lost_is_asked_for(router: Router) -> None:
+    """Of a pair that is overdue and has not taken its leave."""
+    key = Keys("coec", "truck-5").last("front")
+    now_s = 1000.0
+    with connected([router.endpoint], 5.0) as vehicle, board_of(router) as board:
+        wait_until(lambda: board.words.told.is_set(), "nobody has said anything")
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                query.reply(key, packed(a_word("truck-5", said_ns=2**62)))
+
+        vehicle.declare_queryable(key, answer)
+        board.roster.hear(key, packed(a_word("truck-5", state="suspect")), -now_s)
+        assert "silent (suspect)" in text(board)
+        board.asked_s = -now_s
+        wait_until(lambda: "1 healthy" in text(board), "it has answered")
+
+
+def test_keys_are_read_as_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs) as terminal, os.fdopen(ours, "wb", buffering=0) as hand:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        with keyboard.keys() as poll:
+            assert poll(0.0) is None
+            for sent, key in ((b"\x1b[A", "up"), (b"q", "q"), (b"\xff", None), (b"\x1b[B", "down")):
+                hand.write(sent)
+                assert poll(5.0) == key
+
+
+@pytest.mark.fault("a picture from a vehicle that is none", "refused, the board goes on")
+def test_a_picture_that_is_none_is_refused() -> None:
+    with pytest.raises(DecodeError):
+        half_blocks.drawn(b"\xff\xd8\xff not a picture", 80, 24)
+    drawn = half_blocks.drawn(encode_jpeg(np.zeros((100, 400, 3), np.uint8)), 80, 24).plain
+    rows = drawn.splitlines()
+    assert (len(rows), {len(row) for row in rows}) == (10, {80})

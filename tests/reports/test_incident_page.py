@@ -1,0 +1,125 @@
+"""The page of a red event: it tells what the documents say, and obeys none of them."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import replace
+
+import pytest
+
+from coec.cli.fetch import chain_holds
+from coec.reports.incident_page import Story, instant, page, sentences
+from coec.runtime.decisions.chain import GENESIS
+from coec.schemas.base import to_json
+from coec.schemas.incident import Absent
+from coec.schemas.replies import (
+    ChainedEntry,
+    EvidenceEvent,
+    HistoryEntry,
+    HistoryReply,
+    MetricsPoint,
+    Reason,
+    Transform,
+)
+
+S = 1_000_000_000
+EVIL = "<script>alert(1)</script>'\"><img src=http://evil/x>"
+IDENTITY = Transform(
+    matrix=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+    translation_m=(0, 0, 0),
+    quaternion_xyzw=(0, 0, 0, 1),
+)
+EVENT = EvidenceEvent(
+    event_id="front-100",
+    vehicle="truck",
+    pair="front",
+    stamp_ns=100 * S,
+    wall_ns=1_700_000_000 * S,
+    reasons=(Reason(code="bent_mount", text="The mount is bent."),),
+    camera_from_lidar=IDENTITY,
+    window_before="front-7",
+    metrics=tuple(
+        MetricsPoint(
+            stamp_ns=at * S, state="healthy" if at < 100 else "suspect", metrics={"mi": at / 10, "edges": None}
+        )
+        for at in range(80, 120, 5)
+    ),
+)
+STORY = Story(EVENT, None, None, None, None, (), (), None)
+
+
+def test_the_story_is_what_the_documents_say() -> None:
+    told = " ".join(sentences(STORY))
+    assert "At 1970-01-01 00:01:40Z of sensor time the pair front of truck turned red" in told
+    assert "The mount is bent. (bent_mount)" in told
+    assert "The window before it is front-7; nothing is told of what was decided of it." in told
+    assert "There is no window after it." in told
+    assert "It had not ended when this was fetched." in told
+    resolved = replace(
+        STORY, event=EVENT.model_copy(update={"resolved_stamp_ns": 160 * S, "resolution": "healthy: ok"})
+    )
+    assert "It ended after 60 s: healthy: ok" in " ".join(sentences(resolved))
+
+
+def test_figures_are_drawn_on_one_axis_of_time_with_the_event_in_it() -> None:
+    text = page(STORY, ["before.jpg"])
+    assert text.count("<rect") == len(EVENT.metrics)
+    (points,) = re.findall(r"<polyline points='([^']*)'", text)
+    assert len(points.split()) == len(EVENT.metrics), "a figure that was not told is not drawn"
+    assert text.count("class=zero") == 2
+    assert "8.000 to 11.500" in text
+
+
+@pytest.mark.fault("a vehicle whose texts are markup", "the page shows them as text, and loads nothing")
+def test_what_a_vehicle_says_is_text() -> None:
+    event = EVENT.model_copy(
+        update={
+            "reasons": (Reason(code=EVIL, text=EVIL),),
+            "resolution": EVIL,
+            "window_before": EVIL,
+            "metrics": (MetricsPoint(stamp_ns=-(2**70), state="healthy", metrics={EVIL: 1.0}),),
+        }
+    )
+    entry = HistoryEntry(
+        sequence=0, previous_sha256=EVIL, kind="command", code=EVIL, text=EVIL, wall_ns=2**90, sender=EVIL
+    )
+    history = HistoryReply(
+        vehicle="v", pair="p", total=0, results=(), entries=(ChainedEntry(sha256=EVIL, entry=entry),)
+    )
+    story = Story(event, history, None, None, None, (), (Absent(what=EVIL, why=EVIL),), False)
+    text = page(story, [])
+    assert "<script" not in text
+    assert "<img" not in text
+    assert "something was changed, taken out or put in" in text
+    assert instant(2**90) == f"{2**90} ns"
+
+
+def chained(*texts: str) -> list[ChainedEntry]:
+    made, before = [], GENESIS
+    for number, text in enumerate(texts):
+        entry = HistoryEntry(
+            sequence=number, previous_sha256=before, kind="state", book="states", code="c", text=text, wall_ns=number
+        )
+        before = sha256(entry)
+        made.append(ChainedEntry(sha256=before, entry=entry))
+    return made
+
+
+def sha256(entry: HistoryEntry) -> str:
+    return hashlib.sha256(to_json(entry)).hexdigest()
+
+
+def held(*entries: ChainedEntry) -> bool | None:
+    return chain_holds(HistoryReply(vehicle="v", pair="p", total=0, results=(), entries=entries))
+
+
+@pytest.mark.fault("an entry of the history that was changed, taken out or put in on the way", "the page says so")
+def test_entries_are_held_against_their_hashes() -> None:
+    one, two, three = chained("a", "b", "c")
+    assert held(one, two, three) is True
+    assert held(two) is None
+    assert held(one, three) is None, "what lies between them was not asked for"
+    forged = two.entry.model_copy(update={"text": "B"})
+    assert held(one, ChainedEntry(sha256=two.sha256, entry=forged), three) is False
+    assert held(one, ChainedEntry(sha256=sha256(forged), entry=forged), three) is False, "it is not what follows on"

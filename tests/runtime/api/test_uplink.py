@@ -1,0 +1,52 @@
+"""How much evidence leaves a vehicle in a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+
+import pytest
+
+from coec.adapters.zenoh.bus import Answer
+from coec.config import UplinkConfig
+from coec.runtime.api.uplink import BURST_BYTES, Uplink, UplinkBusyError
+
+RATE = 100_000
+PIECE = 2**20
+
+
+@pytest.mark.fault("somebody fetches windows as fast as he can", "what goes out keeps to the configured rate")
+def test_in_the_long_run_no_more_goes_out_than_is_configured(
+    record_property: Callable[[str, object], None],
+) -> None:
+    now_s = 0.0
+    uplink = Uplink(UplinkConfig(evidence_bytes_per_s=RATE), lambda: now_s)
+    piece, sent = Answer(bytes(PIECE), ""), 0
+    for tick in range(3600 * 4):
+        now_s = tick / 4
+        with suppress(UplinkBusyError):
+            sent += len(uplink.metered("windows", lambda: piece).payload)
+    rate = (sent - BURST_BYTES) / now_s
+    record_property("figure", f"{rate / RATE:.3f} of the rate after the burst")
+    assert rate <= RATE * (1 + PIECE / (RATE * 3600))
+    assert rate >= 0.99 * RATE, "and no less, where somebody asks all the time"
+    assert uplink.sent == {"windows": sent}
+    assert uplink.refused["windows"] > 0
+
+
+def test_nothing_is_read_that_may_not_go_out() -> None:
+    uplink = Uplink(UplinkConfig(evidence_bytes_per_s=RATE), lambda: 0.0)
+    uplink.metered("windows", lambda: Answer(bytes(BURST_BYTES + RATE), ""))
+    with pytest.raises(UplinkBusyError, match=r"ask again in 1\.0 s"):
+        uplink.metered("overlay", lambda: pytest.fail("it was made"))
+    assert uplink.refused == {"overlay": 1}
+
+
+def test_a_new_rate_holds_at_once_and_gives_nothing_for_the_time_before() -> None:
+    now_s = 0.0
+    uplink = Uplink(UplinkConfig(evidence_bytes_per_s=RATE), lambda: now_s)
+    uplink.metered("windows", lambda: Answer(bytes(BURST_BYTES + 10 * RATE), ""))
+    now_s = 5.0
+    uplink.use(UplinkConfig(evidence_bytes_per_s=5 * RATE))
+    with pytest.raises(UplinkBusyError, match=r"1\.0 s"):
+        uplink.metered("windows", lambda: Answer(b"", ""))
