@@ -8,6 +8,10 @@ completes the pair. `write_result` adds `/diagnostics`, the result as a JSON cha
 A window may hold pairs of an earlier one that were kept for it. They come last, though they were taken first; the
 metadata `coec_kept` name the window that they are from. A reader sorts pairs by their stamps.
 
+The thinned pairs between those of the window have topics and indices of their own; of these the image comes last,
+too. They are asked where the camera moved within the window: `write_result` leaves them out where it did not, which
+more than halves what is kept of most windows.
+
 The sender's own sequence numbers are not kept: the pairs of a window were chosen, so gaps between them mean nothing.
 Chunks are not compressed: images are encoded already, clouds shrink by an eighth, lz4 costs a fifth of the throughput.
 Equal pairs give equal bytes: nothing in the file tells when or where it was written.
@@ -23,7 +27,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mcap.writer import CompressionType, Writer
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -65,6 +69,12 @@ IMAGE, COMPRESSED, DEPTH = "camera/image", "camera/image/compressed", "camera/de
 POINTS, CAMERA_INFO, RESULT_TOPIC = "lidar/points", "camera/camera_info", "result"
 ODOMETRY, IMU = "odometry", "imu"
 """Topics below `/coec/<pair>/`."""
+
+BETWEEN = "between/"
+"""Below it the sweep, ego-motion and image of the thinned pairs, as above."""
+
+BETWEEN_IMAGE = BETWEEN + "image/compressed"
+"""Their images are compressed, whatever the camera sends."""
 
 
 CHUNK_BYTES = 64 * 1024
@@ -227,6 +237,7 @@ class WindowWriter:
             RecordingError: the file cannot be written.
         """
         self.pairs = 0
+        self._between = 0
         self._rig, self._T_start, self._window_id = rig, T_camera_lidar_start, window_id
         self._file = _WindowFile(temporary or _beside(path_final, PART_SUFFIX), path_final)
         document = _RigAttachment(
@@ -259,21 +270,10 @@ class WindowWriter:
                 removed.
         """
         stamp_ns = pair.stamp_ns
-        for frame in (pair.camera, pair.lidar, pair.motion):
-            if frame is not None and not 0 <= frame.stamp_ns < MAX_STAMP_NS:
-                self.abandon()
-                raise RecordingError(f"stamp {frame.stamp_ns} ns does not fit the 32-bit seconds of ROS 2")
+        self._refuse_stamps_beyond_ros(pair)
         if self.pairs == 0:
             self._cdr(TF_STATIC, messages.TF, stamp_ns, outgoing.encode_tf_static(self._rig, self._T_start, stamp_ns))
-        self._cdr(self._topic(POINTS), messages.POINT_CLOUD, pair.lidar.stamp_ns, outgoing.encode_cloud(pair.lidar))
-        if pair.motion is not None:
-            motion_type, motion = outgoing.encode_motion(pair.motion)
-            self._cdr(
-                self._topic(IMU if motion_type == messages.IMU else ODOMETRY),
-                motion_type,
-                pair.motion.stamp_ns,
-                motion,
-            )
+        self._sweep_and_motion("", pair, self.pairs)
         if pair.camera.depth is not None:
             depth = outgoing.encode_depth(stamp_ns, pair.camera.frame_id, pair.camera.depth)
             self._cdr(self._topic(DEPTH), messages.COMPRESSED_IMAGE, stamp_ns, depth)
@@ -284,6 +284,18 @@ class WindowWriter:
         self._cdr(topic, image_type, stamp_ns, image)
         self._file.sync()
         self.pairs += 1
+
+    def add_between(self, pair: FramePair) -> None:
+        """Appends a thinned pair, whose image is compressed. It is on the disk with the next one of the window.
+
+        Raises:
+            RecordingError: as for `add`.
+        """
+        self._refuse_stamps_beyond_ros(pair)
+        self._sweep_and_motion(BETWEEN, pair, self._between)
+        image_type, image = outgoing.encode_image(pair.camera)
+        self._cdr(self._topic(BETWEEN_IMAGE), image_type, pair.stamp_ns, image, self._between)
+        self._between += 1
 
     def finish(self) -> RecordedWindow:
         """Writes the index, syncs, and gives the file its final name.
@@ -297,16 +309,34 @@ class WindowWriter:
         """Removes the `.part` file. May be called at any time before `finish`, and more than once."""
         self._file.abandon()
 
+    def _sweep_and_motion(self, below: str, pair: FramePair, index: int) -> None:
+        lidar, motion = pair.lidar, pair.motion
+        points = outgoing.encode_cloud(lidar)
+        self._cdr(self._topic(below + POINTS), messages.POINT_CLOUD, lidar.stamp_ns, points, index)
+        if motion is not None:
+            motion_type, data = outgoing.encode_motion(motion)
+            name = below + (IMU if motion_type == messages.IMU else ODOMETRY)
+            self._cdr(self._topic(name), motion_type, motion.stamp_ns, data, index)
+
+    def _refuse_stamps_beyond_ros(self, pair: FramePair) -> None:
+        for frame in (pair.camera, pair.lidar, pair.motion):
+            if frame is not None and not 0 <= frame.stamp_ns < MAX_STAMP_NS:
+                self.abandon()
+                raise RecordingError(f"stamp {frame.stamp_ns} ns does not fit the 32-bit seconds of ROS 2")
+
     def _topic(self, name: str) -> str:
         return _topic(self._rig.pair, name)
 
-    def _cdr(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
-        self._file.message(topic, _ros_schema(type_name), "cdr", stamp_ns, self.pairs, data)
+    def _cdr(self, topic: str, type_name: str, stamp_ns: int, data: bytes, index: int | None = None) -> None:
+        """A message of the pair of this index, or of the one that is being added."""
+        sequence = self.pairs if index is None else index
+        self._file.message(topic, _ros_schema(type_name), "cdr", stamp_ns, sequence, data)
 
 
 def write_result(path: Path, result: CalibrationResult) -> RecordedWindow:
     """Writes the window again with its result (an earlier one is replaced): as `/diagnostics`, JSON message and
-    attachment. The file is replaced at once; a reader sees the one or the other.
+    attachment. The file is replaced at once; a reader sees the one or the other. The pairs between those of the window
+    stay where the result says that the camera moved, as it took its time from them.
 
     Raises:
         WindowError: the window is damaged.
@@ -314,7 +344,9 @@ def write_result(path: Path, result: CalibrationResult) -> RecordedWindow:
     """
     file = _WindowFile(_beside(path, REWRITE_SUFFIX), path)
     try:
-        window_id, pairs = _copy(path, file, without=(DIAGNOSTICS, _topic(result.pair, RESULT_TOPIC)))
+        earlier = (DIAGNOSTICS, _topic(result.pair, RESULT_TOPIC))
+        moved = result.moved is not None
+        window_id, pairs = _copy(path, file, lambda topic: topic in earlier or (_is_between(topic) and not moved))
         stamp_ns, document = result.data_stamp_ns, to_json(result)
         file.message(DIAGNOSTICS, _ros_schema(messages.DIAGNOSTICS), "cdr", stamp_ns, 0, _diagnostics(result))
         file.message(_topic(result.pair, RESULT_TOPIC), None, "json", stamp_ns, 0, document)
@@ -360,12 +392,15 @@ def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
     for record in _records(path, max_unpacked_bytes=size * MAX_UNPACKED + CHUNK_BYTES):
         content.take(record)
     rig, T_camera_lidar_start, window_id = content.head(path)
-    written = [content.pair(path, index) for index in sorted(content.parts)]
-    pairs = tuple(sorted(written, key=lambda pair: pair.stamp_ns))
+    places = sorted(content.parts)
+    pairs, between = (
+        tuple(sorted((content.pair(path, of) for of in places if of.between == asked), key=lambda pair: pair.stamp_ns))
+        for asked in (False, True)
+    )
     if not pairs:
         raise WindowError(f"{path} holds no camera-LiDAR pair")
     # The service began it at the extrinsic in use.
-    window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD)
+    window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD, between)
     return window, content.parsed_configuration(path)
 
 
@@ -377,11 +412,11 @@ def pairs_since(path: Path, since_ns: int) -> Iterator[FramePair]:
     """
     content = _Content()
     for record in _records(path, max_unpacked_bytes=_size(path) * MAX_UNPACKED + CHUNK_BYTES):
-        index = content.take(record)
-        if index is None:
+        place = content.take(record)
+        if place is None:
             continue
-        pair = content.pair(path, index)
-        if pair.stamp_ns >= since_ns:
+        pair = content.pair(path, place)
+        if pair.stamp_ns >= since_ns and not place.between:
             yield pair
 
 
@@ -429,6 +464,13 @@ def is_window(path: Path) -> bool:
         raise SourceError(error.of(path)) from error
 
 
+class _Place(NamedTuple):
+    """Of a pair in the order in which we write: among those of the window, or among those between."""
+
+    between: bool
+    order: int
+
+
 @dataclass(slots=True)
 class _Parts:
     """What has been seen of one pair."""
@@ -448,10 +490,10 @@ class _Content:
     kept: dict[str, str] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    parts: dict[int, _Parts] = field(default_factory=dict)
+    parts: dict[_Place, _Parts] = field(default_factory=dict)
 
-    def take(self, record: Record) -> int | None:
-        """Adds a record. Returns the index of the pair that it completes, in the order in which we write, else None."""
+    def take(self, record: Record) -> _Place | None:
+        """Adds a record. Returns the place of the pair that it completes, else None."""
         match record:
             case Schema():
                 self.schemas[record.schema_id] = record
@@ -489,17 +531,18 @@ class _Content:
         except ValidationError as error:
             raise WindowError(f"{path}: {CONFIGURATION}: {describe(error)}") from error
 
-    def pair(self, path: Path, index: int) -> FramePair:
-        """Takes out the pair of this index."""
-        parts = self.parts.pop(index)
+    def pair(self, path: Path, place: _Place) -> FramePair:
+        """Takes out the pair of this place."""
+        parts = self.parts.pop(place)
         if parts.camera is None or parts.lidar is None:
-            raise WindowError(f"{path}: pair {index} lacks its {'sweep' if parts.lidar is None else 'image'}")
+            named = f"{'thinned ' if place.between else ''}pair {place.order}"
+            raise WindowError(f"{path}: {named} lacks its {'sweep' if parts.lidar is None else 'image'}")
         camera = parts.camera
         if parts.depth is not None:
             camera = CameraFrame(camera.stamp_ns, camera.frame_id, camera.image, depth=parts.depth.image)
         return FramePair(camera, parts.lidar, parts.motion)
 
-    def _take_message(self, message: Message) -> int | None:
+    def _take_message(self, message: Message) -> _Place | None:
         channel = self.channels.get(message.channel_id)
         schema = None if channel is None else self.schemas.get(channel.schema_id)
         if channel is None or schema is None or schema.name not in _FRAME_TYPES:
@@ -508,7 +551,8 @@ class _Content:
             frame = incoming.decode(schema.name, message.data, _LIMITS, point_time=WRITTEN_TIME)
         except DecodeError as error:
             raise WindowError(f"a message on {channel.topic} cannot be decoded: {error}") from error
-        parts = self.parts.setdefault(message.sequence, _Parts())
+        place = _Place(_is_between(channel.topic), message.sequence)
+        parts = self.parts.setdefault(place, _Parts())
         match frame:
             case LidarFrame():
                 parts.lidar = frame
@@ -518,7 +562,7 @@ class _Content:
                 parts.depth = frame
             case CameraFrame():
                 parts.camera = frame
-                return message.sequence
+                return place
         return None
 
 
@@ -529,12 +573,16 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> Rec
         # The error that ends the file also ends the loop; whatever came before it was sound.
         with suppress(WindowError):
             for record in _records(part_path):
-                index = content.take(record)
-                if index is None:
+                place = content.take(record)
+                if place is None:
                     continue
                 if writer is None:
                     writer = _writer_like(content, part_path, final)
-                writer.add(content.pair(part_path, index))
+                pair = content.pair(part_path, place)
+                if place.between:
+                    writer.add_between(pair)
+                else:
+                    writer.add(pair)
                 progress()
     except BaseException:
         if writer is not None:
@@ -559,7 +607,7 @@ def _writer_like(content: _Content, part_path: Path, final: Path) -> WindowWrite
     )
 
 
-def _copy(path: Path, file: _WindowFile, without: tuple[str, ...]) -> tuple[str, int]:
+def _copy(path: Path, file: _WindowFile, leave_out: Callable[[str], bool]) -> tuple[str, int]:
     """Copies a window record by record, without some topics and the result; returns its id and number of pairs."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -579,7 +627,7 @@ def _copy(path: Path, file: _WindowFile, without: tuple[str, ...]) -> tuple[str,
                 channel = channels.get(record.channel_id)
                 if channel is None:
                     raise WindowError(f"{path}: a message belongs to no channel")
-                if channel.topic in without:
+                if leave_out(channel.topic):
                     continue
                 file.message(
                     channel.topic,
@@ -633,6 +681,11 @@ _FRAME_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD,
 
 def _topic(pair: str, name: str) -> str:
     return f"/coec/{pair}/{name}"
+
+
+def _is_between(topic: str) -> bool:
+    """A pair may have any name."""
+    return topic.split("/")[3:4] == [BETWEEN.rstrip("/")]
 
 
 @lru_cache(maxsize=16)

@@ -120,7 +120,7 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     blur_rad = edges.band_blur_rad[0]
     near = sample_reach(pose, SearchBox(NEAR_BLURS * blur_rad, 0.0), NEAR_POSES)
     poses = np.concatenate([pose[None], near, *_put_forward(chart, pose, len(band.first_point) - 1)])
-    early = np.cumsum([_scores(band, at) for at in poses], axis=1).T  # (F, K)
+    early = np.cumsum([scores(band, at) for at in poses], axis=1).T  # (F, K)
     total = early[-1]
     late = total - early
     gains = early[:-1].max(axis=1) + late[:-1].max(axis=1) - total.max()
@@ -140,14 +140,14 @@ def _settled(sharp: EdgeFrames, first_late: int, begun: Sequence[Matrix4], blur_
         T_after, after = _climbed(_part(sharp, first_late, frames), T_after, blur_rad)
         if before + after > most:
             best, most = (first_late, T_before, T_after), before + after
-        split = 1 + int(np.argmax(np.cumsum(_scores(sharp, T_before) - _scores(sharp, T_after))[:-1]))
+        split = 1 + int(np.argmax(np.cumsum(scores(sharp, T_before) - scores(sharp, T_after))[:-1]))
         if split == first_late:
             break
         first_late = split
     first_late, T_before, T_after = best
     # One pose for all of them is no worse than that of either side.
     together = max(_climbed(sharp, T, blur_rad)[1] for T in (T_whole, T_before, T_after))
-    at_before, at_after = _scores(sharp, T_before), _scores(sharp, T_after)
+    at_before, at_after = scores(sharp, T_before), scores(sharp, T_after)
     before, after = float(at_before[:first_late].sum()), float(at_after[first_late:].sum())
     losses = _loss(before, float(at_after[:first_late].sum())), _loss(after, float(at_before[first_late:].sum()))
     return ChangePoint(
@@ -182,14 +182,14 @@ def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[
     return [cover[chosen], *about] if chosen else []
 
 
-def _scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
-    """(F,) z of each frame by itself."""
+def scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
+    """(F,) z of each frame by itself at a pose (4, 4)."""
     at = frame_alignment(band, pose)
     return np.asarray(at.strength / np.sqrt(np.maximum(at.square, LEAST_SQUARE)))
 
 
 def _score(band: EdgeFrames, pose: Matrix4) -> float:
-    return float(_scores(band, pose).sum())
+    return float(scores(band, pose).sum())
 
 
 def _loss(own: float, other: float) -> float:
