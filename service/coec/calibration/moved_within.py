@@ -19,9 +19,9 @@ def moved_within(change: ChangePoint, edges: EdgeWitness, sight: Sight) -> Moved
     """The change that the edges of a window tell, dated by the pairs between those of the window, too."""
     window = sight.window
     stamps_ns = tuple(pair.stamp_ns for pair in window.pairs)
-    told = step_time(change, DatedEdges(stamps_ns, edges.sharp), window.between, lambda pairs: _edges_of(pairs, sight))
+    told = step_time(change, DatedEdges(stamps_ns, edges), window.between, lambda pairs: _edges_of(pairs, sight))
     pairs_after = sum(stamp_ns >= told.first_after_ns for stamp_ns in stamps_ns)
-    return MovedWithin(told.last_before_ns, told.first_after_ns, pairs_after, change.T_before, change.T_after)
+    return MovedWithin(told.last_before_ns, told.first_after_ns, pairs_after, told.T_before, told.T_after)
 
 
 def in_words(moved: MovedWithin, window: Window) -> str:
@@ -47,4 +47,4 @@ def _edges_of(pairs: Sequence[FramePair], sight: Sight) -> DatedEdges | None:
         witness = build_edges(usable, of.points, (grey for _, grey in seen), sight.window.rig)
     except CalibrationError:
         return None
-    return DatedEdges(tuple(pair.stamp_ns for pair in usable), witness.sharp)
+    return DatedEdges(tuple(pair.stamp_ns for pair in usable), witness)

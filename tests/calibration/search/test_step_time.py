@@ -1,115 +1,109 @@
-"""When a camera moved, asked of frames between those of a window: to a frame, and no closer than they can tell."""
+"""When a camera moved, asked of pairs between those of a window: to a pair, and no closer than they can tell."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from calibration.search.test_change_point import turned
 from calibration.search.test_global_search import away_from
-from coec.calibration.objective.edges import EdgeWitness
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.objective.edges import build_edges
 from coec.calibration.search import step_time as searched
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.search.step_time import DatedEdges, step_time
-from coec.calibration.types import FramePair, Window
-from coec.geometry.edges.alignment import EdgeFrames
+from coec.calibration.search.step_time import DatedEdges, StepTime, step_time
+from coec.calibration.types import FramePair, Matrix4, Window
+from coec.config import LimitsConfig
+from coec.geometry import se3
 
 WINDOW = (0, 3, 6, 9)
-"""Frames of the street that are the window's; the others lie between."""
+"""Pairs of the street that are the window's; the others lie between."""
 
 
-class Between:
-    """Frames of a witness, which are looked at when they are asked for."""
+def moved(pair: FramePair, T_before: Matrix4, T_after: Matrix4, window: Window) -> FramePair:
+    """The pair, motion-compensated, as if the mount had moved before it: to move the sweep by S⁻¹ is to move the mount
+    by S."""
+    back = se3.inverse(T_after) @ T_before
+    xyz_m = compensate(pair, window.rig, enabled=True) @ back[:3, :3].T + back[:3, 3]
+    return replace(pair, lidar=replace(pair.lidar, xyz_m=xyz_m.astype(np.float32)))
 
-    def __init__(self, edges: EdgeFrames, unreadable: Sequence[int] = ()) -> None:
-        self._edges = edges
-        self._unreadable = unreadable
+
+class Knocked:
+    """A street within which the mount moves before a pair: edges of those pairs that are asked for."""
+
+    def __init__(self, street: Window, first_late: int, size_deg: float) -> None:
+        self.T_before = street.T_camera_lidar_start
+        self.T_after = away_from(self.T_before, size_deg, seed=first_late)
+        ends = [self.T_before if i < first_late else self.T_after for i in range(len(street.pairs))]
+        self.pairs = [moved(pair, self.T_before, T, street) for pair, T in zip(street.pairs, ends, strict=True)]
         self.asked: list[int] = []
+        self._rig = street.rig
+        split = sum(frame < first_late for frame in WINDOW)
+        self.change = ChangePoint(split, self.T_before, self.T_after, gain=10.0, support=10.0, likeness=1.0)
 
-    def dated(self, frames: Sequence[int]) -> DatedEdges:
-        first = self._edges.first_point
-        points = np.concatenate([np.arange(first[frame], first[frame + 1]) for frame in frames])
-        ends = np.cumsum([0, *(first[frame + 1] - first[frame] for frame in frames)])
-        part = replace(
-            self._edges,
-            xyz_m=np.ascontiguousarray(self._edges.xyz_m[:, points]),
-            weight=self._edges.weight[points],
-            first_point=ends.astype(np.int64),
-            maps=self._edges.maps[list(frames)],
-        )
-        return DatedEdges(tuple(frames), part)
+    def edges(self, pairs: Sequence[FramePair]) -> DatedEdges:
+        images = GreyImages(LimitsConfig())
+        greys = (images.grey(pair.camera) for pair in pairs)
+        found = build_edges(pairs, lambda i, chosen: pairs[i].lidar.xyz_m[chosen], greys, self._rig)
+        return DatedEdges(tuple(pair.stamp_ns for pair in pairs), found)
 
-    def __call__(self, pairs: Sequence[FramePair]) -> DatedEdges | None:
+    def look(self, pairs: Sequence[FramePair]) -> DatedEdges:
         self.asked += [pair.stamp_ns for pair in pairs]
-        usable = [pair.stamp_ns for pair in pairs if pair.stamp_ns not in self._unreadable]
-        return self.dated(usable) if usable else None
+        return self.edges(pairs)
+
+    def told(
+        self,
+        change: ChangePoint | None = None,
+        look: Callable[[Sequence[FramePair]], DatedEdges | None] | None = None,
+        between: Sequence[int] = (1, 2, 4, 5, 7, 8),
+    ) -> StepTime:
+        own = self.edges([self.pairs[frame] for frame in WINDOW])
+        return step_time(change or self.change, own, [self.pairs[frame] for frame in between], look or self.look)
+
+    def frames(self, told: StepTime) -> tuple[int, int]:
+        stamps_ns = [pair.stamp_ns for pair in self.pairs]
+        return stamps_ns.index(told.last_before_ns), stamps_ns.index(told.first_after_ns)
 
 
-def at(*frames: int) -> list[Any]:
-    """Pairs of which only the stamp matters."""
-    return [SimpleNamespace(stamp_ns=frame) for frame in frames]
+@pytest.mark.parametrize("first_late", [2, 3, 5, 8])
+def test_the_change_lies_between_two_pairs_of_all(sharp_street: Window, first_late: int) -> None:
+    street = Knocked(sharp_street, first_late, 3.0)
+    assert street.frames(street.told()) == (first_late - 1, first_late)
 
 
-def change(edges: EdgeWitness, street: Window, first_late: int, size_deg: float) -> tuple[EdgeFrames, ChangePoint]:
-    T_before = street.T_camera_lidar_start
-    T_after = away_from(T_before, size_deg, seed=first_late)
-    moved = turned(edges, first_late, 10, T_before, T_after).sharp
-    of_window = sum(frame < first_late for frame in WINDOW)
-    return moved, ChangePoint(of_window, T_before, T_after, gain=10.0, support=10.0, likeness=1.0)
-
-
-@pytest.mark.parametrize("first_late", [2, 3, 4, 6, 8])
-def test_the_change_lies_between_two_frames_of_all(
-    sharp_street: Window, sharp_edges: EdgeWitness, first_late: int
-) -> None:
-    edges, found = change(sharp_edges, sharp_street, first_late, 2.0)
-    between = Between(edges)
-    told = step_time(found, between.dated(WINDOW), at(1, 2, 4, 5, 7, 8), between)
-    assert (told.last_before_ns, told.first_after_ns) == (first_late - 1, first_late)
-
-
-def test_a_split_that_is_one_frame_of_the_window_off_is_put_right(
-    sharp_street: Window, sharp_edges: EdgeWitness
-) -> None:
-    edges, found = change(sharp_edges, sharp_street, 5, 2.0)
-    between = Between(edges)
+def test_a_split_that_is_one_pair_of_the_window_off_is_put_right(sharp_street: Window) -> None:
+    street = Knocked(sharp_street, 5, 3.0)
     for off in (-1, 1):
-        wrong = replace(found, first_late=found.first_late + off)
-        told = step_time(wrong, between.dated(WINDOW), at(1, 2, 4, 5, 7, 8), between)
-        assert (told.last_before_ns, told.first_after_ns) == (4, 5)
+        wrong = replace(street.change, first_late=street.change.first_late + off)
+        assert street.frames(street.told(wrong)) == (4, 5)
 
 
-def test_without_frames_between_the_window_tells_as_closely_as_it_can(
-    sharp_street: Window, sharp_edges: EdgeWitness
-) -> None:
-    edges, found = change(sharp_edges, sharp_street, 5, 2.0)
-    between = Between(edges, unreadable=range(10))
-    for pairs in ([], at(1, 2, 4, 5, 7, 8)):
-        told = step_time(found, between.dated(WINDOW), pairs, between)
-        assert (told.last_before_ns, told.first_after_ns) == (3, 6)
+def test_a_pose_that_the_window_tells_badly_is_found_among_the_pairs_between(sharp_street: Window) -> None:
+    """As of a single pair before the change, which fits another pose as well."""
+    street = Knocked(sharp_street, 3, 3.0)
+    astray = replace(street.change, T_before=away_from(street.T_before, 2.0, seed=77))
+    told = street.told(astray)
+    assert street.frames(told)[1] == 3
+    assert np.degrees(se3.rotation_angle_rad(told.T_before @ se3.inverse(street.T_before))) < 0.6
 
 
-def test_frames_that_hardly_tell_the_poses_apart_leave_the_time_open(
-    sharp_street: Window, sharp_edges: EdgeWitness
-) -> None:
-    edges, found = change(sharp_edges, sharp_street, 5, 0.05)
-    between = Between(edges)
-    told = step_time(found, between.dated(WINDOW), at(1, 2, 4, 5, 7, 8), between)
-    assert told.last_before_ns < 4 <= 5 < told.first_after_ns
+def test_without_pairs_between_the_window_tells_as_closely_as_it_can(sharp_street: Window) -> None:
+    street = Knocked(sharp_street, 5, 3.0)
+    assert street.frames(street.told(between=())) == (3, 6)
+    assert street.frames(street.told(look=lambda _: None)) == (3, 6)
 
 
-def test_so_many_at_a_time_are_looked_at_and_none_twice(
-    sharp_street: Window, sharp_edges: EdgeWitness, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    edges, found = change(sharp_edges, sharp_street, 5, 0.05)
-    whole = Between(edges)
-    expected = step_time(found, whole.dated(WINDOW), at(1, 2, 4, 5, 7, 8), whole)
-    monkeypatch.setattr(searched, "AT_ONCE", 1)
-    between = Between(edges)
-    assert step_time(found, between.dated(WINDOW), at(1, 2, 4, 5, 7, 8), between) == expected
-    assert len(between.asked) == len(set(between.asked))
+def test_pairs_that_hardly_tell_the_poses_apart_leave_the_time_open(sharp_street: Window) -> None:
+    street = Knocked(sharp_street, 5, 0.05)
+    last_before, first_after = street.frames(street.told())
+    assert first_after - last_before > 3
+
+
+def test_so_many_at_a_time_are_looked_at_and_none_twice(sharp_street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    street = Knocked(sharp_street, 5, 3.0)
+    monkeypatch.setattr(searched, "AT_ONCE", 2)
+    assert street.frames(street.told()) == (4, 5)
+    assert len(street.asked) == len(set(street.asked)) > 2
