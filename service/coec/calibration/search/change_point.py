@@ -63,6 +63,10 @@ within a percent of its maximum."""
 TURNS = 4
 """Of splitting and climbing on the sharpest edges, at most: two changed nothing any more in nine of ten windows."""
 
+FEW = 3
+"""One or two frames fit some pose of hundreds well by chance, better than many fit the right one on the blurred band:
+the best split with at least so many on either side is settled, too."""
+
 MAX_SWEEPS = 8
 """Of a climb over the axes: it begins within two steps of its end."""
 
@@ -127,11 +131,21 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     total = early[-1]
     late = total - early
     gains = early[:-1].max(axis=1) + late[:-1].max(axis=1) - total.max()
-    last_early = int(np.argmax(gains))
-    ends = [poses[int(np.argmax(scores))] for scores in (early[last_early], late[last_early], total)]
-    parts = (_part(band, 0, last_early + 1), _part(band, last_early + 1, len(early)), band)
-    begun = tuple(_climbed(part, end, blur_rad)[0] for part, end in zip(parts, ends, strict=True))
-    return _settled(sharp, last_early + 1, begun, edges.blur_rad)
+    T_whole, _ = _climbed(band, poses[int(np.argmax(total))], blur_rad)
+    settled = []
+    for last_early in _promising(gains):
+        ends = (poses[int(np.argmax(of_side))] for of_side in (early[last_early], late[last_early]))
+        sides = (_part(band, 0, last_early + 1), _part(band, last_early + 1, len(early)))
+        begun = [_climbed(side, end, blur_rad)[0] for side, end in zip(sides, ends, strict=True)]
+        settled.append(_settled(sharp, last_early + 1, (*begun, T_whole), edges.blur_rad))
+    return max(settled, key=lambda change: (change.of_camera, change.gain))
+
+
+def _promising(gains: NDArray[np.float64]) -> list[int]:
+    """Splits (the last early frame of each) to settle, of gains (F - 1,): the best, and the best that leaves some
+    frames on either side."""
+    best, inner = int(np.argmax(gains)), gains[FEW - 1 : len(gains) - FEW + 1]
+    return [best] if len(inner) == 0 else list(dict.fromkeys((best, FEW - 1 + int(np.argmax(inner)))))
 
 
 def _settled(sharp: EdgeFrames, first_late: int, begun: Sequence[Matrix4], blur_rad: float) -> ChangePoint:
