@@ -425,9 +425,9 @@ class MovedWithin:
     """The camera moved while a window was taken: two poses, one after the other, explain it, and one does not.
 
     Attributes:
-        last_before_ns, first_after_ns: stamps of the pairs between which it moved: of the pairs of the window, or of
-            those recorded between them.
-        pairs_after: how many pairs there are after it.
+        last_before_ns, first_after_ns: stamps of the pairs between which it moved: of the window, or of those recorded
+            between its own.
+        pairs_after: how many pairs of the window there are after it.
         T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after; turned about the camera's centre.
     """
 

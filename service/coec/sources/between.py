@@ -27,7 +27,9 @@ def with_between(window: Window, recording: Recording, config: WindowConfig) -> 
     rig = window.rig
     lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
     picked = BetweenPairs(Compressed(LimitsConfig()), half_field_of_view_rad(rig.camera, lit))
-    picked.begin(config.model_copy(update={"pairs": len(stamps_ns)}), stamps_ns[0], stamps_ns[-1] - stamps_ns[0])
+    # From the first of n to the last there are n - 1 times the distance of two, in a slice n times.
+    of_window = config.model_copy(update={"pairs": max(1, len(stamps_ns) - 1)})
+    picked.begin(of_window, stamps_ns[0], stamps_ns[-1] - stamps_ns[0])
     own, between = set(stamps_ns), []
     for pair in _pairs(recording, window, config):
         if pair.stamp_ns in own:
