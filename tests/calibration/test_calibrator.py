@@ -231,10 +231,8 @@ def test_pairs_between_those_of_the_window_tell_when_the_knock_was(
     assert moved is not None
     assert (moved.last_before_ns, moved.first_after_ns) == (stamps_ns[4], stamps_ns[5])
     assert moved.pairs_after == 2, "pairs between are not kept for the next window"
-    record_property("figure", "7 s instead of 14 s")
-    without = solve(replace(window, between=()), stereo, CalibrationConfig()).moved
-    assert without is not None
-    assert (without.last_before_ns, without.first_after_ns) == (stamps_ns[4], stamps_ns[6])
+    told_s, apart_s = (moved.first_after_ns - moved.last_before_ns) / 1e9, (stamps_ns[6] - stamps_ns[4]) / 1e9
+    record_property("figure", f"{told_s:.0f} s of {apart_s:.0f} s")
 
 
 @pytest.mark.fault("a picture between those of a window that cannot be decoded", "it is passed over")
