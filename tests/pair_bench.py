@@ -223,6 +223,7 @@ class InstantRecorder:
         self.loses = False
         self.sees_knocks = False
         self.stamps: dict[str, list[int]] = {}
+        self.between: dict[str, list[int]] = {}
         self.latest: Path | None = None
         self._folder = folder
         self._on_recorded = on_recorded
@@ -238,6 +239,9 @@ class InstantRecorder:
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
         del window_id, T_camera_lidar
         self._stamps.append(pair.stamp_ns)
+
+    def add_between(self, window_id: str, pair: FramePair) -> None:
+        self.between.setdefault(window_id, []).append(pair.stamp_ns)
 
     def end(self, ended: SliceEnded) -> None:
         stamps, self._stamps = self._stamps, []

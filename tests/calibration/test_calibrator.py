@@ -1,5 +1,6 @@
 """The solver on a street with a known truth, and what must follow when its input is changed in a known way."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -211,6 +212,41 @@ def knocked(window: Window, first_late: int, turn_deg: float) -> Window:
         for pair in window.pairs[first_late:]
     )
     return replace(window, pairs=(*window.pairs[:first_late], *late))
+
+
+def sparse(window: Window, knock: int) -> Window:
+    """The window of every other pair, those it leaves out lying between, as if the mount had turned before the pair
+    `knock`."""
+    pairs = knocked(window, knock, 2.0).pairs
+    return replace(window, pairs=pairs[::2], between=pairs[1::2])
+
+
+@pytest.mark.fault("a knock between two pairs of a window that lie far apart", "pairs between them tell when it was")
+def test_pairs_between_those_of_the_window_tell_when_the_knock_was(
+    sharp_street: Window, stereo: DepthModel, record_property: Callable[[str, object], None]
+) -> None:
+    stamps_ns = [pair.stamp_ns for pair in sharp_street.pairs]
+    window = sparse(sharp_street, 5)
+    moved = solve(window, stereo, CalibrationConfig()).moved
+    assert moved is not None
+    assert (moved.last_before_ns, moved.first_after_ns) == (stamps_ns[4], stamps_ns[5])
+    assert moved.pairs_after == 2, "pairs between are not kept for the next window"
+    told_s, apart_s = (moved.first_after_ns - moved.last_before_ns) / 1e9, (stamps_ns[6] - stamps_ns[4]) / 1e9
+    record_property("figure", f"{told_s:.0f} s of {apart_s:.0f} s")
+
+
+@pytest.mark.fault("a picture between those of a window that cannot be decoded", "it is passed over")
+def test_a_pair_between_that_cannot_be_decoded_is_passed_over(
+    sharp_street: Window, stereo: DepthModel, record_property: Callable[[str, object], None]
+) -> None:
+    window = sparse(sharp_street, 6)
+    broken = replace(window.between[2].camera, image=replace(window.between[2].camera.image, data=b"no image"))
+    between = (*window.between[:2], replace(window.between[2], camera=broken), *window.between[3:])
+    moved = solve(replace(window, between=between), stereo, CalibrationConfig()).moved
+    assert moved is not None
+    stamps_ns = [pair.stamp_ns for pair in sharp_street.pairs]
+    assert (moved.last_before_ns, moved.first_after_ns) == (stamps_ns[4], stamps_ns[6])
+    record_property("figure", "the interval of the two pairs beside it")
 
 
 @pytest.mark.fault("a knock in the middle of a window", "the window is refused, and says when it was")

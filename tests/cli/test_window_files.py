@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,18 @@ from coec.adapters.images.codec import GreyImages
 from coec.adapters.mcap.windows import WindowWriter, read_result, read_window, write_result
 from coec.calibration.calibrator import calibrate
 from coec.calibration.ports import Silence
-from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig
+from coec.calibration.types import FramePair
+from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveConfig, WindowConfig
 from coec.errors import SourceError
 from coec.geometry import se3
 from coec.sources import windows
+from coec.sources.between import with_between
+from drives import drawn_source
 
 LIMITS = LimitsConfig()
+SHARP_STREET = "sim:seed=1&seconds=70&camera_hz=0.142857&lidar_hz=0.142857&camera=fisheye700&lidar=32&depth=yes"
+"""Ten pairs, seven seconds apart."""
+
 CONFIGURATION = CalibrationConfig(
     depth=DepthConfig(model="stereo"), objective=ObjectiveConfig(kind="mi", depth_bins=24, range_bins=20)
 )
@@ -72,6 +79,40 @@ def test_replay_is_identical(coec: Coec, recorded: Path) -> None:
     assert outcome.status == 0
     assert outcome.document["identical"] is True
     assert outcome.document["differences"] == []
+
+
+def test_replay_of_a_window_that_holds_a_knock_dates_it_by_the_same_pairs(coec: Coec, tmp_path: Path) -> None:
+    recording = drawn_source(SHARP_STREET)
+    loaded = windows.chosen_from(recording, 5, lambda *_: None).window
+    window = with_between(loaded, recording, WindowConfig(between_s=5.0))
+    knock_ns = window.between[2].stamp_ns
+    back = se3.exp(np.array([0.0, -np.radians(2.0), 0.0, 0.0, 0.0, 0.0])).astype(np.float32)
+    T = window.T_camera_lidar_start.astype(np.float32)
+
+    def knocked(pair: FramePair) -> FramePair:
+        """After the knock the sweep lies as if the camera had been turned by two degrees."""
+        if pair.stamp_ns < knock_ns:
+            return pair
+        seen = (pair.lidar.xyz_m @ T[:3, :3].T + T[:3, 3]) @ back[:3, :3].T
+        return replace(pair, lidar=replace(pair.lidar, xyz_m=((seen - T[:3, 3]) @ T[:3, :3]).astype(np.float32)))
+
+    path = tmp_path / f"{window.window_id}.mcap"
+    start = window.T_camera_lidar_start
+    configuration = CalibrationConfig(depth=DepthConfig(model="stereo"))
+    writer = WindowWriter(path, window.rig, start, window.window_id, configuration, {})
+    for pair in sorted((*window.pairs, *window.between), key=lambda pair: pair.stamp_ns):
+        add = writer.add_between if pair in window.between else writer.add
+        add(knocked(pair))
+    writer.finish()
+    read, _ = read_window(path)
+    depth = open_depth(configuration.depth, LIMITS)
+    estimate = calibrate(read, depth, GreyImages(LIMITS), configuration, Silence())
+    assert estimate.moved is not None
+    assert (estimate.moved.last_before_ns, estimate.moved.first_after_ns) == (window.pairs[2].stamp_ns, knock_ns)
+    write_result(path, result_of(estimate, read.rig, "v7"))
+    outcome = coec("replay", path, "--json")
+    assert outcome.status == 0
+    assert outcome.document["identical"] is True
 
 
 def test_replay_names_the_fields_that_differ(coec: Coec, recorded: Path, tmp_path: Path) -> None:

@@ -133,16 +133,15 @@ def test_the_time_of_a_step_is_known_where_its_place_is(street: Window, monkeypa
 
 def test_the_table_has_a_row_for_each_knock_in_their_order() -> None:
     def one(name: str, **told: Any) -> TriedKnock:
-        return TriedKnock(
-            name, **{"accepted": False, "wrong": False, "moved": False, "off_s": None, "late": 0.5, **told}
-        )
+        plain = {"accepted": False, "wrong": False, "moved": False, "off_s": None, "told_s": None, "holds": None}
+        return TriedKnock(name, **{**plain, "late": 0.5, **told})
 
-    told = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0), one("1 deg", accepted=True, wrong=True)]
-    told += [one("1 deg, slowly", moved=True)]
+    told = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0, told_s=2.5, holds=True)]
+    told += [one("1 deg", accepted=True, wrong=True), one("1 deg, slowly", moved=True)]
     assert steps.table(told) == (
-        KnockRow("none", 1, 1.0, 0.0, 0.0, None),
-        KnockRow("1 deg", 2, 0.5, 0.5, 0.5, 0.5),
-        KnockRow("1 deg, slowly", 1, 0.0, 0.0, 1.0, None),
+        KnockRow("none", 1, 1.0, 0.0, 0.0, None, None, None, None),
+        KnockRow("1 deg", 2, 0.5, 0.5, 0.5, 0.5, 1.0, 2.5, 1.0),
+        KnockRow("1 deg, slowly", 1, 0.0, 0.0, 1.0, None, None, None, None),
     )
 
 

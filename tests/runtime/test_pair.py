@@ -73,6 +73,17 @@ def test_the_same_drive_gives_the_same_decisions(bench: Bench, tmp_path: Path) -
     assert timeless[0] == timeless[1]
 
 
+def test_pairs_are_recorded_between_those_of_a_window_a_second_apart(bench: Bench) -> None:
+    bench.drive(BEGIN_S, STEP_S)
+    for window_id, stamps_ns in list(bench.recorder.stamps.items())[:2]:
+        between_ns = bench.recorder.between[window_id]
+        assert stamps_ns[0] < between_ns[0]
+        assert between_ns[-1] < stamps_ns[0] + 40 * S
+        apart_s = np.diff(sorted([*stamps_ns, *between_ns])) / S
+        assert apart_s.max() <= 1.5, "so far apart are two pairs, chosen or not"
+        assert len(between_ns) > 2 * len(stamps_ns)
+
+
 @pytest.mark.fault("a worker that is slow", "it changes no decision")
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_worker_that_takes_its_time_changes_no_decision(bench: Bench, tmp_path: Path, seed: int) -> None:

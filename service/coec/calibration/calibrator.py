@@ -15,9 +15,10 @@ from coec.calibration.confidence.told import LENS
 from coec.calibration.confidence.uncertainty import measure_uncertainty
 from coec.calibration.estimators import ESTIMATORS, Found, sight_of
 from coec.calibration.frames.motion_compensation import compensation
+from coec.calibration.moved_within import in_words, moved_within
 from coec.calibration.objective.curvature import measure_curvature
 from coec.calibration.ports import DepthModel, ImageReader, Progress
-from coec.calibration.search.change_point import ChangePoint, change_point
+from coec.calibration.search.change_point import change_point
 from coec.calibration.search.observability import TRANSLATIONS, unobservable, without
 from coec.calibration.types import (
     INTRINSICS_OFF,
@@ -25,7 +26,6 @@ from coec.calibration.types import (
     Compensation,
     Estimate,
     Matrix4,
-    MovedWithin,
     Optimum,
     Window,
 )
@@ -76,17 +76,20 @@ def calibrate(
     at_optimum = objective.evaluate(pose)
     change = None if found.edges is None else change_point(found.edges, pose)
     looks, pairs = uncertainty.looks, len(window.pairs)
+    changed = change_metric(change, config.verdict)
     metrics = (
         *counted_once(found.metrics, looks, pairs),
         *shape_metrics(at_optimum, curvature, uncertainty.sigma, config.verdict),
         *intrinsics_metric(loosened, config.verdict),
-        *change_metric(change, config.verdict),
+        *changed,
     )
-    moved = None if change is None else _moved(change, window)
+    moved = None
+    if found.edges is not None and change is not None and not all(metric.passed for metric in changed):
+        moved = moved_within(change, found.edges, sight)
     details = {
         "sigma_deg": _told_of_words(loosened),
         INTRINSICS_OFF: _told_of_lens(loosened, window),
-        MOVED: "" if moved is None else _told(moved, window),
+        MOVED: "" if moved is None else in_words(moved, window),
     }
     verdict = judge(metrics, search.stop_reason, looks, pairs, details)
     progress.step("diagnosis", 1, 1)
@@ -118,7 +121,7 @@ def calibrate(
         config_hash=config_hash(
             config.objective, config.search, config.verdict, str(config.motion_compensation), depth.identity
         ),
-        moved=moved if any(reason.code == MOVED for reason in verdict.reasons) else None,
+        moved=moved,
     )
 
 
@@ -158,16 +161,3 @@ def _told_of_lens(loosened: Sequence[Loosened], window: Window) -> str:
         f", a focal length {100.0 * longer:+.1f} % and a principal point {right * camera.fx:+.1f} px across and "
         f"{down * camera.fy:+.1f} px down from it"
     )
-
-
-def _moved(change: ChangePoint, window: Window) -> MovedWithin:
-    before, after = (window.pairs[index].stamp_ns for index in (change.first_late - 1, change.first_late))
-    return MovedWithin(before, after, len(window.pairs) - change.first_late, change.T_before, change.T_after)
-
-
-def _told(moved: MovedWithin, window: Window) -> str:
-    turn_deg = degrees(se3.rotation_angle_rad(moved.T_after @ se3.inverse(moved.T_before)))
-    before_s, after_s = (
-        (stamp_ns - window.pairs[0].stamp_ns) / 1e9 for stamp_ns in (moved.last_before_ns, moved.first_after_ns)
-    )
-    return f", by {turn_deg:.1f}° between {before_s:.1f} and {after_s:.1f} s after its first pair"

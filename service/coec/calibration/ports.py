@@ -51,6 +51,18 @@ class ImageInspector(Protocol):
         ...
 
 
+class ImageReducer(Protocol):
+    """Makes exposures small enough to be recorded by the hundred."""
+
+    def reduced(self, frame: CameraFrame) -> CameraFrame:
+        """The frame without its depth map, its image compressed if it was not.
+
+        Raises:
+            DecodeError: the image cannot be decoded within the limits.
+        """
+        ...
+
+
 class Progress(Protocol):
     """Hears how far a calibration has come; it has no say in the result."""
 

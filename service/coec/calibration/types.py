@@ -228,6 +228,9 @@ class Window:
     `T_camera_lidar_start` (4, 4) is where the search starts: it is part of the window, so that a replay starts there
     too. `start_known_to_rad` is how far it usually is from
     the truth: half a turn where it is a guess.
+
+    `between` are further pairs of the slice, thinned, in order of their stamps, too. They enter no estimate: where the
+    camera moved between two pairs of the window, they tell when.
     """
 
     window_id: str
@@ -235,6 +238,7 @@ class Window:
     T_camera_lidar_start: Matrix4
     pairs: tuple[FramePair, ...]
     start_known_to_rad: float = pi
+    between: tuple[FramePair, ...] = ()
 
     @property
     def stamp_ns(self) -> int:
@@ -421,8 +425,9 @@ class MovedWithin:
     """The camera moved while a window was taken: two poses, one after the other, explain it, and one does not.
 
     Attributes:
-        last_before_ns, first_after_ns: stamps of the pairs between which it moved.
-        pairs_after: how many pairs there are after it.
+        last_before_ns, first_after_ns: stamps of the pairs between which it moved: of the window, or of those recorded
+            between its own.
+        pairs_after: how many pairs of the window there are after it.
         T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after; turned about the camera's centre.
     """
 

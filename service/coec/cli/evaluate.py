@@ -43,6 +43,7 @@ from coec.schemas.base import to_json
 from coec.schemas.evaluation import ComparisonReport, DetectionReport, EvaluationReport, StepRow
 from coec.schemas.replies import Vector6
 from coec.sources import open_source, windows
+from coec.sources.between import with_between
 from coec.sources.recording import KnowsTruth
 
 MARGIN_DEG, MARGIN_M = 5.0, 0.2
@@ -156,6 +157,8 @@ def _subject(options: Options, stages: Stages) -> _Subject:
         require_enough(len(window.pairs))
     if options.camera_model is not None:
         window, _ = calibrate_command.refitted(window, options.camera_model)
+    if options.steps and loaded.configuration is None:  # a recorded window has what was recorded
+        window = with_between(window, open_source(options.source), WindowConfig())
     model = open_depth(configuration_of(_first_of(options), loaded.configuration).depth, LimitsConfig())
     depth = experiments.inferred(window, model, stages.begin("depth", len(window.pairs)))
     return _Subject(window, model, depth, loaded.configuration, loaded.vehicle)

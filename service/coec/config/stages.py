@@ -46,6 +46,15 @@ class WindowConfig(Stage):
         default=0.6, gt=0, le=1, description="share of black or white pixels; a covered or blinded lens"
     )
     min_points_in_view: int = Field(default=500, ge=1, description="LiDAR points in the image at the current extrinsic")
+    between_s: float = Field(
+        default=1.0,
+        ge=0.1,
+        le=MAX_SLICE_S,
+        description="pairs so far apart are recorded between the chosen ones, thinned: they tell when the camera moved",
+    )
+    between_mib: int = Field(
+        default=48, ge=0, le=1024, description="MiB of them in a window at most, evenly over its slice; 0 = none"
+    )
 
     @model_validator(mode="after")
     def _counts_agree(self) -> WindowConfig:

@@ -109,7 +109,7 @@ def inferred(window: Window, model: DepthModel, heard: Callable[[int, str], None
 
 def greys_of(window: Window) -> ImageReader:
     """The images of a window, decoded once for all solves."""
-    return CachedGreys(GreyImages(LimitsConfig()), len(window.pairs))
+    return CachedGreys(GreyImages(LimitsConfig()), len(window.pairs) + len(window.between))
 
 
 def from_reference(bench: Bench, stages: Stages) -> Outcome:

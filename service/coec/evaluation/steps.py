@@ -40,7 +40,7 @@ SEED = 20_230_617
 @dataclass(frozen=True, slots=True)
 class Knock:
     """A movement of the mount within a window: a turn about a drawn axis (rad) and a shift in a drawn direction (m),
-    at once between two pairs, or evenly from the first pair to the last."""
+    at once between two pairs, or evenly in time from the first pair to the last."""
 
     name: str
     turn_rad: float
@@ -76,7 +76,10 @@ class TriedKnock:
         accepted: whether the window was.
         wrong: whether it was accepted elsewhere than where the mount is at its end.
         moved: whether it was refused because the camera moved within it.
-        off_s: how far the told time is from that of the knock, s; None where no time was told, or there was no step.
+        off_s: how far the middle of the told interval is from the time of the knock, s; None where no time was told,
+            or there was no step.
+        told_s: length of that interval, s, and
+        holds: whether the knock lies in it; None likewise.
         late: share of the pairs after the knock.
     """
 
@@ -85,12 +88,16 @@ class TriedKnock:
     wrong: bool
     moved: bool
     off_s: float | None
+    told_s: float | None
+    holds: bool | None
     late: float
 
 
 @dataclass(frozen=True, slots=True)
 class KnockRow:
-    """The windows with one knock: shares of them, and of those with a step the share whose time is known."""
+    """The windows with one knock: shares of them, and of those with a step the share whose time is known. Of those
+    whose time was told: how far off it is in the median, s, the interval that was told for it, and in which share that
+    holds it."""
 
     name: str
     windows: int
@@ -98,6 +105,9 @@ class KnockRow:
     wrong: float
     moved: float
     time_known: float | None
+    off_s: float | None
+    told_s: float | None
+    holds: float | None
 
 
 def try_knocks(
@@ -117,7 +127,8 @@ def try_knocks(
     """
     if len(window.pairs) < 2:
         raise CalibrationError(f"a knock lies between two pairs of a window, there are {len(window.pairs)}")
-    still = replace(window, pairs=_compensated(window, config), start_known_to_rad=MOUNT_RAD)
+    pairs, between = (_compensated(of, window, config) for of in (window.pairs, window.between))
+    still = replace(window, pairs=pairs, between=between, start_known_to_rad=MOUNT_RAD)
     config = config.model_copy(update={"motion_compensation": False})
     # Other recordings, other knocks: what many of them tell is of many.
     drawn_for = zlib.crc32(window.pairs[0].camera.image.data)
@@ -138,6 +149,7 @@ def table(tried: Sequence[TriedKnock]) -> tuple[KnockRow, ...]:
         of = [one for one in tried if one.name == name]
         known = [one.off_s is not None and one.off_s <= KNOWN_TO_S for one in of]
         has_time = not any(knock.name == name and (knock.creeps or not knock.moves) for knock in KNOCKS)
+        told = [one for one in of if one.off_s is not None]
         rows.append(
             KnockRow(
                 name,
@@ -146,6 +158,9 @@ def table(tried: Sequence[TriedKnock]) -> tuple[KnockRow, ...]:
                 sum(one.wrong for one in of) / len(of),
                 sum(one.moved for one in of) / len(of),
                 sum(known) / len(of) if has_time else None,
+                _median([one.off_s for one in told]),
+                _median([one.told_s for one in told]),
+                sum(bool(one.holds) for one in told) / len(told) if told else None,
             )
         )
     return tuple(rows)
@@ -163,35 +178,52 @@ def _try(
     first_late = int(rng.integers(1, count))
     xi = np.concatenate([knock.turn_rad * random_direction(rng), knock.shift_m * random_direction(rng)])
     at_ns = int(rng.integers(still.pairs[first_late - 1].stamp_ns, still.pairs[first_late].stamp_ns))
-    shares = np.arange(count) / (count - 1) if knock.creeps else np.arange(count) >= first_late
-    pairs = tuple(_moved(pair, start, xi * share) for pair, share in zip(still.pairs, shares, strict=True))
+    begin_ns, length_ns = still.pairs[0].stamp_ns, still.stamp_ns - still.pairs[0].stamp_ns
+
+    def knocked(pairs: Sequence[FramePair]) -> tuple[FramePair, ...]:
+        if knock.creeps:
+            return tuple(_moved(pair, start, xi * ((pair.stamp_ns - begin_ns) / length_ns)) for pair in pairs)
+        return tuple(_moved(pair, start, xi * (pair.stamp_ns > at_ns)) for pair in pairs)
+
+    moved = replace(still, pairs=knocked(still.pairs), between=knocked(still.between))
+    late = 1 - first_late / count
     try:
-        estimate = calibrate(replace(still, pairs=pairs), depth, images, config, Silence())
+        estimate = calibrate(moved, depth, images, config, Silence())
     except CalibrationError:
-        return TriedKnock(knock.name, accepted=False, wrong=False, moved=False, off_s=None, late=1 - first_late / count)
+        return TriedKnock(
+            knock.name, accepted=False, wrong=False, moved=False, off_s=None, told_s=None, holds=None, late=late
+        )
     accepted = estimate.verdict.decision is Decision.ACCEPTED
-    off_s = None
-    if estimate.moved is not None and knock.moves and not knock.creeps:
-        told_ns = (estimate.moved.last_before_ns + estimate.moved.first_after_ns) // 2
-        off_s = abs(told_ns - at_ns) / NS_PER_S
+    off_s = told_s = holds = None
+    if (told := estimate.moved) is not None and knock.moves and not knock.creeps:
+        off_s = abs((told.last_before_ns + told.first_after_ns) // 2 - at_ns) / NS_PER_S
+        told_s = (told.first_after_ns - told.last_before_ns) / NS_PER_S
+        holds = told.last_before_ns <= at_ns < told.first_after_ns
     return TriedKnock(
         knock.name,
         accepted,
         accepted and _is_wrong(estimate, se3.perturb(start, xi)),
         any(reason.code == MOVED for reason in estimate.verdict.reasons),
         off_s,
-        1 - first_late / count,
+        told_s,
+        holds,
+        late,
     )
 
 
-def _compensated(window: Window, config: CalibrationConfig) -> tuple[FramePair, ...]:
+def _median(told: Sequence[float | None]) -> float | None:
+    """Of what was told; None of nothing."""
+    return float(np.median([one for one in told if one is not None])) if told else None
+
+
+def _compensated(pairs: Sequence[FramePair], window: Window, config: CalibrationConfig) -> tuple[FramePair, ...]:
     """The pairs with their sweeps as they were at the exposures."""
 
     def of(pair: FramePair) -> FramePair:
         xyz_m = compensate(pair, window.rig, enabled=config.motion_compensation)
         return replace(pair, lidar=replace(pair.lidar, xyz_m=xyz_m))
 
-    return tuple(of(pair) for pair in window.pairs)
+    return tuple(of(pair) for pair in pairs)
 
 
 def _moved(pair: FramePair, T_camera_lidar: Matrix4, xi: NDArray[np.float64]) -> FramePair:

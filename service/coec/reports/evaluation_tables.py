@@ -264,12 +264,16 @@ def show_detection(detection: DetectionReport) -> None:
 
 
 def _show_steps(steps: Sequence[StepRow]) -> None:
-    columns = ("mount moves by", "windows", "refused for it", "accepted", "accepted and wrong", "time known to 2 s")
-    table = console.table(*columns, right=range(1, 6))
+    shares = ("refused for it", "accepted", "accepted and wrong", "time known to 2 s")
+    times = ("off by", "told to be within", "and is")
+    table = console.table("mount moves by", "windows", *shares, *times, right=range(1, 9))
     for row in steps:
-        shares = (row.moved, row.accepted, row.wrong, row.time_known)
-        told = ("-" if share is None else f"{100 * share:.0f} %" for share in shares)
-        table.add_row(row.name, str(row.windows), *told)
+        moved, accepted, wrong, known, holds = (
+            "-" if share is None else f"{100 * share:.0f} %"
+            for share in (row.moved, row.accepted, row.wrong, row.time_known, row.holds)
+        )
+        off, told = ("-" if seconds is None else f"{seconds:.1f} s" for seconds in (row.off_s, row.told_s))
+        table.add_row(row.name, str(row.windows), moved, accepted, wrong, known, off, told, holds)
     console.out.print(table)
 
 

@@ -110,6 +110,9 @@ class StepRow(Part):
     time_known: float | None = Field(
         description="share whose time is told to 2 s; a step lies anywhere between two frames; null where it has none"
     )
+    off_s: float | None = Field(description="of those whose time is told: how far off it is, s, the median")
+    told_s: float | None = Field(description="length of the interval that is told for it, s, the median")
+    holds: float | None = Field(ge=0, le=1, description="share of the intervals that hold the step")
 
 
 class NormalisedErrorsReport(Part):

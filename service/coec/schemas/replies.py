@@ -105,9 +105,11 @@ class Verdict(Part):
 class MovedWithin(Part):
     """The camera moved while the window was taken."""
 
-    last_before_ns: int = Field(description="stamp of the last pair before it moved, ns")
-    first_after_ns: int = Field(description="stamp of the first pair after it, ns")
-    pairs_after: Count = Field(description="pairs after it; they are kept for the next window")
+    last_before_ns: int = Field(
+        description="stamp of the last pair that is surely from before it moved, of the window or recorded between, ns"
+    )
+    first_after_ns: int = Field(description="stamp of the first one that is surely from after it, ns")
+    pairs_after: Count = Field(description="pairs of the window after it; they are kept for the next one")
     before: Transform = Field(description="camera_from_lidar that fits the pairs before it; turned, not shifted")
     after: Transform = Field(description="likewise after it")
 

@@ -44,7 +44,7 @@ from coec.calibration.types import (
 from coec.config import CalibrationConfig, SearchConfig
 from coec.errors import RecordingError, WindowError
 from coec.geometry import cameras, se3
-from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Transform, Verdict
+from coec.schemas.replies import CalibrationResult, MetricReply, MovedWithin, Reason, Transform, Verdict
 from readers import opened
 
 WIDTH, HEIGHT = 64, 48
@@ -272,6 +272,62 @@ def test_a_salvaged_window_says_which_pairs_are_of_another(tmp_path: Path) -> No
     assert recorded is not None
     assert recorded.pairs == 4
     assert notes(path)["from_window"] == "front-0"
+
+
+def with_between(path: Path, name: str = "front") -> RecordedWindow:
+    """Two pairs, and three thinned ones between them."""
+    rig = replace(a_rig(), pair=name)
+    writer = WindowWriter(path, rig, rig.T_camera_lidar_nominal, path.stem, CONFIGURATION, {})
+    writer.add(a_pair(0))
+    for index in (1, 2, 3):
+        writer.add_between(thinned(index))
+    writer.add(a_pair(4))
+    return writer.finish()
+
+
+def thinned(index: int) -> FramePair:
+    pair = a_pair(index, motion=index != 2)
+    return replace(pair, camera=replace(pair.camera, depth=None), lidar=replace(pair.lidar, intensity=None))
+
+
+@pytest.mark.parametrize("name", ["front", "between"])
+def test_pairs_between_those_of_a_window_are_told_apart_from_them(tmp_path: Path, name: str) -> None:
+    recorded = with_between(tmp_path / "w.mcap", name)
+    window, _ = read_window(recorded.path)
+    assert len(window.pairs) == recorded.pairs == 2
+    for got, index in zip(window.pairs, (0, 4), strict=True):
+        assert_same_pair(got, a_pair(index))
+    assert len(window.between) == 3
+    for got, index in zip(window.between, (1, 2, 3), strict=True):
+        assert_same_pair(got, thinned(index))
+    kept = list(pairs_since(recorded.path, a_pair(1).stamp_ns))
+    assert [pair.stamp_ns for pair in kept] == [a_pair(4).stamp_ns], "the next window takes whole pairs only"
+
+
+def test_pairs_between_stay_where_the_result_says_that_the_camera_moved(tmp_path: Path) -> None:
+    path = tmp_path / "front-1.mcap"
+    whole = with_between(path)
+    pose = a_result().camera_from_lidar
+    moved = MovedWithin(last_before_ns=1, first_after_ns=2, pairs_after=1, before=pose, after=pose)
+    with_result = write_result(path, a_result().model_copy(update={"moved": moved}))
+    assert with_result.pairs == 2
+    assert len(read_window(path)[0].between) == 3
+    without = write_result(path, a_result())
+    assert without.pairs == 2
+    assert read_window(path)[0].between == ()
+    assert without.bytes < whole.bytes
+    for got, index in zip(read_window(path)[0].pairs, (0, 4), strict=True):
+        assert_same_pair(got, a_pair(index))
+
+
+def test_a_salvaged_window_has_the_pairs_between(tmp_path: Path) -> None:
+    recorded = with_between(tmp_path / "w.mcap")
+    whole = recorded.path.read_bytes()
+    part = tmp_path / ("w.mcap" + PART_SUFFIX)
+    recorded.path.rename(part)
+    salvaged = salvage(part, lambda: None)
+    assert salvaged is not None
+    assert salvaged.path.read_bytes() == whole
 
 
 def test_senders_sequence_numbers_are_not_kept(tmp_path: Path) -> None:

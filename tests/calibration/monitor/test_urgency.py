@@ -19,13 +19,20 @@ class Inspector:
         return ImageQuality(sharpness=0.3, mean_level=110.0, clipped=0.01, digest=frame.stamp_ns)
 
 
+class AsTheyAre:
+    """Nothing of an exposure is too large."""
+
+    def reduced(self, frame: CameraFrame) -> CameraFrame:
+        return frame
+
+
 class Drive:
     """A stream of pairs, two in a second, through urgency and cutter."""
 
     def __init__(self, street: Window, rate_hz: float = 2.0) -> None:
         self.street = street
         self.rate_hz = rate_hz
-        self.cutter = WindowCutter(WINDOW, street.rig, Inspector())
+        self.cutter = WindowCutter(WINDOW, street.rig, Inspector(), AsTheyAre())
         self.urgency = Urgency(MONITOR)
         self.selected: list[float] = []
 

@@ -165,6 +165,24 @@ def test_a_window_takes_what_an_earlier_one_keeps_for_it_from_the_disk(bench: Be
     assert bench.losses.snapshot() == {}
 
 
+def test_pairs_between_are_recorded_beside_those_of_the_open_window_and_do_not_count(bench: Bench) -> None:
+    with bench.running():
+        bench.recorder.add_between("front-10", pair(5))
+        bench.recorder.add("front-10", pair(10), NOMINAL)
+        bench.recorder.add_between("front-10", pair(15))
+        bench.recorder.add("front-10", pair(20), NOMINAL)
+        bench.recorder.add_between("front-10", pair(25))
+        bench.recorder.end(SliceEnded("front-10", 2, True))
+        bench.recorder.add("front-40", pair(40), NOMINAL)
+        bench.recorder.add_between("front-40", pair(45))
+        bench.recorder.end(SliceEnded("front-40", 1, False))
+        assert bench.recorded.get(timeout=DEADLINE_S)[0] == "front-10"
+    window, _ = read_window(bench.store.path("front-10"))
+    assert [one.stamp_ns for one in window.pairs] == [10, 20]
+    assert [one.stamp_ns for one in window.between] == [15, 25]
+    assert bench.lost == ["front-40"], "pairs between make no window"
+
+
 @pytest.mark.fault("a window whose last pairs the next one is to hold is gone", "the loss is counted, the next is kept")
 def test_kept_pairs_that_are_gone_are_counted_and_cost_no_window(bench: Bench) -> None:
     with bench.running():

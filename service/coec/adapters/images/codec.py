@@ -195,6 +195,26 @@ class GreyImages:
         return decode_grey(frame.image, self._limits)
 
 
+class Compressed:
+    """Implements `ports.ImageReducer`. What came compressed stays as it came; raw pixels become grey JPEG: a tenth to a
+    thirtieth of their bytes, for 10 ms of a core each megapixel."""
+
+    def __init__(self, limits: LimitsConfig) -> None:
+        self._limits = limits
+
+    def reduced(self, frame: CameraFrame) -> CameraFrame:
+        """The frame without its depth map, its image compressed.
+
+        Raises:
+            DecodeError: the reasons of `raw_image`.
+        """
+        image = frame.image
+        if image.format in BYTES_PER_PIXEL:
+            data = encode_jpeg(decode_grey(image, self._limits))
+            image = EncodedImage(ImageFormat.JPEG, image.width, image.height, data)
+        return CameraFrame(frame.stamp_ns, frame.frame_id, image, frame.sequence)
+
+
 class CachedGreys:
     """Keeps the grey images of the last frames: for solving one window many times. Implements `ports.ImageReader`."""
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.geometry.cameras import pixel_rad
-from coec.geometry.edges.range_edges import BAND_RAD, NEIGHBOUR_RAD
+from coec.geometry.edges.range_edges import NEIGHBOUR_RAD
+from coec.geometry.edges.scan_lines import BAND_RAD
 
 LENS_PX = 0.05
 """What a target-based calibration of a lens leaves of its principal point, and of its scale at the rim: half of the 0.1

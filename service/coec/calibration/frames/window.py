@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.frames.between import BetweenPairs
 from coec.calibration.frames.sampling import stands
-from coec.calibration.ports import ImageInspector
+from coec.calibration.ports import ImageInspector, ImageReducer
 from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
 from coec.config import WindowConfig
 from coec.errors import DecodeError
@@ -39,6 +40,14 @@ class PairSelected:
     window_id: str
     pair: FramePair
     first: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairBetween:
+    """A pair, thinned, that is recorded beside those of the window."""
+
+    window_id: str
+    pair: FramePair
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +85,7 @@ class KeptForgotten:
     kept: KeptPairs
 
 
-Event = PairSelected | SliceEnded | KeptForgotten
+Event = PairSelected | PairBetween | SliceEnded | KeptForgotten
 
 
 @dataclass(slots=True)
@@ -96,11 +105,12 @@ class WindowCutter:
         last_quality: what the last look at an image told.
     """
 
-    def __init__(self, config: WindowConfig, rig: Rig, inspector: ImageInspector) -> None:
+    def __init__(self, config: WindowConfig, rig: Rig, inspector: ImageInspector, reducer: ImageReducer) -> None:
         self._config = config
         self._rig = rig
         self._inspector = inspector
         self._in_view = _directions_in_view(rig.camera)
+        self._between = BetweenPairs(reducer, _half_view_rad(self._in_view))
         self._next_config = config
         self._hurried_ns: int | None = None
         self._open: _Slice | None = None
@@ -142,11 +152,15 @@ class WindowCutter:
             self._config = self._next_config
             length_ns = self._hurried_ns or round(self._config.slice_s * NS_PER_S)
             self._open = _Slice(window_id, pair.stamp_ns, length_ns, set(), pair.stamp_ns)
+            self._between.begin(self._config, pair.stamp_ns, length_ns)
             self._hurried_ns = None
         if self._select(self._open, pair, T_camera_lidar):
+            self._between.chosen(pair.stamp_ns)
             events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
             if self._kept is not None and self.selected >= self._config.pairs:
                 events += self.finish()
+        elif (between := self._between.offer(pair, T_camera_lidar)) is not None:
+            events.append(PairBetween(self._open.window_id, between))
         return events
 
     def keep(self, kept: KeptPairs) -> None:
@@ -252,3 +266,8 @@ def _directions_in_view(camera: Camera) -> NDArray[np.bool_]:
     pixels = np.array([project_point(camera, *ray) for ray in rays.tolist()])
     seen = (pixels[:, 2] != 0.0) & in_image(camera, pixels[:, :2])
     return np.asarray(seen.reshape(CELLS, CELLS))
+
+
+def _half_view_rad(in_view: NDArray[np.bool_]) -> float:
+    """The end of the last ring of such cells that has a pixel."""
+    return float(np.flatnonzero(in_view.any(axis=1)).max(initial=-1) + 1) * (np.pi / CELLS)

@@ -265,7 +265,7 @@ def window_wanted_since(state: PairState) -> int | None:
 def kept_for_next(estimate: Estimate) -> KeptPairs | None:
     """The pairs of a window after the camera moved within it: they are as good as those of the next one."""
     moved = estimate.moved
-    if moved is None:
+    if moved is None or not moved.pairs_after:
         return None
     return KeptPairs(estimate.window_id, moved.first_after_ns, estimate.data_stamp_ns, moved.pairs_after)
 

@@ -63,6 +63,10 @@ within a percent of its maximum."""
 TURNS = 4
 """Of splitting and climbing on the sharpest edges, at most: two changed nothing any more in nine of ten windows."""
 
+FEW = 3
+"""One or two frames fit some pose of hundreds well by chance, better than many fit the right one on the blurred band:
+the best split with at least so many on either side is settled, too."""
+
 MAX_SWEEPS = 8
 """Of a climb over the axes: it begins within two steps of its end."""
 
@@ -70,8 +74,9 @@ MIN_FRAMES = 4
 """With fewer there is no early and late."""
 
 MIN_SUPPORT = 5.0
-"""Mean score of a frame on either side, at the pose of its side: at a right pose it is 6 to 20 on every recording tried
-by day; on an open road and at night 1 to 4 at the best of all poses."""
+"""Mean score of a frame that tells anything on either side, at the pose of its side: at a right pose it is 6 to 20 on
+every recording tried by day; on an open road and at night 1 to 4 at the best of all poses. Over all frames of a drive
+a third of which was in a tunnel or at night it would be 3 to 5, and knocks of 1 to 3 degrees would pass."""
 
 MIN_LIKENESS = 0.6
 """A camera that moved from T₁ to T₂ costs the early frames at T₂ as large a share of their score as late ones at T₁;
@@ -87,8 +92,10 @@ class ChangePoint:
         first_late: index of the first pair after it.
         T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after it best.
         gain: what two poses score more than one, in standard deviations of a frame's score.
-        support: mean score of the frames on the side that scores less, at the pose of its side.
-        likeness: what a side loses of its score at the pose of the other: the lesser share over the larger one.
+        support: mean score of the frames on the side that scores less, at the pose of its side, each counted by its
+            score: frames that tell nothing speak neither for nor against.
+        likeness: what a side loses of its score at the pose of the other, frames counted likewise: the lesser share
+            over the larger one.
     """
 
     first_late: int
@@ -120,15 +127,25 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     blur_rad = edges.band_blur_rad[0]
     near = sample_reach(pose, SearchBox(NEAR_BLURS * blur_rad, 0.0), NEAR_POSES)
     poses = np.concatenate([pose[None], near, *_put_forward(chart, pose, len(band.first_point) - 1)])
-    early = np.cumsum([_scores(band, at) for at in poses], axis=1).T  # (F, K)
+    early = np.cumsum([scores(band, at) for at in poses], axis=1).T  # (F, K)
     total = early[-1]
     late = total - early
     gains = early[:-1].max(axis=1) + late[:-1].max(axis=1) - total.max()
-    last_early = int(np.argmax(gains))
-    ends = [poses[int(np.argmax(scores))] for scores in (early[last_early], late[last_early], total)]
-    parts = (_part(band, 0, last_early + 1), _part(band, last_early + 1, len(early)), band)
-    begun = tuple(_climbed(part, end, blur_rad)[0] for part, end in zip(parts, ends, strict=True))
-    return _settled(sharp, last_early + 1, begun, edges.blur_rad)
+    T_whole, _ = _climbed(band, poses[int(np.argmax(total))], blur_rad)
+    settled = []
+    for last_early in _promising(gains):
+        ends = (poses[int(np.argmax(of_side))] for of_side in (early[last_early], late[last_early]))
+        sides = (_part(band, 0, last_early + 1), _part(band, last_early + 1, len(early)))
+        begun = [_climbed(side, end, blur_rad)[0] for side, end in zip(sides, ends, strict=True)]
+        settled.append(_settled(sharp, last_early + 1, (*begun, T_whole), edges.blur_rad))
+    return max(settled, key=lambda change: (change.of_camera, change.gain))
+
+
+def _promising(gains: NDArray[np.float64]) -> list[int]:
+    """Splits (the last early frame of each) to settle, of gains (F - 1,): the best, and the best that leaves some
+    frames on either side."""
+    best, inner = int(np.argmax(gains)), gains[FEW - 1 : len(gains) - FEW + 1]
+    return [best] if len(inner) == 0 else list(dict.fromkeys((best, FEW - 1 + int(np.argmax(inner)))))
 
 
 def _settled(sharp: EdgeFrames, first_late: int, begun: Sequence[Matrix4], blur_rad: float) -> ChangePoint:
@@ -140,22 +157,25 @@ def _settled(sharp: EdgeFrames, first_late: int, begun: Sequence[Matrix4], blur_
         T_after, after = _climbed(_part(sharp, first_late, frames), T_after, blur_rad)
         if before + after > most:
             best, most = (first_late, T_before, T_after), before + after
-        split = 1 + int(np.argmax(np.cumsum(_scores(sharp, T_before) - _scores(sharp, T_after))[:-1]))
+        split = 1 + int(np.argmax(np.cumsum(scores(sharp, T_before) - scores(sharp, T_after))[:-1]))
         if split == first_late:
             break
         first_late = split
     first_late, T_before, T_after = best
     # One pose for all of them is no worse than that of either side.
     together = max(_climbed(sharp, T, blur_rad)[1] for T in (T_whole, T_before, T_after))
-    at_before, at_after = _scores(sharp, T_before), _scores(sharp, T_after)
+    at_before, at_after = scores(sharp, T_before), scores(sharp, T_after)
     before, after = float(at_before[:first_late].sum()), float(at_after[first_late:].sum())
-    losses = _loss(before, float(at_after[:first_late].sum())), _loss(after, float(at_before[first_late:].sum()))
+    losses = (
+        _loss(at_before[:first_late], at_after[:first_late]),
+        _loss(at_after[first_late:], at_before[first_late:]),
+    )
     return ChangePoint(
         first_late,
         T_before,
         T_after,
         gain=before + after - together,
-        support=min(before / first_late, after / (frames - first_late)),
+        support=min(_support(at_before[:first_late]), _support(at_after[first_late:])),
         likeness=min(losses) / max(losses) if min(losses) > 0.0 else 0.0,
     )
 
@@ -165,10 +185,10 @@ def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[
     cover = sample_reach(pose, SearchBox(REACH_RAD, 0.0), CHART_POSES)
     cover = np.concatenate([pose[None], cover])
     of_frames = chart.frame
-    scores = np.array(
+    charted = np.array(
         [charted_significances(chart.of_points(np.flatnonzero(of_frames == f)), cover) for f in range(frames)]
     )
-    early = np.cumsum(scores, axis=0)
+    early = np.cumsum(charted, axis=0)
     sides = np.concatenate([early[:-1], early[-1] - early[:-1]])
     best = np.argmax(sides, axis=1)
     # What a side gains over the solved pose; a pose may be the best of many sides.
@@ -182,19 +202,27 @@ def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[
     return [cover[chosen], *about] if chosen else []
 
 
-def _scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
-    """(F,) z of each frame by itself."""
+def scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
+    """(F,) z of each frame by itself at a pose (4, 4)."""
     at = frame_alignment(band, pose)
     return np.asarray(at.strength / np.sqrt(np.maximum(at.square, LEAST_SQUARE)))
 
 
 def _score(band: EdgeFrames, pose: Matrix4) -> float:
-    return float(_scores(band, pose).sum())
+    return float(scores(band, pose).sum())
 
 
-def _loss(own: float, other: float) -> float:
-    """The share of a score that is lost; 0 of no score."""
-    return (own - other) / own if own > 0.0 else 0.0
+def _support(of_frames: NDArray[np.float64]) -> float:
+    """Mean of scores (F,), each counted by itself; 0 of none above that."""
+    told = np.maximum(of_frames, 0.0)
+    return float(np.square(told).sum() / max(told.sum(), LEAST_SQUARE))
+
+
+def _loss(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """The share of scores (F,) that is lost where they become others (F,), each counted by itself; 0 of none above
+    that."""
+    told = np.maximum(own, 0.0)
+    return float((told * (own - other)).sum() / max(np.square(told).sum(), LEAST_SQUARE))
 
 
 def _climbed(band: EdgeFrames, start: Matrix4, blur_rad: float) -> tuple[Matrix4, float]:

@@ -22,10 +22,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.bearings import Bearings, bearings
 from coec.geometry.compiler import njit, prange
-
-BAND_RAD = math.radians(0.42)
-"""Height of a band of elevation where no ring is known: the beam spacing of a 64-beam sensor. Wider bands only cost
-time, narrower ones cut scan lines of a tilted sensor into pieces."""
+from coec.geometry.edges.scan_lines import BAND_RAD
 
 BANDS = math.ceil(0.5 * math.pi / BAND_RAD)
 """Of a quarter of a turn, from the horizon up or down."""

@@ -13,10 +13,10 @@ from typing import Protocol
 
 from coec.adapters.depth.maps import STEREO
 from coec.adapters.frames.msgpack_frames import encode_camera
-from coec.adapters.images.codec import Inspector
+from coec.adapters.images.codec import Compressed, Inspector
 from coec.adapters.system.logs import LossCounter
 from coec.calibration.frames.sampling import CheckSampler
-from coec.calibration.frames.window import KeptPairs, PairSelected, SliceEnded, WindowCutter
+from coec.calibration.frames.window import KeptPairs, PairBetween, PairSelected, SliceEnded, WindowCutter
 from coec.calibration.monitor.urgency import Urgency
 from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
 from coec.config import MAX_SLICE_S, LimitsConfig, PairConfig, WindowConfig
@@ -80,6 +80,9 @@ class Writes(Protocol):
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
         """A pair was chosen."""
 
+    def add_between(self, window_id: str, pair: FramePair) -> None:
+        """A pair, thinned, is to be recorded beside those."""
+
     def end(self, ended: SliceEnded) -> None:
         """A slice ended."""
 
@@ -134,7 +137,7 @@ class Chooser:
         self._served = served
         self._infers = pair.calibration.depth.model != STEREO
         self._window, self._stretch = pair.window, 1.0
-        self._cutter = WindowCutter(pair.window, rig, Inspector(limits))
+        self._cutter = WindowCutter(pair.window, rig, Inspector(limits), Compressed(limits))
         if first_slice_s < pair.window.slice_s:
             self._cutter.hurry(first_slice_s)
         if kept is not None:
@@ -205,6 +208,8 @@ class Chooser:
             if isinstance(event, PairSelected):
                 self._frozen = False
                 self._select(event, T_camera_lidar)
+            elif isinstance(event, PairBetween):
+                self._recorder.add_between(event.window_id, event.pair)
             elif isinstance(event, SliceEnded):
                 self._end(event, pair.stamp_ns)
                 self._urgency.ended(event, self._cutter, self._pace.rate_hz)

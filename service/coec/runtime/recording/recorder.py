@@ -52,6 +52,12 @@ class _Add:
     T_camera_lidar: Matrix4
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _AddBetween:
+    window_id: str
+    pair: FramePair
+
+
 @dataclass(slots=True)
 class _Open:
     """The window being written."""
@@ -103,7 +109,7 @@ class Recorder:
         self._on_recorded = on_recorded
         self._on_lost = on_lost
         self._condition = threading.Condition()
-        self._queue: deque[_Add | SliceEnded | CalibrationConfig] = deque()
+        self._queue: deque[_Add | _AddBetween | SliceEnded | CalibrationConfig] = deque()
         self._adds = 0
         self._open: _Open | None = None
         self._lost: str | None = None
@@ -151,16 +157,11 @@ class Recorder:
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
         """Queue a chosen pair; never waits for the disk. `T_camera_lidar` (4, 4) is where a search will start if this
         is the first pair of its window."""
-        with self._condition:
-            if self._adds >= PAIRS_WAITING:
-                overrun = True
-            else:
-                overrun = False
-                self._adds += 1
-                self._queue.append(_Add(window_id, pair, T_camera_lidar))
-                self._condition.notify()
-        if overrun:
-            self._losses.add("window", "recorder_overrun")
+        self._put(_Add(window_id, pair, T_camera_lidar))
+
+    def add_between(self, window_id: str, pair: FramePair) -> None:
+        """Queue a pair, thinned, that is recorded beside the chosen ones of a window; likewise."""
+        self._put(_AddBetween(window_id, pair))
 
     def end(self, ended: SliceEnded) -> None:
         """Queue the end of a window; it is finished when it holds enough pairs, else abandoned."""
@@ -174,6 +175,16 @@ class Recorder:
         with self._condition:
             self._condition.notify()
 
+    def _put(self, item: _Add | _AddBetween) -> None:
+        with self._condition:
+            overrun = self._adds >= PAIRS_WAITING
+            if not overrun:
+                self._adds += 1
+                self._queue.append(item)
+                self._condition.notify()
+        if overrun:
+            self._losses.add("window", "recorder_overrun")
+
     # --- on the recorder's thread -----------------------------------------------------------------------------------
 
     def _run(self, thread: ServiceThread) -> None:
@@ -185,8 +196,8 @@ class Recorder:
                 if not self._queue and not thread.stopping:
                     self._condition.wait(DIGEST_PAUSE_S if unread else POLL_S)
                 item = self._queue.popleft() if self._queue else None
-                self._adds -= isinstance(item, _Add)
-            if isinstance(item, _Add):
+                self._adds -= isinstance(item, (_Add, _AddBetween))
+            if isinstance(item, (_Add, _AddBetween)):
                 begun_s = time.monotonic()
                 self._write(item)
                 self.writing_took.add(time.monotonic() - begun_s)
@@ -255,10 +266,13 @@ class Recorder:
         finally:
             self._store.release(window_id)
 
-    def _write(self, item: _Add) -> None:
+    def _write(self, item: _Add | _AddBetween) -> None:
         if item.window_id == self._lost:
             return
         try:
+            if isinstance(item, _AddBetween):
+                self._write_between(item)
+                return
             if self._open is None or self._open.window_id != item.window_id:
                 self._close_stray()
                 self._open = self._start(item)
@@ -266,6 +280,11 @@ class Recorder:
             self._open.pairs += 1
         except (RecordingError, OSError) as error:
             self._lose(item.window_id, error)
+
+    def _write_between(self, item: _AddBetween) -> None:
+        """Only a window that has a pair is on the disk."""
+        if self._open is not None and self._open.window_id == item.window_id:
+            self._open.writer.add_between(item.pair)
 
     def _start(self, item: _Add) -> _Open:
         plan = self._plan  # another may come meanwhile

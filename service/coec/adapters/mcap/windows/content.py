@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import ValidationError
 
 from coec.adapters.mcap.files import Attachment, Channel, Message, Metadata, Record, Schema
 from coec.adapters.mcap.windows import rig_attachment
-from coec.adapters.mcap.windows.names import CONFIGURATION, DEPTH, KEPT, MASK, METADATA, OVERLAY, RIG
+from coec.adapters.mcap.windows.names import CONFIGURATION, DEPTH, KEPT, MASK, METADATA, OVERLAY, RIG, is_between
 from coec.adapters.ros import incoming, messages
 from coec.adapters.ros.point_cloud2 import WRITTEN_TIME
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
@@ -21,6 +22,13 @@ _LIMITS = LimitsConfig(max_message_bytes=2**30, max_image_pixels=2**30, max_poin
 when they are looked at, images are not decoded here, and `reading.MAX_UNPACKED` bounds the whole."""
 
 _FRAME_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, messages.ODOMETRY, messages.IMU)
+
+
+class Place(NamedTuple):
+    """Of a pair in the order in which we write: among those of the window, or among those between."""
+
+    between: bool
+    order: int
 
 
 @dataclass(slots=True)
@@ -48,10 +56,10 @@ class Content:
     kept: dict[str, str] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    parts: dict[int, _Parts] = field(default_factory=dict)
+    parts: dict[Place, _Parts] = field(default_factory=dict)
 
-    def take(self, record: Record) -> int | None:
-        """Adds a record. Returns the index of the pair that it completes, in the order in which we write, else None."""
+    def take(self, record: Record) -> Place | None:
+        """Adds a record. Returns the place of the pair that it completes, else None."""
         match record:
             case Schema():
                 self.schemas[record.schema_id] = record
@@ -82,17 +90,18 @@ class Content:
         except ValidationError as error:
             raise WindowError(f"{path}: {CONFIGURATION}: {describe(error)}") from error
 
-    def pair(self, path: Path, index: int) -> FramePair:
-        """Takes out the pair of this index."""
-        parts = self.parts.pop(index)
+    def pair(self, path: Path, place: Place) -> FramePair:
+        """Takes out the pair of this place."""
+        parts = self.parts.pop(place)
         if parts.camera is None or parts.lidar is None:
-            raise WindowError(f"{path}: pair {index} lacks its {'sweep' if parts.lidar is None else 'image'}")
+            named = f"{'thinned ' if place.between else ''}pair {place.order}"
+            raise WindowError(f"{path}: {named} lacks its {'sweep' if parts.lidar is None else 'image'}")
         camera = parts.camera
         if parts.depth is not None:
             camera = CameraFrame(camera.stamp_ns, camera.frame_id, camera.image, depth=parts.depth.image)
         return FramePair(camera, parts.lidar, parts.motion)
 
-    def _take_message(self, message: Message) -> int | None:
+    def _take_message(self, message: Message) -> Place | None:
         channel = self.channels.get(message.channel_id)
         schema = None if channel is None else self.schemas.get(channel.schema_id)
         if channel is None or schema is None or schema.name not in _FRAME_TYPES:
@@ -103,7 +112,8 @@ class Content:
             frame = incoming.decode(schema.name, message.data, _LIMITS, point_time=WRITTEN_TIME)
         except DecodeError as error:
             raise WindowError(f"a message on {channel.topic} cannot be decoded: {error}") from error
-        parts = self.parts.setdefault(message.sequence, _Parts())
+        place = Place(is_between(channel.topic), message.sequence)
+        parts = self.parts.setdefault(place, _Parts())
         match frame:
             case LidarFrame():
                 parts.lidar = frame
@@ -113,5 +123,5 @@ class Content:
                 parts.depth = frame
             case CameraFrame():
                 parts.camera = frame
-                return message.sequence
+                return place
         return None

@@ -28,10 +28,21 @@ POINTS, CAMERA_INFO, RESULT_TOPIC, OVERLAY = "lidar/points", "camera/camera_info
 ODOMETRY, IMU = "odometry", "imu"
 """Topics below `/coec/<pair>/`."""
 
+BETWEEN = "between/"
+"""Below it the sweep, ego-motion and image of the thinned pairs, as above."""
+
+BETWEEN_IMAGE = BETWEEN + "image/compressed"
+"""Their images are compressed, whatever the camera sends."""
+
 
 def topic(pair: str, name: str) -> str:
     """One of these, of a pair."""
     return f"/coec/{pair}/{name}"
+
+
+def is_between(topic: str) -> bool:
+    """Whether a topic is one of the thinned pairs. A pair may have any name."""
+    return topic.split("/")[3:4] == [BETWEEN.rstrip("/")]
 
 
 def beside(path: Path, suffix: str) -> Path:

@@ -32,12 +32,15 @@ def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
     for record in records_of(path, max_unpacked_bytes=size * MAX_UNPACKED + CHUNK_BYTES):
         content.take(record)
     rig, T_camera_lidar_start, window_id = content.head(path)
-    written = [content.pair(path, index) for index in sorted(content.parts)]
-    pairs = tuple(sorted(written, key=lambda pair: pair.stamp_ns))
+    places = sorted(content.parts)
+    pairs, between = (
+        tuple(sorted((content.pair(path, of) for of in places if of.between == asked), key=lambda pair: pair.stamp_ns))
+        for asked in (False, True)
+    )
     if not pairs:
         raise WindowError(f"{path} holds no camera-LiDAR pair")
     # The service began it at the extrinsic in use.
-    window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD)
+    window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD, between)
     return window, content.parsed_configuration(path)
 
 
@@ -49,11 +52,11 @@ def pairs_since(path: Path, since_ns: int) -> Iterator[FramePair]:
     """
     content = Content()
     for record in records_of(path, max_unpacked_bytes=_size(path) * MAX_UNPACKED + CHUNK_BYTES):
-        index = content.take(record)
-        if index is None:
+        place = content.take(record)
+        if place is None:
             continue
-        pair = content.pair(path, index)
-        if pair.stamp_ns >= since_ns:
+        pair = content.pair(path, place)
+        if pair.stamp_ns >= since_ns and not place.between:
             yield pair
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from coec.adapters.mcap.files import Attachment, Channel, Message, Metadata, Schema
@@ -19,6 +20,7 @@ from coec.adapters.mcap.windows.names import (
     REWRITE_SUFFIX,
     SUFFIX,
     beside,
+    is_between,
     topic,
 )
 from coec.adapters.mcap.windows.reading import metadata_of, records_of
@@ -33,7 +35,8 @@ from coec.schemas.ros_names import DIAGNOSTICS
 def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | None = None) -> RecordedWindow:
     """Writes the window again with its result (an earlier one is replaced): as `/diagnostics`, JSON message and
     attachment, and a picture of the points at the result, if there is one. The file is replaced at once; a reader sees
-    the one or the other.
+    the one or the other. The pairs between those of the window stay where the result says that the camera moved, as it
+    took its time from them.
 
     Raises:
         WindowError: the window is damaged.
@@ -43,7 +46,8 @@ def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | No
     file = WholeFile(beside(path, REWRITE_SUFFIX), path, packed=packed)
     told, overlay = topic(result.pair, RESULT_TOPIC), topic(result.pair, OVERLAY)
     try:
-        window_id, pairs = _copy(path, file, without=(DIAGNOSTICS, told, overlay))
+        earlier, moved = (DIAGNOSTICS, told, overlay), result.moved is not None
+        window_id, pairs = _copy(path, file, lambda topic: topic in earlier or (is_between(topic) and not moved))
         stamp_ns, document = result.data_stamp_ns, to_json(result)
         if overlay_jpeg is not None:
             picture = outgoing.encode_jpeg(stamp_ns, result.camera_frame, overlay_jpeg)
@@ -57,7 +61,7 @@ def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | No
     return RecordedWindow.of(file.finish(), window_id, pairs)
 
 
-def _copy(path: Path, file: WholeFile, without: tuple[str, ...]) -> tuple[str, int]:
+def _copy(path: Path, file: WholeFile, leave_out: Callable[[str], bool]) -> tuple[str, int]:
     """Copies a window record by record, without some topics and the result; returns its id and number of pairs."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -77,7 +81,7 @@ def _copy(path: Path, file: WholeFile, without: tuple[str, ...]) -> tuple[str, i
                 channel = channels.get(record.channel_id)
                 if channel is None:
                     raise WindowError(f"{path}: a message belongs to no channel")
-                if channel.topic in without:
+                if leave_out(channel.topic):
                     continue
                 file.message(
                     channel.topic,

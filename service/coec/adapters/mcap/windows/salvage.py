@@ -43,12 +43,16 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None]) -> Rec
         # The error that ends the file also ends the loop; whatever came before it was sound.
         with suppress(WindowError):
             for record in records_of(part_path):
-                index = content.take(record)
-                if index is None:
+                place = content.take(record)
+                if place is None:
                     continue
                 if writer is None:
                     writer = _writer_like(content, part_path, final)
-                writer.add(content.pair(part_path, index))
+                pair = content.pair(part_path, place)
+                if place.between:
+                    writer.add_between(pair)
+                else:
+                    writer.add(pair)
                 progress()
     except BaseException:
         if writer is not None:

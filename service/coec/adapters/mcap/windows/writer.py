@@ -8,6 +8,10 @@ completes the pair. `write_result` adds `/diagnostics`, the result as a JSON cha
 A window may hold pairs of an earlier one that were kept for it. They come last, though they were taken first; the
 metadata `coec_kept` name the window that they are from. A reader sorts pairs by their stamps.
 
+The thinned pairs between those of the window have topics and indices of their own; of these the image comes last,
+too. They are asked where the camera moved within the window: `write_result` leaves them out where it did not, which
+more than halves what is kept of most windows.
+
 The sender's own sequence numbers are not kept: the pairs of a window were chosen, so gaps between them mean nothing.
 Chunks of clouds and raw images are compressed if it is asked for, others never: encoded images shrink by nothing.
 Equal pairs give equal bytes: nothing in the file tells when or where it was written.
@@ -24,6 +28,8 @@ from coec.adapters.mcap.ros_channels import RosChannel, check_stamp
 from coec.adapters.mcap.whole_file import FinishedFile, WholeFile
 from coec.adapters.mcap.windows import rig_attachment
 from coec.adapters.mcap.windows.names import (
+    BETWEEN,
+    BETWEEN_IMAGE,
     CAMERA_INFO,
     COMPRESSED,
     CONFIGURATION,
@@ -99,6 +105,7 @@ class WindowWriter:
             RecordingError: the file cannot be written.
         """
         self.pairs = 0
+        self._between = 0
         self._rig, self._T_start, self._window_id = rig, T_camera_lidar_start, window_id
         self._file = WholeFile(temporary or beside(path_final, PART_SUFFIX), path_final, packed=packed)
         self._file.attach(RIG, JSON, rig_attachment.encoded(rig, T_camera_lidar_start, window_id))
@@ -128,24 +135,10 @@ class WindowWriter:
                 removed.
         """
         stamp_ns = pair.stamp_ns
-        try:
-            for frame in (pair.camera, pair.lidar, pair.motion):
-                if frame is not None:
-                    check_stamp(frame.stamp_ns)
-        except RecordingError:
-            self.abandon()
-            raise
+        self._refuse_stamps_beyond_ros(pair)
         if self.pairs == 0:
             self._cdr(TF_STATIC, messages.TF, stamp_ns, outgoing.encode_tf_static(self._rig, self._T_start, stamp_ns))
-        self._cdr(self._topic(POINTS), messages.POINT_CLOUD, pair.lidar.stamp_ns, outgoing.encode_cloud(pair.lidar))
-        if pair.motion is not None:
-            motion_type, motion = outgoing.encode_motion(pair.motion)
-            self._cdr(
-                self._topic(IMU if motion_type == messages.IMU else ODOMETRY),
-                motion_type,
-                pair.motion.stamp_ns,
-                motion,
-            )
+        self._sweep_and_motion("", pair, self.pairs)
         if pair.camera.depth is not None:
             depth = outgoing.encode_depth(stamp_ns, pair.camera.frame_id, pair.camera.depth)
             self._cdr(self._topic(DEPTH), messages.COMPRESSED_IMAGE, stamp_ns, depth)
@@ -156,6 +149,18 @@ class WindowWriter:
         self._cdr(self._topic(name), image_type, stamp_ns, image)
         self._file.sync()
         self.pairs += 1
+
+    def add_between(self, pair: FramePair) -> None:
+        """Appends a thinned pair, whose image is compressed. It is on the disk with the next one of the window.
+
+        Raises:
+            RecordingError: as for `add`.
+        """
+        self._refuse_stamps_beyond_ros(pair)
+        self._sweep_and_motion(BETWEEN, pair, self._between)
+        image_type, image = outgoing.encode_image(pair.camera)
+        self._cdr(self._topic(BETWEEN_IMAGE), image_type, pair.stamp_ns, image, self._between)
+        self._between += 1
 
     def finish(self) -> RecordedWindow:
         """Writes the index, syncs, and gives the file its final name.
@@ -169,8 +174,28 @@ class WindowWriter:
         """Removes the `.part` file. May be called at any time before `finish`, and more than once."""
         self._file.abandon()
 
+    def _sweep_and_motion(self, below: str, pair: FramePair, index: int) -> None:
+        lidar, motion = pair.lidar, pair.motion
+        points = outgoing.encode_cloud(lidar)
+        self._cdr(self._topic(below + POINTS), messages.POINT_CLOUD, lidar.stamp_ns, points, index)
+        if motion is not None:
+            motion_type, data = outgoing.encode_motion(motion)
+            name = below + (IMU if motion_type == messages.IMU else ODOMETRY)
+            self._cdr(self._topic(name), motion_type, motion.stamp_ns, data, index)
+
+    def _refuse_stamps_beyond_ros(self, pair: FramePair) -> None:
+        try:
+            for frame in (pair.camera, pair.lidar, pair.motion):
+                if frame is not None:
+                    check_stamp(frame.stamp_ns)
+        except RecordingError:
+            self.abandon()
+            raise
+
     def _topic(self, name: str) -> str:
         return topic(self._rig.pair, name)
 
-    def _cdr(self, topic_name: str, type_name: str, stamp_ns: int, data: bytes) -> None:
-        self._file.ros(RosChannel(topic_name, type_name), stamp_ns, self.pairs, data)
+    def _cdr(self, topic_name: str, type_name: str, stamp_ns: int, data: bytes, index: int | None = None) -> None:
+        """A message of the pair of this index, or of the one that is being added."""
+        sequence = self.pairs if index is None else index
+        self._file.ros(RosChannel(topic_name, type_name), stamp_ns, sequence, data)

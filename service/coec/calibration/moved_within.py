@@ -1,0 +1,50 @@
+"""What is said of a window within which the camera moved: by how much, when, and which of its pairs come after that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import degrees
+
+from coec.calibration.estimators import Sight
+from coec.calibration.objective.edges import EdgeWitness, build_edges
+from coec.calibration.search.change_point import ChangePoint
+from coec.calibration.search.step_time import DatedEdges, step_time
+from coec.calibration.types import FramePair, MovedWithin, Window
+from coec.errors import CalibrationError, DecodeError
+from coec.geometry import se3
+
+
+def moved_within(change: ChangePoint, edges: EdgeWitness, sight: Sight) -> MovedWithin:
+    """The change that the edges of a window tell, dated by the pairs between those of the window, too."""
+    window = sight.window
+    stamps_ns = tuple(pair.stamp_ns for pair in window.pairs)
+    told = step_time(change, DatedEdges(stamps_ns, edges), window.between, lambda pairs: _edges_of(pairs, sight))
+    pairs_after = sum(stamp_ns >= told.first_after_ns for stamp_ns in stamps_ns)
+    return MovedWithin(told.last_before_ns, told.first_after_ns, pairs_after, told.T_before, told.T_after)
+
+
+def in_words(moved: MovedWithin, window: Window) -> str:
+    """By how much and when, after words that say that it moved."""
+    turn_deg = degrees(se3.rotation_angle_rad(moved.T_after @ se3.inverse(moved.T_before)))
+    before_s, after_s = (
+        (stamp_ns - window.pairs[0].stamp_ns) / 1e9 for stamp_ns in (moved.last_before_ns, moved.first_after_ns)
+    )
+    return f", by {turn_deg:.1f}° between {before_s:.1f} and {after_s:.1f} s after its first pair"
+
+
+def _edges_of(pairs: Sequence[FramePair], sight: Sight) -> DatedEdges | None:
+    """Nobody has looked at these pairs before: whichever cannot be used is left out."""
+    seen = []
+    for pair in pairs:
+        try:
+            seen.append((pair, sight.images.grey(pair.camera)))
+        except DecodeError:
+            continue
+    usable = [pair for pair, _ in seen]
+    of = replace(sight, window=replace(sight.window, pairs=tuple(usable)))
+    try:
+        witness = build_edges(usable, of.points, (grey for _, grey in seen), sight.window.rig)
+    except CalibrationError:
+        return None
+    return DatedEdges(tuple(pair.stamp_ns for pair in usable), witness)
