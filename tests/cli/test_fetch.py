@@ -18,7 +18,7 @@ from cli.conftest import Coec
 from coec.adapters.images.codec import encode_jpeg
 from coec.adapters.mcap.windows import WindowWriter, write_result
 from coec.adapters.zenoh.client import RemoteError, connected
-from coec.adapters.zenoh.window_fetch import PIECE_BYTES, fetch_window
+from coec.adapters.zenoh.window_fetch import PIECE_BYTES, Recording, fetch_window
 from coec.config import ZenohConfig
 from coec.errors import NotFoundError, UsageError
 from coec.runtime.recording.digests import DigestReader
@@ -227,7 +227,7 @@ def far(request: pytest.FixtureRequest) -> Keys:
     return Keys("coec", re.sub(r"[^A-Za-z0-9]", "-", request.node.name)[:60])
 
 
-def fetch(router: Router, keys: Keys, path: Path, patience_s: float = 0.3) -> WindowInfo:
+def fetch(router: Router, keys: Keys, path: Path, patience_s: float = 0.3) -> Recording:
     with connected([router.endpoint], 5.0) as session:
         return fetch_window(session, keys, PAIR, WINDOW, path, 5.0, patience_s, lambda *_: None)
 

@@ -13,7 +13,7 @@ from certificates import TestAuthority
 from coec.adapters.tls.conversation import Credentials, Speaker
 from coec.adapters.zenoh.client import JSON, RemoteError, Reply, ask_one
 from coec.adapters.zenoh.proven import give
-from coec.cli.query import download_window
+from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.config import Config, DepthConfig, SnippetsConfig, load_config
 from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
@@ -167,7 +167,7 @@ def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path,
         snippet, *_ = running.until(running.snippets, bool, "the seconds around the step")
         fetched = tmp_path / f"{snippet['snippet_id']}.mcap"
         names = (running.pair, snippet["snippet_id"])
-        download_window(running.session, running.keys, *names, fetched, PATIENCE_S, lambda *_: None)
+        fetch_window(running.session, running.keys, *names, fetched, PATIENCE_S, PATIENCE_S, lambda *_: None)
         bag = opened(fetched)
         images = [topic for topic, kind in bag.types.items() if kind == "sensor_msgs/msg/CompressedImage"]
         assert bag.counts[images[0]] > 20, "every frame of some seconds"

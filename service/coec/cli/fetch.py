@@ -40,6 +40,7 @@ from coec.schemas.replies import (
     HealthReply,
     HistoryReply,
     StatusReply,
+    WindowInfo,
 )
 
 LATEST: Final = "latest"
@@ -244,6 +245,8 @@ class _Fetch:
                     self.options.patience_s,
                     lambda done, total: bars.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} MB"),
                 )
+            if not isinstance(info, WindowInfo):
+                raise RemoteError("malformed", f"what the event calls a window is a snippet: {window_id}")
             sha256 = str(info.sha256)
             name = str(path.relative_to(self.folder))
             self.files[name] = FetchedFile(name=name, sha256=sha256, size_bytes=info.size_bytes)
