@@ -333,6 +333,15 @@ def test_a_moved_mount_becomes_suspect_then_red_and_the_next_window_corrects_it(
     assert fresh.flagged_since_ns is None
 
 
+def test_doubt_begins_with_a_check_that_is_undecided_and_ends_with_one_that_is_clear() -> None:
+    undecided = replace(check(200), undecided=True)
+    doubted = watched(HEALTHY, *clear_from(190, 2), undecided)
+    assert doubted.health is HealthState.HEALTHY
+    assert doubted.flagged_since_ns == 196 * S
+    assert watched(doubted, *flagged_from(205, 3)).flagged_since_ns == 196 * S
+    assert watched(doubted, *clear_from(205, 1)).flagged_since_ns is None
+
+
 def test_a_window_elsewhere_and_a_monitor_that_suspects_are_two_witnesses() -> None:
     suspect = watched(HEALTHY, *clear_from(110, 2), *flagged_from(120, 2))
     assert suspect.health is HealthState.SUSPECT

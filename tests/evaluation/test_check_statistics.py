@@ -12,13 +12,15 @@ from coec.schemas.checks import CheckedDrive, CheckedPose, Judged, MovedStatisti
 from coec.schemas.replies import Vector6
 
 
-def judged(pitch_deg: float, *, faint: tuple[str, ...] = (), causes: tuple[str, ...] = ()) -> Judged:
+def judged(
+    pitch_deg: float, *, undecided: bool = False, faint: tuple[str, ...] = (), causes: tuple[str, ...] = ()
+) -> Judged:
     sigma: Vector6 = (0.002, 0.002, 0.002, 0.03, 0.03, 0.03)
     noise: Vector6 = (0.001, 0.001, 0.001, 0.01, 0.01, 0.01)
     return Judged(
         offset=(radians(pitch_deg), 0.0, 0.0, 0.0, 0.0, 0.0), sigma=sigma, noise=noise, place=noise,
-        dispersion=1.0,        distance2=(radians(pitch_deg) / 0.007) ** 2, flagged=abs(radians(pitch_deg)) > 0.007,
-        faint=faint, causes=causes,
+        dispersion=1.0, distance2=(radians(pitch_deg) / 0.007) ** 2,
+        flagged=abs(radians(pitch_deg)) > 0.007 and not undecided, undecided=undecided, faint=faint, causes=causes,
     )  # fmt: skip
 
 
@@ -34,9 +36,17 @@ def of(rows: list[CheckedDrive], moved: str) -> MovedStatistics:
 
 
 def test_shares_are_of_checks_that_can_tell() -> None:
-    right = (judged(0.0), judged(1.0), judged(1.0, faint=("looks",)), judged(1.0, causes=("dark",)))
-    figures = of([driven("street", 1, right)], "right")
-    assert (figures.checks, figures.blind, figures.weak, figures.clear, figures.flagged) == (4, 1, 1, 2, 1)
+    right = (
+        judged(0.0), judged(1.0), judged(1.0, undecided=True), judged(1.0, faint=("looks",)),
+        judged(1.0, causes=("dark",)),
+    )  # fmt: skip
+    rows = [driven("street", 1, right)]
+    figures = of(rows, "right")
+    assert (figures.checks, figures.blind, figures.weak, figures.undecided) == (5, 1, 1, 1)
+    assert (figures.clear, figures.flagged) == (2, 1)
+    (street,) = report(rows, 0.0).rigs[0].places
+    assert (street.place, street.checks, street.blind, street.weak) == ("street", 5, 1, 1)
+    assert (street.undecided, street.flagged) == (1, 1)
     assert figures.flagged_low is not None
     assert figures.flagged_high is not None
     assert 0.0 < figures.flagged_low < 0.5 < figures.flagged_high < 1.0

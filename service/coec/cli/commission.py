@@ -143,7 +143,6 @@ def show_learned(baseline: Baseline) -> None:
         ("distance² over rotations, σ², at most", monitor.max_distance2_rotation),
         ("distance² of the farthest axis, σ², at most", monitor.max_farthest2_pose),
         ("edges per pair, at least", monitor.min_edges_per_pair),
-        ("edges kept, at least", monitor.min_edges_kept),
         ("agreement of the witnesses, deg, at most", float(np.degrees(monitor.max_agreement_rad))),
         ("overlap, at least", monitor.min_overlap),
     ):

@@ -28,7 +28,7 @@ from coec.sources import windows
 
 
 def run(options: Options) -> int:
-    """One check at the recording's extrinsic, 1 if it is flagged; with `detection`, the table instead.
+    """One check at the recording's extrinsic, 1 if it is flagged or cannot tell; with `detection`, the table instead.
 
     Raises:
         CoecError: nothing can be seen.
@@ -78,10 +78,12 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
             raise UsageError(f"{options.rig} does not hold for this recording: {against}")
     seen = diagnose(window, rigged.depth, rigged.images, rigged.configuration, baseline)
     wrong = seen.flagged or bool(seen.causes)
+    status = "failed" if wrong else "not_accepted" if seen.undecided else "accepted"
     metrics = {metric.name: metric_of(metric) for metric in seen.metrics}
     if options.as_json:
         document: dict[str, Any] = {
             "flagged": seen.flagged,
+            "undecided": seen.undecided,
             "flagged_by_paper": seen.flagged_by_paper,
             "causes": [{"code": cause.code, "text": cause.text} for cause in seen.causes],
             "offset": _in_degrees(seen.offset),
@@ -93,7 +95,7 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
             "metrics": {name: metric.model_dump(mode="json") for name, metric in metrics.items()},
         }
         console.print_json(document)
-        return int(wrong)
+        return int(status != "accepted")
     axes = console.table("axis", "offset", "± σ", "unit", "f'", "f''", right=(1, 2, 4, 5))
     offset, sigma = _in_degrees(seen.offset), _in_degrees(seen.sigma)
     for axis, name in enumerate(console.AXIS_NAMES):
@@ -106,11 +108,11 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
             console.figure(float(seen.second_derivative[axis]), sign=True),
         )
     console.out.print(axes)
-    console.out.print("extrinsic ", console.styled("failed" if wrong else "accepted"), sep="")
+    console.out.print("extrinsic ", console.styled(status), sep="")
     for cause in seen.causes:
         console.show(f"  {cause.code}: {cause.text}", "yellow")
     console.show_metrics(metrics)
-    return int(wrong)
+    return int(status != "accepted")
 
 
 def _in_degrees(rad_m: Any) -> list[float]:

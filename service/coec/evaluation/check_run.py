@@ -17,8 +17,14 @@ from coec.calibration.commissioning.baseline import Baseline, learned_hash
 from coec.calibration.commissioning.learning import FAR_RAD, learn_accuracy, learn_limits
 from coec.calibration.estimators import sight_of
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.monitor.check import NO_BIAS, Check, CheckInput, check_at, gather
-from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, UNCOMMISSIONED, faintness, judge_check
+from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
+from coec.calibration.monitor.check_verdict import (
+    FALSE_ALARM_RATE,
+    UNCOMMISSIONED,
+    expected_of,
+    faintness,
+    judge_check,
+)
 from coec.calibration.monitor.neighbourhood import ROTATION_DOF
 from coec.calibration.monitor.sensor_faults import scene_baseline
 from coec.calibration.ports import DepthModel, ImageReader, Silence
@@ -115,7 +121,7 @@ def _failed(row: CheckedDrive, error: CoecError) -> CheckedDrive:
 
 def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tuple[CheckedPose, ...]:
     configuration = _configuration()
-    bias = NO_BIAS if baseline is None else baseline.rotation.expected
+    expected = expected_of(baseline)
     starts = range(0, len(stage.pairs) - CHECK_PAIRS + 1, CHECK_PAIRS)
     windows = [stage.window(stage.pairs[first : first + CHECK_PAIRS]) for first in starts]
     sights = [sight_of(window, stage.depth, stage.images, configuration, Silence()) for window in windows]
@@ -128,7 +134,7 @@ def _checked(stage: _Stage, drive: CheckDrive, baseline: Baseline | None) -> tup
         if xi is None:
             continue
         pose = se3.perturb(stage.truth, xi)
-        seen = [(evidence, check_at(evidence, pose, bias)) for evidence in gathered]
+        seen = [(evidence, check_at(evidence, pose, expected)) for evidence in gathered]
         of_any = tuple(_judged(*one, pose, None) for one in seen)
         # The reference moves with what is served: a commissioned rig whose mount has moved.
         of_rig = () if baseline is None else tuple(_judged(*one, pose, baseline) for one in seen)
@@ -196,7 +202,8 @@ def _judged(evidence: CheckInput, check: Check, pose: Matrix4, baseline: Baselin
     faint = faintness(evidence.pairs, check, UNCOMMISSIONED if baseline is None else baseline.monitor)
     return Judged(
         offset=_six(seen.offset), sigma=_six(seen.sigma), noise=_six(seen.noise), place=_six(seen.place),
-        dispersion=seen.dispersion, distance2=seen.distance2, flagged=seen.flagged, faint=tuple(sorted(faint)),
+        dispersion=seen.dispersion, distance2=seen.distance2, flagged=seen.flagged, undecided=seen.undecided,
+        faint=tuple(sorted(faint)),
         causes=tuple(cause.code for cause in seen.causes),
     )  # fmt: skip
 

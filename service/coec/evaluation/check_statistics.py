@@ -10,6 +10,7 @@ vehicle stayed at each for ten minutes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain, cycle, islice
 
 import numpy as np
@@ -36,6 +37,7 @@ from coec.schemas.checks import (
     HoursStatistics,
     Judged,
     MovedStatistics,
+    PlaceStatistics,
     RigStatistics,
     TailStatistics,
 )
@@ -79,7 +81,13 @@ def _of_rigs(rows: Sequence[CheckedDrive], commissioned: bool, resampled_h: floa
     settled = Places.of([right[row.name] for row in known])
     tails = [one for stay in (CHECKS, PLACE_CHECKS) if (one := _tail(settled, stay)) is not None]
     moved = [_moved(name, known, right, commissioned) for name in (RIGHT, *(name for name, _, _ in MOVES))]
-    return RigStatistics(commissioned=commissioned, moved=tuple(moved), hours=tuple(hours), tails=tuple(tails))
+    places = tuple(
+        _place(place, [check for row in known if row.place == place for check in right[row.name]])
+        for place in dict.fromkeys(row.place for row in known)
+    )
+    return RigStatistics(
+        commissioned=commissioned, moved=tuple(moved), places=places, hours=tuple(hours), tails=tuple(tails)
+    )
 
 
 def _checks(row: CheckedDrive, moved: str, commissioned: bool) -> tuple[Judged, ...]:
@@ -145,6 +153,31 @@ def _hours(how: str, vehicles: Iterable[list[Where]]) -> HoursStatistics:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """How many of some checks cannot tell, and those that can."""
+
+    blind: int
+    weak: int
+    undecided: int
+    decided: tuple[Judged, ...]
+
+
+def _told(checks: Sequence[Judged]) -> _Told:
+    seeing = [check for check in checks if not check.causes]
+    clear = [check for check in seeing if not check.faint]
+    decided = tuple(check for check in clear if not check.undecided)
+    return _Told(len(checks) - len(seeing), len(seeing) - len(clear), len(clear) - len(decided), decided)
+
+
+def _place(place: str, checks: Sequence[Judged]) -> PlaceStatistics:
+    told = _told(checks)
+    return PlaceStatistics(
+        place=place, checks=len(checks), blind=told.blind, weak=told.weak, undecided=told.undecided,
+        flagged=sum(check.flagged for check in told.decided),
+    )  # fmt: skip
+
+
 def _tail(places: Places, stay_checks: int) -> TailStatistics | None:
     """Of a vehicle that is at another place after every `stay_checks`."""
     levels = alarm_levels(CONFIG)
@@ -180,12 +213,13 @@ def _moved(
         suspected += any(state.evidence >= levels.suspect for state in after)
         confirmed = next((number for number, state in enumerate(after, 1) if state.evidence >= levels.confirmed), None)
         delays += [] if confirmed is None else [confirmed]
-    clear = [check for check in everything if not check.causes and not check.faint]
+    told = _told(everything)
+    clear = told.decided
     flagged = sum(check.flagged for check in clear)
     low, high = interval(flagged, len(clear)) if clear else (None, None)
     return MovedStatistics(
-        moved=name, drives=drives, checks=len(everything), blind=sum(bool(check.causes) for check in everything),
-        weak=sum(bool(check.faint) and not check.causes for check in everything), clear=len(clear), flagged=flagged,
+        moved=name, drives=drives, checks=len(everything), blind=told.blind, weak=told.weak, undecided=told.undecided,
+        clear=len(clear), flagged=flagged,
         flagged_low=low, flagged_high=high, suspected=suspected, confirmed=len(delays), delay_checks=tuple(delays),
     )  # fmt: skip
 
@@ -204,5 +238,6 @@ def _observation(check: Judged, number: int) -> Observation:
         stamp_ns=begin_ns + CHECK_PAIRS - 1, pair_stamps_ns=tuple(begin_ns + pair for pair in range(CHECK_PAIRS)),
         metrics=(), offset=np.array(check.offset), sigma=np.array(check.sigma), noise=np.array(check.noise),
         place=np.array(check.place), dispersion=check.dispersion, distance2=check.distance2, flagged=check.flagged,
+        undecided=check.undecided,
         weak=bool(check.faint), flagged_by_paper=None, causes=tuple(CAUSES[code] for code in check.causes),
     )  # fmt: skip

@@ -15,10 +15,10 @@ from math import radians, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.commissioning.learning import is_flagged, learn_accuracy, learn_limits
+from coec.calibration.commissioning.learning import learn_accuracy, learn_limits
 from coec.calibration.commissioning.quantiles import normal_quantile
-from coec.calibration.monitor.check import Check, CheckInput, check_at
-from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS
+from coec.calibration.monitor.check import Check, CheckInput, Expected, check_at
+from coec.calibration.monitor.check_verdict import FALSE_ALARM_RATE, MIN_PAIRS, Opinion, opinion
 from coec.calibration.monitor.depth_witness import ask_depth
 from coec.calibration.types import Matrix4
 from coec.config import CalibrationConfig
@@ -55,13 +55,15 @@ CONFIDENCE = 0.95
 @dataclass(frozen=True, slots=True)
 class Detection:
     """Checks after one kind of move: how many, the share that each classifier flagged, and the interval of the first at
-    `CONFIDENCE`, as if every check were of pairs of its own. Of the right pose these are the false alarms."""
+    `CONFIDENCE`, as if every check were of pairs of its own. Of the right pose these are the false alarms. `undecided`
+    is the share that the first left open."""
 
     name: str
     checks: int
     flagged: float
     flagged_low: float
     flagged_high: float
+    undecided: float
     flagged_by_paper: float
 
 
@@ -70,7 +72,7 @@ class Tried:
     """One check: the move it was after, and what both classifiers said."""
 
     name: str
-    flagged: bool
+    opinion: Opinion
     flagged_by_paper: bool
     check: Check
 
@@ -114,6 +116,7 @@ def try_detection(
         of_learned = evidence.of(learned)
         accuracies = learn_accuracy(of_learned, right)
         limits = learn_limits(of_learned, right, config, accuracies, FALSE_ALARM_RATE)
+        expected = Expected(*(accuracy.expected for accuracy in accuracies))
         known = [axis for axis in range(3, 6) if accuracies[1].sigma(len(kept))[axis] <= OBSERVABLE_M]
         for name, turn_rad, shift_m in MOVES:
             if shift_m > 0.0 and not known:
@@ -123,9 +126,9 @@ def try_detection(
                 indices = sorted(rng.permutation(kept)[:size].tolist())
                 xi = _move(rng, turn_rad, shift_m, known)
                 part, pose = evidence.of(indices), se3.perturb(right, xi)
-                seen = check_at(part, pose, accuracies[0].expected)
+                seen = check_at(part, pose, expected)
                 by_paper = limits.of_paper.flags(ask_depth(part, seen, pose, config))
-                tried.append(Tried(name, is_flagged(seen, *accuracies, limits), by_paper, seen))
+                tried.append(Tried(name, opinion(seen, *accuracies, limits), by_paper, seen))
         heard(split + 1, splits)
     return tried
 
@@ -136,9 +139,10 @@ def table(tried: Sequence[Tried]) -> tuple[Detection, ...]:
     for name, _, _ in MOVES:
         of = [one for one in tried if one.name == name]
         if of:
-            flagged = sum(one.flagged for one in of)
+            flagged = sum(one.opinion is Opinion.FLAGGED for one in of)
+            undecided = sum(one.opinion is Opinion.UNDECIDED for one in of) / len(of)
             by_paper = sum(one.flagged_by_paper for one in of) / len(of)
-            rows.append(Detection(name, len(of), flagged / len(of), *interval(flagged, len(of)), by_paper))
+            rows.append(Detection(name, len(of), flagged / len(of), *interval(flagged, len(of)), undecided, by_paper))
     return tuple(rows)
 
 

@@ -19,8 +19,8 @@ def show(report: ChecksReport) -> None:
 def _show(rigs: RigStatistics) -> None:
     console.show("commissioned rigs" if rigs.commissioned else "rigs of which nothing is known", "bold")
     table = console.table(
-        "served pose", "checks", "blind", "faint", "clear", "flagged", "of clear", "95 %", "drives", "suspected",
-        "confirmed", "delay", right=range(1, 12),
+        "served pose", "checks", "blind", "faint", "undecided", "clear", "flagged", "of clear", "95 %", "drives",
+        "suspected", "confirmed", "delay", right=range(1, 13),
     )  # fmt: skip
     for row in rigs.moved:
         share = f"{100.0 * row.flagged / row.clear:.1f} %" if row.clear else "-"
@@ -30,10 +30,14 @@ def _show(rigs: RigStatistics) -> None:
             else f"{100.0 * row.flagged_low:.1f} to {100.0 * row.flagged_high:.1f} %"
         )
         delay = f"{median(row.delay_checks):g} checks" if row.delay_checks else "-"
-        counts = (row.checks, row.blind, row.weak, row.clear, row.flagged)
+        counts = (row.checks, row.blind, row.weak, row.undecided, row.clear, row.flagged)
         drives = (row.drives, row.suspected, row.confirmed)
         table.add_row(row.moved, *map(str, counts), share, between, *map(str, drives), delay)
     console.out.print(table)
+    places = console.table("right mount", "checks", "blind", "faint", "undecided", "flagged", right=range(1, 6))
+    for place in rigs.places:
+        places.add_row(place.place, *map(str, (place.checks, place.blind, place.weak, place.undecided, place.flagged)))
+    console.out.print(places)
     hours = console.table("right mount", "hours", "suspicions", "alarms", "in 100 h at most (95 %)", right=range(1, 5))
     for driven in rigs.hours:
         hours.add_row(

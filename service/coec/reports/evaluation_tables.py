@@ -245,11 +245,11 @@ def _show_normalised(found: NormalisedErrorsReport) -> None:
 
 def show_detection(detection: DetectionReport) -> None:
     """Checks of moved extrinsics: how many of them each classifier flags."""
-    table = console.table("extrinsic", "checks", "flagged", "95 %", "by equation (2)", right=(1, 2, 3, 4))
+    table = console.table("extrinsic", "checks", "flagged", "95 %", "undecided", "by equation (2)", right=range(1, 6))
     for row in detection.moves:
         between = f"{100 * row.flagged_low:.1f} to {100 * row.flagged_high:.1f} %"
-        by_paper = f"{100 * row.flagged_by_paper:.1f} %"
-        table.add_row(row.name, str(row.checks), f"{100 * row.flagged:.1f} %", between, by_paper)
+        undecided, by_paper = f"{100 * row.undecided:.1f} %", f"{100 * row.flagged_by_paper:.1f} %"
+        table.add_row(row.name, str(row.checks), f"{100 * row.flagged:.1f} %", between, undecided, by_paper)
     console.out.print(table)
     console.show(
         f"{detection.splits} splits of {detection.pairs} pairs: limits learned on one half, tried on the other; "

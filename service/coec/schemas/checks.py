@@ -19,6 +19,7 @@ class Judged(Part):
     dispersion: float
     distance2: float
     flagged: bool
+    undecided: bool
     faint: tuple[str, ...] = Field(description="of what its edges have too little; empty where they are not faint")
     causes: tuple[str, ...] = Field(description="what is wrong with its data, by code")
 
@@ -52,6 +53,7 @@ class MovedStatistics(Part):
     checks: Count
     blind: Count = Field(description="with a cause in their data: they say nothing of the pose")
     weak: Count = Field(description="with faint edges")
+    undecided: Count = Field(description="with clear edges that neither accuse the pose nor acquit it")
     clear: Count = Field(description="all others")
     flagged: Count = Field(description="of the clear ones")
     flagged_low: float | None = Field(description="95 % interval of that share (Wilson); null of no clear check")
@@ -59,6 +61,17 @@ class MovedStatistics(Part):
     suspected: Count = Field(description="drives on which the detector suspected the mount")
     confirmed: Count = Field(description="drives on which it became certain")
     delay_checks: tuple[Count, ...] = Field(description="until it did, of each of those")
+
+
+class PlaceStatistics(Part):
+    """Of all checks of right mounts in places of one kind: how many can tell."""
+
+    place: str
+    checks: Count
+    blind: Count
+    weak: Count
+    undecided: Count
+    flagged: Count
 
 
 class HoursStatistics(Part):
@@ -93,6 +106,7 @@ class RigStatistics(Part):
 
     commissioned: bool
     moved: tuple[MovedStatistics, ...]
+    places: tuple[PlaceStatistics, ...]
     hours: tuple[HoursStatistics, ...]
     tails: tuple[TailStatistics, ...] = Field(description="empty with fewer than twenty places")
 

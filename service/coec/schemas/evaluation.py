@@ -79,11 +79,12 @@ class DetectionRow(Part):
 
     name: str = Field(description="`right`, or how far the extrinsic was moved")
     checks: Count
-    flagged: float = Field(ge=0, le=1, description="by the distance of the local optimum")
+    flagged: float = Field(ge=0, le=1, description="by where the local optimum lies, and its edges insist on")
     flagged_low: float = Field(
         ge=0, le=1, description="of its 95 % interval (Wilson), as if no two checks shared a pair"
     )
     flagged_high: float = Field(ge=0, le=1, description="likewise")
+    undecided: float = Field(ge=0, le=1, description="neither accused nor acquitted")
     flagged_by_paper: float = Field(
         ge=0, le=1, description="by equation (2) with learned limits; for comparison, it decides nothing"
     )

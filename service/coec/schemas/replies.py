@@ -237,6 +237,7 @@ class CheckReply(Part):
     stamp_ns: int = Field(description="of the last pair, ns")
     pair_stamps_ns: tuple[int, ...] = Field(description="of all of them, ns, ascending")
     flagged: bool = Field(description="the pose is wrong, or the data are")
+    undecided: bool = Field(default=False, description="it neither accuses the pose nor acquits it")
     weak: bool = Field(description="the edges are fainter than they should be: the check counts less")
     flagged_by_paper: bool | None = Field(
         description="equation (2), for comparison: it decides nothing; null until the rig is commissioned"

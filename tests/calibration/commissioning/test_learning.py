@@ -172,7 +172,7 @@ def limits_of(says: NDArray[np.float64], rig: Rig, monkeypatch: pytest.MonkeyPat
         offset = evidence.says.mean(axis=0) - se3.difference(pose, np.eye(4))
         return SimpleNamespace(
             pairs=len(evidence.pairs), offset_rotation=np.where(np.arange(6) < 3, offset, 0.0), offset_pose=offset,
-            edges_at_best=20.0, edges_kept=0.99, overlap=1.0,
+            edges_at_best=20.0, overlap=1.0,
         )  # fmt: skip
 
     def depth_of(*_: object) -> SimpleNamespace:

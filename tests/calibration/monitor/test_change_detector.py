@@ -98,6 +98,8 @@ class TestEvidence:
         states = [after(*(fresh(n, offset=place) for n, place in enumerate(places[:count]))) for count in (1, 2, 3, 4)]
         assert [state.outcome for state in states] == [Finding.CLEAR, *[Finding.AT_ODDS] * 3]
         assert after_observation(states[-1], fresh(9, flagged=False), LEVELS).outcome is Finding.CLEAR
+        open_still = replace(fresh(9, flagged=False), undecided=True)
+        assert after_observation(states[-1], open_still, LEVELS).outcome is Finding.AT_ODDS
 
     @pytest.mark.parametrize("knock", [turned(1.0, 0.0, 0.0), turned(2.0, -2.0, 1.0), turned(5.0, -4.0, 3.0)])
     def test_a_knock_of_any_size_is_the_same_at_every_check(self, knock: NDArray[np.float64]) -> None:

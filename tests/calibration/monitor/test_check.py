@@ -10,9 +10,18 @@ import pytest
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
 from coec.calibration.estimators import sight_of
-from coec.calibration.monitor.check import Check, CheckInput, check_at, gather
-from coec.calibration.monitor.check_verdict import MIN_EDGES_IN_VIEW, MIN_LOOKS, judge_check, over_limits
+from coec.calibration.monitor.check import Check, CheckInput, Expected, check_at, gather
+from coec.calibration.monitor.check_verdict import (
+    MIN_EDGES_IN_VIEW,
+    MIN_LOOKS,
+    TELLING_CONTRAST,
+    Opinion,
+    judge_check,
+    opinion,
+    over_limits,
+)
 from coec.calibration.monitor.neighbourhood import MIN_CONTRAST
+from coec.calibration.monitor.support import Support, support
 from coec.calibration.objective.curvature import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.ports import DepthModel, Silence
@@ -56,18 +65,40 @@ def evidence(sharp_street: Window, stereo: DepthModel) -> CheckInput:
     return gather(sight_of(sharp_street, stereo, GreyImages(LimitsConfig()), CONFIG, Silence()), np.radians(1.0))
 
 
-class TestEdgesKept:
-    def test_are_kept_at_the_right_pose_and_lost_to_its_left(self, evidence: CheckInput, sharp_street: Window) -> None:
+class TestSupport:
+    def test_edges_insist_beside_a_wrong_pose_and_not_at_the_right_one(
+        self, evidence: CheckInput, sharp_street: Window
+    ) -> None:
         right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
-        kept = check_at(evidence, right).edges_kept
-        beside = check_at(evidence, se3.perturb(right, xi)).edges_kept
-        assert kept > 0.9
-        assert beside < 0.7 * kept
+        assert not check_at(evidence, right).of_rotation.insists
+        beside = check_at(evidence, se3.perturb(right, xi))
+        assert beside.of_rotation.insists
+        assert beside.of_pose.insists
 
-    def test_are_looked_for_where_the_bias_puts_them(self, evidence: CheckInput, sharp_street: Window) -> None:
+    def test_nothing_is_gained_where_the_bias_puts_the_optimum(
+        self, evidence: CheckInput, sharp_street: Window
+    ) -> None:
         right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
-        assert check_at(evidence, se3.perturb(right, xi), -xi).edges_kept > 0.9
+        told = check_at(evidence, se3.perturb(right, xi), Expected(-xi, -xi))
+        assert not told.of_rotation.insists
+        assert not told.of_pose.insists
 
+    def test_what_all_cells_gain_is_certain_and_what_a_few_gain_is_not(self) -> None:
+        there = np.full((6, 16), 1.0)
+        everywhere = support(there, there - 0.3 + np.random.default_rng(1).normal(0.0, 0.05, (6, 16)))
+        one_thing = np.zeros((6, 16))
+        one_thing[:, 3] = 16 * 0.3
+        assert everywhere.insists
+        assert support(there, there - one_thing).kept == pytest.approx(everywhere.kept, abs=0.02)
+        assert not support(there, there - one_thing).gained
+
+    def test_an_optimum_without_edges_gained_nothing(self) -> None:
+        told = support(np.zeros((6, 16)), np.zeros((6, 16)))
+        assert (told.kept, told.certainty, told.insists) == (1.0, 0.0, False)
+
+
+NOTHING = Support(kept=1.0, certainty=0.0)
+INSISTS = Support(kept=0.5, certainty=4.0)
 
 A_CHECK = Check(
     pairs=1,
@@ -79,26 +110,52 @@ A_CHECK = Check(
     edges_at_best=10.0,
     edges_in_view=100_000,
     looks=6.0,
-    edges_kept=1.0,
-    contrast=10.0,
+    of_rotation=NOTHING,
+    of_pose=NOTHING,
+    contrast=TELLING_CONTRAST,
     overlap=1.0,
 )
 
 
-class TestOverLimits:
-    LIMITS = MonitorLimits(12.0, 12.0, 4.0, min_edges_kept=0.8)
+class TestOpinion:
+    """At one, two and four times half the limit of the distance."""
+
+    LIMITS = MonitorLimits(12.0, 12.0, 4.0, insisted_share=0.25)
     ACCURACY = Accuracy(np.zeros(6), np.full(6, 0.001), np.zeros(6))
 
-    @pytest.mark.parametrize(("kept", "flagged"), [(0.9, False), (0.7, True)])
-    def test_a_quarter_of_the_distance_is_too_far_where_the_edges_are_lost(self, kept: float, flagged: bool) -> None:
-        seen = replace(A_CHECK, offset_rotation=np.array([0.002, 0, 0, 0, 0, 0]), edges_kept=kept)
-        of_rotation, of_pose = over_limits(seen, self.ACCURACY, self.ACCURACY, self.LIMITS)
-        assert (of_rotation > 1.0) is flagged
-        assert of_pose == 0.0
+    def said(self, seen: Check, off: float, limits: MonitorLimits = LIMITS) -> Opinion:
+        sigma = self.ACCURACY.sigma(1)[0]
+        seen = replace(seen, offset_rotation=np.array([off * sigma * np.sqrt(3.0), 0, 0, 0, 0, 0]))
+        over, _ = over_limits(seen, self.ACCURACY, self.ACCURACY, limits)
+        assert over == pytest.approx(0.25 * off**2)
+        return opinion(seen, self.ACCURACY, self.ACCURACY, limits)
 
-    def test_lost_edges_alone_flag_nothing(self) -> None:
-        of_rotation, _ = over_limits(replace(A_CHECK, edges_kept=0.1), self.ACCURACY, self.ACCURACY, self.LIMITS)
-        assert of_rotation == 0.0
+    @pytest.mark.parametrize(
+        ("support_there", "opinions"),
+        [
+            (NOTHING, (Opinion.CLEAR, Opinion.CLEAR, Opinion.UNDECIDED)),
+            (Support(0.95, 4.0), (Opinion.CLEAR, Opinion.UNDECIDED, Opinion.UNDECIDED)),
+            (Support(0.5, 1.0), (Opinion.CLEAR, Opinion.CLEAR, Opinion.UNDECIDED)),
+            (INSISTS, (Opinion.CLEAR, Opinion.FLAGGED, Opinion.FLAGGED)),
+        ],
+    )
+    def test_far_off_is_wrong_where_the_edges_insist_and_open_where_they_do_not(
+        self, support_there: Support, opinions: tuple[Opinion, ...]
+    ) -> None:
+        seen = replace(A_CHECK, of_rotation=support_there)
+        assert tuple(self.said(seen, off) for off in (0.9, 1.1, 2.1)) == opinions
+
+    def test_the_share_is_of_rigs_whose_bias_is_known(self) -> None:
+        limits = MonitorLimits(12.0, 12.0, 4.0)
+        seen = replace(A_CHECK, of_rotation=INSISTS)
+        assert [self.said(seen, off, limits) for off in (1.1, 2.1)] == [Opinion.CLEAR, Opinion.FLAGGED]
+
+    def test_a_scene_where_optima_scatter_accuses_nobody(self) -> None:
+        seen = replace(A_CHECK, of_rotation=INSISTS, contrast=TELLING_CONTRAST - 0.1)
+        assert [self.said(seen, off) for off in (0.9, 1.1, 2.1)] == [Opinion.CLEAR, *[Opinion.UNDECIDED] * 2]
+
+    def test_what_one_optimum_insists_on_the_other_does_not_say(self) -> None:
+        assert self.said(replace(A_CHECK, of_pose=INSISTS), 2.1) is Opinion.UNDECIDED
 
 
 @pytest.mark.parametrize(
@@ -131,7 +188,7 @@ def test_few_edges_and_frames_that_say_the_same_decide_nothing_however_well_they
     moved = np.array([0.0, np.radians(1.0), 0, 0, 0, 0])
     seen = replace(
         A_CHECK, pairs=pairs, edges_in_view=int(in_view * pairs), looks=looks, edges_at_best=100.0,
-        offset_rotation=moved,
+        offset_rotation=moved, of_rotation=INSISTS,
     )  # fmt: skip
     told = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)
     assert (told.flagged, told.weak) == (True, weak)

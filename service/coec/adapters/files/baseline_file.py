@@ -57,7 +57,7 @@ class LimitsDocument(_Document):
     max_distance2_rotation: float
     max_farthest2_pose: float
     min_edges_per_pair: float
-    min_edges_kept: float | None
+    insisted_share: float
     max_agreement_rad: float | None
     min_overlap: float
     min_mi: float | None
@@ -171,7 +171,7 @@ def baseline_to_json(baseline: Baseline) -> dict[str, Any]:
             max_distance2_rotation=limits.max_distance2_rotation,
             max_farthest2_pose=limits.max_farthest2_pose,
             min_edges_per_pair=limits.min_edges_per_pair,
-            min_edges_kept=_finite(limits.min_edges_kept),
+            insisted_share=limits.insisted_share,
             max_agreement_rad=_finite(limits.max_agreement_rad),
             min_overlap=limits.min_overlap,
             min_mi=_finite(limits.min_mi),
@@ -220,7 +220,7 @@ def baseline_from_json(values: object) -> Baseline:
             max_distance2_rotation=limits.max_distance2_rotation,
             max_farthest2_pose=limits.max_farthest2_pose,
             min_edges_per_pair=limits.min_edges_per_pair,
-            min_edges_kept=_or(limits.min_edges_kept, -math.inf),
+            insisted_share=limits.insisted_share,
             max_agreement_rad=_or(limits.max_agreement_rad, math.inf),
             min_overlap=limits.min_overlap,
             min_mi=_or(limits.min_mi, -math.inf),

@@ -176,6 +176,7 @@ def check_of(observation: Observation, after: PairState) -> replies.CheckReply:
         stamp_ns=observation.stamp_ns,
         pair_stamps_ns=observation.pair_stamps_ns,
         flagged=observation.flagged,
+        undecided=observation.undecided,
         weak=observation.weak,
         flagged_by_paper=observation.flagged_by_paper,
         causes=tuple(replies.Reason(code=cause.code, text=cause.text) for cause in observation.causes),

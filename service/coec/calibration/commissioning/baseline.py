@@ -36,7 +36,7 @@ PIXEL_SHARE = 0.3
 """Share of a pixel that the local optimum may be off for the pixels alone, whatever the scenes of a commissioning say:
 edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
 
-FIGURES = "edges-decide"
+FIGURES = "edges-insist"
 """Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a check at
 the same pairs gives other figures: limits of the old ones would not fit."""
 
@@ -88,7 +88,7 @@ class MonitorLimits:
         max_farthest2_pose: of the local optimum over six degrees of freedom, along the axis that is farthest off,
             likewise squared.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
-        min_edges_kept: see `Check`; where fewer are kept, a quarter of the squared distances is too far.
+        insisted_share: of these two limits, beyond which it is too far where the edges insist on it.
         max_agreement_rad: between the local optima of the two witnesses.
         min_overlap: points in view over the most that any pose within reach sees.
         min_mi, max_f1, min_f2: equation (2) of Borer et al. 2023: nats, per radian, per radian².
@@ -97,7 +97,7 @@ class MonitorLimits:
     max_distance2_rotation: float
     max_farthest2_pose: float
     min_edges_per_pair: float
-    min_edges_kept: float = -inf
+    insisted_share: float = 1.0
     max_agreement_rad: float = inf
     min_overlap: float = 0.5
     min_mi: float = -inf

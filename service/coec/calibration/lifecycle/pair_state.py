@@ -358,7 +358,7 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
     """The monitor checked the served extrinsic. One check decides nothing: `MonitorState` adds them up."""
     monitor = check_taken(state.monitor, observation, rules.alarm)
     since_ns = state.flagged_since_ns
-    if observation.flagged and not observation.causes:
+    if (observation.flagged or observation.undecided) and not observation.causes:
         if since_ns is None:
             # Without a clear check before, nothing says that earlier pairs were any better.
             was_clear = state.monitor.outcome is Finding.CLEAR

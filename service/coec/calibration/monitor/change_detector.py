@@ -93,7 +93,7 @@ class Observation:
         noise: (6,) the part of it that is new at every check.
         place: (6,) the part that all checks of a street share; the rest is the rig's.
         dispersion: times `noise` and `place` that checks of this scene scatter by, 1 at least; see `dispersion`.
-        distance2: squared distance in standard deviations over its limit: above 1 is flagged.
+        distance2: squared distance in standard deviations over its limit.
         flagged: the pose is wrong, or the data are.
         weak: the edges at the local optimum are fainter than they should be.
         flagged_by_paper: equation (2) with learned limits; None until the rig is commissioned.
@@ -104,6 +104,7 @@ class Observation:
         dirty: blocks of the image, by number, that have no contrast in any pair; for commissioned rigs in daylight.
         textured: blocks that could be, 0 where it is not known.
         standing_stamps_ns: of the pairs that were taken while the vehicle stood.
+        undecided: by itself it neither accuses the pose nor acquits it.
     """
 
     stamp_ns: int
@@ -125,6 +126,7 @@ class Observation:
     dirty: tuple[int, ...] = ()
     textured: int = 0
     standing_stamps_ns: tuple[int, ...] = ()
+    undecided: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +255,7 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
         shifted = after_check(shifted, told, TRANSLATIONS, fresh, most)
     step = fresh * (WEAK_SHARE if observation.weak else 1.0)
     if not observation.flagged:
-        at_odds = state.at_odds if observation.weak else 0.0
+        at_odds = state.at_odds if observation.weak or observation.undecided else 0.0
     else:
         at_odds = min(state.at_odds + step, MOST_AT_ODDS)
     counted = min(state.counted + step, AT_ODDS_AT)

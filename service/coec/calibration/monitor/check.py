@@ -28,19 +28,29 @@ from coec.calibration.monitor.sensors import (
     prepare_images,
     prepare_sweep,
 )
+from coec.calibration.monitor.support import Support, support
 from coec.calibration.objective.mutual_information import Features
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.geometry import se3
 from coec.geometry.cameras import in_image
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
 from coec.geometry.edges.image_edges import Rectangle
 from coec.geometry.projection import project
 
 DEPTH_POINTS = 60_000
 """Points of the sweeps of a check, seen or not, that carry the depth witness: its hill is degrees wide."""
 
-NO_BIAS = np.zeros(6)
-"""Of a rig that was not commissioned: its optimum is expected at the pose itself."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """Where the optima over rotations and over all axes are expected, ξ (6,) from the pose that is checked."""
+
+    rotation: NDArray[np.float64]
+    pose: NDArray[np.float64]
+
+
+AT_POSE = Expected(np.zeros(6), np.zeros(6))
+"""Of a rig that was not commissioned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +87,7 @@ class Check:
         edges_at_best: that at the local optimum over rotations.
         edges_in_view: range edges that lie in the images there, of all pairs.
         looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 where they do not tell.
-        edges_kept: that of the finest band where the optimum is expected, over that where it is.
+        of_rotation, of_pose: how far the edges insist on these local optima.
         contrast: how far the edges at the local optimum stand above other poses, standard deviations.
         overlap: range edges in view at the pose over those that come into view within reach.
     """
@@ -91,7 +101,8 @@ class Check:
     edges_at_best: float
     edges_in_view: int
     looks: float
-    edges_kept: float
+    of_rotation: Support
+    of_pose: Support
     contrast: float
     overlap: float
 
@@ -138,11 +149,12 @@ def join(sight: Sight, sweeps: Sequence[PreparedSweep], images: PreparedImages, 
     return CheckInput(window.rig, window.pairs, edges, scenes, features)
 
 
-def check_at(evidence: CheckInput, pose: Matrix4, bias: NDArray[np.float64] = NO_BIAS) -> Check:
-    """A check at `pose` (4, 4), from which the optimum over rotations is expected at ξ = `bias` (6,)."""
+def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) -> Check:
+    """A check at `pose` (4, 4)."""
     edges = evidence.edges
     found = search(edges, pose)
-    landscape = Landscape.about(edges.cells(found.T_rotation), found.T_rotation, tuple(range(ROTATION_DOF)))
+    cells = edges.cells(found.T_rotation)
+    landscape = Landscape.about(cells, found.T_rotation, tuple(range(ROTATION_DOF)))
     noise = measure_noise(landscape)
     whole, sharp = edges.whole.frames, edges.sharp.frames
     return Check(
@@ -155,7 +167,8 @@ def check_at(evidence: CheckInput, pose: Matrix4, bias: NDArray[np.float64] = NO
         edges_at_best=frame_alignment(whole, found.T_rotation).significance,
         edges_in_view=_in_view(sharp, found.T_rotation),
         looks=1.0 if noise is None else noise.looks,
-        edges_kept=_kept(edges.bands[0].frames, se3.perturb(pose, bias), found.T_rotation),
+        of_rotation=support(landscape.centre, cells.at(se3.perturb(pose, expected.rotation))),
+        of_pose=support(cells.at(found.T_pose), cells.at(se3.perturb(pose, expected.pose))),
         contrast=found.contrast,
         overlap=_in_view(sharp, pose) / max(len(sharp.weight), 1),
     )
@@ -165,8 +178,3 @@ def _in_view(edges: EdgeFrames, T_camera_lidar: Matrix4) -> int:
     """How many range edges lie in the images."""
     uv_px, valid = project(edges.camera, placed(edges, T_camera_lidar))
     return int(np.count_nonzero(valid & in_image(edges.camera, uv_px)))
-
-
-def _kept(band: EdgeFrames, T_expected: Matrix4, T_best: Matrix4) -> float:
-    expected, best = significances(band, np.stack([T_expected, T_best])).tolist()
-    return float(expected / best) if best > 0.0 else 1.0  # an optimum without edges has none to lose
