@@ -1,7 +1,7 @@
 """Simulated drives for tests: each is drawn once, and kept under pytest's cache until something it is made of changes.
 
-A drive is made of every module of coec that `coec.simulation.drive` reaches by its imports, and of the libraries that
-draw it: their bytes and versions name the folder, so nobody has to remember to empty it.
+A drive is made of every module of coec that `coec.simulation.drive` and `rig_drive` reach by their imports, and of the
+libraries that draw it: their bytes and versions name the folder, so nobody has to remember to empty it.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ SERVICE = REPOSITORY / "service"
 CACHE = REPOSITORY / ".pytest_cache" / "d" / "drives"
 """Where `pytest --cache-clear` clears."""
 
+ROOTS = ("drive.py", "rig_drive.py")
+
 LIBRARIES = ("embreex", "numba", "numpy", "opencv-python-headless")
 
 
@@ -56,9 +58,7 @@ def drawn_source(source: str, cameras: tuple[int, ...] | None = None) -> Framewi
 @functools.lru_cache(maxsize=8)
 def _drawn(query: tuple[tuple[str, str], ...], cameras: tuple[int, ...] | None) -> FramewiseRecording:
     drive = open_sim(dict(query))
-    name = hashlib.sha256(repr((query, cameras)).encode()).hexdigest()[:16]
-    path = CACHE / _fingerprint() / f"{name}.pickle"
-    messages = _kept(path, lambda: list(drive.messages(cameras)))
+    messages = kept((query, cameras), lambda: list(drive.messages(cameras)))
     pictures = [message for message in messages if isinstance(message, CameraFrame)]
     sweeps = [message for message in messages if isinstance(message, LidarFrame)]
     frames = tuple(
@@ -73,9 +73,10 @@ def _same(frame: F) -> F:
     return frame
 
 
-def _kept(path: Path, draw: Callable[[], list[Message]]) -> list[Message]:
-    """What the file holds, or what is drawn now and kept in it. Processes that want the same wait for the one that
-    draws it."""
+def kept(what: object, draw: Callable[[], list[Message]]) -> list[Message]:
+    """Messages that were drawn before and kept under what they are (by its `repr`), or that are drawn now. Processes
+    that want the same wait for the one that draws it."""
+    path = CACHE / _fingerprint() / f"{hashlib.sha256(repr(what).encode()).hexdigest()[:16]}.pickle"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -102,7 +103,7 @@ def _fingerprint() -> str:
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
         digest.update(f"{library} {version(library)}\n".encode())
-    for path in sorted(modules_behind(SERVICE / "coec" / "simulation" / "drive.py")):
+    for path in sorted(set().union(*(modules_behind(SERVICE / "coec" / "simulation" / root) for root in ROOTS))):
         digest.update(f"{path.relative_to(SERVICE)}\n".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.adapters.ros.diagnostics import MAX_MESSAGE, Level, Service, level_of, of_health
+from coec.adapters.ros.diagnostics import (
+    MAX_MESSAGE,
+    SENSOR_LEVELS,
+    Level,
+    Service,
+    level_of,
+    of_health,
+    of_sensor,
+)
 from coec.schemas.replies import (
     STUCK,
     Axes,
@@ -19,6 +27,8 @@ from coec.schemas.replies import (
     MetricReply,
     Reason,
 )
+from coec.schemas.rig_state import SensorState
+from rig_replies import moved_lidar, sensor
 
 STATES = st.sampled_from(get_args(HealthState))
 SERVICES: st.SearchStrategy[Service] = st.sampled_from(get_args(Service))
@@ -121,3 +131,33 @@ def test_every_figure_is_told_with_its_limit() -> None:
 
 def test_without_a_serial_number_the_hardware_is_the_pair_of_the_vehicle() -> None:
     assert of_health(health("healthy"), "running", None, {}).hardware_id == "shuttle-7/front"
+
+
+@pytest.mark.parametrize("state", get_args(SensorState))
+def test_a_sensor_is_ok_only_where_it_was_looked_at_and_fits(state: SensorState) -> None:
+    told = of_sensor(sensor("roof", "lidar", state), "shuttle-7", "running")
+    assert (told.level is Level.OK) == (state == "calibrated")
+    assert (told.level is Level.ERROR) == state.endswith("_moved")
+    assert told.level is SENSOR_LEVELS[state]
+    assert of_sensor(sensor("roof", "lidar", state), "shuttle-7", "stopping").level is Level.STALE
+    assert told.hardware_id == "shuttle-7/roof"
+
+
+def test_a_sensor_that_moved_says_by_how_much_and_in_which_pairs() -> None:
+    told = of_sensor(moved_lidar(), "shuttle-7", "running")
+    assert told.message == "lidar_moved: It moved by 1.00°: seen by front, left; all else fits (99.8 %)."
+    assert told.values["pairs"] == "front, left"
+    assert told.values["probability of a move"] == "0.998"
+    assert told.values["moved"].startswith("rx 0 ± 0.05 deg, ry 1 ± 0.05 deg")
+    assert told.values["moved"].endswith("tz 0 ± 0.01 m")
+
+
+def test_of_a_sensor_that_nobody_looked_at_nothing_is_made_up() -> None:
+    told = of_sensor(sensor("roof", "lidar", "unknown", probability=None, since_ns=None), "shuttle-7", "running")
+    assert {"probability of a move", "since_ns", "moved"}.isdisjoint(told.values)
+
+
+@given(text=st.text(max_size=4000))
+def test_a_long_reason_of_a_sensor_stays_within_what_a_message_may_have(text: str) -> None:
+    why = (Reason(code="moved", text=text),)
+    assert len(of_sensor(sensor("roof", "lidar", "undecided", reasons=why), "v", "running").message) <= MAX_MESSAGE

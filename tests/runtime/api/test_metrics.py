@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import get_args
+
 import pytest
 
 from coec.runtime.api import metrics
@@ -21,7 +24,9 @@ from coec.schemas.replies import (
     StreamStatus,
     WorkerStatus,
 )
+from coec.schemas.rig_state import RigReply, SensorState
 from open_metrics import Family, MalformedError, parse
+from rig_replies import knocked, untold
 from statuses import a_status
 
 
@@ -98,8 +103,8 @@ def a_view() -> View:
     return View(a_busy_status(), {"front": a_health()}, 5, 6, took)
 
 
-def read() -> dict[str, Family]:
-    return parse(metrics.render(a_view()).decode())
+def read(rig: RigReply | None = None) -> dict[str, Family]:
+    return parse(metrics.render(replace(a_view(), rig=rig)).decode())
 
 
 def test_the_text_is_open_metrics_and_holds_every_family_with_its_help() -> None:
@@ -145,6 +150,29 @@ def test_what_is_not_known_is_not_told() -> None:
     assert (("metric", "overlap"), ("pair", "front")) not in told, "it could not be computed"
     assert not [one for _, one in families["coec_drift"].samples if dict(one)["axis"] == "rz"], "it was not estimated"
     assert {dict(labels)["stream"] for _, labels in families["coec_sample_age_seconds"].samples} == {"camera"}
+
+
+def test_of_a_rig_its_sensors_are_told_its_fit_and_what_was_lost() -> None:
+    families = read(knocked())
+    for name, suffix, labels, value in [
+        ("coec_sensor", "", {"sensor": "roof", "coec_sensor": "lidar_moved"}, 1),
+        ("coec_sensor", "", {"sensor": "roof", "coec_sensor": "calibrated"}, 0),
+        ("coec_sensor", "", {"sensor": "left", "coec_sensor": "undecided"}, 1),
+        ("coec_sensor_moved_probability", "", {"sensor": "roof"}, 0.998),
+        ("coec_rig_p_value", "", {}, 1e-6),
+        ("coec_rig_losses", "_total", {"cause": "late"}, 2),
+    ]:
+        assert families[name].value(suffix, **labels) == value, name
+    states = [labels for _, labels in families["coec_sensor"].samples]
+    assert len(states) == 3 * len(get_args(SensorState)), "each sensor in each state, 0 or 1"
+
+
+def test_of_a_rig_of_which_nothing_is_known_no_figure_is_made_up() -> None:
+    families = read(untold())
+    assert families["coec_sensor"].value("", sensor="roof", coec_sensor="unknown") == 1
+    for name in ("coec_sensor_moved_probability", "coec_rig_p_value", "coec_rig_losses"):
+        assert families[name].samples == {}, name
+    assert read()["coec_sensor"].samples == {}, "a vehicle of one pair"
 
 
 def test_durations_fall_into_buckets_that_hold_their_own_ends() -> None:

@@ -136,6 +136,8 @@ def test_a_sensor_that_had_moved_is_so_after_a_restart(tmp_path: Path) -> None:
     assert [reason.code for reason in sensor.reasons] == ["last_known"]
 
 
+BELOW = [0, 0, 0, 1]
+GOOD_EDGE = {"nominal": np.eye(4).tolist(), "T_camera_lidar": np.eye(4).tolist(), "sigma": [None] * 6}
 BAD_EDGE = {"nominal": np.eye(4).tolist(), "T_camera_lidar": np.ones((4, 4)).tolist(), "sigma": [None] * 6}
 
 
@@ -149,6 +151,19 @@ BAD_EDGE = {"nominal": np.eye(4).tolist(), "T_camera_lidar": np.ones((4, 4)).tol
         {"edges": {}, "event": {"sensors": ["x"] * 40, "since_ns": 0, "stepped_ns": 0, "named": []}},
         {"edges": {}, "event": {"sensors": ["x"], "since_ns": 2**70, "stepped_ns": 0, "named": []}},
         {"edges": [1, 2]},
+        {"edges": {"front-roof": {**GOOD_EDGE, "sigma": [1e300] * 6}}},
+        {"edges": {"front-roof": {**GOOD_EDGE, "nominal": [[1.0] * 4] * 3}}},
+        {
+            "edges": {
+                "front-roof": {**GOOD_EDGE, "T_camera_lidar": [[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], BELOW]}
+            }
+        },
+        {"edges": {"front-roof": {**GOOD_EDGE, "looks": 5}}},
+        {"edges": {"x" * 10_000: GOOD_EDGE}},
+        {"edges": {}, "event": {"sensors": [], "since_ns": 0, "stepped_ns": 0, "named": []}},
+        {"edges": {}, "event": {"sensors": ["roof"], "since_ns": 0.5, "stepped_ns": 0, "named": []}},
+        {"edges": {}, "event": "roof moved"},
+        {},
     ],
 )
 def test_a_hostile_file_is_refused(tmp_path: Path, body: dict[str, object]) -> None:
@@ -160,6 +175,21 @@ def test_a_hostile_file_is_refused(tmp_path: Path, body: dict[str, object]) -> N
     said.scribe.write_due()
     assert (tmp_path / f"{FILE}.broken").exists()
     assert SaidRig(tmp_path).known.why == ()
+
+
+@pytest.mark.fault("the file of the rig says that an edge was a kilometre off", "the rig is named from its looks alone")
+def test_a_file_that_lies_within_its_form_is_outvoted_by_looks(tmp_path: Path) -> None:
+    far = np.eye(4)
+    far[0, 3] = 1000.0
+    edges = {f"{camera}-roof": {"nominal": pose(camera, POSES).tolist(), "T_camera_lidar": far.tolist(),
+                                "sigma": [9.0] * 6} for camera in CAMERAS}  # fmt: skip
+    event = {"sensors": ["front"], "since_ns": 2**62, "stepped_ns": 2**62, "named": ["front"]}
+    StateFile(tmp_path / FILE).save({"edges": edges, "event": event})
+    said = SaidRig(tmp_path)
+    assert said.known.why == ()
+    drive(said, 44.0)
+    assert said.known.losses.get("refused", 0) == 0, "looks are taken as any"
+    from_json(RigReply, to_json(reply(said)))
 
 
 @pytest.mark.fault("the file of the rig is damaged", "refused, counted; learnt anew")

@@ -177,7 +177,7 @@ def _sensor_states(view: View) -> Iterable[Sample]:
 def _of_rig(value: Callable[[RigReply], Mapping[tuple[str, ...], float | None]]) -> Callable[[View], Iterable[Sample]]:
     def samples(view: View) -> Iterable[Sample]:
         told = {} if view.rig is None else value(view.rig)
-        return tuple((labels, figure) for labels, figure in told.items() if figure is not None)
+        return tuple((labels, float(figure)) for labels, figure in told.items() if figure is not None)
 
     return samples
 
