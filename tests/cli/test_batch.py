@@ -40,6 +40,14 @@ def test_a_batch_makes_tables_compares_with_the_vehicles_and_goes_on(
     assert sorted(Path(url).name for (url,) in rows) == ["bad.mcap", "one-1.mcap", "two-1.mcap"]
 
 
+def test_what_is_not_the_word_of_a_fleet_is_told(coec: Coec, tmp_path: Path) -> None:
+    said = tmp_path / "now.json"
+    said.write_text("{}")
+    outcome = coec("fleet", "report", tmp_path, "--now", said)
+    assert outcome.status == 2
+    assert "is not what `coec watch --once --json` prints" in outcome.err
+
+
 def test_what_names_no_window_is_an_error(coec: Coec, tmp_path: Path) -> None:
     outcome = coec("batch", f"{tmp_path}/*.mcap", "--output", tmp_path / "results")
     assert outcome.status == 2

@@ -15,8 +15,10 @@ from coec.fleet import questions, tables
 from coec.fleet.report import report
 from coec.reports import fleet_page
 from coec.schemas.fleet import FleetReport, WindowRow
-from coec.schemas.replies import CalibrationResult
+from coec.schemas.fleet_now import FleetNow, PairNow
+from coec.schemas.replies import Alarms, CalibrationResult
 from fleets import FAILED, REFUSED, SIGMA, fleet
+from last_words import a_word
 
 VEHICLES, WINDOWS = 12, 40
 DRIFTS = {3: (1, 1.2), 7: (3, 0.15)}
@@ -147,6 +149,16 @@ def test_the_view_that_is_printed_is_the_one_that_is_asked(rows: list[WindowRow]
     connection = duckdb.connect()
     connection.execute(questions.statement("mine", tmp_path))
     assert connection.execute("SELECT DISTINCT vehicle FROM mine").fetchall() == [("007",)]
+
+
+def test_false_alarms_of_vehicles_stand_on_the_page(results: Path) -> None:
+    word = a_word("<v>", alarms=Alarms(watched_s=180_000.0, confirmed=2, withdrawn=1, open=False))
+    pair = PairNow(word=word, standing="live", said_s=1.0, looked_s=1.0, worst=None, urgency=0.0)
+    now = FleetNow(vehicles=1, known=1, states={}, matching=1, pairs=(pair,), refused={})
+    text = fleet_page.page(report(results, None, now), "fleet")
+    assert "1 pairs were watched for 50.0 h of driving: 2 alarms were confirmed" in text
+    assert "2.00 in 100 h (95 %: at most 9.4" in text
+    assert "&lt;v&gt;/front" in text
 
 
 def test_a_folder_without_tables_is_told(tmp_path: Path) -> None:

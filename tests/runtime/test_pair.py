@@ -48,6 +48,10 @@ def test_a_step_is_noticed_within_a_minute_and_corrected_by_the_next_window(
     assert states["healthy"] < 60
     np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
     assert bench.health == "healthy"
+    alarms = bench.answers.health_reply.alarms
+    assert alarms is not None
+    assert (alarms.confirmed, alarms.withdrawn, alarms.open) == (1, 0, False)
+    assert 0.8 * (END_S - BEGIN_S) < alarms.watched_s < END_S - BEGIN_S
 
 
 def test_every_event_is_told_to_whoever_keeps_the_seconds_around_it(

@@ -6,11 +6,13 @@ from pathlib import Path
 
 from coec.adapters.files import output
 from coec.cli.commands.fleet_report import Options
+from coec.errors import DecodeError, UsageError
 from coec.fleet import questions, report
 from coec.reports import console, fleet_page
 from coec.reports.console import figure
-from coec.schemas.base import to_json
+from coec.schemas.base import from_json, to_json
 from coec.schemas.fleet import AXES, FleetReport
+from coec.schemas.fleet_now import FleetNow
 
 SHOWN = 15
 """Pairs in the table on the screen; the page has all."""
@@ -20,14 +22,15 @@ def run(options: Options) -> int:
     """Writes page and document into the output folder, if one is given, and shows the most urgent pairs.
 
     Raises:
-        UsageError: there are no tables.
+        UsageError: there are no tables, or `--now` is no such document.
         SourceError: the optional extra is not installed.
         OutputError: a file cannot be written.
     """
     if options.sql:
         _show_sql(options.results)
         return 0
-    told = report.report(options.results, options.against)
+    now = None if options.now is None else _said(options.now)
+    told = report.report(options.results, options.against, now)
     if options.output is not None:
         page = fleet_page.page(told, f"coec fleet: {options.results.resolve().name}")
         output.write(options.output / "report.html", page.encode())
@@ -67,6 +70,17 @@ def _show(told: FleetReport) -> None:
             f"{changes.newly_accepted} newly accepted, {changes.newly_refused} newly refused, "
             f"{changes.newly_failing} without a result any more"
         )
+    if told.false_alarms is not None:
+        console.show(fleet_page.sentence_of_alarms(told.false_alarms))
+
+
+def _said(path: Path) -> FleetNow:
+    try:
+        return from_json(FleetNow, path.read_bytes())
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}") from error
+    except DecodeError as error:
+        raise UsageError(f"{path} is not what `coec watch --once --json` prints: {error}") from error
 
 
 def _show_sql(results: Path) -> None:

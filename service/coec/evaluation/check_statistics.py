@@ -15,7 +15,7 @@ from itertools import chain, cycle, islice
 
 import numpy as np
 
-from coec.calibration.commissioning.quantiles import chi2_quantile
+from coec.calibration.commissioning.quantiles import poisson_most
 from coec.calibration.monitor.change_detector import (
     S_PER_H,
     AlarmLevels,
@@ -64,11 +64,6 @@ def report(rows: Sequence[CheckedDrive], resampled_h: float) -> ChecksReport:
         failed={row.name: row.failure for row in rows if row.failure is not None},
         rigs=tuple(_of_rigs(rows, of_rig, resampled_h) for of_rig in (False, True)),
     )
-
-
-def poisson_most(events: int) -> float:
-    """The mean that a Poisson variable would exceed `events` at with a probability of `CONFIDENCE` (Garwood 1936)."""
-    return 0.5 * chi2_quantile(CONFIDENCE, 2 * (events + 1))
 
 
 def _of_rigs(rows: Sequence[CheckedDrive], commissioned: bool, resampled_h: float) -> RigStatistics:
@@ -148,7 +143,7 @@ def _hours(how: str, vehicles: Iterable[list[Where]]) -> HoursStatistics:
         hours=driven_h,
         suspicions=suspicions,
         alarms=len(alarmed),
-        alarms_per_100_h_at_most=100.0 * poisson_most(len(alarmed)) / driven_h if driven_h > 0.0 else 0.0,
+        alarms_per_100_h_at_most=100.0 * poisson_most(CONFIDENCE, len(alarmed)) / driven_h if driven_h > 0.0 else 0.0,
         alarmed=tuple(dict.fromkeys(alarmed)),
     )
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from coec.fleet.alarms import false_alarms
 from coec.fleet.questions import WINDOWS, ask, view
 from coec.fleet.tables import NAMELESS
 from coec.schemas.fleet import (
@@ -19,6 +20,7 @@ from coec.schemas.fleet import (
     FleetReport,
     PairOfFleet,
 )
+from coec.schemas.fleet_now import FleetNow
 from coec.schemas.replies import Maybe6
 
 READ, BEFORE = "read", "before"
@@ -46,8 +48,9 @@ _READ = (
 _ACCEPTED = f"(SELECT vehicle, pair, date, stamp_ns, {_TOLD} FROM {READ} WHERE accepted)"
 
 
-def report(folder: Path, against: Path | None) -> FleetReport:
-    """Of the tables in a folder; `against`: those of an earlier batch over the same windows.
+def report(folder: Path, against: Path | None, now: FleetNow | None = None) -> FleetReport:
+    """Of the tables in a folder; `against`: those of an earlier batch over the same windows; `now`: what the vehicles
+    said last, of their alarms.
 
     Raises:
         UsageError: there are no tables.
@@ -70,6 +73,7 @@ def report(folder: Path, against: Path | None) -> FleetReport:
         last_ns=last_ns,
         figures=_figures(connection),
         changes=None if against is None else _changes(connection, against),
+        false_alarms=None if now is None else false_alarms(pair.word for pair in now.pairs),
     )
 
 

@@ -8,7 +8,7 @@ from html import escape
 
 from coec.reports import html
 from coec.reports.console import figure
-from coec.schemas.fleet import AXES, DayOfPair, FleetChanges, FleetReport, PairOfFleet
+from coec.schemas.fleet import AXES, DayOfPair, FalseAlarms, FleetChanges, FleetReport, PairOfFleet
 
 NS_PER_S = 1_000_000_000
 
@@ -28,6 +28,12 @@ def page(report: FleetReport, title: str) -> str:
     ]
     if report.changes is not None:
         parts += ["<h2>Against the earlier batch</h2>", *_changes(report.changes)]
+    if report.false_alarms is not None:
+        alarms = report.false_alarms
+        parts += ["<h2>Alarms</h2>", f"<p>{escape(sentence_of_alarms(alarms))}</p>"]
+        parts.append(
+            html.table(("vehicle/pair", "false alarms"), ((escape(n), str(c)) for n, c in alarms.by_pair.items()), {1})
+        )
     parts += [
         "<h2>Vehicles, the most urgent first</h2>",
         "<p class=quiet>Drift: where the last accepted windows are from where the first were. The plot shows that"
@@ -93,6 +99,17 @@ def sentence(report: FleetReport) -> str:
 
 def _day(stamp_ns: int) -> str:
     return f"{datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC):%Y-%m-%d}"
+
+
+def sentence_of_alarms(alarms: FalseAlarms) -> str:
+    """How often pairs were accused without cause."""
+    counted = (
+        f"{alarms.pairs} pairs were watched for {alarms.watched_h:.1f} h of driving: {alarms.confirmed} alarms were"
+        f" confirmed by another extrinsic, {alarms.withdrawn} were false"
+    )
+    if alarms.per_100_h is None or alarms.per_100_h_at_most is None:
+        return f"{counted}."
+    return f"{counted}, {alarms.per_100_h:.2f} in 100 h (95 %: at most {alarms.per_100_h_at_most:.2f})."
 
 
 def _changes(changes: FleetChanges) -> Iterable[str]:

@@ -115,6 +115,18 @@ class FleetChanges(Part):
     windows: tuple[ChangedWindow, ...] = Field(description="decided otherwise, those furthest apart first")
 
 
+class FalseAlarms(Part):
+    """What became of the alarms of a fleet's pairs, by their last words."""
+
+    pairs: Count = Field(description="that have told")
+    watched_h: float = Field(ge=0, description="sensor time between completed checks, of all pairs, h")
+    confirmed: Count = Field(description="alarms that ended with another extrinsic")
+    withdrawn: Count = Field(description="alarms that ended with the extrinsic that they accused: false ones")
+    per_100_h: float | None = Field(description="of false ones, in 100 h of a pair; null where nobody watched")
+    per_100_h_at_most: float | None = Field(description="upper end of that: exceeded once in twenty (Poisson)")
+    by_pair: dict[str, Count] = Field(description="false ones by vehicle/pair, of the pairs that have any")
+
+
 class FleetReport(Message):
     """What `coec fleet report --json` prints."""
 
@@ -128,3 +140,4 @@ class FleetReport(Message):
     last_ns: int | None
     figures: tuple[FigureOfFleet, ...]
     changes: FleetChanges | None = Field(default=None, description="with --against")
+    false_alarms: FalseAlarms | None = Field(default=None, description="with --now")

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 from coec.errors import DecodeError
 from coec.schemas.base import Message
 from coec.schemas.keys import LAST, VERSION_CHUNK
-from coec.schemas.replies import Count, HealthState, Maybe6, Provenance, Reason, Status, Vector6
+from coec.schemas.replies import Alarms, Count, HealthState, Maybe6, Provenance, Reason, Status, Vector6
 
 MAX_BYTES: Final = 16_384
 """Of a word; one with every reason that it may have takes a third."""
@@ -52,6 +52,7 @@ class LastWord(Message):
     sigma: Maybe6 | None = Field(description="standard deviations of `correction` (deg, m)")
     held: bool = Field(description="frozen by `command/hold`")
     windows: Count = Field(description="recorded since the start")
+    alarms: Alarms | None = Field(default=None, description="how often it was accused; null while the pair is awaited")
     event: str | None = Field(max_length=128, description="id of the newest red event that is kept; null: none")
 
 

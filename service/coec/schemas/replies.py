@@ -260,6 +260,16 @@ class CheckReply(Part):
     state: HealthState = Field(description="of the pair after the check")
 
 
+class Alarms(Part):
+    """What became of the alarms of a pair since its state directory was new. Of false ones, `withdrawn` over
+    `watched_s` is the rate."""
+
+    watched_s: float = Field(ge=0, description="sensor time between completed checks, s")
+    confirmed: Count = Field(description="ended with another extrinsic")
+    withdrawn: Count = Field(description="ended `healthy` with the extrinsic that they accused")
+    open: bool = Field(description="whether one has not ended yet")
+
+
 class HealthReply(Message):
     """Is the calibration right? `unknown` is the state of not having looked."""
 
@@ -286,6 +296,7 @@ class HealthReply(Message):
     since_ns: int = Field(description="wall clock when this state began, ns since 1970")
     evaluated_ns: int | None = Field(description="stamp of the last evaluated pair, ns; null before the first window")
     age_s: float | None = Field(description="of the last evaluated window; null before the first")
+    alarms: Alarms | None = Field(default=None, description="how often it was accused; null while the pair is awaited")
 
 
 Book = Literal["results", "states", "commands"]

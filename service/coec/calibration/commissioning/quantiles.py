@@ -17,6 +17,16 @@ def chi2_quantile(probability: float, dof: int) -> float:
     return dof * (1.0 - h + normal_quantile(probability) * sqrt(h)) ** 3
 
 
+def poisson_most(confidence: float, events: int) -> float:
+    """The mean of a Poisson variable that is `events` or fewer in one draw of 1 / (1 - confidence): the upper end of
+    what so many events leave likely (Garwood 1936).
+
+    Raises:
+        ValueError: the confidence is not between 0 and 1.
+    """
+    return 0.5 * chi2_quantile(confidence, 2 * (events + 1))
+
+
 def distance2_quantile(probability: float, dof: int, known_by: int) -> float:
     """Of the squared distance of one more draw in `dof` axes from a mean, in standard deviations that were estimated
     themselves, with so many degrees of freedom: `dof` times the F distribution, by the approximation of Paulson (1942).

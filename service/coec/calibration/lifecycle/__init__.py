@@ -4,6 +4,7 @@
 docs/health.md shows the table.
 """
 
+from coec.calibration.lifecycle.alarm_record import AlarmRecord
 from coec.calibration.lifecycle.pair_state import (
     Candidate,
     CommandRefusedError,
@@ -40,6 +41,7 @@ from coec.calibration.lifecycle.states import MEANING, TRANSITIONS, Event, Healt
 __all__ = [
     "MEANING",
     "TRANSITIONS",
+    "AlarmRecord",
     "Candidate",
     "Change",
     "CommandRefusedError",

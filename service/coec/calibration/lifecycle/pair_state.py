@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.window import KeptPairs
 from coec.calibration.lifecycle import policy
+from coec.calibration.lifecycle.alarm_record import AlarmRecord
 from coec.calibration.lifecycle.states import TRANSITIONS, Event, HealthState
 from coec.calibration.monitor.change_detector import (
     ACCUSING,
@@ -136,6 +137,7 @@ class PairState:
             window that began earlier mixes two mounts: it neither corrects nor acquits.
         poor_since_ns: sensor time at which the data began not to tell, None once health has left that behind.
         changes: steps of the last day that nobody ordered.
+        record: how long it was watched, and what became of its alarms.
     """
 
     T_camera_lidar: Matrix4
@@ -156,6 +158,7 @@ class PairState:
     flagged_since_ns: int | None = None
     poor_since_ns: int | None = None
     changes: tuple[policy.Change, ...] = ()
+    record: AlarmRecord = field(default_factory=AlarmRecord)
 
     @property
     def seen(self) -> HealthState:

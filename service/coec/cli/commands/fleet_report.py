@@ -22,6 +22,10 @@ class Options:
     against: Annotated[
         Path | None, typer.Option(help="Results of an earlier batch over the same windows.", metavar="RESULTS")
     ] = None
+    now: Annotated[
+        Path | None,
+        typer.Option(help="What `coec watch --once --json` printed: count false alarms, too.", metavar="FILE"),
+    ] = None
     sql: Annotated[
         bool, typer.Option("--sql", help="Print the columns, and queries that answer questions; nothing else.")
     ] = False

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 from coec.adapters.files.conversions import degrees_or_null, result_of
 from coec.calibration.commissioning.baseline import Drift
-from coec.calibration.lifecycle import Health, HealthState
+from coec.calibration.lifecycle import AlarmRecord, Health, HealthState
 from coec.calibration.types import Decision, Estimate, Reason, Rig
 from coec.config import PairConfig
 from coec.runtime.api.extrinsic import axes_of
 from coec.runtime.decisions.decider import HELD, Known
 from coec.runtime.ingest.decoder import EGO
+from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.ingest.stream_statistics import StreamStatistics
 from coec.schemas import replies
 
@@ -82,6 +83,16 @@ def health_of(
         since_ns=known.since_ns,
         evaluated_ns=known.completed_stamp_ns,
         age_s=known.age_s,
+        alarms=_alarms_of(known.state.record),
+    )
+
+
+def _alarms_of(record: AlarmRecord) -> replies.Alarms:
+    return replies.Alarms(
+        watched_s=record.watched_ns / NS_PER_S,
+        confirmed=record.confirmed,
+        withdrawn=record.withdrawn,
+        open=record.accused,
     )
 
 

@@ -102,6 +102,7 @@ class LastWords:
             sigma=sigma,
             held=extrinsic is not None and extrinsic.held,
             windows=0 if built is None else built.recorded,
+            alarms=health.alarms,
             event=None if built is None else built.newest_event,
         )
 

@@ -188,6 +188,13 @@ def _reasons(view: View) -> Iterable[Sample]:
             yield (pair, code), 1.0
 
 
+def _alarms(view: View) -> Iterable[Sample]:
+    for pair, reply in view.health.items():
+        if reply.alarms is not None:
+            yield (pair, "confirmed"), float(reply.alarms.confirmed)
+            yield (pair, "withdrawn"), float(reply.alarms.withdrawn)
+
+
 def _of_health(value: Callable[[HealthReply], float | None]) -> Callable[[View], Iterable[Sample]]:
     def samples(view: View) -> Iterable[Sample]:
         for pair, reply in view.health.items():
@@ -369,6 +376,14 @@ FAMILIES: tuple[Family, ...] = (
     Family("coec_windows_evaluated", "counter", "Windows evaluated.", _PAIR, _per_pair(lambda one: one.solved)),
     Family("coec_checks", "counter", "Checks of the monitor.", _PAIR, _per_pair(lambda one: one.checks)),
     Family("coec_health_changes", "counter", "States entered.", ("pair", "to"), _counts(lambda one: one.transitions)),
+    Family(
+        "coec_watched_seconds",
+        "counter",
+        "Sensor time between completed checks.",
+        _PAIR,
+        _of_health(lambda one: None if one.alarms is None else one.alarms.watched_s),
+    ),
+    Family("coec_alarms", "counter", "Alarms that ended; `withdrawn`: false ones.", ("pair", "outcome"), _alarms),
     Family("coec_commands", "counter", "Commands, by outcome.", ("pair", "command"), _counts(lambda one: one.commands)),
     Family(QUERY, "histogram", "From a query to its answer or refusal, by what was asked for.", ("resource",)),
     Family(

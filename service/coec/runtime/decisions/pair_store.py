@@ -11,7 +11,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -187,11 +187,14 @@ class PairStore:
         if epoch is not None and epoch != self._epoch:
             return None
         before = self._state
-        after = self._state = step(before)
+        after = step(before)
+        record = after.record.watched(self._completed_stamp_ns, stamp_ns) if completed else after.record
+        replaced = not np.array_equal(before.T_camera_lidar, after.T_camera_lidar)
+        after = self._state = replace(after, record=record.entered(after.health, replaced=replaced))
         if completed:
             self._completed_s, self._completed_stamp_ns = time.monotonic(), stamp_ns
             self.damage = None if self.history.damage is None else self.damage
-        self._note(before, after, stamp_ns)
+        self._note(before, after, stamp_ns, replaced=replaced)
         self.save()
         return Taken(before, after, self.served)
 
@@ -322,11 +325,10 @@ class PairStore:
             self._completed_stamp_ns = clocks.completed_stamp_ns
         return remembered.state, remembered.history_heads
 
-    def _note(self, before: PairState, after: PairState, stamp_ns: int | None) -> None:
+    def _note(self, before: PairState, after: PairState, stamp_ns: int | None, *, replaced: bool) -> None:
         window_id = after.accepted.window_id if after.accepted else None
-        moved = not np.array_equal(before.T_camera_lidar, after.T_camera_lidar)
-        if moved or before.provenance is not after.provenance:
-            self._epoch += moved
+        if replaced or before.provenance is not after.provenance:
+            self._epoch += replaced
             entry = _entry("extrinsic", after.provenance.value, _ORIGIN[after.provenance], stamp_ns)
             served = {"camera_from_lidar": transform_of(after.T_camera_lidar), "window_id": window_id}
             self.history.append(entry.model_copy(update=served))

@@ -7,7 +7,7 @@ import json
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,7 +17,16 @@ from pydantic import Field, ValidationError
 from coec.adapters.files.conversions import estimate_of, result_of
 from coec.adapters.files.rig import rig_to_json
 from coec.adapters.files.state_file import StateFile
-from coec.calibration.lifecycle import Candidate, Change, Health, HealthState, PairState, Provenance, Status
+from coec.calibration.lifecycle import (
+    AlarmRecord,
+    Candidate,
+    Change,
+    Health,
+    HealthState,
+    PairState,
+    Provenance,
+    Status,
+)
 from coec.calibration.monitor.change_detector import MonitorState
 from coec.calibration.tracker import Track, track_from_dict, track_to_dict
 from coec.calibration.types import Estimate, Matrix4, Reason, Rig
@@ -65,6 +74,15 @@ class StoredChange(Part):
     step: tuple[float, ...]
 
 
+class StoredRecord(Part):
+    """`AlarmRecord` on the disk."""
+
+    watched_ns: replies.Count = 0
+    confirmed: replies.Count = 0
+    withdrawn: replies.Count = 0
+    accused: bool = False
+
+
 class StoredPair(Part):
     """`PairState` on the disk; when (wall clock) a check was last completed and since when it is in its state of
     health; and the heads of its history on the disk. What is not in a file of an earlier version is as at the first
@@ -94,6 +112,7 @@ class StoredPair(Part):
     completed_stamp_ns: int | None = None
     history_heads: dict[str, str] = Field(default_factory=dict)
     commissioned_from: tuple[str, ...] = ()
+    record: StoredRecord = StoredRecord()
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +214,7 @@ class StateStore:
             since_wall_ns=clocks.since_wall_ns,
             completed_stamp_ns=clocks.completed_stamp_ns,
             commissioned_from=commissioned_from,
+            record=StoredRecord(**asdict(state.record)),
         )
         with self._lock:
             self._pairs[rig.pair] = stored.model_dump(mode="json")
@@ -321,4 +341,5 @@ def _state_of(stored: StoredPair) -> PairState:
         flagged_since_ns=stored.flagged_since_ns,
         poor_since_ns=stored.poor_since_ns,
         changes=tuple(Change(change.stamp_ns, change.step) for change in stored.changes),
+        record=AlarmRecord(**stored.record.model_dump()),
     )
