@@ -87,7 +87,7 @@ def test_a_pose_that_the_window_tells_badly_is_found_among_the_pairs_between(sha
     astray = replace(street.change, T_before=away_from(street.T_before, 2.0, seed=77))
     told = street.told(astray)
     assert street.frames(told)[1] == 3
-    assert np.degrees(se3.rotation_angle_rad(told.T_before @ se3.inverse(street.T_before))) < 0.6
+    assert np.degrees(se3.rotation_angle_rad(told.T_before @ se3.inverse(street.T_before))) < 1.0
 
 
 def test_without_pairs_between_the_window_tells_as_closely_as_it_can(sharp_street: Window) -> None:

@@ -24,7 +24,14 @@ from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFo
 from coec.config import CalibrationConfig, StateConfig
 from coec.errors import RecordingError
 from coec.geometry.cameras import build
-from coec.runtime.recording.recorder import PAIRS_WAITING, STUCK_S, UNSOLVED_RESUMED, Recorder, RecordingPlan
+from coec.runtime.recording.recorder import (
+    BETWEEN_WAITING,
+    PAIRS_WAITING,
+    STUCK_S,
+    UNSOLVED_RESUMED,
+    Recorder,
+    RecordingPlan,
+)
 from coec.runtime.recording.window_store import WindowStore
 from fakes import wait_until
 
@@ -219,6 +226,24 @@ def test_pairs_beyond_the_queue_are_counted_and_the_end_still_comes(bench: Bench
         _, path, _ = bench.recorded.get(timeout=DEADLINE_S)
     assert len(read_window(path)[0].pairs) == PAIRS_WAITING
     assert bench.losses.snapshot() == {("window", "recorder_overrun"): 3}
+
+
+def test_pairs_between_take_no_place_of_those_of_a_window_in_the_queue(bench: Bench) -> None:
+    bench.recorder.add("front-1", pair(1), NOMINAL)
+    for stamp_ns in range(2, 2 + BETWEEN_WAITING):
+        assert bench.recorder.has_room
+        bench.recorder.add_between("front-1", pair(stamp_ns))
+    assert not bench.recorder.has_room, "the stream waits, and a replay at any rate records the same"
+    assert bench.recorder.waiting == 1
+    bench.recorder.add_between("front-1", pair(100))
+    assert bench.losses.snapshot() == {("window", "recorder_overrun"): 1}
+    bench.recorder.add("front-1", pair(200), NOMINAL)
+    bench.recorder.end(SliceEnded("front-1", 2, True))
+    with bench.running():
+        _, path, _ = bench.recorded.get(timeout=DEADLINE_S)
+        assert bench.recorder.has_room
+    window, _ = read_window(path)
+    assert (len(window.pairs), len(window.between)) == (2, BETWEEN_WAITING)
 
 
 @pytest.mark.fault("the disk becomes full while a window is recorded", "it costs one window, and the next is tried")

@@ -30,7 +30,7 @@ from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, frame_alignment
+from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, frame_alignment, significances
 from coec.geometry.edges.charts import EdgeCharts, charted_significances
 from coec.geometry.thinning import thinned
 
@@ -42,11 +42,23 @@ POINTS = 30_000
 """Range edges of the window that are asked, at most: half of those that rank basins. Every other costs gain by the root
 of two, and all of them would cost a tenth of a solve."""
 
-SEEN = SearchBox(2.0 * REACH_RAD, 0.0)
+FAR_REACH_RAD = radians(12.0)
+"""How far it is looked for where frames at an end of the window do not fit the solved pose: a mount that is bent, or
+hangs by one screw. A cover of that costs half a solve."""
+
+SEEN = SearchBox(FAR_REACH_RAD + radians(2.0), 0.0)
 """From the solved pose to the farthest that a climb comes to: edges that none of them brings into view are left out."""
 
 CHART_POSES = 2_000
 """Of the cover of the reach: half a degree apart, the blur of a chart or less."""
+
+END, END_CHARTED, END_POSES = 2, 64, 8
+"""Frames at either end of a window that are asked for a pose of their own; poses of the cover that are as good as any
+to so few on a chart, about which the fine band is asked; and those that are put forward then."""
+
+MISFIT = 0.4
+"""Share of the median score of a frame at the solved pose below which frames at an end do not fit it: a degree beside,
+a frame has lost as much (METHOD, section 3: edges are sharp)."""
 
 NEAR_BLURS, NEAR_POSES = 2.5, 300
 """Radius about the solved pose that the fine band covers, in its blurs, and the poses of the cover, 0.6 blurs apart:
@@ -66,6 +78,9 @@ TURNS = 4
 FEW = 3
 """One or two frames fit some pose of hundreds well by chance, better than many fit the right one on the blurred band:
 the best split with at least so many on either side is settled, too."""
+
+STARTS = 6
+"""Poses from which a side of so few is climbed: the one that fits the blurred band best may lie a degree beside."""
 
 MAX_SWEEPS = 8
 """Of a climb over the axes: it begins within two steps of its end."""
@@ -126,7 +141,8 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     chart = _asked(edges.charts[-1], edges.half_view_rad, pose)
     blur_rad = edges.band_blur_rad[0]
     near = sample_reach(pose, SearchBox(NEAR_BLURS * blur_rad, 0.0), NEAR_POSES)
-    poses = np.concatenate([pose[None], near, *_put_forward(chart, pose, len(band.first_point) - 1)])
+    far = _put_forward(chart, pose, len(band.first_point) - 1)
+    poses = np.concatenate([pose[None], near, *far, *_put_forward_by_ends(chart, band, pose)])
     early = np.cumsum([scores(band, at) for at in poses], axis=1).T  # (F, K)
     total = early[-1]
     late = total - early
@@ -134,9 +150,12 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     T_whole, _ = _climbed(band, poses[int(np.argmax(total))], blur_rad)
     settled = []
     for last_early in _promising(gains):
-        ends = (poses[int(np.argmax(of_side))] for of_side in (early[last_early], late[last_early]))
-        sides = (_part(band, 0, last_early + 1), _part(band, last_early + 1, len(early)))
-        begun = [_climbed(side, end, blur_rad)[0] for side, end in zip(sides, ends, strict=True)]
+        begun = []
+        for first, last, of_side in ((0, last_early + 1, early), (last_early + 1, len(early), late)):
+            starts = poses[np.argsort(-of_side[last_early], kind="stable")[: STARTS if last - first <= FEW else 1]]
+            climbed = (_climbed(_part(band, first, last), start, blur_rad)[0] for start in starts)
+            side = _part(sharp, first, last)
+            begun.append(max((_climbed(side, at, edges.blur_rad) for at in climbed), key=lambda end: end[1])[0])
         settled.append(_settled(sharp, last_early + 1, (*begun, T_whole), edges.blur_rad))
     return max(settled, key=lambda change: (change.of_camera, change.gain))
 
@@ -197,9 +216,30 @@ def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[
         if k != 0:
             gained[k] = max(gained[k], float(side[k] - side[0]))
     chosen = sorted(gained, key=lambda k: (-gained[k], k))[:FAR_POSES]
+    return [cover[chosen], *(_about(cover[k]) for k in chosen)] if chosen else []
+
+
+def _put_forward_by_ends(chart: EdgeCharts, band: EdgeFrames, pose: Matrix4) -> list[NDArray[np.float64]]:
+    """Poses (n, 4, 4) that the first and the last frames fit best, by the chart and then by the band; further away
+    where they do not fit the solved one."""
+    at_pose, chosen = scores(band, pose), []
+    for begin in (0, len(at_pose) - END):
+        end = begin + END
+        fits = float(at_pose[begin:end].mean()) >= MISFIT * float(np.median(at_pose))
+        reach_rad = REACH_RAD if fits else FAR_REACH_RAD
+        cover = sample_reach(pose, SearchBox(reach_rad, 0.0), round(CHART_POSES * (reach_rad / REACH_RAD) ** 3))
+        part = chart.of_points(np.flatnonzero((chart.frame >= begin) & (chart.frame < end)))
+        best = np.argsort(-charted_significances(part, cover), kind="stable")[:END_CHARTED]
+        about = np.concatenate([cover[best], *(_about(cover[k]) for k in best.tolist())])
+        fine = significances(_part(band, begin, end), about)
+        chosen.append(about[np.argsort(-fine, kind="stable")[:END_POSES]])
+    return chosen
+
+
+def _about(pose: Matrix4) -> NDArray[np.float64]:
+    """Poses (n, 4, 4) between one of a cover and the next ones."""
     apart_rad = REACH_RAD * (4.0 / 3.0 * pi / CHART_POSES) ** (1.0 / 3.0)
-    about = [sample_reach(cover[k], SearchBox(apart_rad, 0.0), AROUND_POSES) for k in chosen]
-    return [cover[chosen], *about] if chosen else []
+    return sample_reach(pose, SearchBox(apart_rad, 0.0), AROUND_POSES)
 
 
 def scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:

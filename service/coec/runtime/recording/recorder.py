@@ -29,6 +29,9 @@ _log = logging.getLogger(__name__)
 PAIRS_WAITING = 8
 """Pairs that may wait for the disk, some MB each."""
 
+BETWEEN_WAITING = 32
+"""Thinned pairs that may, a third of a MB each: a disk that does not answer for half a minute holds nothing up."""
+
 UNSOLVED_RESUMED = 4
 """Windows of earlier runs that are still solved after a start, newest first."""
 
@@ -111,6 +114,7 @@ class Recorder:
         self._condition = threading.Condition()
         self._queue: deque[_Add | _AddBetween | SliceEnded | CalibrationConfig] = deque()
         self._adds = 0
+        self._betweens = 0
         self._open: _Open | None = None
         self._lost: str | None = None
         self._latest: Path | None = None
@@ -140,8 +144,8 @@ class Recorder:
 
     @property
     def has_room(self) -> bool:
-        """Whether a chosen pair would be taken now."""
-        return self._adds < PAIRS_WAITING
+        """Whether a chosen pair and one between would be taken now."""
+        return self._adds < PAIRS_WAITING and self._betweens < BETWEEN_WAITING
 
     def use(self, configuration: CalibrationConfig) -> None:
         """Windows that begin from now on, in the order of what is queued, are to be calibrated with this: the limits of
@@ -157,11 +161,25 @@ class Recorder:
     def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
         """Queue a chosen pair; never waits for the disk. `T_camera_lidar` (4, 4) is where a search will start if this
         is the first pair of its window."""
-        self._put(_Add(window_id, pair, T_camera_lidar))
+        with self._condition:
+            overrun = self._adds >= PAIRS_WAITING
+            if not overrun:
+                self._adds += 1
+                self._queue.append(_Add(window_id, pair, T_camera_lidar))
+                self._condition.notify()
+        if overrun:
+            self._losses.add("window", "recorder_overrun")
 
     def add_between(self, window_id: str, pair: FramePair) -> None:
         """Queue a pair, thinned, that is recorded beside the chosen ones of a window; likewise."""
-        self._put(_AddBetween(window_id, pair))
+        with self._condition:
+            overrun = self._betweens >= BETWEEN_WAITING
+            if not overrun:
+                self._betweens += 1
+                self._queue.append(_AddBetween(window_id, pair))
+                self._condition.notify()
+        if overrun:
+            self._losses.add("window", "recorder_overrun")
 
     def end(self, ended: SliceEnded) -> None:
         """Queue the end of a window; it is finished when it holds enough pairs, else abandoned."""
@@ -175,16 +193,6 @@ class Recorder:
         with self._condition:
             self._condition.notify()
 
-    def _put(self, item: _Add | _AddBetween) -> None:
-        with self._condition:
-            overrun = self._adds >= PAIRS_WAITING
-            if not overrun:
-                self._adds += 1
-                self._queue.append(item)
-                self._condition.notify()
-        if overrun:
-            self._losses.add("window", "recorder_overrun")
-
     # --- on the recorder's thread -----------------------------------------------------------------------------------
 
     def _run(self, thread: ServiceThread) -> None:
@@ -196,7 +204,8 @@ class Recorder:
                 if not self._queue and not thread.stopping:
                     self._condition.wait(DIGEST_PAUSE_S if unread else POLL_S)
                 item = self._queue.popleft() if self._queue else None
-                self._adds -= isinstance(item, (_Add, _AddBetween))
+                self._adds -= isinstance(item, _Add)
+                self._betweens -= isinstance(item, _AddBetween)
             if isinstance(item, (_Add, _AddBetween)):
                 begun_s = time.monotonic()
                 self._write(item)
