@@ -6,9 +6,11 @@ import pytest
 from coec.calibration.objective.mutual_information import (
     GUARD_OVERLAP,
     MutualInformation,
+    Points,
     SearchBox,
     build_mutual_information,
     distance_and_depth,
+    distances,
 )
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import DepthMap, Window
@@ -70,6 +72,41 @@ def test_the_truth_is_a_maximum_along_every_rotation(objective: MutualInformatio
             xi = np.zeros(6)
             xi[axis] = np.radians(degrees)
             assert objective.evaluate(se3.perturb(street.T_camera_lidar_start, xi)).score < truth
+
+
+NEAR = SearchBox(np.radians(4.0), 0.1)
+
+
+def points_of(window: Window, every: int) -> list[Points]:
+    """Of each sweep one point of so many."""
+    return [distances(pair.lidar.xyz_m[::every], window.T_camera_lidar_start) for pair in window.pairs]
+
+
+def test_the_same_points_tell_the_same_near_a_pose(objective: MutualInformation, street: Window) -> None:
+    """All that no pose near by brings into view may be left out."""
+    truth, rng = street.T_camera_lidar_start, np.random.default_rng(3)
+    points = [
+        Points(one.xyz_m[seen], one.of_points[seen])
+        for one in points_of(street, 1)
+        for seen in [objective.may_see(one.xyz_m, truth, NEAR)]
+    ]
+    assert sum(len(one.xyz_m) for one in points) < 0.8 * sum(len(pair.lidar.xyz_m) for pair in street.pairs)
+    again = objective.with_points(points, np.ones(len(points)), truth, NEAR, ObjectiveConfig())
+    for _ in range(5):
+        pose = se3.perturb(truth, rng.uniform(-1.0, 1.0, 6) * [*[NEAR.rotation_rad] * 3, *[NEAR.translation_m] * 3])
+        whole, near = objective.evaluate(pose), again.evaluate(pose)
+        assert near.points_in_view == whole.points_in_view
+        assert near.overlap == whole.overlap
+        # Shares of distances are those of other points.
+        assert near.mi == pytest.approx(whole.mi, rel=0.05)
+
+
+def test_as_much_is_expected_in_view_as_there_are_points(objective: MutualInformation, street: Window) -> None:
+    truth, every = street.T_camera_lidar_start, 3
+    times = np.full(len(street.pairs), 1.0 / every)
+    fewer = objective.with_points(points_of(street, every), times, truth, NEAR, ObjectiveConfig())
+    assert fewer.evaluate(truth).points_in_view < 0.4 * objective.evaluate(truth).points_in_view
+    assert fewer.evaluate(truth).overlap == pytest.approx(objective.evaluate(truth).overlap, rel=0.02)
 
 
 def test_unrelated_depth_tells_less(objective: MutualInformation, street: Window) -> None:

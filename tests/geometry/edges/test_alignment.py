@@ -13,6 +13,7 @@ from coec.geometry.edges.alignment import (
     alignment_of_each,
     alignment_of_parts,
     frame_alignment,
+    significance_of_late,
     significances,
 )
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
@@ -106,6 +107,17 @@ def test_each_frame_may_have_a_pose_of_its_own() -> None:
         alone = frame_alignment(frames, pose)
         assert at.strength[number] == alone.strength[number]
         assert at.square[number] == alone.square[number]
+
+
+def test_edges_that_were_seen_later_are_where_they_have_come_to() -> None:
+    frames, rng = frames_of(CAMERAS["double_sphere"], (2000, 0, 1501)), np.random.default_rng(3)
+    passing = rng.normal(scale=8.0, size=frames.xyz_m.shape).astype(np.float32)
+    share = rng.uniform(-0.5, 1.0, frames.xyz_m.shape).astype(np.float32)
+    late_s = np.array([0.03, -0.02, 0.05], np.float32)
+    come = frames.xyz_m + passing * (late_s[0] * share[0] + late_s[1] * share[1] + late_s[2] * share[2])
+    expected = frame_alignment(replace(frames, xyz_m=come), POSE).significance
+    assert significance_of_late(frames, passing, share, late_s, POSE) == expected
+    assert expected != frame_alignment(frames, POSE).significance
 
 
 def test_points_behind_the_camera_and_masked_pixels_count_for_nothing() -> None:

@@ -17,7 +17,7 @@ from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
 from coec.geometry.culling import half_field_of_view_rad
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significance_of_late
 from coec.geometry.edges.image_edges import VOID
 from coec.geometry.projection import project
 from coec.geometry.thinning import thinned
@@ -71,13 +71,17 @@ class Told:
 
     def otherwise(self, deviation: NDArray[np.float64]) -> tuple[EdgeFrames, Matrix4]:
         """The edges and the pose (4, 4) at a deviation (12,)."""
-        frames, later_s = self.frames, deviation[CLOCKS].astype(np.float32)
+        frames, later_s = self._through_lens(deviation), deviation[CLOCKS].astype(np.float32)
         if later_s.any():
             late = later_s[0] * self.share[0] + later_s[1] * self.share[1] + later_s[2] * self.share[2]
             frames = replace(frames, xyz_m=frames.xyz_m + self.passing * late)
-        if deviation[LENS].any():
-            frames = replace(frames, camera=_through(frames.camera, deviation[LENS]))
         return frames, se3.perturb(self.pose, deviation[: SHIFTS.stop])
+
+    def _through_lens(self, deviation: NDArray[np.float64]) -> EdgeFrames:
+        frames = self.frames
+        if not deviation[LENS].any():
+            return frames
+        return replace(frames, camera=_through(frames.camera, deviation[LENS]))
 
     def thinned(self, at_most: int) -> Told:
         """Of about so many of the range edges."""
@@ -88,7 +92,11 @@ class Told:
 
     def significance(self, deviation: NDArray[np.float64]) -> float:
         """Of the alignment at a deviation (12,)."""
-        return frame_alignment(*self.otherwise(deviation)).significance
+        pose, late_s = se3.perturb(self.pose, deviation[: SHIFTS.stop]), deviation[CLOCKS].astype(np.float32)
+        frames = self._through_lens(deviation)
+        if late_s.any():
+            return significance_of_late(frames, self.passing, self.share, late_s, pose)
+        return frame_alignment(frames, pose).significance
 
     def pixels(self, deviation: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(E, 2) where the range edges lie at a deviation (12,), and (E,) whether they do."""

@@ -80,6 +80,10 @@ class FusedObjective:
         """The blur of the edges, or more: the hill of the sharpest has ripples a pixel wide."""
         return self._step_rad
 
+    def with_depth(self, depth: MutualInformation) -> FusedObjective:
+        """The same edges with another depth witness, counted on the same scale."""
+        return FusedObjective(self._edges, self._step_rad, depth, self._of_edges, self._of_depth)
+
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
         """The objective at `T_camera_lidar` (4, 4), in standard deviations."""
         depth = self._depth.evaluate(T_camera_lidar)

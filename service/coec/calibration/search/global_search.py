@@ -71,6 +71,9 @@ SHIFTED_POSES, SHIFT_M = 4, 0.25
 axis: poses of one rotation do not lie apart, so that the translation was chosen on the coarse chart, which hardly tells
 it (one start of 24, half a metre away, had ended 36 cm aside)."""
 
+SHIFTED = _Round(6 * SHIFTED_POSES, 0.0, FINE, thinned=False, points=4_000, step_rad=radians(0.15), halvings=1)
+"""How these climb: as in the last round, with as many edges as tell a quarter of a metre."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basin:
@@ -107,7 +110,7 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
         poses, z = _climbed(charts, poses, number, start, reach)
     if reach.translation_m > 0.0:
         more = _shifted(poses[np.argsort(-z, kind="stable")[:SHIFTED_POSES]])
-        more, _ = _climbed(finest, more, ROUNDS[-1], start, reach)
+        more, _ = _climbed(finest, more, SHIFTED, start, reach)
         poses = np.concatenate([poses, more])
     z = charted_significances(finest, poses)
     return [Basin(poses[k], float(z[k])) for k in _apart(poses, z, len(poses), ROUNDS[-1].apart_rad)]

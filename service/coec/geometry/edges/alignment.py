@@ -93,11 +93,11 @@ class PartedAlignment:
 
 def frame_alignment(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> Alignment:
     """The alignment at one pose (4, 4), with e interpolated between pixels: smooth in the pose."""
-    return alignment_of_each(frames, np.broadcast_to(T_camera_lidar, (len(frames.maps), 4, 4)))
+    return alignment_of_each(frames, T_camera_lidar[None])
 
 
 def alignment_of_each(frames: EdgeFrames, poses: NDArray[np.float64]) -> Alignment:
-    """The same with a pose for each frame (F, 4, 4)."""
+    """The same with a pose for each frame (F, 4, 4); or one (1, 4, 4) for all."""
     sums = _smooth_sums(*_arguments(frames), poses.astype(np.float32, order="C"))
     return Alignment(sums[:, 0], sums[:, 1])
 
@@ -109,6 +109,20 @@ def alignment_of_parts(
     belongs."""
     sums = _smooth_sums_of_parts(*_arguments(frames), T_camera_lidar.astype(np.float32), part, parts)
     return PartedAlignment(sums[:, :, 0], sums[:, :, 1])
+
+
+def significance_of_late(
+    frames: EdgeFrames,
+    passing: NDArray[np.float32],
+    share: NDArray[np.float32],
+    late_s: NDArray[np.float32],
+    T_camera_lidar: NDArray[np.float64],
+) -> float:
+    """z at one pose (4, 4), with e interpolated between pixels, of range edges that pass at (3, E) m/s and were seen
+    later than they were placed: by their shares (3, E) of three delays (3,), s. To the last bits that of
+    `frame_alignment` of edges moved by as much."""
+    sums = _late_sums(*_arguments(frames), T_camera_lidar.astype(np.float32), passing, share, late_s)
+    return Alignment(sums[:, 0], sums[:, 1]).significance
 
 
 def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -166,8 +180,50 @@ def _smooth_sums(
     frames = first_point.shape[0] - 1
     sums = np.zeros((frames, 2))
     for f in prange(frames):
-        sums[f] = _smooth_sums_of_frame(camera, poses[f], xyz, weight, first_point[f], first_point[f + 1], maps[f])
+        pose = poses[min(np.int64(f), poses.shape[0] - 1)]
+        sums[f] = _smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[f])
     return sums
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _late_sums(
+    camera: Camera,
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.int8],
+    T: NDArray[np.float32],
+    passing: NDArray[np.float32],
+    share: NDArray[np.float32],
+    late_s: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    frames = first_point.shape[0] - 1
+    sums = np.zeros((frames, 2))
+    for f in prange(frames):
+        told, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
+        edges, block, moved_m = maps[f].ravel(), _block(), np.empty((3, BLOCK), np.float32)
+        for begin in range(first_point[f], first_point[f + 1], BLOCK):
+            end = min(begin + BLOCK, first_point[f + 1])
+            _pass_by(xyz[:, begin:end], passing[:, begin:end], share[:, begin:end], late_s, moved_m)
+            x, y, z = moved_m[0, : end - begin], moved_m[1, : end - begin], moved_m[2, : end - begin]
+            _add(told, square, *_between(camera, T, x, y, z, weight[begin:end], edges, block))
+        sums[f, 0], sums[f, 1] = _total(told) / STRENGTH_STEPS, _total(square)
+    return sums
+
+
+@njit(cache=True)
+def _pass_by(
+    xyz_m: NDArray[np.float32],
+    passing: NDArray[np.float32],
+    share: NDArray[np.float32],
+    late_s: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    """Points (3, n) where they are later, into `out` (3, at least n)."""
+    for i in range(xyz_m.shape[1]):
+        late = late_s[0] * share[0, i] + late_s[1] * share[1, i] + late_s[2] * share[2, i]
+        for axis in range(3):
+            out[axis, i] = xyz_m[axis, i] + passing[axis, i] * late
 
 
 @njit(cache=True, error_model="numpy")
