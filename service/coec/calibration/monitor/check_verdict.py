@@ -45,12 +45,12 @@ at unless told otherwise."""
 MIN_PAIRS = 4
 """With fewer, a lamp post decides."""
 
-TELLING_CONTRAST = 10.0
+TELLING_CONTRAST = 9.0
 """Standard deviations by which an optimum stands out from other poses, below which one check accuses nobody: checks of
-such scenes scatter three times as far as those of a street, see `dispersion`, and where those are good to 0.06 to 0.1°
-half a degree is two to three standard deviations then. Of 419 checks of right mounts on 168 simulated drives whose
-edges are clear eight were below, five of them on highways; four of these eight insisted on an optimum that was too far
-off, and one of the 411 others."""
+such scenes scatter more than three times as far as those of a street, see `dispersion`, and where those are good to
+0.08° half a degree is no more than two standard deviations then. Of 419 checks of right mounts on 168 simulated drives
+whose edges are clear five were below, four of them on highways; three of these five insisted on an optimum that was too
+far off, and two of the 414 others."""
 
 MIN_EDGES_IN_VIEW = 150.0
 """Range edges in view, per pair, below which a check's edges count as faint, too, however well they fit: with fewer, a

@@ -5,8 +5,8 @@ of a hill on rough ground the top is where hill and roughness together are highe
 every check (`contrast`). So a highway, where everything runs to one point, and a night accuse a mount by no more than
 they can tell, without a step between scenes that tell and scenes that do not.
 
-It is for what checks are worth as evidence. Whether one is flagged, the limits of its rig say, whatever the scene: next
-to a wrong pose an optimum may stand out little for being the wrong one.
+It is for what checks are worth as evidence. Whether one is flagged, the limits of its rig and its own edges say, see
+`support`; of scenes that scatter too far, none is.
 """
 
 from __future__ import annotations
