@@ -82,7 +82,8 @@ class BudgetConfig(Stage):
         gt=0,
         le=64,
         description="processor time of the worker in a second of driving, s: a replay at ten times the pace of the "
-        "drive spends ten times as much, and is checked as often",
+        "drive spends ten times as much, and is checked as often. The worker does one thing after the other: where "
+        "that is more than it gets done, answers come late and frames are looked at without them (`not_awaited`)",
     )
 
 

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation, after_observation, alarm_levels
+from coec.calibration.lifecycle import PairState, Provenance, Rules, Status, after_observation
+from coec.calibration.monitor.change_detector import Finding, MonitorState, Observation
 from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.rig.attribution import RigState, after_look, begun, sensors, served
 from coec.calibration.rig.evidence import of_check
-from coec.config import MonitorConfig
+from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.evaluation.check_drives import CHECK_PAIRS
 from coec.evaluation.rig_drives import FIRST_SEED, LIDAR, KnockedDrive
 from coec.evaluation.rig_evidence import WINDOW
@@ -21,7 +22,7 @@ from coec.schemas.rig import Mounts, RigDriveMoves, RigDriveRow, RigDrivesReport
 from coec.simulation.journey import START_NS
 
 NS_PER_S = 1_000_000_000
-CONFIG = MonitorConfig(period_s=PERIOD_S, pairs=CHECK_PAIRS)
+RULES = Rules(PolicyConfig(), TrackerConfig(), MonitorConfig(period_s=PERIOD_S, pairs=CHECK_PAIRS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,19 +112,23 @@ def _looks_of(row: RigDriveRow, who: frozenset[str]) -> Iterator[RigLook]:
 
 def _told(drive: KnockedDrive, looks: Iterator[RigLook]) -> Iterator[tuple[float, frozenset[str], frozenset[str]]]:
     """After each look: second of the drive, the sensors that are named, and the pairs that are sure of a move."""
-    graph, levels = drive.graph, alarm_levels(CONFIG)
+    graph = drive.graph
     state: RigState = begun(graph)
     for edge, pose in drive.served.items():
         state = served(state, edge, pose, WINDOW)
-    monitors = {edge.name: MonitorState(vouched=True) for edge in graph.edges}
+    pairs = {
+        edge: PairState(pose, Provenance.ESTIMATED, Status.ACCEPTED, START_NS, monitor=MonitorState(vouched=True))
+        for edge, pose in drive.served.items()
+    }
     for look in looks:
         observation = observation_of(look)
-        monitors[look.edge] = after_observation(monitors[look.edge], observation, levels)
-        evidence = of_check(look.edge, drive.served[look.edge], observation)
+        pairs[look.edge] = pair = after_observation(pairs[look.edge], observation, RULES)
+        pose = drive.served[look.edge]
+        evidence = of_check(look.edge, pose, observation, stepped_ns=pair.flagged_since_ns)
         if evidence is not None:
             state = after_look(state, graph, evidence)
         named = frozenset(one.name for one in sensors(state, graph) if one.health in MOVED)
-        sure = frozenset(pair for pair, monitor in monitors.items() if monitor.outcome is Finding.CONFIRMED)
+        sure = frozenset(name for name, of in pairs.items() if of.monitor.outcome is Finding.CONFIRMED)
         yield (observation.stamp_ns - START_NS) / NS_PER_S, named, sure
 
 

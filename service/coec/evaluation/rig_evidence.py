@@ -75,6 +75,14 @@ none in a whole drive."""
 BIASED = 2.0
 """Times the bias of the others that one pair of each rig has."""
 
+POOR, POOREST = 0.2, 3.0
+"""Share of streets on which the looks at a pair scatter by more than on others, and by how many times at most: looks at
+right mounts with the faintest contrast lie 2.6 standard deviations of a street off (`monitor.dispersion`). Who looks
+says nothing of it."""
+
+CHECK_S = 4.0
+"""From the first frame of a check to its last."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnRig:
@@ -165,7 +173,7 @@ def checks(
         period_s = float(rng.choice(PERIODS_S))
         at, street, bad = float(rng.uniform(0.0, period_s)), STREET * rng.normal(size=6), np.zeros(6)
         right = se3.difference(before[edge.a] @ se3.inverse(before[edge.b]), edge.T_a_b)
-        in_run = False
+        in_run, poor, suspected_ns = False, _poor(rng), None
         while at < until_s:
             poses = before if at < at_s else after
             here = se3.difference(poses[edge.a] @ se3.inverse(poses[edge.b]), edge.T_a_b)
@@ -173,23 +181,33 @@ def checks(
                 here = here + bend.xi
             faint = bool(rng.random() < FAINT)
             scatter = CHECK * (WEAK_TIMES if faint else 1.0)
-            seen = here + bias + street + scatter * rng.standard_t(TAILS, size=6) / np.sqrt(TAILS / (TAILS - 2.0))
+            told = scatter * rng.standard_t(TAILS, size=6) / np.sqrt(TAILS / (TAILS - 2.0))
+            seen = here + bias + poor * (street + told)
             if not in_run or rng.random() >= SAME:
                 bad = REACH * rng.normal(size=6)
             in_run = bool(rng.random() < (BAD_LASTS if in_run else BAD))
             if in_run or (faint and rng.random() < FAINT_BAD):
                 seen = bad + CHECK * rng.normal(size=6)
             late_s = float(rng.uniform(0.0, LATE_S))
+            flagged = float((np.abs(seen - right) / np.hypot(CHECK, UNCOMMISSIONED_BIAS)).max()) > FLAGGED
             if not blind and rng.random() >= MISSING:
-                found.append((at + late_s, _look(edge, at, seen, scatter, faint)))
+                if not flagged:
+                    suspected_ns = None
+                elif suspected_ns is None:
+                    suspected_ns = round((at - CHECK_S) * NS_PER_S)
+                found.append((at + late_s, _look(edge, at, seen, scatter, faint, suspected_ns)))
             if rng.random() < period_s / STREET_S:
-                street = STREET * rng.normal(size=6)
-            away = np.abs(seen - right) / np.hypot(CHECK, UNCOMMISSIONED_BIAS)
-            at += PERIODS_S[0] if away.max() > FLAGGED and not faint else period_s
+                street, poor = STREET * rng.normal(size=6), _poor(rng)
+            at += PERIODS_S[0] if flagged and not faint else period_s
     return [look for _, look in sorted(found, key=lambda one: (one[0], one[1].edge))]
 
 
-def _look(edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool) -> Look:
+def _poor(rng: np.random.Generator) -> float:
+    """Times the scatter of others that looks at one pair in a street have."""
+    return float(rng.uniform(1.0, POOREST)) if rng.random() < POOR else 1.0
+
+
+def _look(edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool, suspected_ns: int | None) -> Look:
     return Look(
         edge=edge.name,
         stamp_ns=round(at_s * NS_PER_S),
@@ -198,6 +216,7 @@ def _look(edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool) -> Lo
         place=STREET,
         rig=UNCOMMISSIONED_BIAS,
         weak=faint,
+        stepped_ns=suspected_ns,
     )
 
 

@@ -10,6 +10,7 @@ from statistics import mean
 
 import pytest
 
+from coec.config import BudgetConfig
 from coec.runtime.budget.store import DEPTH_S, Debt, Store
 from coec.runtime.budget.turns import Turns
 
@@ -38,6 +39,7 @@ class Drive:
     window_s: float
     suspected: Suspicion = nobody
     silent: Callable[[str, float], bool] = nobody
+    frame_s: float = FRAME_S
     begun: dict[str, list[float]] = field(default_factory=dict)
     ended: dict[str, list[float]] = field(default_factory=dict)
     windows: list[tuple[str, float]] = field(default_factory=list)
@@ -53,8 +55,8 @@ class Drive:
             phase = self.turns.join(name, PERIOD_S, SLICE_S)
             ends_s[name] = SLICE_S - phase * (SLICE_S - URGENT_S)
             self.begun[name], self.ended[name] = [], []
-        for step in range(round(seconds / FRAME_S)):
-            now_s = step * FRAME_S
+        for step in range(round(seconds / self.frame_s)):
+            now_s = step * self.frame_s
             if doing and now_s >= busy_until_s:
                 kind, name = doing.split()
                 self._end(kind, name, now_s)
@@ -68,7 +70,7 @@ class Drive:
                     in_work.add(name)
                     self.windows.append((name, now_s))
                     heapq.heappush(waiting, (1, now_s, f"window {name}"))
-                if step % round(PERIOD_S / FRAME_S) == 0:
+                if step % round(PERIOD_S / self.frame_s) == 0:
                     ready.add(name)
                 if name not in ready or name in in_work:
                     continue
@@ -95,6 +97,16 @@ class Drive:
     def longest_unseen_s(self, name: str) -> float:
         times = [0.0, *self.ended[name]]
         return max(later - earlier for earlier, later in pairwise(times))
+
+    @property
+    def late(self) -> float:
+        """Share of the checks that are answered after the period within which their pair's frames need not wait."""
+        took = [
+            end - begin
+            for name in self.begun
+            for begin, end in zip(self.begun[name], self.ended[name], strict=False)
+        ]  # fmt: skip
+        return sum(one > PERIOD_S for one in took) / len(took)
 
 
 def four(look_s: float) -> dict[str, float]:
@@ -137,6 +149,34 @@ def test_where_it_does_not_all_periods_stretch_alike() -> None:
     assert drive.spent_s / 3600.0 == pytest.approx(0.2, rel=0.1)
     windows = [sum(each == name for each, _ in drive.windows) for name in NAMES]
     assert mean(windows) == pytest.approx(3600.0 / SLICE_S / turns.stretch, rel=0.25)
+
+
+@pytest.mark.fault(
+    "eight cameras and three LiDARs on the default budget", "each pair in its turn; status says the rest"
+)
+def test_sixteen_pairs_are_looked_at_in_turn_and_what_they_lack_is_told(
+    record_property: Callable[[str, object], None],
+) -> None:
+    """Those of `deploy/examples/rig.yaml`, at the prices of a slow core."""
+    names = [str(number) for number in range(16)]
+    turns = Turns(BudgetConfig().cores)
+    drive = Drive(turns, dict.fromkeys(names, 0.3), 6.0, frame_s=0.1).run(720.0)
+    counts = [len(drive.ended[name]) for name in names]
+    unseen_s = max(drive.longest_unseen_s(name) for name in names)
+    record_property("figure", f"{turns.wanted:.2f} cores wanted, unseen {unseen_s:.0f} s, periods × {turns.stretch:g}")
+    assert max(counts) - min(counts) <= 2, "in turn"
+    assert turns.wanted == pytest.approx(16 * (0.3 / PERIOD_S + 6.0 / SLICE_S))
+    assert turns.stretch == pytest.approx(turns.wanted / BudgetConfig().cores, abs=0.05)
+    assert unseen_s <= 3.0 * turns.stretch * PERIOD_S
+    assert drive.late <= 0.1, "the worker keeps up with what it is asked"
+
+
+def test_a_budget_beyond_what_one_worker_does_makes_answers_late() -> None:
+    """Which is why it is the budget that has to be set, not the checks that have to wait."""
+    names = [str(number) for number in range(16)]
+    drive = Drive(Turns(64.0), dict.fromkeys(names, 0.3), 6.0, frame_s=0.1).run(720.0)
+    assert drive.spent_s / 720.0 > 0.9, "it does what it can"
+    assert drive.late > 0.2
 
 
 def test_a_dear_pair_takes_no_more_turns_than_a_cheap_one() -> None:

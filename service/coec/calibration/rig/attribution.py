@@ -4,13 +4,16 @@ A knocked LiDAR moves the edges to all its cameras alike, a knocked camera its o
 rig was last consistent is asked again every few seconds (`moves`), of steps at some times back (`steps`).
 
 A sensor is named by two answers in a row, with a look in between, and by two of its pairs where it has as many: what a
-run of bad looks says of one pair, or one pair that was looked at before the others, the next look denies.
+run of bad looks says of one pair, or one pair that was looked at before the others, the next look denies. Where two
+sensors are said to have moved at once it takes one answer more, for each: a bad look at one pair just after a sensor of
+many was knocked makes its other sensor seem to have moved as well.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import degrees
 
@@ -29,6 +32,10 @@ NAMED_AT = 0.95
 """Probability from which a sensor is named, if it was before, and below whose complement it is called calibrated.
 Between: undecided."""
 
+ANSWERS, ANSWERS_FOR_TWO = 2, 3
+"""In a row, that name a sensor by itself, and beside another. The second on drawn drives of
+`evaluation.rig_moves` (seed 17900001): with two, a camera was named beside a knocked LiDAR on three of thirty."""
+
 CALM_AT = 0.5
 """Probability of nobody, from which looks that grow old are taken for such of a right rig."""
 
@@ -39,6 +46,10 @@ tell already, and others were last looked at before."""
 AGES_S = (10.0, 16.0, 26.0, 42.0, 68.0, 110.0)
 """How long ago it is looked for otherwise, in steps that a robust mean bridges; and beyond these, before all looks that
 are kept."""
+
+MOST_SUSPECTED = 4
+"""Times at which pairs by themselves think they stepped that are asked of, the earliest: a sensor that moves is
+suspected by its pairs within a few looks."""
 
 BIAS_TIMES = 2.0
 """Times the bias that looks of a rig usually have, to which the first of them are trusted: that of the next rig may be
@@ -93,7 +104,7 @@ class RigState:
         posterior: who moved, as of when that was last asked; None before the first look.
         asked_ns: stamp of the look at which it was.
         stepped_ns: the step in question lies before looks from this stamp on.
-        claimed: sensors as probable as those that are named, by the last answer.
+        claimed: sensors as probable as those that are named, and by how many answers in a row, no more than count.
         named: those that moved.
     """
 
@@ -101,7 +112,7 @@ class RigState:
     posterior: Posterior | None = None
     asked_ns: int = BEFORE_ALL_NS
     stepped_ns: int = BEFORE_ALL_NS
-    claimed: frozenset[str] = frozenset()
+    claimed: Mapping[str, int] = field(default_factory=dict)
     named: frozenset[str] = frozenset()
 
     @property
@@ -160,18 +171,23 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
     histories = {**state.histories, look.edge: history.after(look, state.calm)}
     if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
         return replace(state, histories=histories)
-    times_ns = _times_ns(histories)
+    times_ns = _times_ns(histories, state.stepped_ns)
     posterior = _posterior(histories, times_ns, graph)
     stepped_ns = times_ns[posterior.when]
     probable = [name for name, p in posterior.sensors.items() if p >= NAMED_AT]
-    claimed = frozenset(name for name in probable if _seen_by_two(name, graph, histories, stepped_ns))
+    needed = ANSWERS if len(probable) == 1 else ANSWERS_FOR_TWO
+    claimed = {
+        name: min(state.claimed.get(name, 0) + 1, ANSWERS_FOR_TWO)
+        for name in probable
+        if _seen_by_two(name, graph, histories, stepped_ns)
+    }
     return RigState(
         histories,
         posterior,
         asked_ns=look.stamp_ns,
         stepped_ns=stepped_ns,
         claimed=claimed,
-        named=claimed & (state.claimed | state.named),
+        named=frozenset(name for name, count in claimed.items() if count >= needed or name in state.named),
     )
 
 
@@ -183,12 +199,20 @@ def _seen_by_two(name: str, graph: RigGraph, histories: Mapping[str, History], s
     return len(pairs) == 1 or looked >= 2
 
 
-def _times_ns(histories: Mapping[str, History]) -> list[int]:
-    """Stamps from which looks may lie after a step, the newest first."""
-    last_ns = sorted({history.looks[-1].stamp_ns for history in histories.values() if history.looks}, reverse=True)
+def _times_ns(histories: Mapping[str, History], stepped_ns: int) -> list[int]:
+    """Stamps of looks from which on they may lie after a step, the newest first: times that no look lies between are
+    one. The likeliest of the last answer, `stepped_ns`, and those since which pairs are suspected by themselves do not
+    drift as looks grow old, as ages do."""
+    looked = [history.looks for history in histories.values() if history.looks]
+    last_ns = sorted({looks[-1].stamp_ns for looks in looked}, reverse=True)
     aged_ns = [last_ns[0] - round(age_s * NS_PER_S) for age_s in AGES_S]
     just_after = (stamp_ns + 1 for stamp_ns in last_ns[1:NEWEST])
-    return sorted({last_ns[0], *just_after, *aged_ns, BEFORE_ALL_NS}, reverse=True)
+    suspected = sorted({looks[-1].stepped_ns for looks in looked if looks[-1].stepped_ns is not None})[:MOST_SUSPECTED]
+    all_ns = sorted({look.stamp_ns for looks in looked for look in looks})
+    first_after = (bisect_left(all_ns, at_ns) for at_ns in (*just_after, *aged_ns, stepped_ns, *suspected))
+    # From the first of all on is before all.
+    found = {all_ns[place] for place in first_after if 0 < place < len(all_ns)}
+    return sorted({last_ns[0], *found, BEFORE_ALL_NS}, reverse=True)
 
 
 def _posterior(histories: Mapping[str, History], times_ns: list[int], graph: RigGraph) -> Posterior:

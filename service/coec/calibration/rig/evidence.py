@@ -40,6 +40,8 @@ class Look:
         rig: (6,) of what no place tells: the bias of whoever looks, as far as it is unknown.
         share: how far it counts, 0 to 1: by the part of its frames that no look before it held.
         weak: whether it has little to go by, and may lie anywhere.
+        stepped_ns: stamp of the first frame since which whoever looks at this edge alone has something against it; None
+            while it has nothing. Only where a step is looked for.
     """
 
     edge: str
@@ -50,6 +52,7 @@ class Look:
     rig: NDArray[np.float64]
     share: float = 1.0
     weak: bool = False
+    stepped_ns: int | None = None
 
     @property
     def log_bad(self) -> float:
@@ -88,9 +91,11 @@ def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     return information
 
 
-def of_check(edge: str, T_served: Matrix4, observation: Observation, share: float = 1.0) -> Look | None:
+def of_check(
+    edge: str, T_served: Matrix4, observation: Observation, share: float = 1.0, stepped_ns: int | None = None
+) -> Look | None:
     """What a check of the pose `T_served` (4, 4) says; None where it says nothing of the mount: the data were at fault,
-    or it holds no frame that is new.
+    or it holds no frame that is new. `stepped_ns` is since when the pair is suspected by itself, see `Look`.
 
     Raises:
         ValueError: the pose is not rigid, or the offset no six numbers.
@@ -118,6 +123,7 @@ def of_check(edge: str, T_served: Matrix4, observation: Observation, share: floa
         rig=rig,
         share=min(share, 1.0),
         weak=observation.weak,
+        stepped_ns=stepped_ns,
     )
 
 

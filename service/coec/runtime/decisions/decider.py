@@ -329,7 +329,7 @@ class Decider:
         if effect is None:
             self._losses.add("monitor", "check_overtaken")
         else:
-            self._rig.looked(question.due_ns, before, observation)
+            self._rig.looked(question.due_ns, before, self._store.state, observation)
             self._check_attempts.succeeded()
             self._checks += 1
             self._latest_check = check_of(observation, self._store.state)

@@ -64,10 +64,10 @@ class PairOfRig:
 
     # --- on the thread that decides ---------------------------------------------------------------------------------
 
-    def looked(self, due_ns: int, before: PairState, observation: Observation) -> None:
+    def looked(self, due_ns: int, before: PairState, after: PairState, observation: Observation) -> None:
         """A check of what was served `before` was completed."""
         share = share_told(before.monitor, observation)
-        look = of_check(self._name, before.T_camera_lidar, observation, share)
+        look = of_check(self._name, before.T_camera_lidar, observation, share, after.flagged_since_ns)
         if look is not None:
             self._rig.put(self._name, due_ns, look)
 
