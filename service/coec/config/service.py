@@ -66,10 +66,8 @@ class SnippetsConfig(Stage):
         description="of the frames of all pairs that are kept for them: a quarter for the time before, a quarter for "
         "the time after, half for what is being written. 0: none are recorded",
     )
-    before_s: float = Field(
-        default=15.0, gt=0, le=600, description="what is kept of the time before, as far as it fits"
-    )
-    after_s: float = Field(default=5.0, gt=0, le=600)
+    before_s: float = Field(default=15.0, gt=0, le=600, description="of the time before the event, as far as it fits")
+    after_s: float = Field(default=5.0, gt=0, le=600, description="of the time after it, as far as it fits")
     max_bytes: int = Field(default=2**30, ge=2**20, description="of all that are kept on the disk; the oldest go first")
 
 

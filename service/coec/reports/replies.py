@@ -115,13 +115,14 @@ def windows(payload: bytes) -> None:
     reply = from_json(replies.WindowsReply, payload)
     snippets = f", {len(reply.snippets)} snippets" if reply.snippets else ""
     console.show(f"{reply.vehicle}/{reply.pair}  {len(reply.windows)} windows{snippets}")
-    table = console.table("window", "pairs", "MB", "verdict", "sha256", "kept for", right=(1, 2))
+    kept = ("kept for",) if any(window.kept_for for window in reply.windows) else ()
+    table = console.table("window", "pairs", "MB", "verdict", "sha256", *kept, right=(1, 2))
     for window in reply.windows:
         size = f"{window.size_bytes / 1e6:.1f}"
         verdict = console.styled(window.decision or ("not evaluated" if window.sha256 else "not read yet"))
         pairs = "?" if window.pairs is None else str(window.pairs)
-        kept_for = (window.kept_for or "").replace("_", " ")
-        table.add_row(window.window_id, pairs, size, verdict, (window.sha256 or "not read yet")[:16], kept_for)
+        row = (window.window_id, pairs, size, verdict, (window.sha256 or "not read yet")[:16])
+        table.add_row(*row, *([(window.kept_for or "").replace("_", " ")] if kept else []))
     console.out.print(table)
     if reply.snippets:
         table = console.table("snippet", "MB", "event", "sha256", right=(1,))

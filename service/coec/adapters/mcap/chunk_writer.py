@@ -25,7 +25,7 @@ PROFILE = "ros2"
 LIBRARY = f"coec/{__version__}"
 
 CHUNK_BYTES = 64 * 1024
-"""A chunk is closed at the first message past this size, so that a killed recorder loses a pair at most."""
+"""A chunk is closed at the first message past this size, if it was not before: what is in memory stays small."""
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")

@@ -56,6 +56,7 @@ class RosChannel:
         return {QOS: _qos_text(self.topic)}
 
 
+@lru_cache(maxsize=64)
 def _qos_text(topic: str) -> str:
     """As rosbag2 writes it up to version 8 of its metadata, in numbers: so it is read where no `metadata.yaml` says
     another version (`rmw_qos_*_policy_t` of rmw/types.h; rosbag2_storage/qos.cpp)."""

@@ -3,7 +3,8 @@
 Layout. First the attachments without which the rest means nothing (`rig.json`, `configuration.json`, `mask.png`), so
 that whatever is cut off behind them can be salvaged. Then pair by pair the sweep, ego-motion, depth map, camera info
 and image, each dated by its sensor and with the index of its pair as sequence number; the image comes last and
-completes the pair. `write_result` adds `/diagnostics`, the result as a JSON channel and as attachment `result.json`.
+completes the pair. `write_result` adds a picture (`overlay`), `/diagnostics`, the result as a JSON channel and as
+attachment `result.json`. Chunks end with the pairs, so that whatever was added is on the disk.
 
 A window may hold pairs of an earlier one that were kept for it. They come last, though they were taken first; the
 metadata `coec_kept` name the window that they are from. A reader sorts pairs by their stamps.
