@@ -109,6 +109,7 @@ def test_an_event_comes_home_as_one_folder_that_tells_its_story(coec: Coec, rout
     for file in report.files:
         data = (folder / file.name).read_bytes()
         assert (hashlib.sha256(data).hexdigest(), len(data)) == (file.sha256, file.size_bytes)
+    assert {"config.json", "event.json", "history.json", "rig.json", "status.json"} <= there
     assert [window.window_id for window in report.windows] == [event["window_before"], event["window_after"]]
     assert [window.in_history for window in report.windows] == [True, True]
     assert report.chain_holds is True
