@@ -38,6 +38,7 @@ class Vehicle:
 
     bench: Bench
     bus: Bus
+    uplink: Uplink
 
     @property
     def is_held(self) -> bool:
@@ -50,7 +51,7 @@ class Vehicle:
         return self.bench.answers.status().commands
 
 
-def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
+def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> Vehicle:
     """Declare all that a vehicle answers, as the daemon does."""
     pair, authority = bench.pair, bench.config.authority
     credentials = credentials_of(authority)
@@ -65,6 +66,7 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
         told = a_status(vehicle=VEHICLE, pairs=(pair.answers.status(),))
         return Snapshot.of(told)
 
+    uplink = Uplink(UplinkConfig())
     words = LastWords(KEYS, "0", UplinkConfig(), bus.publish)
     VehicleAnswers(
         KEYS,
@@ -75,12 +77,13 @@ def serve(bench: Bench, config: ZenohConfig, bus: Bus) -> None:
         lambda: document,
         RigAnswers(KEYS, bus.publish),
         words,
-        Uplink(UplinkConfig()),
+        uplink,
     ).declare(bus)
     words.renew("running", "0", [pair.answers])
     for name, answer in (("extrinsic", pair.answers.extrinsic), ("health", pair.answers.health)):
         bus.publish(f"{KEYS.root}/{pair.name}/{name}", answer("msgpack"))
     bus.declare_alive(KEYS.alive(pair.name))
+    return Vehicle(bench, bus, uplink)
 
 
 @contextmanager
@@ -98,8 +101,7 @@ def serving(
     for thread in threads:
         thread.start()
     try:
-        serve(bench, config, bus)
-        yield Vehicle(bench, bus)
+        yield serve(bench, config, bus)
     finally:
         bus.undeclare_inputs()
         bench.intake.request_stop()

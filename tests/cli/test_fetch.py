@@ -17,10 +17,12 @@ import zenoh
 from cli.conftest import Coec
 from coec.adapters.images.codec import encode_jpeg
 from coec.adapters.mcap.windows import WindowWriter, write_result
+from coec.adapters.zenoh.bus import Answer
 from coec.adapters.zenoh.client import RemoteError, connected
 from coec.adapters.zenoh.window_fetch import PIECE_BYTES, Recording, fetch_window
-from coec.config import ZenohConfig
+from coec.config import UplinkConfig, ZenohConfig
 from coec.errors import NotFoundError, UsageError
+from coec.runtime.api.uplink import BURST_BYTES
 from coec.runtime.recording.digests import DigestReader
 from coec.schemas.base import to_json
 from coec.schemas.incident import IncidentReport
@@ -107,6 +109,7 @@ def test_an_event_comes_home_as_one_folder_that_tells_its_story(coec: Coec, rout
     for file in report.files:
         data = (folder / file.name).read_bytes()
         assert (hashlib.sha256(data).hexdigest(), len(data)) == (file.sha256, file.size_bytes)
+    assert {"config.json", "event.json", "history.json", "rig.json", "status.json"} <= there
     assert [window.window_id for window in report.windows] == [event["window_before"], event["window_after"]]
     assert [window.in_history for window in report.windows] == [True, True]
     assert report.chain_holds is True
@@ -142,6 +145,23 @@ def test_recordings_can_be_left_on_board(coec: Coec, router: Router, tmp_path: P
     assert coec("fetch", VEHICLE, "latest", *arguments).status == 0
     assert not (tmp_path / "windows").exists()
     assert "None was fetched" in (tmp_path / "index.html").read_text()
+
+
+@pytest.mark.fault("the uplink of the vehicle is spent", "what is fetched comes when it may, and is counted")
+def test_whatever_is_fetched_is_metered_and_waited_for(
+    coec: Coec, router: Router, vehicle: Vehicle, tmp_path: Path
+) -> None:
+    before = dict(vehicle.uplink.sent)
+    vehicle.uplink.use(UplinkConfig(evidence_bytes_per_s=1_000_000))
+    vehicle.uplink.metered("test", lambda: Answer(bytes(BURST_BYTES + 300_000), ""))
+    outcome = coec("fetch", VEHICLE, "latest", "--connect", router.endpoint, "--output", tmp_path, "--json")
+    assert outcome.status == 0, outcome.err
+    report = IncidentReport.model_validate(outcome.document)
+    sent = {name: count - before.get(name, 0) for name, count in vehicle.uplink.sent.items()}
+    assert sent["windows"] == sum(window.size_bytes for window in report.windows)
+    assert sent["evidence"] > 0
+    assert sent["history"] > 0
+    assert sum(vehicle.uplink.refused.values()) > 0
 
 
 @pytest.mark.usefixtures("vehicle")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
@@ -16,16 +17,18 @@ from rich.console import Console
 from cli.conftest import Coec
 from coec.adapters.images.codec import encode_jpeg
 from coec.adapters.system import keyboard
+from coec.adapters.zenoh.bus import open_session
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.words import Words
 from coec.cli.watch_board import Asking, Board
+from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import DecodeError
 from coec.fleet.roster import Filter, Roster
 from coec.reports import half_blocks
 from coec.schemas.base import to_msgpack
 from coec.schemas.keys import Keys
 from coec.schemas.replies import HistoryReply
-from e2e.processes import Router
+from e2e.processes import Router, free_endpoint
 from fakes import wait_until
 from last_words import a_word, packed
 from storages import Storage
@@ -157,6 +160,40 @@ def test_a_word_that_was_lost_is_asked_for(router: Router) -> None:
         assert "silent (suspect)" in text(board)
         board.asked_s = -now_s
         wait_until(lambda: "1 healthy" in text(board), "it has answered")
+
+
+@contextmanager
+def router_at(endpoint: str) -> Iterator[zenoh.Session]:
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig()) as session:
+        yield session
+
+
+@pytest.mark.fault("the link to the fleet's router breaks", "the board says so, ages go on, words come again with it")
+def test_a_link_that_breaks_is_said_and_words_come_again_with_it(
+    record_property: Callable[[str, object], None],
+) -> None:
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        with router_at(endpoint) as session:
+            board = stack.enter_context(board_of(Router(session, endpoint)))
+            wait_until(lambda: board.words.told.is_set(), "nobody has said anything")
+            say(session, "truck-1")
+            wait_until(lambda: "1 vehicles, 1 pairs: 1 healthy" in text(board), "it is told")
+        wait_until(lambda: "no router: nothing new comes" in text(board), "the link is gone")
+        board.clock = lambda: time.monotonic() + 200.0
+        assert "silent (healthy)" in text(board), "its last state is not taken for the present one"
+        board.clock = time.monotonic
+        with router_at(endpoint) as session:
+            begun_s = time.monotonic()
+            wait_until(lambda: board.words.is_connected, "the link is back")
+            again = iter(range(1000))
+            wait_until(lambda: _hears(board, session, next(again)), "a word comes again")
+            record_property("figure", f"{time.monotonic() - begun_s:.1f} s")
+
+
+def _hears(board: Board, session: zenoh.Session, attempt: int) -> bool:
+    say(session, "truck-2", state="suspect", windows=attempt)
+    return "1 suspect" in text(board)
 
 
 def test_keys_are_read_as_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,3 +21,17 @@ def test_a_figure_without_a_limit_keeps_none(
 ) -> None:
     text, mark = console.limit_of(MetricReply(value=1.0, limit=limit, at_least=at_least, passed=passed))
     assert (text, mark.plain) == shown
+
+
+@pytest.mark.fault("a text from a vehicle that a terminal would obey", "it is shown with marks in its place")
+def test_what_came_over_a_network_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
+    evil = "a\x1b[2J\x07b [red]c[/red]\r"
+    console.show(evil)
+    console.say(evil)
+    table = console.table("[x]", "y")
+    table.add_row(evil, console.styled("healthy"))
+    console.out.print(table)
+    captured = capsys.readouterr()
+    for text in (captured.out, captured.err):
+        assert not {"\x1b", "\x07", "\r"} & set(text)
+        assert "a�[2J�b [red]c[/red]" in text

@@ -7,6 +7,7 @@ what a document says of itself is held against what was asked for.
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -42,6 +43,7 @@ from coec.schemas.replies import (
     StatusReply,
     WindowInfo,
 )
+from coec.schemas.rig_state import RigReply
 
 LATEST: Final = "latest"
 VEHICLE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -176,6 +178,8 @@ class _Fetch:
         health = self._optional("health.json", HealthReply, keys.health(pair))
         extrinsic = self._optional("extrinsic.json", ExtrinsicReply, keys.extrinsic(pair))
         status = self._optional("status.json", StatusReply, keys.status)
+        self._optional("rig.json", RigReply, keys.rig)
+        self._try("config.json", lambda: self._keep("config.json", self._configuration()))
         for side in event.overlays:
             self._try(f"{side}.jpg", lambda side=side: self._picture(event_id, side))  # type: ignore[misc]
         windows = [
@@ -219,6 +223,15 @@ class _Fetch:
 
         self._try(name, ask_for)
         return found[0] if found else None
+
+    def _configuration(self) -> bytes:
+        """As the vehicle says it; a newer one may have what this program does not know."""
+        data = self._answer(f"{self.keys.config}?format=json")
+        try:
+            document = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise DecodeError("message_malformed", "the configuration is no JSON") from error
+        return json.dumps(document, indent=2, sort_keys=True).encode()
 
     def _picture(self, event_id: str, side: str) -> None:
         data = self._answer(f"{self.keys.evidence_of(self.pair, event_id)}?overlay={side}")

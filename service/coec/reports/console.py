@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
@@ -52,14 +52,19 @@ def raw(text: str) -> None:
     sys.stdout.flush()
 
 
+def plain(text: str) -> str:
+    """The text, without what a terminal would obey: some of what is shown came over a network."""
+    return "".join(character if character.isprintable() or character in "\n\t" else "\ufffd" for character in text)
+
+
 def say(text: str) -> None:
     """A remark, as it is, on standard error."""
-    err.print(Text(text), soft_wrap=True)
+    err.print(Text(plain(text)), soft_wrap=True)
 
 
 def show(text: str, style: str = "") -> None:
     """A line, as it is, on standard output."""
-    out.print(Text(text, style=style), soft_wrap=True)
+    out.print(Text(plain(text), style=style), soft_wrap=True)
 
 
 def progress(*, counted: bool = True) -> Progress:
@@ -80,11 +85,18 @@ def progress(*, counted: bool = True) -> Progress:
 
 def table(*columns: str, right: Iterable[int] = ()) -> Table:
     """A table; the columns whose index is in `right` hold numbers."""
-    made = Table(box=None, pad_edge=False, header_style="bold")
+    made = _PlainTable(box=None, pad_edge=False, header_style="bold")
     numbers = set(right)
     for index, column in enumerate(columns):
         made.add_column(column, justify="right" if index in numbers else "left", overflow="fold")
     return made
+
+
+class _PlainTable(Table):
+    """Cells that are text are text, and no markup either."""
+
+    def add_row(self, *cells: RenderableType | None, **more: Any) -> None:
+        super().add_row(*(Text(plain(cell)) if isinstance(cell, str) else cell for cell in cells), **more)
 
 
 def figure(value: float | None, digits: int = 3, sign: bool = False) -> str:

@@ -50,11 +50,13 @@ def detail(pair: PairNow) -> RenderableType:
             f"{word.vehicle}/{word.pair}  ",
             told(pair),
             f" since {duration(max(word.said_ns - word.since_ns, 0) * 1e-9 + pair.said_s)}",
-            f", said {duration(pair.said_s)} ago, by coec {_plain(word.version)}, "
-            f"configuration {_plain(word.config_hash)}, {word.windows} windows{', held' if word.held else ''}",
+            f", said {duration(pair.said_s)} ago, by coec {console.plain(word.version)}, "
+            f"configuration {console.plain(word.config_hash)}, {word.windows} windows{', held' if word.held else ''}",
         )
     ]
-    lines += [Text(f"  {_plain(reason.code)}: {_plain(reason.text)}", "yellow") for reason in word.reasons]
+    lines += [
+        Text(f"  {console.plain(reason.code)}: {console.plain(reason.text)}", "yellow") for reason in word.reasons
+    ]
     if not word.reasons:
         lines.append(Text("  no reasons", "dim"))
     figures = Table(box=None, pad_edge=False, header_style="bold")
@@ -73,7 +75,7 @@ def detail(pair: PairNow) -> RenderableType:
         cells = [console.figure(value, sign=sign) for value, sign in zip(values, signed, strict=True)]
         figures.add_row(f"{title} [{console.UNITS[axis]}]", *cells)
     served = f"served: {word.provenance or 'nothing yet'}, latest attempt {word.status or '-'}"
-    event = f", newest red event {_plain(word.event)}" if word.event else ""
+    event = f", newest red event {console.plain(word.event)}" if word.event else ""
     return Group(*lines, Text(served + event), figures)
 
 
@@ -111,11 +113,6 @@ def _row(pair: PairNow, *, marked: bool) -> tuple[RenderableType, ...]:
         Text("never" if pair.looked_s is None else duration(pair.looked_s)),
         Text(drift, "bold red" if pair.urgency >= 1.0 else ""),
         Text(sigma),
-        Text(", ".join(_plain(reason.code) for reason in word.reasons), overflow="ellipsis", no_wrap=True),
-        Text(_plain(word.event or "")),
+        Text(", ".join(console.plain(reason.code) for reason in word.reasons), overflow="ellipsis", no_wrap=True),
+        Text(console.plain(word.event or "")),
     )
-
-
-def _plain(text: str) -> str:
-    """What a vehicle calls things, without what a terminal would obey."""
-    return "".join(character if character.isprintable() else "�" for character in text)
