@@ -123,3 +123,9 @@ def test_entries_are_held_against_their_hashes() -> None:
     forged = two.entry.model_copy(update={"text": "B"})
     assert held(one, ChainedEntry(sha256=two.sha256, entry=forged), three) is False
     assert held(one, ChainedEntry(sha256=sha256(forged), entry=forged), three) is False, "it is not what follows on"
+
+
+def test_snippets_are_links_into_the_folder() -> None:
+    text = page(replace(STORY, snippets=("front-7.snippet", "<b>")), [])
+    assert "href='windows/front-7.snippet.mcap'" in text
+    assert "<b>" not in text

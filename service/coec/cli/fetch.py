@@ -10,7 +10,7 @@ import hashlib
 import json
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypeVar
@@ -22,7 +22,7 @@ from coec.adapters.files import output
 from coec.adapters.images.codec import probe
 from coec.adapters.mcap.windows import read_result
 from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected_by, nobody
-from coec.adapters.zenoh.window_fetch import fetch_window
+from coec.adapters.zenoh.window_fetch import Recording, fetch_window
 from coec.cli.commands.fetch import Options
 from coec.cli.query import OF_PAIR, asked_of
 from coec.config import LimitsConfig
@@ -42,6 +42,7 @@ from coec.schemas.replies import (
     HistoryReply,
     StatusReply,
     WindowInfo,
+    WindowsReply,
 )
 from coec.schemas.rig_state import RigReply
 
@@ -50,6 +51,9 @@ VEHICLE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 AROUND_NS: Final = 600 * 1_000_000_000
 """Of the history, before the first and after the last figure that is kept of the event: 10 minutes."""
+
+SNIPPET_NS: Final = 60 * 1_000_000_000
+"""Sensor time between an event and a snippet that belongs to it: a suspicion is told before it, by up to a minute."""
 
 ENTRIES: Final = 300
 """Of the history at most, some 6 kB each."""
@@ -187,9 +191,10 @@ class _Fetch:
             for window_id in dict.fromkeys(filter(None, (event.window_before, event.window_after)))
             if not self.options.no_windows and (fetched := self._window(window_id, history)) is not None
         ]
+        snippets = () if self.options.no_windows else tuple(self._snippets(event))
         holds = None if history is None else chain_holds(history)
         told = (event, history, health, extrinsic, status)
-        story = incident_page.Story(*told, tuple(windows), tuple(self.absent), holds)
+        story = incident_page.Story(*told, tuple(windows), tuple(self.absent), holds, snippets)
         pictures = [name for name in ("before.jpg", "after.jpg") if name in self.files]
         self._keep(PAGE, incident_page.page(story, pictures).encode())
         report = IncidentReport(
@@ -239,42 +244,50 @@ class _Fetch:
         self._keep(f"{side}.jpg", data)
 
     def _window(self, window_id: str, history: HistoryReply | None) -> FetchedWindow | None:
-        if (named := OF_PAIR.fullmatch(window_id)) is None or named["pair"] != self.pair:
-            self.absent.append(Absent(what="a window", why="what the event calls it is no name of a window"))
+        info = self._recording(window_id)
+        if not isinstance(info, WindowInfo):
             return None
-        path = self.folder / "windows" / f"{window_id}.mcap"
-        found: list[FetchedWindow] = []
+        return FetchedWindow(
+            window_id=window_id,
+            sha256=str(info.sha256),
+            size_bytes=info.size_bytes,
+            pairs=info.pairs,
+            decision=info.decision,
+            in_history=_in_history(self.folder / _recorded(window_id), window_id, history),
+        )
+
+    def _snippets(self, event: EvidenceEvent) -> Iterator[str]:
+        """What was recorded at full rate about the event."""
+        listed: list[WindowsReply] = []
+        self._try("snippets", lambda: listed.append(self._document(WindowsReply, self.keys.windows(self.pair))))
+        for snippet in listed[0].snippets if listed else ():
+            if abs(snippet.stamp_ns - event.stamp_ns) <= SNIPPET_NS and self._recording(snippet.snippet_id) is not None:
+                yield snippet.snippet_id
+
+    def _recording(self, recording_id: str) -> Recording | None:
+        if (named := OF_PAIR.fullmatch(recording_id)) is None or named["pair"] != self.pair:
+            self.absent.append(Absent(what="a recording", why="what the vehicle calls it is no name of one"))
+            return None
+        name = _recorded(recording_id)
+        found: list[Recording] = []
 
         def fetch() -> None:
             with console.progress(counted=False) as bars:
-                task = bars.add_task(window_id, note="")
+                task = bars.add_task(recording_id, note="")
                 info = fetch_window(
                     self.session,
                     self.keys,
                     self.pair,
-                    window_id,
-                    path,
+                    recording_id,
+                    self.folder / name,
                     self.options.timeout_s,
                     self.options.patience_s,
                     lambda done, total: bars.update(task, completed=done, total=total, note=f"{done / 1e6:.1f} MB"),
                 )
-            if not isinstance(info, WindowInfo):
-                raise RemoteError("malformed", f"what the event calls a window is a snippet: {window_id}")
-            sha256 = str(info.sha256)
-            name = str(path.relative_to(self.folder))
-            self.files[name] = FetchedFile(name=name, sha256=sha256, size_bytes=info.size_bytes)
-            found.append(
-                FetchedWindow(
-                    window_id=window_id,
-                    sha256=sha256,
-                    size_bytes=info.size_bytes,
-                    pairs=info.pairs,
-                    decision=info.decision,
-                    in_history=_in_history(path, window_id, history),
-                )
-            )
+            self.files[name] = FetchedFile(name=name, sha256=str(info.sha256), size_bytes=info.size_bytes)
+            found.append(info)
 
-        self._try(f"windows/{window_id}.mcap", fetch)
+        self._try(name, fetch)
         return found[0] if found else None
 
     def _answer(self, selector: str) -> bytes:
@@ -317,6 +330,11 @@ def chain_holds(history: HistoryReply) -> bool | None:
                 return False
         last[entry.book] = chained
     return True if linked else None
+
+
+def _recorded(recording_id: str) -> str:
+    """Where a recording lies in the folder."""
+    return f"windows/{recording_id}.mcap"
 
 
 def _around(key: str, event: EvidenceEvent) -> str:

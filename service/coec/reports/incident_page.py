@@ -55,6 +55,7 @@ class Story:
     windows: tuple[FetchedWindow, ...]
     absent: tuple[Absent, ...]
     chain_holds: bool | None
+    snippets: tuple[str, ...] = ()
 
 
 def page(story: Story, pictures: Sequence[str]) -> str:
@@ -76,7 +77,7 @@ def page(story: Story, pictures: Sequence[str]) -> str:
         parts += [each for result in results for each in _refusal(result)]
     if story.history is not None and story.history.entries:
         parts += ["<h2>What happened, in the vehicle's history</h2>", _chain(story), _entries(story.history)]
-    parts += ["<h2>Recordings</h2>", _windows(story.windows)]
+    parts += ["<h2>Recordings</h2>", _windows(story.windows), _snippets(story.snippets)]
     if story.health is not None:
         parts += ["<h2>Since then</h2>", *_now(story, story.health)]
     if story.absent:
@@ -272,6 +273,13 @@ def _windows(windows: Sequence[FetchedWindow]) -> str:
         "<p class=quiet>They open in Foxglove, Lichtblick and ROS 2 tools; <code>coec replay windows/ID.mcap</code> "
         "reaches the recorded decision again.</p>"
     )
+
+
+def _snippets(snippets: Sequence[str]) -> str:
+    if not snippets:
+        return ""
+    links = ", ".join(f"<a href='windows/{escape(one, quote=True)}.mcap'>{escape(one)}</a>" for one in snippets)
+    return f"<p>Every frame of the seconds about the event: {links}.</p>"
 
 
 def _now(story: Story, health: HealthReply) -> Iterable[str]:
