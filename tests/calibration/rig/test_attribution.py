@@ -43,6 +43,24 @@ def test_those_that_moved_are_named_and_told_by_how_much(
     record_property("figure", f"{min(s.probability for s in sensors(state, rig) if s.name in who):.3f}")
 
 
+@pytest.mark.parametrize(("who", "answers"), [(("roof",), 2), (("front", "rear"), 3)])
+def test_two_sensors_at_once_take_one_answer_more_than_one_alone(who: tuple[str, ...], answers: int) -> None:
+    rig = graph(STAR)
+    state, after, rng = driven(rig, POSES, POSES, rounds=(4, 0)), with_moved(*who), np.random.default_rng(7)
+    asked: list[RigState] = []
+    for turn in range(4, 12):
+        for place, edge in enumerate(rig.edges):
+            before, at_s = state, 5.0 * turn + 0.5 * place
+            state = after_look(state, rig, look(edge, after, at_s, SIGMA * rng.normal(size=6)))
+            if state.asked_ns != before.asked_ns:
+                asked.append(state)
+    probable = [set(who) <= {name for name, p in one.posterior.sensors.items() if p >= 0.95}
+                for one in asked if one.posterior is not None]  # fmt: skip
+    first_said, first_named = probable.index(True), [one.named for one in asked].index(frozenset(who))
+    assert first_named - first_said == answers - 1
+    assert all(one.named <= set(who) for one in asked)
+
+
 def test_nothing_happened_and_nobody_is_named() -> None:
     rig = graph(STAR)
     assert set(_health(driven(rig, POSES, POSES), rig).values()) == {SensorHealth.CALIBRATED}

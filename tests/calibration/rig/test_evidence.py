@@ -49,6 +49,13 @@ def test_a_faint_check_says_less_and_one_of_bad_data_nothing() -> None:
     assert of_check("e", POSE, _observation(TURN), share=0.0) is None
 
 
+def test_a_check_carries_since_when_its_pair_is_suspected_by_itself() -> None:
+    for since_ns in (None, 5):
+        found = of_check("e", POSE, _observation(TURN), stepped_ns=since_ns)
+        assert found is not None
+        assert found.stepped_ns == since_ns
+
+
 @pytest.mark.fault("a check of a rig's pair is NaN, or served where no pose is", "it says nothing, or is refused")
 def test_hostile_checks_say_nothing() -> None:
     assert of_check("e", POSE, _observation(np.full(6, np.nan))) is None

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from coec.cli.demo.rig import report, story
 from coec.cli.demo.rig.outcome import Outcome, is_over, outcome_of
-from coec.cli.demo.rig.service import serving
 from coec.cli.demo.rig.story import Act
-from coec.cli.demo.rig.told import Asker, Told
+from coec.cli.demo.rig.told import Beholder, Told
 from coec.cli.demo.rig.vehicle import RigVehicle
 from coec.reports import console
 
@@ -19,7 +18,7 @@ def run(output: Path, *, as_json: bool) -> int:
     """Plays all of it; 1 if an act did not come true.
 
     Raises:
-        DemoError: the service does not start, answer or end.
+        CalibrationError: a picture cannot be decoded.
         OutputError: a file cannot be written.
     """
     started_s = time.monotonic()
@@ -40,22 +39,20 @@ def run(output: Path, *, as_json: bool) -> int:
 
 
 def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[Outcome, list[Told]]:
-    """With a service of its own, which knows nothing of other acts: until the story is told, or the drive is over.
-    `heard` is told of every instant."""
+    """Until the story is told, or the drive is over; `heard` is told of every instant."""
+    teller = Beholder(vehicle.as_built, story.LIDAR)
     said: list[Told] = []
     outcome = outcome_of(act, said)
-    with serving(vehicle.as_built, story.LIDAR) as service:
-        teller = Asker(service)
-        for frames in vehicle.frames(act):
-            heard(f"{act.name}: {frames.second:.0f} s of driving")
-            for told in teller.hear(frames):
-                before = said[-1] if said else None
-                said.append(told)
-                if before is None or before.named != told.named:
-                    console.say(f"demo: {act.name}: {told.second:5.1f} s of driving: {_words(told)}")
-            outcome = outcome_of(act, said)
-            if said and is_over(outcome, said[-1]):
-                break
+    for frames in vehicle.frames(act):
+        heard(f"{act.name}: {frames.second:.0f} s of driving")
+        for told in teller.hear(frames):
+            before = said[-1] if said else None
+            said.append(told)
+            if before is None or before.named != told.named:
+                console.say(f"demo: {act.name}: {told.second:5.1f} s of driving: {_words(told)}")
+        outcome = outcome_of(act, said)
+        if said and is_over(outcome, said[-1]):
+            break
     return outcome, said
 
 
