@@ -53,7 +53,7 @@ whose edges are clear five were below, four of them on highways; three of these 
 far off, and two of the 414 others."""
 
 LOST_SHARE = 0.5
-"""Of the significance at the optimum: where the expected pose has less, no scatter explains that, whatever the scene."""
+"""Of the significance at the optimum: where the expected pose has less, no scatter explains that in any scene."""
 
 MIN_EDGES_IN_VIEW = 150.0
 """Range edges in view, per pair, below which a check's edges count as faint, too, however well they fit: with fewer, a
