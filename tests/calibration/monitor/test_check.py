@@ -104,7 +104,7 @@ class TestSupport:
 
 
 NOTHING = Support(kept=1.0, certainty=0.0)
-INSISTS = Support(kept=0.5, certainty=4.0)
+INSISTS = Support(kept=0.6, certainty=4.0)
 
 A_CHECK = Check(
     pairs=1,
@@ -160,6 +160,10 @@ class TestOpinion:
     def test_a_scene_where_optima_scatter_accuses_nobody(self) -> None:
         seen = replace(A_CHECK, of_rotation=INSISTS, contrast=TELLING_CONTRAST - 0.1)
         assert [self.said(seen, off) for off in (0.9, 1.1, 2.1)] == [Opinion.CLEAR, *[Opinion.UNDECIDED] * 2]
+
+    def test_but_where_most_edges_are_lost_any_scene_tells(self) -> None:
+        seen = replace(A_CHECK, of_rotation=replace(INSISTS, kept=0.4), contrast=TELLING_CONTRAST - 0.1)
+        assert self.said(seen, 2.1) is Opinion.FLAGGED
 
     def test_what_one_optimum_insists_on_the_other_does_not_say(self) -> None:
         assert self.said(replace(A_CHECK, of_pose=INSISTS), 2.1) is Opinion.UNDECIDED

@@ -254,7 +254,8 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     if told is not None:
         shifted = after_check(shifted, told, TRANSLATIONS, fresh, most)
     step = fresh * (WEAK_SHARE if observation.weak else 1.0)
-    if not observation.flagged:
+    # Check after check too far off, and edges that insist on nothing: of images and sweeps that are not of one moment.
+    if not observation.flagged and not (observation.undecided and observation.distance2 > 1.0):
         at_odds = state.at_odds if observation.weak or observation.undecided else 0.0
     else:
         at_odds = min(state.at_odds + step, MOST_AT_ODDS)

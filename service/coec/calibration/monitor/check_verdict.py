@@ -52,6 +52,9 @@ such scenes scatter more than three times as far as those of a street, see `disp
 whose edges are clear five were below, four of them on highways; three of these five insisted on an optimum that was too
 far off, and two of the 414 others."""
 
+LOST_SHARE = 0.5
+"""Of the significance at the optimum: where the expected pose has less, no scatter explains that in any scene."""
+
 MIN_EDGES_IN_VIEW = 150.0
 """Range edges in view, per pair, below which a check's edges count as faint, too, however well they fit: with fewer, a
 guard rail and a lane marking decide, in every pair the same. Of checks of right mounts on simulated drives all that
@@ -227,7 +230,8 @@ def opinion(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimi
     half-way: what edges gain by there is no acquittal."""
     undecided = False
     for over, said in zip(over_limits(seen, rotation, pose, limits), (seen.of_rotation, seen.of_pose), strict=True):
-        if said.insists and over > limits.insisted_share and seen.contrast >= TELLING_CONTRAST:
+        tells = seen.contrast >= TELLING_CONTRAST or said.kept < LOST_SHARE
+        if said.insists and over > limits.insisted_share and tells:
             return Opinion.FLAGGED
         undecided |= over > 1.0 or (said.gained and over > limits.insisted_share)
     return Opinion.UNDECIDED if undecided else Opinion.CLEAR

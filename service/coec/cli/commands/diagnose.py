@@ -36,7 +36,8 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Take one check of the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong."""
+    """Take one check of the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong,
+    or cannot be told from a wrong one."""
     from coec.cli import diagnose as work
 
     return work.run(options)
