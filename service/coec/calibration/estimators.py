@@ -67,6 +67,10 @@ their root, and what a thousand cells scatter by puts ripples on the hill, whose
 little is near. Eight windows of four simulated drives, six degrees of freedom, starts 20° and 0.3 m away: root mean
 square 0.08° and 1.0 cm on the worst axes instead of 0.10° and 1.6 cm."""
 
+TELLING = 2.0
+"""Standard deviations by which the depth witness stands out at a pose, from which more points are spent on it: below
+that it might be chance, and would not tell more with them."""
+
 SETTLING = SearchBox(radians(8.0), 0.5)
 """How far from a settled pose those are asked at most: by its summits, and by how wide its hill is."""
 
@@ -235,7 +239,9 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
         Metric("runner_up", runner_up(contrast, rival), limits.max_runner_up, at_least=False),
     )
     alike = sorted((end for end in polished if not _differ(end[1], pose)), key=lambda end: -end[0])
-    finest = fusion.settling[-1].with_depth(_denser(sight, depth, alike[0][1], config))
+    finest = fusion.settling[-1]
+    if fusion.depth_contrast(alike[0][1]) >= TELLING:
+        finest = finest.with_depth(_denser(sight, depth, alike[0][1], config))
     last = (fusion.settling[0], finest)
     settled = [polish_in_turn(last, end, config.search, progress) for _, end in alike[:SETTLED_POSES]]
     best = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
@@ -309,10 +315,10 @@ def _number(count: int, share: float) -> int:
 
 
 def _denser(sight: Sight, depth: MutualInformation, pose: Matrix4, config: CalibrationConfig) -> MutualInformation:
-    """The depth witness of a fusion near `pose` (4, 4), with about `SEEN_DEPTH_POINTS` in view there; as it is where
-    half as many are, or none."""
+    """The depth witness of a fusion near `pose` (4, 4), which sees some, with about `SEEN_DEPTH_POINTS` in view there;
+    as it is where half as many are."""
     seen = depth.evaluate(pose).points_in_view
-    if seen == 0 or 2 * seen >= SEEN_DEPTH_POINTS:
+    if 2 * seen >= SEEN_DEPTH_POINTS:
         return depth
     counts = [len(pair.lidar.xyz_m) for pair in sight.window.pairs]
     leading = [_number(count, LEADING_DEPTH_POINTS / sum(counts)) for count in counts]

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.sweep_times import azimuth_offsets_s
 from coec.calibration.types import Compensation, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, SweepTiming
-from coec.geometry import se3
 from coec.geometry.deskew import deskew
 
 Choice = NDArray[np.int64] | slice
@@ -48,11 +47,12 @@ def sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.fl
     """Angular (3,) rad/s and linear velocity (3,) m/s of the LiDAR in its own frame; the lever arm turns rotation into
     velocity. Where the linear velocity of the vehicle is not known, none is assumed of the LiDAR."""
     rotation = T_lidar_ego[:3, :3]
-    lidar_in_ego_m = se3.inverse(T_lidar_ego)[:3, 3]
     angular = np.asarray(motion.angular_radps)
     if motion.linear_mps is None:
         return rotation @ angular, np.zeros(3)
-    linear = np.asarray(motion.linear_mps) + np.cross(angular, lidar_in_ego_m)
+    # The lever is where the LiDAR is in the vehicle's frame. Number by number: arrays of three are mostly overhead.
+    (a, b, c), (x, y, z) = motion.angular_radps, (-rotation.T @ T_lidar_ego[:3, 3]).tolist()
+    linear = np.asarray(motion.linear_mps) + np.array([b * z - c * y, c * x - a * z, a * y - b * x])
     return rotation @ angular, rotation @ linear
 
 
