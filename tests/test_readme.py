@@ -284,7 +284,7 @@ def shim(folder: Path) -> Path:
     path.write_text(
         "#!/bin/bash\n"
         f"case $1 in run | play) sed -i s/127.0.0.1:7447/{endpoint}/ ./*.yaml ;; esac\n"
-        f'[ "$1" = query ] && set -- "$@" --connect tcp/{endpoint}\n'
+        f'case $1 in query | watch) set -- "$@" --connect tcp/{endpoint} ;; esac\n'
         f'exec {shlex.quote(sys.executable)} -m coec "$@"\n'
     )
     path.chmod(0o755)
