@@ -8,13 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
 from certificates import TestAuthority
 from coec.adapters.tls.conversation import Credentials, Speaker
 from coec.adapters.zenoh.client import JSON, RemoteError, Reply, ask_one
 from coec.adapters.zenoh.proven import give
 from coec.adapters.zenoh.window_fetch import fetch_window
-from coec.config import Config, DepthConfig, SnippetsConfig, load_config
+from coec.config import Config, DepthConfig, SnippetsConfig, UplinkConfig, load_config
 from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
 from e2e.planted import plant, said, written
@@ -30,6 +31,9 @@ MAX_ERROR_DEG = 0.35
 
 SNIPPET_BYTES = 256 * 2**20
 """Of memory; several seconds of the drive."""
+
+FAST = 10**9
+"""Bytes a second of an uplink."""
 
 MAPS = DepthConfig(model="stereo")
 """Depth from the maps that come with the frames."""
@@ -65,7 +69,8 @@ def test_a_step_is_noticed_corrected_and_remembered(
     authority: TestAuthority,
     record_property: Callable[[str, object], None],
 ) -> None:
-    config = stepped_configuration(tmp_path, router, MAPS)
+    # All that it has to say is read, windows too: no answer shall be that the uplink is busy.
+    config = changed(stepped_configuration(tmp_path, router, MAPS), uplink=UplinkConfig(evidence_bytes_per_s=FAST))
     secrets = plant(config, router, authority)
     with service(config, router) as running:
         keys, pair = running.keys, running.pair
@@ -111,6 +116,7 @@ def test_a_step_is_noticed_corrected_and_remembered(
         assert running.command("reset")["code"] == "held"
         replies = list(said(running))
         assert len(replies) > 30
+        assert not any(b"uplink_busy" in reply for reply in replies)
         programs = (running.process.pid, running.worker()["pid"])
         lines = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in programs]
         assert commanded(running, "hold", authority.credentials("operator")) == "held"
@@ -136,15 +142,16 @@ def test_a_step_is_noticed_corrected_and_remembered(
     record_property("figure", f"{len(secrets)} secrets, {len(replies)} replies, {len(disk)} texts on the disk")
 
 
-def with_snippets(path: Path) -> Path:
-    """The configuration, with memory for the seconds around events."""
-    document = {**load_config(path).model_dump(), "snippets": SnippetsConfig(memory_bytes=SNIPPET_BYTES)}
+def changed(path: Path, **sections: BaseModel) -> Path:
+    """The configuration, with other sections."""
+    document = {**load_config(path).model_dump(), **sections}
     path.write_text(commented_yaml(Config.model_validate(document)))
     return path
 
 
 def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path, drive: Drive, router: Router) -> None:
-    config = with_snippets(stepped_configuration(tmp_path, router, MAPS, apply="never"))
+    remembering = SnippetsConfig(memory_bytes=SNIPPET_BYTES)
+    config = changed(stepped_configuration(tmp_path, router, MAPS, apply="never"), snippets=remembering)
     with service(config, router) as running:
         running.send(drive.between(0, STEP_S))
         running.rest()
