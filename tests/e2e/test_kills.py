@@ -16,6 +16,7 @@ import pytest
 
 from coec.adapters.mcap.windows import read_window
 from coec.adapters.zenoh.cadence import repeated
+from coec.adapters.zenoh.client import is_alive
 from coec.adapters.zenoh.player import Player, Streams, shifted
 from coec.config import (
     CalibrationConfig,
@@ -28,7 +29,8 @@ from coec.config import (
 )
 from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, STEPPED, Drive, rendered
-from e2e.processes import Router, Service, service, write_configuration
+from e2e.processes import PATIENCE_S, Router, Service, service, write_configuration
+from fakes import wait_until
 
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
@@ -113,6 +115,8 @@ def lives(config: Path, router: Router, folder: Path, kills: int, seed: int) -> 
                 running.changed.wait(min(ASK_PERIOD_S, max(kill_s - time.monotonic(), 0.0)))
                 running.changed.clear()
             running.kill()
+            # A busy router notices late, and whom it still announces the next one does not join.
+            wait_until(lambda: not is_alive(router.session, running.keys, PATIENCE_S), "forgotten", PATIENCE_S)
     return starts_s
 
 
