@@ -16,9 +16,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from coec.adapters.files import durable
+from coec.adapters.files.piece import read_piece
 from coec.adapters.mcap.snippet_file import metadata_of, salvage_snippet
 from coec.adapters.mcap.windows import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX
-from coec.errors import CoecError, DecodeError, NotFoundError, RecordingError, UsageError
+from coec.errors import CoecError, DecodeError, NotFoundError, RecordingError
 from coec.schemas.base import from_json, to_json
 from coec.schemas.replies import SnippetInfo
 
@@ -83,15 +84,7 @@ class SnippetStore:
             known = name in self._found and _pair_of(name) == pair
         if not known:
             raise NotFoundError(f"pair {pair} has no snippet of this id; the list is in `windows`")
-        try:
-            with self.path(name).open("rb") as stream:
-                size = os.fstat(stream.fileno()).st_size
-                if offset > size:
-                    raise UsageError(f"`offset` lies behind the end of the file ({size} bytes)")
-                stream.seek(offset)
-                return stream.read(length)
-        except OSError as error:
-            raise NotFoundError(f"the snippet cannot be read: {error.strerror}") from error
+        return read_piece(self.path(name), "the snippet", offset, length)
 
     def add(self, info: SnippetInfo) -> None:
         """A snippet was recorded: it is listed once a restart would list it, too.

@@ -22,9 +22,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from coec.adapters.files import durable
+from coec.adapters.files.piece import read_piece
 from coec.adapters.mcap.windows import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX, RecordedWindow
 from coec.config import StateConfig
-from coec.errors import NotFoundError, RecordingError, UsageError
+from coec.errors import NotFoundError, RecordingError
 from coec.runtime.recording.window_index import IndexedWindow, WindowIndex, WindowVersion
 from coec.schemas.replies import KeptFor, WindowInfo
 
@@ -169,15 +170,7 @@ class WindowStore:
             NotFoundError: no such window.
             UsageError: the offset lies behind the end.
         """
-        try:
-            with self.existing(pair, window_id).open("rb") as stream:
-                size = os.fstat(stream.fileno()).st_size
-                if offset > size:
-                    raise UsageError(f"`offset` lies behind the end of the file ({size} bytes)")
-                stream.seek(offset)
-                return stream.read(length)
-        except OSError as error:
-            raise NotFoundError(f"the window cannot be read: {error.strerror}") from error
+        return read_piece(self.existing(pair, window_id), "the window", offset, length)
 
     # --- what is known of it ----------------------------------------------------------------------------------------
 
