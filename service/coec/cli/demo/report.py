@@ -155,7 +155,7 @@ def _summary(outcome: Ending, moments: Sequence[Moment]) -> list[tuple[str, str]
     axes = "  ".join(f"{value:+.3f}°" for value in last.error_by_axis_deg)
     return [
         ("error of the workshop's calibration", f"{moments[0].error_deg:.3f}°"),
-        ("error after the first window", f"{early[-1].error_deg:.3f}°" if early else "no window was accepted"),
+        ("error after the first window", f"{early[0].error_deg:.3f}°" if early else "no window was accepted"),
         ("knock", f"{story.KNOCK_DEG:g}° in pitch at {outcome.knock_s:.0f} s of driving"),
         ("alarm", after_knock(outcome.alarm_s)),
         ("repair", after_knock(outcome.repaired_s)),
