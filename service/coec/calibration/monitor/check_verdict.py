@@ -37,6 +37,7 @@ from coec.calibration.types import FramePair, Matrix4, Metric, Window
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
+from coec.geometry.compiler import on_one_thread
 
 FALSE_ALARM_RATE = 0.01
 """Share of checks at a right pose that may be flagged: the limit of an uncommissioned rig, and what commissioning aims
@@ -97,6 +98,7 @@ UNCOMMISSIONED = MonitorLimits(
 """Of an uncommissioned rig. Edges at the right pose are at 10 to 24 on every recording tried."""
 
 
+@on_one_thread()
 def observe(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
 ) -> Observation:
@@ -114,6 +116,7 @@ def observe(
     return with_depth(told, ask_depth(evidence, seen, pose, config), baseline)
 
 
+@on_one_thread()
 def diagnose(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
 ) -> Observation:
