@@ -26,6 +26,6 @@ def test_work_that_fails_gives_its_threads_back() -> None:
         raise ValueError(numba.get_num_threads())
 
     for _ in range(2):
-        with pytest.raises(ValueError, match="^1$"):
+        with pytest.raises(ValueError, match=r"^1$"):
             fail()
     assert numba.get_num_threads() == before
