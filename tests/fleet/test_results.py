@@ -84,6 +84,16 @@ def test_a_batch_that_ends_anywhere_is_gone_on_with(tmp_path: Path, count: int) 
     assert Results(tmp_path, Terms(), resume=True).urls == {row.url for row in rows(11)}
 
 
+def test_rows_are_the_same_whether_a_batch_was_stopped_or_not(tmp_path: Path, row: WindowRow) -> None:
+    whole, stopped = (Results(tmp_path / name, Terms(), resume=False) for name in ("whole", "stopped"))
+    for batch in (whole, stopped):
+        batch.add(row)
+    whole.finish()
+    Results(tmp_path / "stopped", Terms(), resume=True).finish()
+    (one,), (other,) = (list((tmp_path / name).rglob("*.parquet")) for name in ("whole", "stopped"))
+    assert one.read_bytes() == other.read_bytes()
+
+
 def test_tables_that_were_made_before_the_journal_was_emptied_are_not_made_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

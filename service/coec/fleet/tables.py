@@ -13,6 +13,7 @@ from urllib.parse import quote
 from coec.adapters.files import output
 from coec.errors import SourceError
 from coec.fleet.extra import library
+from coec.schemas.base import to_json
 from coec.schemas.fleet import AXES, WindowRow
 from coec.schemas.replies import Maybe6, Maybe6x6
 
@@ -123,13 +124,14 @@ def _parquet(rows: Sequence[WindowRow]) -> bytes:
 
 
 def _values(row: WindowRow) -> dict[str, Any]:
+    """What is kept by name is in the order of the names: equal rows are equal bytes, those of a resumed batch, too."""
     told: dict[str, Any] = {
         "url": row.url,
         "sha256": row.sha256,
         "bytes": row.bytes,
         "recorded_decision": row.recorded,
         "decision": row.decided,
-        "versions": row.versions,
+        "versions": sorted(row.versions.items()),
         "seconds": row.seconds,
         "cpu_s": row.cpu_s,
         "error_code": row.error_code,
@@ -156,8 +158,8 @@ def _values(row: WindowRow) -> dict[str, Any]:
         "accepted": result.verdict.decision == "accepted",
         "reason_codes": [reason.code for reason in result.verdict.reasons],
         "reasons": [reason.text for reason in result.verdict.reasons],
-        "figures": {name: metric.value for name, metric in result.metrics.items()},
-        "limits": {name: metric.limit for name, metric in result.metrics.items()},
+        "figures": [(name, metric.value) for name, metric in sorted(result.metrics.items())],
+        "limits": [(name, metric.limit) for name, metric in sorted(result.metrics.items())],
         "independent_looks": result.independent_looks,
         "score": result.score,
         "score_at_start": result.score_at_start,
@@ -170,7 +172,7 @@ def _values(row: WindowRow) -> dict[str, Any]:
         "second_derivative": result.second_derivative,
         "depth_identity": result.depth_identity,
         "config_hash": result.config_hash,
-        "result": result.model_dump_json(),
+        "result": to_json(result).decode(),
     }
 
 
