@@ -176,9 +176,9 @@ def errors_deg(running: Service, knock: Knock | None) -> dict[str, float]:
 
 
 def states_of(running: Service, pair: str) -> list[str]:
-    """In which its health has been."""
-    entries = running.ask(running.keys.history(pair), ";limit=1000")["entries"]
-    return [one["entry"]["code"] for one in entries if one["entry"]["kind"] == "state"]
+    """In which its health has been, by what was seen: a drive that is over makes pairs degraded by the clock."""
+    entries = [one["entry"] for one in running.ask(running.keys.history(pair), ";limit=1000")["entries"]]
+    return [entry["code"] for entry in entries if entry["kind"] == "state" and entry["stamp_ns"] is not None]
 
 
 def corrected(running: Service, pair: str) -> int:
@@ -237,8 +237,8 @@ def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
         )
         assert max(errors.values()) <= MAX_ERROR_DEG, errors
         assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
-        healths = {camera: running.ask(running.keys.health(camera))["state"] for camera in cameras}
-        assert set(healths.values()) == {"healthy"}, healths
+        last = {camera: states_of(running, camera)[-1] for camera in cameras}
+        assert set(last.values()) == {"healthy"}, last
         assert running.terminate() == 0
 
 
@@ -264,4 +264,5 @@ def test_a_knocked_camera_is_named_and_put_right_and_no_other(
         )
         assert max(errors.values()) <= MAX_ERROR_DEG, errors
         assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
+        assert states_of(running, LEFT.sensor)[-1] == "healthy"
         assert running.terminate() == 0
