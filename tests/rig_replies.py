@@ -10,6 +10,7 @@ from coec.schemas.rig_state import (
     JointReply,
     OpenLoop,
     RigCorrection,
+    RigMove,
     RigReply,
     SensorKind,
     SensorMove,
@@ -65,9 +66,11 @@ def knocked(**more: Any) -> RigReply:
     """The LiDAR of two cameras moved, and was put right."""
     sensors = (sensor("front", "camera", "calibrated"), sensor("left", "camera", "undecided"), moved_lidar())
     correction = RigCorrection(stamp_ns=9 * NS, from_ns=24 * NS, sensors=("roof",), pairs=("front", "left"))
+    move = RigMove(sensors=("roof",), since_ns=8 * NS, stepped_ns=4 * NS, over_ns=9 * NS, by={"roof": MOVE})
     told: dict[str, Any] = {
         "vehicle": "shuttle-7", "stamp_ns": 10 * NS, "sensors": sensors, "nobody": 0.002, "disturbed": {"front": 0.0},
-        "joint": joint(), "correction": correction, "looks": {"front": 5, "left": 4}, "losses": {"late": 2},
+        "joint": joint(), "correction": correction, "move": move,
+        "looks": {"front": 5, "left": 4}, "losses": {"late": 2},
     }  # fmt: skip
     return RigReply(**{**told, **more})
 
@@ -76,4 +79,5 @@ def untold() -> RigReply:
     """Before anything was looked at."""
     why = (Reason(code="one_pair", text="One pair cannot tell its camera from its LiDAR."),)
     sensors = (sensor("roof", "lidar", "unknown", probability=None, since_ns=None, reasons=why),)
-    return knocked(stamp_ns=None, sensors=sensors, nobody=None, joint=None, correction=None, reasons=why, losses={})
+    nothing: dict[str, Any] = dict.fromkeys(("stamp_ns", "nobody", "joint", "correction", "move"))
+    return knocked(sensors=sensors, reasons=why, losses={}, **nothing)

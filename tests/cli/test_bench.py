@@ -16,7 +16,7 @@ from rich.progress import Progress
 from cli.conftest import SMALL, Coec
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.cli import bench
-from coec.cli.bench import live, recording, rig, rows, scene, worker
+from coec.cli.bench import live, load, recording, rig, rows, scene, worker
 from coec.cli.bench.process import ProcessReading
 from coec.geometry import se3
 
@@ -88,7 +88,6 @@ def test_a_worker_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     [
         pytest.param(live.native, "", marks=pytest.mark.slow),
         (live.ros, "ros_"),
-        pytest.param(live.large_rig, "large_rig_", marks=pytest.mark.slow),
     ],
 )
 def test_a_daemon_is_measured_under_load(
@@ -118,16 +117,18 @@ def test_writing_windows_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_the_cameras_of_a_vehicle_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A minute of it says nothing of the figures, but each is there, and every pair was looked at."""
+@pytest.mark.parametrize("form", rig.SECONDS)
+def test_the_cameras_of_a_vehicle_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str) -> None:
+    """A minute of it says nothing of the figures, but each is there, and pairs were looked at."""
     monkeypatch.setattr(rig, "SETTLE_S", 1.0)
-    monkeypatch.setattr(rig, "SECONDS", 20.0)
+    monkeypatch.setattr(rig, "SECONDS", {form: 20.0})
     monkeypatch.setattr(rig, "PACE", 0.5)
     document = rig.measure(tmp_path, lambda _: None)
-    assert set(document) >= {row.key for row in rows.ROWS if row.key.startswith("rig_")}
-    assert document["rig_cpu_percent"] > document["rig_io_cpu_percent"] > 0.0
-    assert document["rig_worker_s"]["check"] > 0.0
-    assert document["rig_done"]["checks"] > 0
+    assert set(document) >= {row.key for row in rows.ROWS if row.key.startswith(f"{form}_")}
+    assert document[f"{form}_cpu_percent"] > document[f"{form}_io_cpu_percent"] > 0.0
+    assert document[f"{form}_worker_s"]["check"] > 0.0
+    assert document[f"{form}_done"]["checks"] > 0
+    assert sum(document[f"{form}_health"].values()) == len(load.LOADS[form].pairs)
 
 
 def test_the_table_says_what_is_not_as_required(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,15 +15,13 @@ from dataclasses import replace
 from cli.conftest import Coec
 from coec.cli.demo.rig import performance, report, story
 from coec.cli.demo.rig.outcome import Outcome, is_over, outcome_of
-from coec.cli.demo.rig.told import Beholder, SensorTold, Told
+from coec.cli.demo.rig.told import NS_PER_S, SensorTold, Told, told_of
 from coec.cli.demo.rig.vehicle import Frames, RigVehicle
-from coec.evaluation.check_drives import CHECK_PAIRS
-from coec.evaluation.rig_looks import TURN_S
 from coec.reports.rig_plot import EdgeSeen
 from coec.simulation.journey import START_NS
 from coec.simulation.rig_drive import RigConfig, RigDrive
-from coec.simulation.rig_instants import instants
-from coec.sources.recording import Message
+from rig_replies import knocked, untold
+from runtime.api.test_metrics import a_health
 
 LIDAR, CAMERA = story.ACTS
 SENSORS = ("front", "left", "rear", "right", "roof")
@@ -98,29 +97,26 @@ def test_acts_share_the_frames_of_what_stands_still(monkeypatch: pytest.MonkeyPa
             assert (picture is after.pictures[camera]) is not turned
 
 
-def test_who_looks_for_itself_tells_of_each_pair_in_its_turn() -> None:
-    """One instant again and again, each time a little later: no street, no move."""
-    drive = RigDrive(RigConfig(seed=3, seconds=0.5, camera="fisheye64", ego_hz=20.0))
-    sees = Beholder(drive, story.LIDAR)
-    heard: list[Told] = []
-    for turn in range(CHECK_PAIRS + 4):
-        heard += sees.hear(_once(drive, turn))
-    assert [one.looked_at for one in heard] == [f"{camera}-roof" for camera in drive.cameras]
-    assert set(heard[-1].sensors) == set(SENSORS)
-    assert heard[-1].named == frozenset()
-    assert heard[0].sensors["right"].state == "unknown"
-
-
-def _once(drive: RigDrive, turn: int) -> Frames:
-    """The first instant of a drive, so many instants later."""
-    (instant,) = instants(drive, story.LIDAR, 1.0)
-
-    def later(message: Message) -> Message:
-        return replace(message, stamp_ns=message.stamp_ns + round(turn * TURN_S * 1e9))
-
-    pictures = {camera: later(drive.message(entry)) for camera, entry in instant.pictures.items()}
-    motions = tuple(later(drive.message(entry)) for entry in instant.motions)
-    return Frames(later(drive.message(instant.sweep)), pictures, motions)
+def test_what_the_service_says_is_told_as_it_is() -> None:
+    offset = (0.3, 0.4, None, 0.0, 0.0, None)
+    taken = a_health().check
+    assert taken is not None
+    check = taken.model_copy(update={"offset": offset, "sigma": (0.1, 0.1, None, 0.01, 0.01, None)})
+    blind = taken.model_copy(update={"offset": (None,) * 6, "sigma": (None,) * 6})
+    sensors_of = {"front": ("front", "roof"), "left": ("left", "roof")}
+    reply = knocked()
+    said = told_of(reply, START_NS + 9 * NS_PER_S, ["front", "left"], {"front": check, "left": blind}, sensors_of)
+    assert said.second == 9.0
+    assert said.looked_at == "front, left"
+    assert said.named == {"roof"}
+    roof = said.sensors["roof"]
+    assert (roof.state, roof.probability, roof.moved_deg) == ("lidar_moved", 0.998, 1.0)
+    assert roof.reason.startswith("It moved by 1.00°")
+    assert said.edges["front"].deg == pytest.approx(0.5)
+    assert said.edges["front"].sigmas == pytest.approx(5.0)
+    assert said.edges["left"].sigmas == 0.0, "a pair that cannot tell is no evidence"
+    unknown = told_of(untold(), START_NS, [], {}, sensors_of)
+    assert (unknown.sensors["roof"].state, unknown.sensors["roof"].probability, unknown.edges) == ("unknown", 0.0, {})
 
 
 def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,12 +124,16 @@ def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeyp
         """Tells of nothing but calm."""
 
         def __init__(self, *_: object) -> None:
-            self._told = False
+            pass
 
         def hear(self, frames: Frames) -> list[Told]:
             return [told(frames.second)]
 
-    monkeypatch.setattr(performance, "Beholder", Silent)
+        def rest(self) -> list[Told]:
+            return [told(story.LONGEST_S)]
+
+    monkeypatch.setattr(performance, "Asker", Silent)
+    monkeypatch.setattr(performance, "serving", lambda *_: nullcontext())
     monkeypatch.setattr(story, "CAMERA_PX", 64)
     monkeypatch.setattr(story, "LONGEST_S", 2.0)
     outcome = coec("demo", "--rig", "--json", "--output", tmp_path)

@@ -154,6 +154,9 @@ def test_a_knocked_lidar_is_corrected_once_for_all_pairs_and_the_same_in_a_repla
     assert reply.correction.sensors == ("roof",)
     assert set(reply.correction.pairs) == set(CAMERAS)
     assert {sensor.state for sensor in reply.sensors} == {"calibrated"}
+    assert reply.move is not None
+    assert (reply.move.sensors, set(reply.move.by)) == (("roof",), {"roof"})
+    assert reply.move.over_ns is not None
     for name in CAMERAS:
         (corrected,) = [entry for entry in bench.entries(name, "command") if entry.code == "corrected"]
         assert "roof" in corrected.text

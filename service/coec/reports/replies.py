@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
+from math import hypot
 from typing import Final
 
 from rich.table import Table
@@ -214,6 +215,13 @@ def rig(payload: bytes) -> None:
     console.out.print(table)
     if reply.joint is not None:
         _joint(reply.joint)
+    if reply.move is not None:
+        move, far = reply.move, []
+        for name in move.sensors:
+            by = move.by.get(name)
+            far.append(name if by is None else f"{name} by {hypot(*by.by[:3]):.2f}°")
+        over = "goes on" if move.over_ns is None else f"over since {_instant(move.over_ns)}"
+        console.show(f"last moved: {' and '.join(far)}, named at {_instant(move.since_ns)}, {over}")
     if reply.correction is not None:
         named, pairs = " and ".join(reply.correction.sensors), ", ".join(reply.correction.pairs)
         console.show(f"last put right: {named}, in {pairs}, since {_instant(reply.correction.from_ns)}")

@@ -77,6 +77,16 @@ class JointReply(Part):
     widened: float = Field(ge=1, description="factor on all standard deviations, for what the loops miss")
 
 
+class RigMove(Part):
+    """A move of one or two sensors: from when they were named until every pair of them serves another extrinsic."""
+
+    sensors: tuple[str, ...]
+    since_ns: int = Field(description="sensor time at which they were named, ns")
+    stepped_ns: int = Field(description="sensor time before which they moved, ns")
+    over_ns: int | None = Field(description="sensor time at which it was put right, ns; null while it is not")
+    by: dict[str, SensorMove] = Field(description="by sensor, as it was known when they were named")
+
+
 class RigCorrection(Part):
     """A move of one or two sensors, put right in all of their pairs at once."""
 
@@ -96,6 +106,9 @@ class RigReply(Message):
     disturbed: dict[str, Probability] = Field(description="that something else lastingly disturbs a pair, by pair")
     joint: JointReply | None = Field(description="null before the first accepted window, or of a single pair")
     correction: RigCorrection | None = Field(description="the latest; null before the first")
+    move: RigMove | None = Field(
+        default=None, description="the latest, over or not; null before the first since the service was started"
+    )
     reasons: tuple[Reason, ...] = Field(default=(), description="what keeps the pairs from being put together")
     looks: Counts = Field(description="checks that were put together, by pair")
     losses: Counts = Field(description="what was not, or out of order, by cause")

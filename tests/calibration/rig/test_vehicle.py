@@ -96,6 +96,9 @@ def test_a_knocked_lidar_is_put_right_in_all_its_pairs_at_once(
     assert drive.state.event is None
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
     assert drive.state.correction is correction
+    move = drive.state.move
+    assert move is not None
+    assert (move.event.sensors, set(move.moved), move.over_ns is not None) == (("roof",), {"roof"}, True)
     record_property("figure", f"{len(correction.pairs)} pairs")
 
 
@@ -138,6 +141,44 @@ def test_a_pair_that_is_blind_is_not_waited_for() -> None:
         drive.window(name, after, knocked_s + 6.0)
     assert drive.state.correction is not None
     assert set(drive.state.correction.pairs) == {"front-roof", "left-roof"}
+
+
+@pytest.mark.fault(
+    "a camera is knocked by 1°, and its pair puts itself right before looks alone name it", "it is named all the same"
+)
+def test_a_camera_whose_pair_repairs_itself_at_once_is_named_all_the_same() -> None:
+    drive, after = Drive(graph(STAR)), with_moved("front")
+    drive.looks(POSES, 8)
+    knocked_s = drive.at_s
+    drive.looks(after, 2)
+    assert drive.state.move is None, "looks alone say too little yet"
+    edge = drive.state.graph.edge["front-roof"]
+    window = _windowed(edge, after, knocked_s, SIGMA)
+    drive.state = vehicle.after_window(drive.state, edge.name, window, round(drive.at_s * NS))
+    assert drive.health()["front"] is SensorHealth.CAMERA_MOVED
+    move = drive.state.move
+    assert move is not None
+    assert move.event.sensors == ("front",)
+    assert np.degrees(move.moved["front"].x[:3]) == pytest.approx([0.0, 1.0, 0.0], abs=0.25)
+    assert (move.event.stepped_ns, move.over_ns) == (window.start_ns, None)
+    served = Served(window.measurement.T_camera_lidar, SIGMA, window.start_ns)
+    drive.state = vehicle.after_served(drive.state, edge.name, served, round(drive.at_s * NS))
+    drive.looks(after, 3)
+    assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
+    assert drive.state.correction is None, "what one pair tells by itself needs nobody to tell it"
+    move = drive.state.move
+    assert move is not None
+    assert move.over_ns == round((drive.at_s - 15.0) * NS), "what was is still told"
+
+
+def test_a_window_that_looks_of_its_own_time_deny_names_nobody() -> None:
+    drive = Drive(graph(STAR))
+    drive.looks(POSES, 8)
+    drive.window("front-roof", with_moved("front"), drive.at_s - 20.0, serves=False)
+    assert SensorHealth.CAMERA_MOVED not in drive.health().values()
+    drive.looks(POSES, 4)
+    assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
+    assert drive.state.move is None
 
 
 def test_what_nobody_can_attribute_is_over_when_its_pair_serves_what_it_found() -> None:

@@ -6,7 +6,8 @@ rig was last consistent is asked again every few seconds (`moves`), of steps at 
 A sensor is named by two answers in a row, with a look in between, and by two of its pairs where it has as many: what a
 run of bad looks says of one pair, or one pair that was looked at before the others, the next look denies. Where two
 sensors are said to have moved at once it takes one answer more, for each: a bad look at one pair just after a sensor of
-many was knocked makes its other sensor seem to have moved as well.
+many was knocked makes its other sensor seem to have moved as well. An accepted window is a witness of another kind:
+with it one answer suffices.
 """
 
 from __future__ import annotations
@@ -162,29 +163,52 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
     Raises:
         ValueError: it is of no edge of the rig.
     """
+    state = _with(state, look)
+    if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
+        return state
+    return replace(_asked(state, graph, {}), asked_ns=look.stamp_ns)
+
+
+def after_window(state: RigState, graph: RigGraph, look: Look) -> RigState:
+    """The state after an accepted window, as a look at the stamp of its first frame: who moved is asked at once, as the
+    pair may serve what it says from now on, and who moved then is asked no more. It is another witness than the looks
+    before, with a search of its own: of the sensors of its edge its answer counts for as many as name one.
+
+    Raises:
+        ValueError: it is of no edge of the rig.
+    """
+    state = _with(state, look)
+    edge = graph.edge[look.edge]
+    return _asked(state, graph, dict.fromkeys((edge.a, edge.b), ANSWERS))
+
+
+def _with(state: RigState, look: Look) -> RigState:
+    """The state with one more look, of which nobody was asked."""
     if look.edge not in state.histories:
         raise ValueError(f"{look.edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
     history = state.histories[look.edge]
     if not history.looks:
         # Whoever looks has a bias of its own on this rig, however well the pose is known that is served.
         history = History.at(history.origin, np.hypot(np.nan_to_num(history.sigma), BIAS_TIMES * look.rig))
-    histories = {**state.histories, look.edge: history.after(look, state.calm)}
-    if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
-        return replace(state, histories=histories)
+    return replace(state, histories={**state.histories, look.edge: history.after(look, state.calm)})
+
+
+def _asked(state: RigState, graph: RigGraph, answers: Mapping[str, int]) -> RigState:
+    """Who moved, by all looks? `answers`: for how many an answer counts, where not for one, by sensor."""
+    histories = state.histories
     times_ns = _times_ns(histories, state.stepped_ns)
     posterior = _posterior(histories, times_ns, graph)
     stepped_ns = times_ns[posterior.when]
     probable = [name for name, p in posterior.sensors.items() if p >= NAMED_AT]
     needed = ANSWERS if len(probable) == 1 else ANSWERS_FOR_TWO
     claimed = {
-        name: min(state.claimed.get(name, 0) + 1, ANSWERS_FOR_TWO)
+        name: min(state.claimed.get(name, 0) + answers.get(name, 1), ANSWERS_FOR_TWO)
         for name in probable
         if _seen_by_two(name, graph, histories, stepped_ns)
     }
-    return RigState(
-        histories,
-        posterior,
-        asked_ns=look.stamp_ns,
+    return replace(
+        state,
+        posterior=posterior,
         stepped_ns=stepped_ns,
         claimed=claimed,
         named=frozenset(name for name, count in claimed.items() if count >= needed or name in state.named),

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from coec.calibration.rig import attribution
 from coec.calibration.rig.attribution import NS_PER_S, RigState, SensorHealth, SensorState
-from coec.calibration.rig.evidence import Look
+from coec.calibration.rig.evidence import Look, of_window
 from coec.calibration.rig.joint import JointEstimate, estimate
+from coec.calibration.rig.moves import Moved
 from coec.calibration.rig.types import RigGraph
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
@@ -77,6 +78,16 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """An event, for who asks later: by how much its sensors had moved, by name, as far as that was known when they were
+    named; and the stamp at which it was over, None while it goes on."""
+
+    event: Event
+    moved: Mapping[str, Moved]
+    over_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class VehicleRig:
     """All that is known.
 
@@ -85,6 +96,7 @@ class VehicleRig:
         windows: the newest of each edge, as far as it is of the rig as it is now.
         serves: what each pair serves.
         event: the one that is going on; None while all is calm.
+        move: the latest event, over or not; None before the first.
         joint: the rig by these windows; None before the first, and while two windows of an edge are awaited.
         sensors: what is believed of each, by name.
         since_ns: since when each is in its state, by name.
@@ -97,6 +109,7 @@ class VehicleRig:
     serves: Mapping[str, Served]
     windows: Mapping[str, Windowed] = field(default_factory=dict)
     event: Event | None = None
+    move: Move | None = None
     joint: JointEstimate | None = None
     sensors: tuple[SensorState, ...] = ()
     since_ns: Mapping[str, int] = field(default_factory=dict)
@@ -118,7 +131,7 @@ def going_on(rig: VehicleRig, event: Event) -> VehicleRig:
     """With an event of before a restart: windows of its edges from before the move are of no use."""
     told = attribution.sensors(rig.believed, rig.graph)
     since_ns = {sensor.name: event.since_ns for sensor in told if sensor.name in rig.believed.named}
-    return _without_stale(replace(rig, event=event, sensors=told, since_ns=since_ns))
+    return _without_stale(replace(rig, event=event, move=Move(event, {}), sensors=told, since_ns=since_ns))
 
 
 def grown(rig: VehicleRig, fresh: VehicleRig) -> VehicleRig:
@@ -152,8 +165,8 @@ def after_look(rig: VehicleRig, look: Look) -> VehicleRig:
 
 
 def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) -> VehicleRig:
-    """A window of an edge was accepted; `stamp_ns` is when that was known. One that began before a move of its sensors
-    tells of neither mount.
+    """A window of an edge was accepted; `stamp_ns` is when that was known. It says where the edge is, and who moved.
+    One that began before a move of its sensors tells of neither mount.
 
     Raises:
         ValueError: it is of no edge of the rig, or its pose or covariance are none.
@@ -161,7 +174,13 @@ def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) ->
     event = rig.event
     if event is not None and window.start_ns < event.stepped_ns and edge in pairs_of(rig.graph, event.sensors):
         return rig
-    return _followed(_combined(replace(rig, windows={**rig.windows, edge: window})), stamp_ns)
+    rig = _combined(replace(rig, windows={**rig.windows, edge: window}))
+    look = of_window(edge, window.measurement)
+    if look is not None:
+        # All of its frames lie after a step only if the first one does.
+        look = replace(look, stamp_ns=window.start_ns)
+        rig = _noted(replace(rig, believed=attribution.after_window(rig.believed, rig.graph, look)), stamp_ns)
+    return _followed(rig, stamp_ns)
 
 
 def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> VehicleRig:
@@ -178,7 +197,7 @@ def forgotten(rig: VehicleRig) -> VehicleRig:
     """Sensor time stepped back: looks of the old time are none of the new. What went before them stays."""
     histories = {name: replace(history, looks=()) for name, history in rig.believed.histories.items()}
     believed = RigState(histories)
-    rig = replace(rig, believed=believed, windows={}, joint=None, event=None, since_ns={})
+    rig = replace(rig, believed=believed, windows={}, joint=None, event=None, move=None, since_ns={})
     return replace(rig, sensors=attribution.sensors(believed, rig.graph))
 
 
@@ -275,7 +294,9 @@ def _begun_or_grown(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     ]
     stepped_ns = min(after, default=stamp_ns) if event is None else event.stepped_ns
     since_ns = stamp_ns if event is None else event.since_ns
-    return _without_stale(replace(rig, event=Event(sensors, since_ns, stepped_ns)))
+    event = Event(sensors, since_ns, stepped_ns)
+    moved = {sensor.name: sensor.moved for sensor in rig.sensors if sensor.name in sensors and sensor.moved is not None}
+    return _without_stale(replace(rig, event=event, move=Move(event, moved)))
 
 
 def _told(joint: JointEstimate, edge: str, own: Measurement) -> Told:
@@ -294,7 +315,8 @@ def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:
         if name in told:
             T_a_b, sigma = told[name].T_a_b, np.sqrt(told[name].covariance.diagonal())
         believed = attribution.served(believed, name, T_a_b, sigma)
-    return _noted(replace(rig, believed=attribution.settled(believed), event=None), stamp_ns)
+    move = rig.move if event is None or rig.move is None else replace(rig.move, over_ns=stamp_ns)
+    return _noted(replace(rig, believed=attribution.settled(believed), event=None, move=move), stamp_ns)
 
 
 def _without_stale(rig: VehicleRig) -> VehicleRig:

@@ -61,7 +61,7 @@ def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     Raises:
         ConnectionFailedError: the daemon did not become ready.
     """
-    return native(folder, heard) | ros(folder, heard) | large_rig(folder, heard)
+    return native(folder, heard) | ros(folder, heard)
 
 
 def native(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
@@ -76,12 +76,6 @@ def ros(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
     """By the same sensors as nodes of ROS, with windows as long as they are by default."""
     with _settled(folder, "ros", WindowConfig(), heard) as (session, process):
         return {f"ros_{name}": figure for name, figure in _resources(session, process, heard).items()}
-
-
-def large_rig(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
-    """By eight cameras below three LiDARs that they share, with windows as long as they are by default."""
-    with _settled(folder, "large_rig", WindowConfig(), heard) as (session, process):
-        return {f"large_rig_{figure}": value for figure, value in _resources(session, process, heard).items()}
 
 
 @contextmanager
@@ -182,22 +176,20 @@ def _counters(session: zenoh.Session, keys: Keys) -> dict[str, int]:
 def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig, budget: BudgetConfig) -> Config:
     """Every camera with every LiDAR, as if all were at one place: what is found there does not matter."""
     what = load.LOADS[form]
-    many = {"camera": range(what.cameras), "lidar": range(what.lidars)}
     stages = {"window": window, "calibration": CalibrationConfig(search=SearchConfig(dof=6))}
-    pairs = [
-        PairConfig.model_validate(
-            {
-                "name": f"{camera}-{lidar}",
-                "camera": _place(what, "camera", camera) | {"intrinsics": _INTRINSICS},
-                "lidar": _place(what, "lidar", lidar),
-                "ego": _place(what, "ego", 0),
-                "T_camera_lidar": scene.T_TRUE.tolist(),
-                **stages,
-            }
-        )
-        for camera in many["camera"]
-        for lidar in many["lidar"]
-    ]
+    intrinsics = intrinsics_config(what.camera)
+    pairs = []
+    for name in what.pairs:
+        camera, lidar = map(int, name.split("-"))
+        document = {
+            "name": name,
+            "camera": _place(what, "camera", camera) | {"intrinsics": intrinsics},
+            "lidar": _place(what, "lidar", lidar),
+            "ego": _place(what, "ego", 0),
+            "T_camera_lidar": scene.T_TRUE.tolist(),
+            **stages,
+        }
+        pairs.append(PairConfig.model_validate(document))
     return Config(
         budget=budget,
         vehicle=VEHICLE,
@@ -207,9 +199,6 @@ def _configuration(endpoint: str, state: Path, form: str, window: WindowConfig, 
         log=LogConfig(level="error"),
         pairs=tuple(pairs),
     )
-
-
-_INTRINSICS = intrinsics_config(scene.CAMERAS[load.CAMERA])
 
 
 def _place(what: load.Load, kind: str, index: int) -> dict[str, str]:

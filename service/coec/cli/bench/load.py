@@ -21,6 +21,7 @@ from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.ros_publisher import RosNode, RosPublishers
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.cli.bench import scene
+from coec.geometry.cameras import Camera
 
 Frame = CameraFrame | LidarFrame | EgoMotion
 
@@ -33,6 +34,7 @@ class Load:
         cameras, lidars: how many.
         camera_hz: images a second of each.
         sweep_every: of how many images each LiDAR has a sweep.
+        side_px: of the images.
         is_ros: as nodes of ROS.
     """
 
@@ -40,16 +42,27 @@ class Load:
     lidars: int = 1
     camera_hz: float = 30.0
     sweep_every: int = 3
+    side_px: int = scene.IMAGE_PX
     is_ros: bool = False
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Names of the pairs: every camera with every LiDAR."""
+        return tuple(f"{camera}-{lidar}" for camera in range(self.cameras) for lidar in range(self.lidars))
+
+    @property
+    def camera(self) -> Camera:
+        """Of every camera."""
+        return scene.camera_of(CAMERA, self.side_px)
 
 
 LOADS: Mapping[str, Load] = {
     "native": Load(),
     "ros": Load(is_ros=True),
     "rig": Load(cameras=4, camera_hz=10.0, sweep_every=1),
-    "large_rig": Load(cameras=8, lidars=3, camera_hz=10.0, sweep_every=1),
+    "large_rig": Load(cameras=8, lidars=3, camera_hz=10.0, sweep_every=1, side_px=700),
 }
-"""By name. A rig is of four fisheyes and a LiDAR; a large one of eight with three."""
+"""By name. A rig is of four fisheyes and a LiDAR; a large one of eight with three, with pictures of half the width."""
 
 ROOMS = 7
 """Different frames that are sent in turn: a camera that sends one and the same would look frozen."""
@@ -70,7 +83,7 @@ def main(endpoint: str, name: str, pace: str = "1") -> int:
     """Publishes until standard input ends; always 0. `name` is one of `LOADS`; `pace`: seconds of driving in a second,
     by which stamps and frames come."""
     load = LOADS[name]
-    pairs = [scene.pair(scene.CAMERAS[CAMERA], seed, 0) for seed in range(ROOMS)]
+    pairs = [scene.pair(load.camera, seed, 0) for seed in range(ROOMS)]
     with connected([endpoint], CONNECT_S) as session:
         send = (_ros if load.is_ros else _native)(session, load)
         begin_s, begin_ns = time.monotonic(), time.time_ns()

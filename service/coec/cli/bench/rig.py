@@ -1,14 +1,15 @@
-"""The daemon with the cameras of a whole vehicle: four fisheyes and one LiDAR, as four pairs. What its processes take
-of the machine, and how long a pair is not seen.
+"""The daemon with the cameras of a whole vehicle: four fisheyes and one LiDAR, as four pairs; and eight cameras with
+three LiDARs, as twenty-four. What its processes take of the machine, and how long a pair is not seen.
 
 At the rates of a vehicle and with the defaults of the configuration: a check of each pair every five seconds, a window
-of each every three minutes, and as long as a window is what is measured. Real processes, as in `live`.
+of each every three minutes, and what the budget allows of that. Real processes, as in `live`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,13 @@ from coec.config import BudgetConfig, WindowConfig
 from coec.runtime.worker import jobs
 
 KEYS = live.KEYS
-PAIRS = tuple(f"{camera}-0" for camera in range(load.LOADS["rig"].cameras))
 
 SETTLE_S = 20.0
 """Under load before anything counts: the first checks, whose pairs the worker has never seen the like of."""
 
-SECONDS = WindowConfig().slice_s
-"""Of the time that counts: each pair has one window in it."""
+SECONDS = {"rig": WindowConfig().slice_s, "large_rig": 60.0}
+"""Of the time that counts, by load: each pair of the rig has one window in it; the large one is on the budget that many
+pairs wait for, and a minute shows how long."""
 
 LOOK_S = 1.0
 """Of driving, between two looks at how old the latest check of each pair is."""
@@ -40,24 +41,30 @@ can be asked for the same at a slower pace."""
 
 
 def measure(folder: Path, heard: Callable[[str], None]) -> dict[str, Any]:
-    """Runs the daemon in `folder` under the load of the rig of `load.LOADS`.
+    """Runs the daemon in `folder` under each load that `SECONDS` names, one after the other.
 
     Raises:
         ConnectionFailedError: the daemon did not become ready.
     """
-    with live.loaded(folder, "rig", (WindowConfig(), BudgetConfig()), heard, PACE) as (session, process):
-        time.sleep(SETTLE_S / PACE)
-        return _figures(session, process)
+    document: dict[str, Any] = {}
+    for form, seconds in SECONDS.items():
+        with live.loaded(folder, form, (WindowConfig(), BudgetConfig()), heard, PACE) as (session, process):
+            time.sleep(SETTLE_S / PACE)
+            figures = _figures(session, process, load.LOADS[form].pairs, seconds)
+            document |= {f"{form}_{name}": figure for name, figure in figures.items()}
+    return document
 
 
-def _figures(session: zenoh.Session, service: ProcessReading) -> dict[str, Any]:
+def _figures(session: zenoh.Session, service: ProcessReading, pairs: Sequence[str], seconds: float) -> dict[str, Any]:
     worker = ProcessReading(service.children[0])
     before, begin_s = daemons.status(session, KEYS), time.monotonic()
+    for process in (service, worker):
+        process.reset_peak()
     service_s, worker_s = service.cpu_s, worker.cpu_s
-    unseen_s = dict.fromkeys(PAIRS, 0.0)
-    while time.monotonic() < begin_s + SECONDS / PACE:
+    unseen_s = dict.fromkeys(pairs, 0.0)
+    while time.monotonic() < begin_s + seconds / PACE:
         time.sleep(LOOK_S / PACE)
-        for name in PAIRS:
+        for name in pairs:
             age_s = daemons.answered(session, KEYS.health(name))["age_s"]
             elapsed_s = time.monotonic() - begin_s
             unseen_s[name] = max(unseen_s[name], PACE * (elapsed_s if age_s is None else age_s))
@@ -65,15 +72,22 @@ def _figures(session: zenoh.Session, service: ProcessReading) -> dict[str, Any]:
     io_percent = 100.0 * (service.cpu_s - service_s) / elapsed_s
     worker_percent = 100.0 * (worker.cpu_s - worker_s) / elapsed_s
     after = daemons.status(session, KEYS)
+    losses = Counter[str]()
+    for pair in after["pairs"]:
+        losses.update(pair["losses"])
     return {
-        "rig_cpu_percent": io_percent + worker_percent,
-        "rig_io_cpu_percent": io_percent,
-        "rig_worker_cpu_percent": worker_percent,
-        "rig_worker_s": {kind: 60.0 * (_spent_s(after, kind) - _spent_s(before, kind)) / elapsed_s for kind in KINDS},
-        "rig_unseen_s": max(unseen_s.values()),
-        "rig_done": {name: _done(after, name) - _done(before, name) for name in ("checks", "solved")},
-        "rig_resident_mb": service.resident_mb,
-        "rig_health": {name: daemons.answered(session, KEYS.health(name))["state"] for name in PAIRS},
+        "cpu_percent": io_percent + worker_percent,
+        "io_cpu_percent": io_percent,
+        "worker_cpu_percent": worker_percent,
+        "worker_s": {kind: 60.0 * (_spent_s(after, kind) - _spent_s(before, kind)) / elapsed_s for kind in KINDS},
+        "unseen_s": max(unseen_s.values()),
+        "done": {name: _done(after, name) - _done(before, name) for name in ("checks", "solved")},
+        "resident_mb": service.peak_mb,
+        "worker_resident_mb": worker.peak_mb,
+        "wanted_cores": after["budget"]["wanted"],
+        "stretched_by": after["budget"]["stretched_by"],
+        "losses": dict(losses),
+        "health": Counter(daemons.answered(session, KEYS.health(name))["state"] for name in pairs),
     }
 
 

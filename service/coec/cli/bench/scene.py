@@ -55,6 +55,11 @@ FISHEYES = ("double_sphere", "kannala_brandt", "mei", "eucm")
 """Cameras whose image is a circle that touches the borders; the corners are masked."""
 
 
+def camera_of(model: str, side_px: int) -> Camera:
+    """One of `CAMERAS`, for an image of so many pixels a side."""
+    return scaled(CAMERAS[model], side_px / IMAGE_PX, side_px / IMAGE_PX)
+
+
 def objective_of(camera: Camera, frames: int, start: Matrix4, box: SearchBox) -> MutualInformation:
     """The objective of a window of so many frames of `POINTS` points, as the service builds it."""
     rig = rig_of(camera)
@@ -64,8 +69,8 @@ def objective_of(camera: Camera, frames: int, start: Matrix4, box: SearchBox) ->
 
 def rig_of(camera: Camera) -> Rig:
     """The camera at its true place, with the mask of its image circle."""
-    across = np.arange(IMAGE_PX) - camera.cx
-    circle = across**2 + across[:, None] ** 2 <= (IMAGE_PX / 2) ** 2
+    across = np.arange(camera.width) - camera.cx
+    circle = across**2 + across[:, None] ** 2 <= (camera.width / 2) ** 2
     return Rig("bench", camera, "camera", "lidar", T_TRUE, np.eye(4), circle if name_of(camera) in FISHEYES else None)
 
 
@@ -77,14 +82,15 @@ def pair(camera: Camera, seed: int, stamp_ns: int) -> FramePair:
 def picture(camera: Camera, seed: int, stamp_ns: int) -> CameraFrame:
     """A JPEG: the nearer the wall, the darker, of coarse plaster."""
     rng, phases = _room(seed)
+    side_px = camera.width
     rays, valid = _pixel_rays(camera)
     grey = np.where(valid, 20.0 + 8.0 * _walls_m(rays, phases), 0.0)
-    side = -(-IMAGE_PX // PLASTER_PX)
-    grain = PLASTER * rng.standard_normal((side, side), np.float32)
-    grain = grain.repeat(PLASTER_PX, axis=0).repeat(PLASTER_PX, axis=1)[:IMAGE_PX, :IMAGE_PX]
-    pixels = np.clip(grey.reshape(IMAGE_PX, IMAGE_PX) + grain, 0, 255).astype(np.uint8)
+    grains = -(-side_px // PLASTER_PX)
+    grain = PLASTER * rng.standard_normal((grains, grains), np.float32)
+    grain = grain.repeat(PLASTER_PX, axis=0).repeat(PLASTER_PX, axis=1)[:side_px, :side_px]
+    pixels = np.clip(grey.reshape(side_px, side_px) + grain, 0, 255).astype(np.uint8)
     jpeg = encode_jpeg(np.repeat(pixels[:, :, None], 3, axis=2), JPEG_QUALITY)
-    return CameraFrame(stamp_ns, "camera", EncodedImage(ImageFormat.JPEG, IMAGE_PX, IMAGE_PX, jpeg), sequence=seed)
+    return CameraFrame(stamp_ns, "camera", EncodedImage(ImageFormat.JPEG, side_px, side_px, jpeg), sequence=seed)
 
 
 def sweep(seed: int, stamp_ns: int) -> LidarFrame:
@@ -144,7 +150,7 @@ def _room(seed: int) -> tuple[np.random.Generator, NDArray[np.float64]]:
 @lru_cache(maxsize=1)
 def _pixel_rays(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """(N, 3) unit directions of the pixels, LiDAR frame, row by row, and which of them there are."""
-    across = np.arange(IMAGE_PX, dtype=np.float64)
+    across = np.arange(camera.width, dtype=np.float64)
     rays, valid = unproject(camera, np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2))
     return rays @ T_TRUE[:3, :3], valid
 

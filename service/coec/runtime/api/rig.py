@@ -13,8 +13,9 @@ from coec.adapters.files.conversions import transform_of
 from coec.adapters.zenoh.bus import Answer
 from coec.calibration.rig.attribution import SensorHealth, SensorState
 from coec.calibration.rig.joint import JointEstimate
+from coec.calibration.rig.moves import Moved
 from coec.calibration.rig.types import Kind, RigGraph
-from coec.calibration.rig.vehicle import VehicleRig, inconsistent, pairs_of
+from coec.calibration.rig.vehicle import Move, VehicleRig, inconsistent, pairs_of
 from coec.calibration.types import Reason
 from coec.geometry import se3
 from coec.runtime.api.health import reasons_of
@@ -48,6 +49,7 @@ class RigAnswers:
             tuple((sensor.name, sensor.state, tuple(r.code for r in sensor.reasons)) for sensor in self.reply.sensors),
             None if joint is None else (joint.stamp_ns, joint.consistent),
             self.reply.correction,
+            None if self.reply.move is None else (self.reply.move.since_ns, self.reply.move.over_ns),
             self.reply.reasons,
         )
         if essence != self._essence:
@@ -93,6 +95,7 @@ def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
         else rig_state.RigCorrection(
             stamp_ns=last.stamp_ns, from_ns=known.from_ns, sensors=last.sensors, pairs=tuple(last.pairs)
         ),
+        move=None if rig.move is None else _move(rig.move),
         reasons=reasons_of(known.why),
         looks=dict(rig.looks),
         losses=dict(known.losses),
@@ -150,12 +153,25 @@ def _sensor(rig: VehicleRig, sensor: SensorState) -> rig_state.SensorReply:
         state=sensor.health.value,
         probability=None if unknown else _share(sensor.probability),
         since_ns=rig.since_ns.get(sensor.name),
-        moved=None
-        if moved is None
-        else rig_state.SensorMove(by=_degrees(moved.x), sigma=_degrees(np.sqrt(moved.covariance.diagonal()))),
+        moved=None if moved is None else _moved(moved),
         pairs=pairs_of(rig.graph, (sensor.name,)),
         reasons=reasons_of(sensor.reasons),
     )
+
+
+def _move(move: Move) -> rig_state.RigMove:
+    event = move.event
+    return rig_state.RigMove(
+        sensors=event.sensors,
+        since_ns=event.since_ns,
+        stepped_ns=event.stepped_ns,
+        over_ns=move.over_ns,
+        by={name: _moved(moved) for name, moved in move.moved.items()},
+    )
+
+
+def _moved(moved: Moved) -> rig_state.SensorMove:
+    return rig_state.SensorMove(by=_degrees(moved.x), sigma=_degrees(np.sqrt(moved.covariance.diagonal())))
 
 
 def _joint(rig: VehicleRig, joint: JointEstimate) -> rig_state.JointReply:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from coec.cli.demo.rig import report, story
 from coec.cli.demo.rig.outcome import Outcome, is_over, outcome_of
+from coec.cli.demo.rig.service import serving
 from coec.cli.demo.rig.story import Act
-from coec.cli.demo.rig.told import Beholder, Told
+from coec.cli.demo.rig.told import Asker, Told
 from coec.cli.demo.rig.vehicle import RigVehicle
 from coec.reports import console
 
@@ -18,7 +19,7 @@ def run(output: Path, *, as_json: bool) -> int:
     """Plays all of it; 1 if an act did not come true.
 
     Raises:
-        CalibrationError: a picture cannot be decoded.
+        DemoError: the service does not start, answer or end.
         OutputError: a file cannot be written.
     """
     started_s = time.monotonic()
@@ -39,21 +40,28 @@ def run(output: Path, *, as_json: bool) -> int:
 
 
 def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[Outcome, list[Told]]:
-    """Until the story is told, or the drive is over; `heard` is told of every instant."""
-    teller = Beholder(vehicle.as_built, story.LIDAR)
+    """With a service of its own, which knows nothing of other acts: until the story is told, or the drive is over.
+    `heard` is told of every instant."""
     said: list[Told] = []
-    outcome = outcome_of(act, said)
-    for frames in vehicle.frames(act):
-        heard(f"{act.name}: {frames.second:.0f} s of driving")
-        for told in teller.hear(frames):
-            before = said[-1] if said else None
-            said.append(told)
-            if before is None or before.named != told.named:
-                console.say(f"demo: {act.name}: {told.second:5.1f} s of driving: {_words(told)}")
-        outcome = outcome_of(act, said)
-        if said and is_over(outcome, said[-1]):
-            break
-    return outcome, said
+    with serving(vehicle.as_built, story.LIDAR) as service:
+        teller = Asker(service)
+        for frames in vehicle.frames(act):
+            heard(f"{act.name}: {frames.second:.0f} s of driving")
+            _hear(act, said, teller.hear(frames))
+            if said and is_over(outcome_of(act, said), said[-1]):
+                break
+        else:
+            _hear(act, said, teller.rest())
+    return outcome_of(act, said), said
+
+
+def _hear(act: Act, said: list[Told], new: list[Told]) -> None:
+    """Keep what is new, and say who is named anew."""
+    for told in new:
+        before = said[-1].named if said else None
+        said.append(told)
+        if before != told.named:
+            console.say(f"demo: {act.name}: {told.second:5.1f} s of driving: {_words(told)}")
 
 
 def _words(told: Told) -> str:

@@ -127,7 +127,7 @@ def page(pictures: Sequence[Path], acts: Sequence[Performance]) -> str:
         "A camera that is knocked puts its own pair wrong; a LiDAR that is knocked puts all pairs wrong, and alike. "
         "Which sensor explains all looks with the fewest moves is asked after each of them. Vehicle and street are "
         f"simulated, with pictures of {story.CAMERA_PX} pixels a side, of which those rows are drawn that the LiDAR "
-        "sees; what looks and tells is what runs on a vehicle, here without the service around it.",
+        "sees; what looks and tells is the service, a process of its own behind a router, as on a vehicle.",
     ]
     for path, (outcome, heard) in zip(pictures, acts, strict=True):
         parts += [

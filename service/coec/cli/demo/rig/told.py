@@ -1,35 +1,33 @@
-"""The last hop of the demonstration of a rig: frames in, what is believed of every sensor out.
-
-`Beholder` does what the service does, in this process: looks pair by pair, each look evidence of its edge, and all of
-them attributed. Whoever asks a running service instead has the same method.
-"""
+"""The last hop of the demonstration of a rig: frames in, what the service believes of every sensor out."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping
+import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import degrees, sqrt
-from typing import Protocol
+from math import hypot
 
-import numpy as np
-
-from coec.calibration.monitor.change_detector import Observation
-from coec.calibration.monitor.sensors import prepare_sweep
-from coec.calibration.rig.attribution import SensorState, after_look, begun, sensors
-from coec.calibration.rig.evidence import of_check
-from coec.calibration.types import LidarFrame
+from coec.adapters.zenoh.player import Player
+from coec.cli.demo.daemon import DemoError
+from coec.cli.demo.rig.service import Service
 from coec.cli.demo.rig.vehicle import Frames
-from coec.evaluation.check_drives import CHECK_PAIRS
-from coec.evaluation.rig_looks import SeenPair, due, graph_of, look_at
 from coec.reports.rig_plot import MOVED, EdgeSeen
-from coec.simulation.rig_drive import RigDrive
-from coec.simulation.rig_instants import pair_of
+from coec.schemas.replies import CheckReply
+from coec.schemas.rig_state import RigReply, SensorReply
+from coec.simulation.journey import START_NS
+
+NS_PER_S = 1_000_000_000
+
+LISTEN_S = 30.0
+"""For a service that runs to listen to all its sensors."""
+
+MOST_HELD = 4
+"""Pairs of frames that may wait in the service before more are sent: it goes on while these are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorTold:
-    """What is believed of a sensor, see `SensorState`; `moved_deg` is None where it did not move."""
+    """What is believed of a sensor, see `SensorReply`; `moved_deg` is None where it did not move."""
 
     name: str
     kind: str
@@ -41,11 +39,11 @@ class SensorTold:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """After a look at a pair.
+    """After looks at some pairs.
 
     Attributes:
-        second: of the drive, of the last frame that was looked at.
-        looked_at: the pair.
+        second: of the drive, up to which all is in it.
+        looked_at: the pairs.
         sensors: by name.
         edges: what the latest look at each pair says, by pair; pairs that were never looked at are not there.
     """
@@ -61,60 +59,78 @@ class Told:
         return frozenset(name for name, sensor in self.sensors.items() if sensor.state in MOVED)
 
 
-class Teller(Protocol):
-    """Who is shown the frames and tells."""
+class Asker:
+    """Sends the frames to a service, and asks it."""
 
-    def hear(self, frames: Frames) -> list[Told]:
-        """After frames of one more instant: something new for each look that was taken, in order."""
-        ...
-
-
-class Beholder:
-    """Looks for itself: nothing is known of the rig but where it was built."""
-
-    def __init__(self, drive: RigDrive, lidar: str) -> None:
-        self._rigs = {camera: drive.pair(camera, lidar).rig for camera in drive.cameras}
-        self._graph = graph_of(drive, lidar)
-        self._state = begun(self._graph)
-        self._seen: dict[str, deque[SeenPair]] = {camera: deque(maxlen=CHECK_PAIRS) for camera in drive.cameras}
-        self._edges: dict[str, EdgeSeen] = {}
+    def __init__(self, service: Service) -> None:
+        """Raises DemoError: the service does not listen to its sensors."""
+        self._service = service
+        self._player = Player(service.session, service.sensors, "msgpack")
+        if deaf := self._player.wait_for_listener(LISTEN_S):
+            raise DemoError(f"the service does not listen to {', '.join(deaf)}")
         self._instants = 0
+        self._motion_ns = -1
+        self._looks: Mapping[str, int] = {}
 
     def hear(self, frames: Frames) -> list[Told]:
-        """See `Teller`.
+        """After frames of one more instant: what is new since.
 
         Raises:
-            CalibrationError: a picture cannot be decoded.
+            DemoError: the service ends, or does not look.
         """
-        sweep = frames.sweep
-        assert isinstance(sweep, LidarFrame)
-        ready = prepare_sweep(sweep)
-        for camera, picture in frames.pictures.items():
-            pair = pair_of(picture, sweep, frames.motions)
-            if pair is not None:
-                self._seen[camera].append(SeenPair(pair, ready))
+        # Motion around two instants may be the same.
+        motions = [motion for motion in frames.motions if motion.stamp_ns > self._motion_ns]
+        self._motion_ns = max((motion.stamp_ns for motion in motions), default=self._motion_ns)
+        ordered = sorted((frames.sweep, *frames.pictures.values(), *motions), key=lambda frame: frame.stamp_ns)
+        self._player.play(ordered, 0.0, threading.Event(), lambda *_: None)
         self._instants += 1
-        return [self._look(frames, camera) for camera in due(self._instants, tuple(self._rigs))]
+        self._service.until_taken(self._instants, MOST_HELD)
+        return self._new()
 
-    def _look(self, frames: Frames, camera: str) -> Told:
-        rig = self._rigs[camera]
-        pose = rig.T_camera_lidar_nominal
-        told = look_at(rig, pose, self._seen[camera])
-        evidence = of_check(rig.pair, pose, told)
-        if evidence is not None:
-            self._state = after_look(self._state, self._graph, evidence)
-            self._edges[rig.pair] = _edge(camera, rig.lidar_frame, told)
-        believed = {one.name: _sensor(one) for one in sensors(self._state, self._graph)}
-        return Told(frames.second, rig.pair, believed, dict(self._edges))
+    def rest(self) -> list[Told]:
+        """After the last frames: what is new once all of them were looked at.
+
+        Raises:
+            DemoError: the service ends, or does not look.
+        """
+        self._service.until_at_rest()
+        return self._new()
+
+    def _new(self) -> list[Told]:
+        reply = self._service.rig()
+        looked_at = sorted(pair for pair, count in reply.looks.items() if count > self._looks.get(pair, 0))
+        if not looked_at or reply.stamp_ns is None:
+            return []
+        self._looks = reply.looks
+        health = self._service.health()
+        checks = {pair: of.check for pair, of in health.items() if of.check is not None}
+        return [told_of(reply, reply.stamp_ns, looked_at, checks, self._service.sensors_of)]
 
 
-def _sensor(of: SensorState) -> SensorTold:
-    moved_deg = None if of.moved is None else degrees(float(np.linalg.norm(of.moved.x[:3])))
-    return SensorTold(of.name, of.kind.value, of.health.value, of.probability, moved_deg, of.reasons[0].text)
+def told_of(
+    reply: RigReply,
+    stamp_ns: int,
+    looked_at: Sequence[str],
+    checks: Mapping[str, CheckReply],
+    sensors_of: Mapping[str, tuple[str, str]],
+) -> Told:
+    """What a reply, by all up to a stamp, and the latest checks say. `sensors_of` are camera and LiDAR of each pair."""
+    return Told(
+        second=(stamp_ns - START_NS) / NS_PER_S,
+        looked_at=", ".join(looked_at),
+        sensors={one.name: _sensor(one) for one in reply.sensors},
+        edges={pair: _edge(*sensors_of[pair], check) for pair, check in checks.items()},
+    )
 
 
-def _edge(camera: str, lidar: str, told: Observation) -> EdgeSeen:
+def _sensor(of: SensorReply) -> SensorTold:
+    moved_deg = None if of.moved is None else hypot(*of.moved.by[:3])
+    return SensorTold(of.name, of.kind, of.state, of.probability or 0.0, moved_deg, of.reasons[0].text)
+
+
+def _edge(camera: str, lidar: str, told: CheckReply) -> EdgeSeen:
     """By how much the pair is turned; its σ such that the turn has as many of it as all three axes together."""
-    turn = told.offset[:3]
-    turn_rad, sigmas = float(np.linalg.norm(turn)), sqrt(float(np.sum((turn / told.sigma[:3]) ** 2)))
-    return EdgeSeen(camera, lidar, degrees(turn_rad), degrees(turn_rad / sigmas) if sigmas > 0.0 else float("nan"))
+    pairs = zip(told.offset[:3], told.sigma[:3], strict=True)
+    axes = [(turn, sigma) for turn, sigma in pairs if turn is not None and sigma is not None and sigma > 0.0]
+    turn_deg, sigmas = hypot(*(turn for turn, _ in axes)), hypot(*(turn / sigma for turn, sigma in axes))
+    return EdgeSeen(camera, lidar, turn_deg, turn_deg / sigmas if sigmas > 0.0 else float("nan"))

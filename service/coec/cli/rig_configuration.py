@@ -1,0 +1,43 @@
+"""The configuration of a service for all sensors of a simulated rig, each told once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coec.adapters.files.output import write
+from coec.adapters.files.rig import intrinsics_config, mask_to_png, matrix_rows
+from coec.adapters.zenoh.player import SensorKeys
+from coec.geometry.se3 import inverse
+
+if TYPE_CHECKING:
+    from coec.simulation.rig_drive import RigDrive
+
+
+def document_of(drive: RigDrive, lidars: Sequence[str], folder: Path) -> dict[str, Any]:
+    """`cameras`, `lidars`, `ego` and `pairs: all`, with the poses that the workshop believes in, for frames on
+    `sensors/<sensor>`; masks go into the folder.
+
+    Args:
+        lidars: of the drive, those that are to be paired.
+
+    Raises:
+        OutputError: a mask cannot be written.
+    """
+    keys = SensorKeys(("ego", *lidars, *drive.cameras)).keys()
+    poses = {name: matrix_rows(inverse(drive.T_sensor_ego_nominal(name))) for name in (*lidars, *drive.cameras)}
+    intrinsics = intrinsics_config(drive.camera).model_dump(exclude_none=True)
+    cameras = []
+    for name in drive.cameras:
+        mask = f"{name}_mask.png"
+        write(folder / mask, mask_to_png(drive.mask(name)))
+        cameras.append(
+            {"name": name, "key": keys[name], "intrinsics": intrinsics, "mask": mask, "T_vehicle_camera": poses[name]}
+        )
+    return {
+        "cameras": cameras,
+        "lidars": [{"name": name, "key": keys[name], "T_vehicle_lidar": poses[name]} for name in lidars],
+        "ego": {"key": keys["ego"]},
+        "pairs": "all",
+    }

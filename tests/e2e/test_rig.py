@@ -1,0 +1,268 @@
+"""A vehicle of four fisheyes and a LiDAR in a running service: nobody is knocked, its LiDAR is, one of its cameras is.
+Which it was is said of that sensor, and put right in all pairs of it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import hypot
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+
+from coec.adapters.zenoh.player import Frame, Player, SensorKeys
+from coec.cli.rig_configuration import document_of
+from coec.geometry.se3 import inverse, rotation_angle_rad
+from coec.schemas.base import from_msgpack
+from coec.schemas.rig_state import RigCorrection, RigReply
+from e2e.processes import PATIENCE_S, Router, Service, service
+from e2e.rig_street import (
+    KNOCK_S,
+    LIDAR,
+    SECONDS,
+    Knock,
+    drive_of,
+    frames_of,
+    second_of,
+    truth,
+)
+
+NAMED_S = 60.0
+"""Of driving, within which a sensor that was knocked has to be named."""
+
+MAX_ERROR_DEG = 0.3
+
+HELD = 8
+"""Pairs of frames that may wait in the service before more are sent."""
+
+QUIET_STATUSES = 8
+"""Renewals of the status without work, after which nothing comes any more: the rig looks for silence, too."""
+
+ROOF, LEFT = Knock(LIDAR, 1.5), Knock("left", 1.5)
+
+STAGES = {
+    # Windows as `coec demo` has them, for a street of one and a half minutes. The rows that are not drawn are black.
+    "window": {"pairs": 16, "min_pairs": 8, "slice_s": 24.0, "max_clipped": 0.9},
+    "monitor": {"period_s": 5.0, "pairs": 5, "min_pairs": 4, "urgent_slice_s": 12.0},
+    "calibration": {"depth": {"model": "stereo"}},
+}
+
+
+@dataclass
+class Story:
+    """All that the service published of the rig while it was driven, in order, and what it said in the end."""
+
+    told: list[RigReply]
+    last: RigReply
+
+    @property
+    def named(self) -> set[str]:
+        """Sensors that were said to have moved, at any time."""
+        return set().union(*map(moved_in, self.told))
+
+    @property
+    def corrections(self) -> list[RigCorrection]:
+        """Those that were told, each once."""
+        found = [told.correction for told in (*self.told, self.last) if told.correction is not None]
+        return list({correction.stamp_ns: correction for correction in found}.values())
+
+    def named_s(self, sensor: str) -> float:
+        """Seconds of driving between the knock and its being named."""
+        stamps = [told.stamp_ns for told in self.told if sensor in moved_in(told) and told.stamp_ns is not None]
+        return second_of(min(stamps)) - KNOCK_S
+
+    def turned_deg(self, sensor: str) -> float:
+        """By how much it is said to have turned; the move is over."""
+        move = self.last.move
+        assert move is not None
+        assert move.over_ns is not None
+        assert move.sensors == (sensor,)
+        return hypot(*move.by[sensor].by[:3])
+
+    def lines(self) -> str:
+        """What was said when, for who has to find out why it was not what it should be."""
+        lines = []
+        for reply in (*self.told, self.last):
+            states = {sensor.name: (sensor.state, sensor.probability) for sensor in reply.sensors}
+            at_s = None if reply.stamp_ns is None else round(second_of(reply.stamp_ns), 1)
+            lines.append(f"{at_s}: {states} {reply.looks} {reply.losses} {reply.correction}")
+        return "\n".join(dict.fromkeys(lines))
+
+
+def moved_in(reply: RigReply) -> set[str]:
+    """Sensors that it says have moved."""
+    return {sensor.name for sensor in reply.sensors if sensor.state in ("camera_moved", "lidar_moved")}
+
+
+def configuration(folder: Path, router: Router) -> Path:
+    """Of a vehicle: sensors, each told once; pairs follow."""
+    document = {
+        **document_of(drive_of(None), (LIDAR,), folder),
+        "budget": {"cores": 64.0},  # sensor time is compressed
+        "zenoh": {"connect": [router.endpoint], "listen": [router.endpoint]},
+        "state": {"directory": "state", "min_free_bytes": 0},
+        "worker": {"niceness": 0},
+        "stages": STAGES,
+    }
+    path = folder / "coec.yaml"
+    path.write_text(json.dumps(document))  # which is YAML, too
+    return path
+
+
+def driven(running: Service, frames: list[Frame]) -> Story:
+    """A second of driving at a time, each once the service has kept up; then until all is judged."""
+    sensors = SensorKeys(tuple(sorted({frame.frame_id for frame in frames})))
+    player = Player(running.session, sensors, "msgpack")
+    told, sent = [rig_of(running)], Counter[str]()
+
+    def heard(sample: zenoh.Sample) -> None:
+        told.append(from_msgpack(RigReply, sample.payload.to_bytes()))
+
+    def taken(status: Any) -> bool:
+        return all(pair["camera"]["received"] >= sent[pair["name"]] and pair["held"] < HELD for pair in status["pairs"])
+
+    published = running.session.declare_subscriber(running.keys.rig, zenoh.handlers.Callback(heard, indirect=False))
+    try:
+        assert not player.wait_for_listener(PATIENCE_S)
+        for second in range(SECONDS + 1):
+            part = [frame for frame in frames if second <= second_of(frame.stamp_ns) < second + 1]
+            player.play(part, 0.0, threading.Event(), lambda *_: None)
+            sent.update(frame.frame_id for frame in part)
+            running.until(running.status, taken, f"second {second} of the drive")
+        rest(running)
+        return Story(told, rig_of(running))
+    finally:
+        published.undeclare()
+        player.close()
+
+
+def rig_of(running: Service) -> RigReply:
+    """What it says of the rig now."""
+    return RigReply.model_validate(running.ask(running.keys.rig))
+
+
+def rest(running: Service) -> None:
+    """Until nothing waits, and nothing is under way, for as long as it takes the rig to see that."""
+    quiet: dict[float, Any] = {}
+
+    def rests(status: Any) -> bool:
+        at_work = status["worker"]["state"] != "idle" or status["worker"]["queued"]
+        at_work = at_work or any(pair["held"] or pair["unanswered"] for pair in status["pairs"])
+        done = [(pair["checks"], pair["solved"]) for pair in status["pairs"]]
+        if at_work or any(before != done for before in quiet.values()):
+            quiet.clear()
+        else:
+            quiet[status["uptime_s"]] = done
+        return len(quiet) >= QUIET_STATUSES
+
+    running.until(running.status, rests, "rest")
+
+
+def errors_deg(running: Service, knock: Knock | None) -> dict[str, float]:
+    """Of what every pair serves, against the truth at the end of the drive."""
+    found = {}
+    for pair in running.config.pairs:
+        served = np.array(running.ask(running.keys.extrinsic(pair.name))["camera_from_lidar"]["matrix"])
+        found[pair.name] = float(np.degrees(rotation_angle_rad(served @ inverse(truth(knock, pair.name, SECONDS)))))
+    return found
+
+
+def states_of(running: Service, pair: str) -> list[str]:
+    """In which its health has been, by what was seen: a drive that is over makes pairs degraded by the clock."""
+    entries = [one["entry"] for one in running.ask(running.keys.history(pair), ";limit=1000")["entries"]]
+    return [entry["code"] for entry in entries if entry["kind"] == "state" and entry["stamp_ns"] is not None]
+
+
+def corrected(running: Service, pair: str) -> int:
+    """How often the rig put a pair right."""
+    entries = running.ask(running.keys.history(pair), ";limit=1000")["entries"]
+    return sum((one["entry"]["kind"], one["entry"]["code"]) == ("command", "corrected") for one in entries)
+
+
+@pytest.mark.slow
+@pytest.mark.fault("nothing, for a drive of four fisheyes and a LiDAR", "no sensor is said to have moved, no alarm")
+def test_a_right_rig_raises_no_alarm(
+    tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
+) -> None:
+    with service(configuration(tmp_path, router), router) as running:
+        cameras = drive_of(None).cameras
+        assert {pair.name for pair in running.config.pairs} == set(cameras)
+        story = driven(running, frames_of(None))
+        said = story.lines()
+        assert {sensor.state for sensor in story.told[0].sensors} == {"unknown"}
+        assert story.named == set(), said
+        assert story.corrections == [], said
+        assert story.last.move is None, said
+        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
+        assert set(story.last.looks) == set(cameras), said
+        assert not any("miscalibrated" in states_of(running, camera) for camera in cameras)
+        errors = errors_deg(running, None)
+        record_property("figure", f"{sum(story.last.looks.values())} looks, ≤ {max(errors.values()):.2f}° off")
+        assert max(errors.values()) < MAX_ERROR_DEG, errors
+        assert running.terminate() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.fault(
+    "the LiDAR of a running vehicle is knocked by 1.5°", "it alone is named, in a minute; one correction for all pairs"
+)
+def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
+    tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
+) -> None:
+    with service(configuration(tmp_path, router), router) as running:
+        cameras = drive_of(ROOF).cameras
+        story = driven(running, frames_of(ROOF))
+        said = story.lines()
+        assert story.named == {LIDAR}, said
+        assert story.turned_deg(LIDAR) == pytest.approx(ROOF.turn_deg, abs=MAX_ERROR_DEG), said
+        assert 0.0 < story.named_s(LIDAR) <= NAMED_S, said
+        (correction,) = story.corrections
+        assert correction.sensors == (LIDAR,)
+        assert set(correction.pairs) == set(cameras), said
+        assert [corrected(running, camera) for camera in cameras] == [1] * len(cameras)
+        errors = errors_deg(running, ROOF)
+        put_right_s = second_of(correction.stamp_ns) - KNOCK_S
+        record_property(
+            "figure",
+            f"named {story.named_s(LIDAR):.0f} s, put right {put_right_s:.0f} s of driving after the knock; then "
+            f"{max(errors.values()):.2f}° off at most",
+        )
+        assert max(errors.values()) <= MAX_ERROR_DEG, errors
+        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
+        last = {camera: states_of(running, camera)[-1] for camera in cameras}
+        assert set(last.values()) == {"healthy"}, last
+        assert running.terminate() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.fault(
+    "a camera of a running vehicle is knocked by 1.5°", "it alone is named, in a minute, and put right; no other alarm"
+)
+def test_a_knocked_camera_is_named_and_put_right_and_no_other(
+    tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
+) -> None:
+    with service(configuration(tmp_path, router), router) as running:
+        others = set(drive_of(LEFT).cameras) - {LEFT.sensor}
+        story = driven(running, frames_of(LEFT))
+        said = story.lines()
+        assert story.named == {LEFT.sensor}, said
+        assert story.turned_deg(LEFT.sensor) == pytest.approx(LEFT.turn_deg, abs=MAX_ERROR_DEG), said
+        assert 0.0 < story.named_s(LEFT.sensor) <= NAMED_S, said
+        assert not any("miscalibrated" in states_of(running, camera) for camera in others)
+        errors = errors_deg(running, LEFT)
+        record_property(
+            "figure",
+            f"named {story.named_s(LEFT.sensor):.0f} s after the knock; then {errors[LEFT.sensor]:.2f}° off",
+        )
+        assert max(errors.values()) <= MAX_ERROR_DEG, errors
+        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
+        assert states_of(running, LEFT.sensor)[-1] == "healthy"
+        assert running.terminate() == 0
