@@ -164,6 +164,18 @@ def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) ->
     return _followed(_combined(replace(rig, windows={**rig.windows, edge: window})), stamp_ns)
 
 
+def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
+    """Two LiDARs were registered. No pair serves where the one sits in the other: it is where that was found.
+
+    Raises:
+        ValueError: as `after_look` and `after_window`.
+    """
+    measured = window.measurement
+    found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns)
+    rig = replace(rig, serves={**rig.serves, look.edge: found})
+    return after_window(after_look(rig, look), look.edge, window, look.stamp_ns)
+
+
 def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> VehicleRig:
     """A pair serves something else. The first that rests on frames tells where the edge is; later ones, while all is
     calm, are corrections of what looks tell as well."""
@@ -254,8 +266,11 @@ def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -
     joint = rig.joint
     if joint is None or not (joint.consistent or joint.left_out is not None):
         return rig
-    told = {name: _told(joint, name, rig.windows[name].measurement) for name in fresh if name in joint.measured}
-    if len(told) < 2:
+    measured = [name for name in fresh if name in joint.measured]
+    told = {
+        name: _told(joint, name, rig.windows[name].measurement) for name in measured if name not in rig.graph.of_lidars
+    }
+    if len(measured) < 2 or not told:
         return rig
     return replace(rig, correction=Correction(stamp_ns, event.sensors, told))
 
