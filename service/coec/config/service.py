@@ -92,8 +92,8 @@ class LidarEdgesConfig(Stage):
         default=15.0,
         ge=0,
         le=86_400,
-        description="one look per so much sensor time at every two of them, s, 4 at least; it takes about half a second "
-        "of the worker's processor time. 0: none. Needs the extra `lidars`, and ego-motion",
+        description="one look per so much sensor time at every two of them, s, 4 at least; it takes about half a "
+        "second of the worker's processor time. 0: none. Needs the extra `lidars`, and ego-motion",
     )
 
 

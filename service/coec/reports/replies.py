@@ -214,10 +214,34 @@ def rig(payload: bytes) -> None:
     console.out.print(table)
     if reply.joint is not None:
         _joint(reply.joint)
+    if reply.lidars:
+        _lidars(reply)
     if reply.correction is not None:
         named, pairs = " and ".join(reply.correction.sensors), ", ".join(reply.correction.pairs)
         console.show(f"last put right: {named}, in {pairs}, since {_instant(reply.correction.from_ns)}")
     _losses({"rig": reply.losses})
+
+
+def _lidars(reply: rig_state.RigReply) -> None:
+    """Where LiDARs sit to one another, and how old that is, in sensor time."""
+    table = console.table(
+        "LiDARs", "state", "age, s", "looks", *(f"{name} ± σ" for name in console.AXES), right=range(2, 10)
+    )
+    for lidars in reply.lidars:
+        age = "-"
+        if lidars.measured_ns is not None and reply.stamp_ns is not None:
+            age = f"{max(reply.stamp_ns - lidars.measured_ns, 0) / 1e9:.0f}"
+        steps = ["-"] * 6
+        if lidars.correction is not None and lidars.sigma is not None:
+            rows = zip(lidars.correction, lidars.sigma, strict=True)
+            steps = [f"{step:+.3f} ± {sigma:.3f}" for step, sigma in rows]
+        table.add_row(lidars.name, console.styled(lidars.state), age, str(lidars.looks), *steps)
+    console.show("two LiDARs each, from how they were built (deg, m)")
+    console.out.print(table)
+    for lidars in reply.lidars:
+        for reason in lidars.reasons:
+            console.show(f"  {lidars.name}: {reason.text}", "yellow")
+        _losses({lidars.name: lidars.losses})
 
 
 def _joint(joint: rig_state.JointReply) -> None:

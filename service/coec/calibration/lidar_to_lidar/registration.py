@@ -30,6 +30,8 @@ REACHES_M = (2.0, 1.0, 0.6, 0.4, 0.3)
 repeated until the pose rests."""
 STEPS = 30
 """At most; most rest after ten."""
+HOPELESS = 0.5
+"""Share of the least that has to be in common, below which further steps bring nothing together."""
 RESTS_RAD, RESTS_M = 1e-5, 1e-4
 """A step shorter than this is none: a thousandth of a degree and a tenth of a millimetre are far below what chance
 does."""
@@ -96,7 +98,7 @@ def register(rig: LidarRig, pairs: Sequence[SweepPair], search: NeighbourSearch)
         step = _step(met, weight, known)
         T_a_b, bias = se3.perturb(T_a_b, step[:6]), bias + step[6:]
         rests = float(np.abs(step[:3]).max()) < RESTS_RAD and float(np.abs(step[3:]).max()) < RESTS_M
-        if rests and number >= len(REACHES_M):
+        if number >= len(REACHES_M) and (rests or len(met.residual) < HOPELESS * LEAST_SHARE * met.tried):
             break
     met = _meet(indexed, T_a_b, bias, REACHES_M[-1])
     weight = _weights(met.residual, max(SCALE_SHARE * REACHES_M[-1], LEAST_SCALE_M))

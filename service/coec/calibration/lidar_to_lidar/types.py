@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, SweepTiming
 
 KNOWN_BEFORE = np.array([radians(10.0)] * 3 + [1.0] * 3)
-"""(6,) standard deviation of what is known of a mount before any look (rad, m): they are built to that, at the worst."""
+"""(6,) standard deviation of what is known of a mount before any look (rad, m): they are built to that at the worst."""
 
 LEAST_SHARE = 0.05
 """Of the points of b, that must meet a surface of a: with fewer the fields of view hardly overlap."""

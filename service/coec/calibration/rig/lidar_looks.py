@@ -17,10 +17,11 @@ Array = NDArray[np.float64]
 
 PLACE = np.array([radians(0.02)] * 3 + [0.004] * 3)
 """Standard deviation by which streets differ in where they put one LiDAR in another, beyond what a look claims (rad,
-m)."""
+m): within simulated drives (seeds 41000 to 41005) looks scattered by 0.01 to 0.03° and 1 to 4 mm."""
 
-BIAS = np.array([radians(0.02)] * 3 + [0.004] * 3)
-"""Of what no street tells: errors of angle and range that belong to the two sensors (rad, m)."""
+BIAS = np.array([radians(0.03)] * 3 + [0.006] * 3)
+"""Of what no street tells, errors of angle and range that belong to the two sensors (rad, m): the means of these drives
+were off by 0.01 to 0.04° and 1 to 6 mm."""
 
 TELLS = 0.3
 """Share of what is known before that the standard deviation of a direction may have, for the look to tell it: 3° and
