@@ -7,7 +7,7 @@ once. It is over when they all serve what they were told or found since: their l
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from coec.calibration.rig import attribution
 from coec.calibration.rig.attribution import NS_PER_S, RigState, SensorHealth, SensorState
 from coec.calibration.rig.evidence import Look
 from coec.calibration.rig.joint import JointEstimate, estimate
+from coec.calibration.rig.steps import MOST_LOOKS
 from coec.calibration.rig.types import RigGraph
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
@@ -231,10 +232,11 @@ def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     if event is None:
         return _settled_unnamed(rig, stamp_ns)
     pairs = pairs_of(rig.graph, event.sensors)
-    alive = [name for name in pairs if _last_ns(rig, name) > stamp_ns - ALIVE_NS]
+    served = _served(rig, pairs)
+    alive = [name for name in served if _last_ns(rig, name) > stamp_ns - ALIVE_NS]
     fresh = [name for name in pairs if name in rig.windows]
     if not event.corrected:
-        if fresh and set(alive) <= set(fresh):
+        if _served(rig, fresh) and set(alive) <= set(fresh):
             return _followed(_corrected(rig, event, fresh, stamp_ns), stamp_ns)
     elif alive and all(_renewed(rig, name, event.stepped_ns) for name in alive):
         return _over(rig, pairs, stamp_ns)
@@ -244,13 +246,23 @@ def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
 
 
 def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
-    """Something moved, and nothing tells what: that is over when every pair that stepped serves what it found since."""
+    """Something moved, and nothing tells what: that is over when every pair that stepped serves what it found since;
+    or, if only edges between LiDARs did, when all that is kept of them is of after it."""
     if rig.believed.calm:
         return rig
     pairs = attribution.stepped(rig.believed)
-    if not pairs or not all(_renewed(rig, name, rig.believed.stepped_ns) for name in pairs):
-        return rig
-    return _over(rig, pairs, stamp_ns)
+    served, since_ns = _served(rig, pairs), rig.believed.stepped_ns
+    if served:
+        is_over = all(_renewed(rig, name, since_ns) for name in served)
+    else:
+        kept = [rig.believed.histories[name].looks for name in pairs]
+        is_over = all(len(looks) >= MOST_LOOKS and looks[0].stamp_ns >= since_ns for looks in kept)
+    return _over(rig, pairs, stamp_ns) if pairs and is_over else rig
+
+
+def _served(rig: VehicleRig, edges: Sequence[str]) -> list[str]:
+    """Of these edges those that a pair serves, which is what puts a move right."""
+    return [name for name in edges if name not in rig.graph.of_lidars]
 
 
 def _renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
