@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from coec.adapters.files.scribe import Scribe
+from coec.adapters.registration import nearest
 from coec.calibration.lidar_to_lidar.types import LidarRig, RangeBias
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason
 from coec.config import BudgetConfig, LidarEdgesConfig, LimitsConfig, PairConfig
 from coec.geometry import se3
 from coec.runtime.api.rig import reply_of
 from coec.runtime.budget.budget import Budget
-from coec.runtime.edges import plan
 from coec.runtime.edges.all import LidarEdges
 from coec.runtime.ingest.decoder import EGO, Frame
 from coec.runtime.ingest.intake import Intake
@@ -116,17 +116,21 @@ class LidarBench:
         self.worker = Asked(answers)
         self.budget = Budget(BudgetConfig(cores=cores), lambda: 0.0)
         self.told: list[RigKnown] = []
-        configs = [pair_of(lidar, ego=ego) for lidar in lidars]
+        self.ego = ego
         self.pairs: list[PairOfRig] = []
-        for config in configs:
-            self.intake.sensors_of(config)
-            pose = np.array(config.T_camera_lidar)
-            self.pairs.append(self.keeper.join(config, pose, state("front"), lambda: True))
+        configs = [self.join(lidar) for lidar in lidars]
         worker = cast("Worker", self.worker)
         self.edges = LidarEdges(LidarEdgesConfig(period_s=period_s), self.intake, worker, self.budget, self.keeper)
         self.edges.grow(configs)
         self.keeper.listen(self.told.append, lambda: None)
         self.settle()
+
+    def join(self, lidar: str) -> PairConfig:
+        """A pair of it becomes one of the rig."""
+        config = pair_of(lidar, ego=self.ego)
+        self.intake.sensors_of(config)
+        self.pairs.append(self.keeper.join(config, np.array(config.T_camera_lidar), state("front"), lambda: True))
+        return config
 
     def drive(self, begin_s: float, end_s: float, *, speed_mps: float = 8.0, timed: bool = True) -> None:
         """Frames of this stretch of sensor time, and what becomes of them."""
@@ -185,4 +189,4 @@ def frame(stream: str, stamp_ns: int, speed_mps: float, *, timed: bool) -> Frame
 @pytest.fixture
 def with_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if what registers LiDARs were installed."""
-    monkeypatch.setattr(plan.nearest, "installed", lambda: True)
+    monkeypatch.setattr(nearest, "installed", lambda: True)

@@ -264,7 +264,8 @@ class RigKeeper:
             return
         if name not in self._rig.graph.edge:
             self._grow()
-        self._rig = vehicle.after_lidars(self._rig, said.told.look, said.told.window)
+        if self._rig is not None and name in self._rig.graph.edge:
+            self._rig = vehicle.after_lidars(self._rig, said.told.look, said.told.window)
 
     def _meanwhile(self, pair: str, what: Said | _SteppedBack) -> None:
         """There is no rig yet: what a pair comes to until there is one."""
@@ -275,10 +276,10 @@ class RigKeeper:
 
     def _grow(self) -> None:
         """There is one more pair, or edge between two LiDARs."""
-        of_lidars = {name: known.edge for name, known in self._lidars.items() if known.looks}
+        measured = [known.edge for known in self._lidars.values() if known.looks]
         try:
             told = {name: (joined.config, joined.nominal) for name, joined in self._pairs.items()}
-            self._graph = graph_of(told, self._links, list(of_lidars.values()))
+            self._graph = graph_of(told, self._links, measured)
         except ValueError as error:
             self._rig, self._why = None, (Reason("no_rig", f"The pairs are not put together: {error}."),)
             return
@@ -288,7 +289,7 @@ class RigKeeper:
         self._why = self._file.damage
         serves = {name: joined.serves for name, joined in self._pairs.items()}
         # As built; it is no pose that the first look, which is one of many, were to replace.
-        serves |= {name: Served(edge.T_a_b, KNOWN_BEFORE, order.NEVER_NS) for name, edge in of_lidars.items()}
+        serves |= {edge.name: Served(edge.T_a_b, KNOWN_BEFORE, order.NEVER_NS) for edge in measured}
         windows = {name: joined.window for name, joined in self._pairs.items() if joined.window is not None}
         fresh = self._file.recalled(vehicle.begun(self._graph, serves, windows))
         self._rig = fresh if self._rig is None else vehicle.grown(self._rig, fresh)
