@@ -15,6 +15,7 @@ from coec.config.reading import config_of, load_config
 from coec.config.ros import RosConfig, RosOutput
 from coec.config.service import (
     BudgetConfig,
+    LidarEdgesConfig,
     LimitsConfig,
     LogConfig,
     SnippetsConfig,
@@ -75,6 +76,7 @@ __all__ = [
     "FilePath",
     "KnownStreamConfig",
     "LidarConfig",
+    "LidarEdgesConfig",
     "LidarMessage",
     "LimitsConfig",
     "LinkConfig",

@@ -85,6 +85,18 @@ class BudgetConfig(Stage):
     )
 
 
+class LidarEdgesConfig(Stage):
+    """Where the LiDARs of a vehicle that has several sit to one another, by the surfaces that both of two see."""
+
+    period_s: float = Field(
+        default=15.0,
+        ge=0,
+        le=86_400,
+        description="one look per so much sensor time at every two of them, s, 4 at least; it takes about half a "
+        "second of the worker's processor time. 0: none. Needs the extra `lidars`, and ego-motion",
+    )
+
+
 class WorkerConfig(Stage):
     """The process that infers and solves."""
 

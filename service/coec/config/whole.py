@@ -17,6 +17,7 @@ from coec.config.rig import MAX_LINKS, MAX_SENSORS
 from coec.config.ros import RosConfig
 from coec.config.service import (
     BudgetConfig,
+    LidarEdgesConfig,
     LimitsConfig,
     LogConfig,
     SnippetsConfig,
@@ -46,6 +47,7 @@ class Config(Stage):
     snippets: SnippetsConfig = SnippetsConfig()
     worker: WorkerConfig = WorkerConfig()
     budget: BudgetConfig = BudgetConfig()
+    lidar_edges: LidarEdgesConfig = LidarEdgesConfig()
     limits: LimitsConfig = LimitsConfig()
     stale_after_s: float = Field(
         default=600.0, gt=0, description="age of the last completed check at which a pair is called stale, s"

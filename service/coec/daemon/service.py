@@ -52,6 +52,7 @@ from coec.runtime.api.uplink import Uplink
 from coec.runtime.budget.budget import Budget
 from coec.runtime.decisions.decider import Decider
 from coec.runtime.decisions.state_store import StateStore
+from coec.runtime.edges.all import LidarEdges
 from coec.runtime.ingest.intake import Intake
 from coec.runtime.nominal.kept import completed
 from coec.runtime.outside import Outside
@@ -143,6 +144,8 @@ class Daemon:
         snippets = _snippets_of(config)
         self._outside = Outside(self._keys, self._intake, store, self._scribe, self._folder, *told, snippets=snippets)
         self._pairs = {pair.name: Pair(pair, config, self._outside) for pair in config.pairs}
+        self._lidars = LidarEdges(config.lidar_edges, self._intake, self._worker, self._budget, self._rig)
+        self._lidars.grow(config.pairs)
         self._rig.listen(self._rig_answers.hear, self._intake.inbox.wake)
         while self._rig.work(0.0):  # a reply exists before the first question
             pass
@@ -243,6 +246,7 @@ class Daemon:
         fresh = {name: Pair(config, whole, self._outside) for name, config in found.items()}
         self._pairs = {**self._pairs, **fresh}  # before the configuration that names them
         self._config = whole
+        self._lidars.grow(whole.pairs)
         for name, pair in fresh.items():
             self._commands[name] = pair.commands
             self._answers.replace(pair.answers)
@@ -446,7 +450,7 @@ class Daemon:
 
     def _status_now(self) -> replies.StatusReply:
         usage = self._folder.usage()
-        own = () if self._door.trouble is None else (self._door.trouble,)
+        own = tuple(reason for reason in (self._door.trouble, self._lidars.trouble) if reason is not None)
         return replies.StatusReply(
             version=__version__,
             vehicle=self._config.vehicle,

@@ -222,10 +222,34 @@ def rig(payload: bytes) -> None:
             far.append(name if by is None else f"{name} by {hypot(*by.by[:3]):.2f}°")
         over = "goes on" if move.over_ns is None else f"over since {_instant(move.over_ns)}"
         console.show(f"last moved: {' and '.join(far)}, named at {_instant(move.since_ns)}, {over}")
+    if reply.lidars:
+        _lidars(reply)
     if reply.correction is not None:
         named, pairs = " and ".join(reply.correction.sensors), ", ".join(reply.correction.pairs)
         console.show(f"last put right: {named}, in {pairs}, since {_instant(reply.correction.from_ns)}")
     _losses({"rig": reply.losses})
+
+
+def _lidars(reply: rig_state.RigReply) -> None:
+    """Where LiDARs sit to one another, and how old that is, in sensor time."""
+    table = console.table(
+        "LiDARs", "state", "age, s", "looks", *(f"{name} ± σ" for name in console.AXES), right=range(2, 10)
+    )
+    for lidars in reply.lidars:
+        age = "-"
+        if lidars.measured_ns is not None and reply.stamp_ns is not None:
+            age = f"{max(reply.stamp_ns - lidars.measured_ns, 0) / 1e9:.0f}"
+        steps = ["-"] * 6
+        if lidars.correction is not None and lidars.sigma is not None:
+            rows = zip(lidars.correction, lidars.sigma, strict=True)
+            steps = [f"{step:+.3f} ± {sigma:.3f}" for step, sigma in rows]
+        table.add_row(lidars.name, console.styled(lidars.state), age, str(lidars.looks), *steps)
+    console.show("two LiDARs each, from how they were built (deg, m)")
+    console.out.print(table)
+    for lidars in reply.lidars:
+        for reason in lidars.reasons:
+            console.show(f"  {lidars.name}: {reason.text}", "yellow")
+        _losses({lidars.name: lidars.losses})
 
 
 def _joint(joint: rig_state.JointReply) -> None:

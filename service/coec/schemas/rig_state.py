@@ -15,6 +15,7 @@ from coec.schemas.replies import Count, Counts, Maybe6x6, Reason, Transform, Vec
 
 SensorKind = Literal["camera", "lidar"]
 SensorState = Literal["calibrated", "camera_moved", "lidar_moved", "undecided", "unknown"]
+LidarsState = Literal["not_measured", "waiting", "measured", "refused"]
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -87,6 +88,30 @@ class RigMove(Part):
     by: dict[str, SensorMove] = Field(description="by sensor, as it was known when they were named")
 
 
+class LidarsReply(Part):
+    """Two LiDARs of the vehicle, by the surfaces that both see: no camera has a part in it."""
+
+    name: str = Field(description="of the edge, as in `disturbed` and `looks`")
+    a: str
+    b: str
+    state: LidarsState = Field(
+        description="`measured`: the latest look tells where b sits in a; `refused`: it does not, or there was none; "
+        "`waiting`: there was none yet; `not_measured`: nothing looks"
+    )
+    reasons: tuple[Reason, ...] = Field(description="of the state; empty where it is `measured`")
+    stamp_ns: int | None = Field(description="of the latest look, or of the sweep that made none, ns; null: none came")
+    measured_ns: int | None = Field(description="of the latest look that told something, of which the rest is, ns")
+    a_from_b: Transform | None = Field(description="maps coordinates of b to those of a; null before any look")
+    sigma: Vector6 | None = Field(description="standard deviations about and along the axes of a (deg, m)")
+    correction: Vector6 | None = Field(description="from how they were built to this: rx ry rz (deg), tx ty tz (m)")
+    range_bias_m: float | None = Field(description="by how much b measures longer than a, m")
+    range_bias_sigma_m: float | None
+    rms_m: float | None = Field(description="distance of the points of b from the surfaces of a, m")
+    share: Probability | None = Field(description="of the points of b that lie on a surface of a")
+    looks: Count = Field(description="that told something")
+    losses: Counts = Field(description="looks and sweeps that were lost, by cause")
+
+
 class RigCorrection(Part):
     """A move of one or two sensors, put right in all of their pairs at once."""
 
@@ -103,12 +128,15 @@ class RigReply(Message):
     stamp_ns: int | None = Field(description="all that was asked up to this sensor time is in it, ns; null: nothing is")
     sensors: tuple[SensorReply, ...]
     nobody: Probability | None = Field(description="that no sensor moved; null before the first look")
-    disturbed: dict[str, Probability] = Field(description="that something else lastingly disturbs a pair, by pair")
+    disturbed: dict[str, Probability] = Field(
+        description="that something else lastingly disturbs a pair, or an edge between two LiDARs, by name"
+    )
     joint: JointReply | None = Field(description="null before the first accepted window, or of a single pair")
     correction: RigCorrection | None = Field(description="the latest; null before the first")
     move: RigMove | None = Field(
         default=None, description="the latest, over or not; null before the first since the service was started"
     )
+    lidars: tuple[LidarsReply, ...] = Field(default=(), description="every two of them")
     reasons: tuple[Reason, ...] = Field(default=(), description="what keeps the pairs from being put together")
-    looks: Counts = Field(description="checks that were put together, by pair")
+    looks: Counts = Field(description="checks that were put together, by pair, and looks at two LiDARs, by edge")
     losses: Counts = Field(description="what was not, or out of order, by cause")

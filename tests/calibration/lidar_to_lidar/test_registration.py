@@ -148,6 +148,22 @@ def test_moving_b_by_s_moves_its_pose_by_the_inverse() -> None:
     assert np.abs(apart[3:]).max() < 0.015
 
 
+def test_the_pose_of_a_in_b_is_the_inverse() -> None:
+    rng = np.random.default_rng(12)
+    a = sweep(room(rng, 2200), T_A_EGO, "a", rng)
+    b = sweep(room(rng, 2200), se3.inverse(T_A_B) @ T_A_EGO, "b", rng)
+    off = np.array([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.03, 0.0])
+    start = se3.perturb(T_A_B, off)
+    there = register(LidarRig("a", "b", start, T_A_EGO), [SweepPair(a, b, None)], Search())
+    T_b_ego = se3.inverse(T_A_B) @ T_A_EGO
+    back = register(LidarRig("b", "a", se3.inverse(start), T_b_ego), [SweepPair(b, a, None)], Search())
+    apart = se3.difference(there.T_a_b, se3.inverse(back.T_a_b))
+    # Points of the one on planes of the other, and the other way round: not the same draw of the noise.
+    sigma = np.hypot(there.sigma, (np.abs(se3.adjoint(there.T_a_b)) @ back.sigma))
+    assert (np.abs(apart) < 3.0 * sigma).all()
+    assert np.rad2deg(np.abs(apart[:3])).max() < 0.2
+
+
 def test_along_a_corridor_nothing_is_claimed() -> None:
     """Normals that scatter must not pass for a wall across."""
     along, up = T_A_EGO[:3, 0], T_A_EGO[:3, 2]

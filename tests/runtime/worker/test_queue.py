@@ -174,7 +174,7 @@ def test_a_window_that_could_not_be_sent_has_had_no_attempt() -> None:
     assert ends(queue) == [("a", Fate.FAILED, "worker_failed")]
 
 
-@pytest.mark.parametrize("kind", [Kind.CHECK, Kind.OVERLAY, Kind.COMMISSION])
+@pytest.mark.parametrize("kind", [Kind.CHECK, Kind.OVERLAY, Kind.COMMISSION, Kind.REGISTER])
 def test_other_work_is_done_once_or_not_at_all_and_sent_at_most_twice(kind: Kind) -> None:
     queue = asked([a_job("begun", kind), a_job("unsent", kind)])
     begin(queue)

@@ -27,6 +27,11 @@ class Tree:
         return np.asarray(found).astype(np.int64), np.asarray(squared, np.float64)
 
 
+def installed() -> bool:
+    """Whether the optional extra is there."""
+    return importlib.util.find_spec("small_gicp") is not None
+
+
 class Trees:
     """A `calibration.ports.NeighbourSearch`.
 
@@ -35,7 +40,7 @@ class Trees:
     """
 
     def __init__(self) -> None:
-        if importlib.util.find_spec("small_gicp") is None:
+        if not installed():
             raise SourceError("LiDARs are registered with the optional extra `lidars`: pip install 'coec[lidars]'")
 
     def over(self, points_m: NDArray[np.float64]) -> Tree:

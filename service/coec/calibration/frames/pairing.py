@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter, deque
+from collections.abc import Sequence
 from typing import TypeVar
 
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
@@ -30,8 +31,12 @@ PAIRS_WAITING = 32
 Frame = TypeVar("Frame", CameraFrame, LidarFrame, EgoMotion)
 
 
-class _TimeLine:
-    """Refuses single stamps that leave the order of their stream; follows a step that lasts."""
+class TimeLine:
+    """Refuses single stamps that leave the order of their stream; follows a step that lasts.
+
+    Attributes:
+        latest_ns: stamp that was accepted last; None before the first.
+    """
 
     def __init__(self, max_jump_ns: int) -> None:
         self._max_jump_ns = max_jump_ns
@@ -70,7 +75,7 @@ class Pairer:
         self._queue_frames = config.queue_frames
         self._expects_motion = expects_motion
         jump_ns = round(config.max_stamp_jump_s * NS_PER_S)
-        self._camera_time, self._lidar_time, self._motion_time = (_TimeLine(jump_ns) for _ in range(3))
+        self._camera_time, self._lidar_time, self._motion_time = (TimeLine(jump_ns) for _ in range(3))
         self._cameras: deque[CameraFrame] = deque()
         self._sweeps: deque[LidarFrame] = deque()
         self._motions: deque[EgoMotion] = deque(maxlen=MOTION_SAMPLES)
@@ -98,7 +103,7 @@ class Pairer:
         self._match(final=True)
         return self._release(final=True)
 
-    def _enqueue(self, frame: Frame, time_line: _TimeLine, queue: deque[Frame], stream: str) -> None:
+    def _enqueue(self, frame: Frame, time_line: TimeLine, queue: deque[Frame], stream: str) -> None:
         reason = time_line.refusal(frame.stamp_ns)
         if reason is not None:
             self.losses[f"{stream}_{reason}"] += 1
@@ -149,7 +154,8 @@ class Pairer:
                     break
                 self._unmoved_ns = pair.stamp_ns
             self._waiting.popleft()
-            released.append(FramePair(pair.camera, pair.lidar, self._motion_at(pair.stamp_ns)))
+            motion = motion_at(list(self._motions), pair.stamp_ns, self._motion_tolerance_ns)
+            released.append(FramePair(pair.camera, pair.lidar, motion))
         return released
 
     def _motion_has_come(self, stamp_ns: int) -> bool:
@@ -162,28 +168,26 @@ class Pairer:
         late = newest_camera_ns is not None and newest_camera_ns - stamp_ns > patience_ns
         return late or len(self._waiting) > PAIRS_WAITING
 
-    def _motion_at(self, stamp_ns: int) -> EgoMotion | None:
-        """Ego-motion at the stamp: a sample with exactly this stamp as it is, else interpolated between its neighbours,
-        else the nearest within the tolerance."""
-        samples = list(self._motions)
-        after = bisect_left(samples, stamp_ns, key=lambda sample: sample.stamp_ns)
-        near = [
-            s for s in samples[max(after - 1, 0) : after + 1] if abs(s.stamp_ns - stamp_ns) <= self._motion_tolerance_ns
-        ]
-        if not near:
-            return None
-        if near[-1].stamp_ns == stamp_ns:
-            return near[-1]
-        if len(near) == 1:
-            return EgoMotion(stamp_ns, near[0].frame_id, near[0].linear_mps, near[0].angular_radps)
-        before, behind = near
-        weight = (stamp_ns - before.stamp_ns) / (behind.stamp_ns - before.stamp_ns)
-        return EgoMotion(
-            stamp_ns,
-            before.frame_id,
-            _blended_or_unknown(before.linear_mps, behind.linear_mps, weight),
-            _blend(before.angular_radps, behind.angular_radps, weight),
-        )
+
+def motion_at(samples: Sequence[EgoMotion], stamp_ns: int, tolerance_ns: int) -> EgoMotion | None:
+    """Ego-motion at a stamp, of samples in the order of theirs: one with exactly this stamp as it is, else interpolated
+    between its neighbours, else the nearest within the tolerance."""
+    after = bisect_left(samples, stamp_ns, key=lambda sample: sample.stamp_ns)
+    near = [s for s in samples[max(after - 1, 0) : after + 1] if abs(s.stamp_ns - stamp_ns) <= tolerance_ns]
+    if not near:
+        return None
+    if near[-1].stamp_ns == stamp_ns:
+        return near[-1]
+    if len(near) == 1:
+        return EgoMotion(stamp_ns, near[0].frame_id, near[0].linear_mps, near[0].angular_radps)
+    before, behind = near
+    weight = (stamp_ns - before.stamp_ns) / (behind.stamp_ns - before.stamp_ns)
+    return EgoMotion(
+        stamp_ns,
+        before.frame_id,
+        _blended_or_unknown(before.linear_mps, behind.linear_mps, weight),
+        _blend(before.angular_radps, behind.angular_radps, weight),
+    )
 
 
 Vector = tuple[float, float, float]

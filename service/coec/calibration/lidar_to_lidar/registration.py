@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.lidar_to_lidar.spread import covariance_of
 from coec.calibration.lidar_to_lidar.sweeps import Cloud, clouds_of
-from coec.calibration.lidar_to_lidar.types import LidarEdge, LidarRig, RangeBias, SweepPair
+from coec.calibration.lidar_to_lidar.types import KNOWN_BEFORE, LEAST_SHARE, LidarEdge, LidarRig, RangeBias, SweepPair
 from coec.calibration.ports import Neighbourhood, NeighbourSearch
 from coec.calibration.types import Matrix4, Reason
 from coec.geometry import se3
@@ -31,6 +30,8 @@ REACHES_M = (2.0, 1.0, 0.6, 0.4, 0.3)
 repeated until the pose rests."""
 STEPS = 30
 """At most; most rest after ten."""
+HOPELESS = 0.5
+"""Share of the least that has to be in common, below which further steps bring nothing together."""
 RESTS_RAD, RESTS_M = 1e-5, 1e-4
 """A step shorter than this is none: a thousandth of a degree and a tenth of a millimetre are far below what chance
 does."""
@@ -48,13 +49,13 @@ THICKEST_M = 0.04
 NARROWEST, NARROWEST_M = 0.15, 0.04
 """A surface is a strip, of one ring, where the narrower of its two extents is less than this share of the wider one,
 or no wider than it is thick."""
-PRIOR = np.array([radians(10.0)] * 3 + [1.0] * 3 + [0.03] * 2)
-"""Standard deviations of what is known before: mounts are built to that, at the worst; ranges by data sheets."""
+PRIOR = np.concatenate([KNOWN_BEFORE, [0.03] * 2])
+"""Standard deviations of what is known before, of the mount and of ranges, which have data sheets (m)."""
 NOISE_M = 0.02
 """Of a residual, against which the priors are weighed; what the covariance claims is taken from the residuals
 themselves."""
-LEAST_POINTS, LEAST_SHARE = 500, 0.05
-"""Fewer do not make an edge: fields of view that hardly overlap."""
+LEAST_POINTS = 500
+"""Fewer, and less than `LEAST_SHARE` of those that were tried, do not make an edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +98,7 @@ def register(rig: LidarRig, pairs: Sequence[SweepPair], search: NeighbourSearch)
         step = _step(met, weight, known)
         T_a_b, bias = se3.perturb(T_a_b, step[:6]), bias + step[6:]
         rests = float(np.abs(step[:3]).max()) < RESTS_RAD and float(np.abs(step[3:]).max()) < RESTS_M
-        if rests and number >= len(REACHES_M):
+        if number >= len(REACHES_M) and (rests or len(met.residual) < HOPELESS * LEAST_SHARE * met.tried):
             break
     met = _meet(indexed, T_a_b, bias, REACHES_M[-1])
     weight = _weights(met.residual, max(SCALE_SHARE * REACHES_M[-1], LEAST_SCALE_M))

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import sensor_twist
+from coec.calibration.frames.sweep_times import azimuth_offsets_s
 from coec.calibration.lidar_to_lidar.types import LidarRig, SweepPair
-from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, SweepTiming
 from coec.geometry import se3
 from coec.geometry.deskew import deskew
 from coec.geometry.vectors import lengths
@@ -56,16 +57,18 @@ class Cloud:
 def clouds_of(rig: LidarRig, pair: SweepPair) -> Cloud:
     """Motion-compensated by the time of each point; a sweep without such times, or without ego-motion, as it is."""
     a, b = pair.a, pair.b
-    a_m = _at(np.ascontiguousarray(a.xyz_m), _offsets_s(a), pair.motion, rig.T_a_ego)
+    a_m = _at(np.ascontiguousarray(a.xyz_m), _offsets_s(a, rig.sweep_a), pair.motion, rig.T_a_ego)
     range_m = lengths(b.xyz_m)
     used = np.flatnonzero((range_m > NEAREST_M) & (range_m < FURTHEST_M))
     chosen = used[_first_of_each_cube(b.xyz_m[used])]
-    after_s = _offsets_s(b)[chosen] + (b.stamp_ns - a.stamp_ns) * 1e-9
+    after_s = _offsets_s(b, rig.sweep_b)[chosen] + (b.stamp_ns - a.stamp_ns) * 1e-9
     return Cloud(a_m, np.ascontiguousarray(b.xyz_m[chosen]), after_s, pair.motion, rig.T_a_ego)
 
 
-def _offsets_s(sweep: LidarFrame) -> Doubles:
-    return np.zeros(len(sweep.xyz_m)) if sweep.time_offset_s is None else sweep.time_offset_s.astype(np.float64)
+def _offsets_s(sweep: LidarFrame, timing: SweepTiming | None) -> Doubles:
+    if sweep.time_offset_s is not None:
+        return sweep.time_offset_s.astype(np.float64)
+    return np.zeros(len(sweep.xyz_m)) if timing is None else azimuth_offsets_s(sweep.xyz_m, timing)
 
 
 def _at(xyz_m: NDArray[np.float32], after_s: Doubles, motion: EgoMotion | None, T_lidar_ego: Matrix4) -> Doubles:

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, SweepTiming
+
+KNOWN_BEFORE = np.array([radians(10.0)] * 3 + [1.0] * 3)
+"""(6,) standard deviation of what is known of a mount before any look (rad, m): they are built to that at the worst."""
+
+LEAST_SHARE = 0.05
+"""Of the points of b, that must meet a surface of a: with fewer the fields of view hardly overlap."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,12 +25,15 @@ class LidarRig:
         a, b: names; b is brought to a. The denser one should be a: its points make the surfaces.
         T_a_b_nominal: (4, 4) maps coordinates of b to those of a.
         T_a_ego: (4, 4) maps ego coordinates to those of a; carries ego-motion to both.
+        sweep_a, sweep_b: how points are timed that do not tell it themselves; None where nothing does.
     """
 
     a: str
     b: str
     T_a_b_nominal: Matrix4
     T_a_ego: Matrix4
+    sweep_a: SweepTiming | None = None
+    sweep_b: SweepTiming | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -130,19 +130,29 @@ class RigGraph:
         first of any part that no edge joins to it."""
         found: dict[str, Matrix4] = {}
         for sensor in self.sensors:
-            if sensor.name in found:
-                continue
-            found[sensor.name] = np.eye(4)
-            reached = [sensor.name]
-            for name in reached:  # grows as it goes: breadth first
-                for known in self.known:
-                    if known.b == name and known.a not in found:
-                        found[known.a] = np.asarray(known.T_a_b @ found[name])
-                        reached.append(known.a)
-                    elif known.a == name and known.b not in found:
-                        found[known.b] = np.asarray(se3.inverse(known.T_a_b) @ found[name])
-                        reached.append(known.b)
+            if sensor.name not in found:
+                found |= self.joined_to(sensor.name)
         return tuple(found[sensor.name] for sensor in self.sensors)
+
+    @cached_property
+    def of_lidars(self) -> frozenset[str]:
+        """Names of the edges between two LiDARs, which no pair serves."""
+        kinds = {sensor.name: sensor.kind for sensor in self.sensors}
+        return frozenset(edge.name for edge in self.edges if kinds[edge.a] is kinds[edge.b] is Kind.LIDAR)
+
+    def joined_to(self, origin: str) -> Mapping[str, Matrix4]:
+        """T_sensor_origin (4, 4) as the vehicle was built, by name, of each sensor that edges or links join to one."""
+        found: dict[str, Matrix4] = {origin: np.eye(4)}
+        reached = [origin]
+        for name in reached:  # grows as it goes: breadth first
+            for known in self.known:
+                if known.b == name and known.a not in found:
+                    found[known.a] = np.asarray(known.T_a_b @ found[name])
+                    reached.append(known.a)
+                elif known.a == name and known.b not in found:
+                    found[known.b] = np.asarray(se3.inverse(known.T_a_b) @ found[name])
+                    reached.append(known.b)
+        return found
 
     def loop_through(self, closing: str, among: Sequence[str]) -> tuple[str, ...] | None:
         """The shortest loop through the edge or link `closing` along those of the names `among`: their names, from that

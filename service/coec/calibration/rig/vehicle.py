@@ -7,7 +7,7 @@ once. It is over when they all serve what they were told or found since: their l
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from coec.calibration.rig.attribution import NS_PER_S, RigState, SensorHealth, S
 from coec.calibration.rig.evidence import Look, of_window
 from coec.calibration.rig.joint import JointEstimate, estimate
 from coec.calibration.rig.moves import Moved
+from coec.calibration.rig.steps import MOST_LOOKS
 from coec.calibration.rig.types import RigGraph
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
@@ -171,8 +172,7 @@ def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) ->
     Raises:
         ValueError: it is of no edge of the rig, or its pose or covariance are none.
     """
-    event = rig.event
-    if event is not None and window.start_ns < event.stepped_ns and edge in pairs_of(rig.graph, event.sensors):
+    if _from_before_a_move(rig, edge, window):
         return rig
     rig = _combined(replace(rig, windows={**rig.windows, edge: window}))
     look = of_window(edge, window.measurement)
@@ -181,6 +181,28 @@ def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) ->
         look = replace(look, stamp_ns=window.start_ns)
         rig = _noted(replace(rig, believed=attribution.after_window(rig.believed, rig.graph, look)), stamp_ns)
     return _followed(rig, stamp_ns)
+
+
+def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
+    """Two LiDARs were registered: one look, of which both who moved and the joint estimate hear. No pair serves where
+    the one sits in the other: it is where that was found.
+
+    Raises:
+        ValueError: as `after_look` and `after_window`.
+    """
+    measured = window.measurement
+    found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns)
+    rig = replace(rig, serves={**rig.serves, look.edge: found})
+    rig = after_look(rig, look)
+    if _from_before_a_move(rig, look.edge, window):
+        return rig
+    return _followed(_combined(replace(rig, windows={**rig.windows, look.edge: window})), look.stamp_ns)
+
+
+def _from_before_a_move(rig: VehicleRig, edge: str, window: Windowed) -> bool:
+    """Whether it began before its sensors moved."""
+    event = rig.event
+    return event is not None and window.start_ns < event.stepped_ns and edge in pairs_of(rig.graph, event.sensors)
 
 
 def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> VehicleRig:
@@ -238,10 +260,11 @@ def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     if event is None:
         return _settled_unnamed(rig, stamp_ns)
     pairs = pairs_of(rig.graph, event.sensors)
-    alive = [name for name in pairs if _last_ns(rig, name) > stamp_ns - ALIVE_NS]
+    served = _served(rig, pairs)
+    alive = [name for name in served if _last_ns(rig, name) > stamp_ns - ALIVE_NS]
     fresh = [name for name in pairs if name in rig.windows]
     if not event.corrected:
-        if fresh and set(alive) <= set(fresh):
+        if _served(rig, fresh) and set(alive) <= set(fresh):
             return _followed(_corrected(rig, event, fresh, stamp_ns), stamp_ns)
     elif alive and all(_renewed(rig, name, event.stepped_ns) for name in alive):
         return _over(rig, pairs, stamp_ns)
@@ -251,13 +274,23 @@ def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
 
 
 def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
-    """Something moved, and nothing tells what: that is over when every pair that stepped serves what it found since."""
+    """Something moved, and nothing tells what: that is over when every pair that stepped serves what it found since;
+    or, if only edges between LiDARs did, when all that is kept of them is of after it."""
     if rig.believed.calm:
         return rig
     pairs = attribution.stepped(rig.believed)
-    if not pairs or not all(_renewed(rig, name, rig.believed.stepped_ns) for name in pairs):
-        return rig
-    return _over(rig, pairs, stamp_ns)
+    served, since_ns = _served(rig, pairs), rig.believed.stepped_ns
+    if served:
+        is_over = all(_renewed(rig, name, since_ns) for name in served)
+    else:
+        kept = [rig.believed.histories[name].looks for name in pairs]
+        is_over = all(len(looks) >= MOST_LOOKS and looks[0].stamp_ns >= since_ns for looks in kept)
+    return _over(rig, pairs, stamp_ns) if pairs and is_over else rig
+
+
+def _served(rig: VehicleRig, edges: Sequence[str]) -> list[str]:
+    """Of these edges those that a pair serves, which is what puts a move right."""
+    return [name for name in edges if name not in rig.graph.of_lidars]
 
 
 def _renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
@@ -273,8 +306,11 @@ def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -
     joint = rig.joint
     if joint is None or not (joint.consistent or joint.left_out is not None):
         return rig
-    told = {name: _told(joint, name, rig.windows[name].measurement) for name in fresh if name in joint.measured}
-    if len(told) < 2:
+    measured = [name for name in fresh if name in joint.measured]
+    told = {
+        name: _told(joint, name, rig.windows[name].measurement) for name in measured if name not in rig.graph.of_lidars
+    }
+    if len(measured) < 2 or not told:
         return rig
     return replace(rig, correction=Correction(stamp_ns, event.sensors, told))
 

@@ -21,6 +21,7 @@ from coec.geometry import se3
 from coec.runtime.api.health import reasons_of
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.rig.keeper import ONE_PAIR, RigKnown
+from coec.runtime.rig.lidar_side import LidarsKnown
 from coec.schemas import rig_state
 from coec.schemas.keys import Format, Keys
 from coec.schemas.replies import Maybe6x6, Vector6
@@ -50,6 +51,7 @@ class RigAnswers:
             None if joint is None else (joint.stamp_ns, joint.consistent),
             self.reply.correction,
             None if self.reply.move is None else (self.reply.move.since_ns, self.reply.move.over_ns),
+            tuple((lidars.name, lidars.state) for lidars in self.reply.lidars),
             self.reply.reasons,
         )
         if essence != self._essence:
@@ -78,6 +80,7 @@ def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
             disturbed={},
             joint=None,
             correction=None,
+            lidars=tuple(_lidars(one) for one in known.lidars),
             reasons=reasons_of(known.why),
             looks={},
             losses=dict(known.losses),
@@ -96,6 +99,7 @@ def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
             stamp_ns=last.stamp_ns, from_ns=known.from_ns, sensors=last.sensors, pairs=tuple(last.pairs)
         ),
         move=None if rig.move is None else _move(rig.move),
+        lidars=tuple(_lidars(one) for one in known.lidars),
         reasons=reasons_of(known.why),
         looks=dict(rig.looks),
         losses=dict(known.losses),
@@ -137,7 +141,7 @@ def _untold(graph: RigGraph, why: tuple[Reason, ...]) -> tuple[rig_state.SensorR
             probability=None,
             since_ns=None,
             moved=None,
-            pairs=pairs_of(graph, (sensor.name,)),
+            pairs=_pairs(graph, sensor.name),
             reasons=reasons_of(why),
         )
         for sensor in graph.sensors
@@ -154,7 +158,7 @@ def _sensor(rig: VehicleRig, sensor: SensorState) -> rig_state.SensorReply:
         probability=None if unknown else _share(sensor.probability),
         since_ns=rig.since_ns.get(sensor.name),
         moved=None if moved is None else _moved(moved),
-        pairs=pairs_of(rig.graph, (sensor.name,)),
+        pairs=_pairs(rig.graph, sensor.name),
         reasons=reasons_of(sensor.reasons),
     )
 
@@ -174,9 +178,38 @@ def _moved(moved: Moved) -> rig_state.SensorMove:
     return rig_state.SensorMove(by=_degrees(moved.x), sigma=_degrees(np.sqrt(moved.covariance.diagonal())))
 
 
+def _pairs(graph: RigGraph, sensor: str) -> tuple[str, ...]:
+    """Of a sensor: those that serve something."""
+    return tuple(name for name in pairs_of(graph, (sensor,)) if name not in graph.of_lidars)
+
+
+def _lidars(known: LidarsKnown) -> rig_state.LidarsReply:
+    told, edge = known.told, known.edge
+    pose = None if told is None else told.window.measurement.T_camera_lidar
+    bias = None if told is None else told.range_bias
+    return rig_state.LidarsReply(
+        name=edge.name,
+        a=edge.a,
+        b=edge.b,
+        state=known.state.value,
+        reasons=reasons_of(known.reasons),
+        stamp_ns=known.stamp_ns,
+        measured_ns=None if told is None else told.look.stamp_ns,
+        a_from_b=None if pose is None else transform_of(pose),
+        sigma=None if told is None else _degrees(told.window.measurement.uncertainty.sigma),
+        correction=None if pose is None else _degrees(se3.difference(pose, edge.T_a_b)),
+        range_bias_m=None if bias is None else bias.longer_m,
+        range_bias_sigma_m=None if bias is None else bias.sigma_m,
+        rms_m=None if told is None or not isfinite(told.rms_m) else told.rms_m,
+        share=None if told is None else _share(told.share),
+        looks=known.looks,
+        losses=dict(known.losses),
+    )
+
+
 def _joint(rig: VehicleRig, joint: JointEstimate) -> rig_state.JointReply:
     pairs = []
-    for edge in rig.graph.edges:
+    for edge in (edge for edge in rig.graph.edges if edge.name not in rig.graph.of_lidars):
         pose, covariance = joint.T_a_b[edge.name], joint.between(edge.name, edge.name)
         pairs.append(
             rig_state.JointPair(

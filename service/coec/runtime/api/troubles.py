@@ -43,6 +43,10 @@ TROUBLES: Mapping[str, Trouble] = {
         "Said of `rig`: its pairs are not put together, as the vehicle has more sensors than that is made for.",
         "Nothing: every pair is calibrated by itself. Leave pairs out that are of no use, to have the others together.",
     ),
+    "lidars_not_installed": Trouble(
+        "There are several LiDARs, and what measures where they sit to one another is not installed.",
+        "Install the extra `lidars`, or set `lidar_edges.period_s: 0`; all else goes on without it.",
+    ),
     "rig_state_damaged": Trouble(
         "Said of `rig`: what was known of it before the restart cannot be read; it is kept aside and learnt anew.",
         "See to the disk of `state.directory`. A sensor that was knocked meanwhile is told by its pairs only.",

@@ -67,6 +67,11 @@ class Budget:
             phase = self._turns.join(pair, monitor.period_s, window.slice_s)
         return window.slice_s - phase * max(window.slice_s - monitor.urgent_slice_s, 0.0)
 
+    def join_looks(self, name: str, period_s: float) -> None:
+        """Something joins that wants a look in each period, and no windows."""
+        with self._lock:
+            self._turns.join(name, period_s, period_s)
+
     def affords(self, pair: str, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether a check of a pair, whose stream has come to this stamp, may begin; `ended` has to follow then."""
         with self._lock:
@@ -84,7 +89,7 @@ class Budget:
         with self._lock:
             self._spending.add(cost.kind, cost.pair, cost.cpu_s, now_s)
             match cost.kind:
-                case jobs.Kind.CHECK:
+                case jobs.Kind.CHECK | jobs.Kind.REGISTER:
                     self._looked_s[cost.pair] = now_s
                     self._turns.looked(cost.pair, cost.cpu_s)
                 case jobs.Kind.SOLVE:

@@ -37,14 +37,14 @@ IDLE_S = 0.25
 
 
 class Takes(Protocol):
-    """A pair, as far as it takes part; see `pair_stream`."""
+    """A pair, as far as it takes part, see `pair_stream`; or two LiDARs."""
 
     @property
     def sensors(self) -> Mapping[str, SensorStream]:
-        """Its streams, by kind."""
+        """Its streams, by the names that they have here."""
 
-    def push(self, frame: Frame) -> None:
-        """The next frame of one of its streams."""
+    def taker(self, name: str) -> Callable[[Frame], None]:
+        """Who takes the frames of one of its streams."""
 
     def may_choose(self) -> bool:
         """Whether a pair has come that may be looked at now."""
@@ -91,7 +91,18 @@ class Intake:
 
     def sensors_of(self, pair: PairConfig) -> dict[str, SensorStream]:
         """The streams of a pair by kind: those that other pairs have, too, and new ones."""
-        return {kind: self._sensor(kind, stream) for kind, stream in pair.streams.items()}
+        return {kind: self.sensor(kind, stream) for kind, stream in pair.streams.items()}
+
+    def sensor(self, kind: str, stream: KnownStreamConfig) -> SensorStream:
+        """A stream of this kind: the one that others have, too, or a new one."""
+        alike = read_alike(kind, stream)
+        if alike not in self._sensors:
+            sensor = SensorStream(kind, f"{kind}-{len(self._sensors)}", stream, self._limits)
+            self._by_number[sensor.number] = sensor
+            self.inbox.open(sensor.number, sensor.depth)
+            self._unheard.append(sensor)
+            self._sensors[alike] = sensor
+        return self._sensors[alike]
 
     def join(self, pair: Takes) -> None:
         """A pair takes part from now on."""
@@ -102,16 +113,6 @@ class Intake:
         unheard, self._unheard = self._unheard, []
         for sensor in unheard:
             subscribe(sensor.config, self.inbox.receiver(sensor.number))
-
-    def _sensor(self, kind: str, stream: KnownStreamConfig) -> SensorStream:
-        alike = read_alike(kind, stream)
-        if alike not in self._sensors:
-            sensor = SensorStream(kind, f"{kind}-{len(self._sensors)}", stream, self._limits)
-            self._by_number[sensor.number] = sensor
-            self.inbox.open(sensor.number, sensor.depth)
-            self._unheard.append(sensor)
-            self._sensors[alike] = sensor
-        return self._sensors[alike]
 
     # --- on any -----------------------------------------------------------------------------------------------------
 
@@ -127,8 +128,8 @@ class Intake:
 
     def _join(self, pair: Takes) -> None:
         self._pairs.append(pair)
-        for sensor in pair.sensors.values():
-            sensor.takers = (*sensor.takers, pair.push)
+        for name, sensor in pair.sensors.items():
+            sensor.takers = (*sensor.takers, pair.taker(name))
 
     def turn(self, idle_s: float) -> bool:
         """Take what came first, and look at a pair of each that has one; whether anything came within `idle_s`."""

@@ -137,6 +137,11 @@ class PairStream:
         while self._held:
             self._choose()
 
+    def taker(self, name: str) -> Callable[[Frame], None]:
+        """Who takes the frames of one of its streams: they tell themselves which."""
+        del name
+        return self.push
+
     def push(self, frame: Frame) -> None:
         """The next frame of one of its streams came."""
         self._quiet_ticks = 0

@@ -12,8 +12,11 @@ from coec.calibration.types import Matrix4
 from coec.config import LinkConfig, PairConfig
 
 
-def graph_of(pairs: Mapping[str, tuple[PairConfig, Matrix4]], links: Sequence[LinkConfig]) -> RigGraph:
-    """Of pairs by name, each with its nominal calibration (4, 4). Links of sensors that are not there yet are left out.
+def graph_of(
+    pairs: Mapping[str, tuple[PairConfig, Matrix4]], links: Sequence[LinkConfig], of_lidars: Sequence[Edge] = ()
+) -> RigGraph:
+    """Of pairs by name, each with its nominal calibration (4, 4), and edges between their LiDARs. Edges and links of
+    sensors that are not there yet are left out.
 
     Raises:
         ValueError: more sensors than a rig may have.
@@ -24,6 +27,7 @@ def graph_of(pairs: Mapping[str, tuple[PairConfig, Matrix4]], links: Sequence[Li
         camera, lidar = sensors_of(pair)
         sensors |= {camera: Sensor(camera, Kind.CAMERA), lidar: Sensor(lidar, Kind.LIDAR)}
         edges.append(Edge(name, camera, lidar, T_camera_lidar))
+    edges += [edge for edge in of_lidars if {edge.a, edge.b} <= set(sensors)]
     rigid = [_link(link) for link in links]
     return RigGraph.of(list(sensors.values()), edges, [link for link in rigid if {link.a, link.b} <= set(sensors)])
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from coec.adapters.files.scribe import Scribe
 from coec.adapters.system.threads import ServiceThread
+from coec.calibration.lidar_to_lidar.types import KNOWN_BEFORE
 from coec.calibration.lifecycle import PairState
 from coec.calibration.rig import vehicle
 from coec.calibration.rig.evidence import Look
@@ -28,6 +29,7 @@ from coec.runtime.ingest.sensor_clock import NS_PER_S
 from coec.runtime.recording.window_store import start_ns_of
 from coec.runtime.rig import order
 from coec.runtime.rig.graph import graph_of
+from coec.runtime.rig.lidar_side import LidarsKnown, LidarsSaid
 from coec.runtime.rig.pair_side import Correction, PairOfRig, Said, served_by
 from coec.runtime.rig.rig_file import RigFile
 
@@ -61,6 +63,7 @@ class RigKnown:
         rig: None while there is no rig to speak of; `why` not, then.
         stamp_ns: all that counts up to this sensor time is in it; None before any.
         correction: the latest, and from when it counts.
+        lidars: every two of them.
         losses: by cause.
     """
 
@@ -69,6 +72,7 @@ class RigKnown:
     why: tuple[Reason, ...] = ()
     stamp_ns: int | None = None
     from_ns: int | None = None
+    lidars: tuple[LidarsKnown, ...] = ()
     losses: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -84,12 +88,11 @@ class _Joined:
     nominal: Matrix4
     serves: Served
     window: Windowed | None
-    has_all_answers: Callable[[], bool]
 
 
 class RigKeeper:
-    """Of one vehicle. `put`, `at`, `step_back`, `corrections` and `join` are for any thread; everything else belongs to
-    `thread`."""
+    """Of one vehicle. `put`, `at`, `step_back`, `corrections`, `join` and `join_lidars` are for any thread; everything
+    else belongs to `thread`."""
 
     def __init__(self, folder: Path, links: Sequence[LinkConfig], scribe: Scribe) -> None:
         """`listen` is to be called before anything is told."""
@@ -98,9 +101,11 @@ class RigKeeper:
         self._scribe = scribe
         self._file = RigFile(folder)
         self._condition = threading.Condition()
-        self._order: order.Order[Said | _Joined | _SteppedBack] = order.Order()
+        self._order: order.Order[Said | LidarsSaid | LidarsKnown | _Joined | _SteppedBack] = order.Order()
         self._corrections: dict[str, deque[Correction]] = {}
         self._pairs: dict[str, _Joined] = {}
+        self._lidars: dict[str, LidarsKnown] = {}
+        self._have_all_answers: list[Callable[[], bool]] = []
         self._count = 0
         self._quiet_ticks = 0
         self._rig: VehicleRig | None = None
@@ -128,14 +133,23 @@ class RigKeeper:
         accepted = state.accepted
         window = None if accepted is None else Windowed(Measurement.of(accepted), start_ns_of(accepted.window_id))
         serves = served_by(state, prior_sigma(pair.tracker))
-        joined = _Joined(pair, nominal, serves, window, has_all_answers)
+        joined = _Joined(pair, nominal, serves, window)
         with self._condition:
             self._count += 1
+            self._have_all_answers.append(has_all_answers)
             self._order.put(pair.name, None, joined)
             self._condition.notify_all()
         return PairOfRig(pair, self)
 
-    def put(self, pair: str, due_ns: int | None, said: Said) -> None:
+    def join_lidars(self, known: LidarsKnown, has_all_answers: Callable[[], bool]) -> None:
+        """Two LiDARs of pairs that have joined are looked at, or are not and that is to be told. Of them is spoken by
+        the name of their edge; it is of the rig once a look has told where it is."""
+        with self._condition:
+            self._have_all_answers.append(has_all_answers)
+            self._order.put(known.edge.name, None, known)
+            self._condition.notify_all()
+
+    def put(self, pair: str, due_ns: int | None, said: Said | LidarsSaid) -> None:
         """See `pair_side.Keeps`."""
         with self._condition:
             if self._count < 2:
@@ -203,7 +217,8 @@ class RigKeeper:
             if not self._order.is_ready and timeout_s > 0.0 and not self._condition.wait(timeout_s):
                 self._quiet_ticks += 1
             quiet = self._quiet_ticks >= QUIET_TICKS
-        return self._take_one(silent=quiet and all(pair.has_all_answers() for pair in self._pairs.values()))
+            have_all_answers = list(self._have_all_answers)
+        return self._take_one(silent=quiet and all(has() for has in have_all_answers))
 
     def _take_one(self, *, silent: bool) -> bool:
         with self._condition:
@@ -224,10 +239,14 @@ class RigKeeper:
         self._tell_now()
         return True
 
-    def _after(self, pair: str, due_ns: int, what: Said | _Joined | _SteppedBack) -> None:
+    def _after(self, pair: str, due_ns: int, what: Said | LidarsSaid | LidarsKnown | _Joined | _SteppedBack) -> None:
         if isinstance(what, _Joined):
             self._pairs[pair] = what
             self._grow()
+        elif isinstance(what, LidarsKnown):
+            self._lidars[pair] = what
+        elif isinstance(what, LidarsSaid):
+            self._after_lidars(pair, what)
         elif self._rig is None:
             self._meanwhile(pair, what)
         elif isinstance(what, _SteppedBack):
@@ -239,6 +258,15 @@ class RigKeeper:
         else:
             self._rig = vehicle.after_served(self._rig, pair, what, due_ns)
 
+    def _after_lidars(self, name: str, said: LidarsSaid) -> None:
+        self._lidars[name] = self._lidars[name].after(said)
+        if said.told is None or self._rig is None:
+            return
+        if name not in self._rig.graph.edge:
+            self._grow()
+        if self._rig is not None and name in self._rig.graph.edge:
+            self._rig = vehicle.after_lidars(self._rig, said.told.look, said.told.window)
+
     def _meanwhile(self, pair: str, what: Said | _SteppedBack) -> None:
         """There is no rig yet: what a pair comes to until there is one."""
         if isinstance(what, Served):
@@ -247,10 +275,11 @@ class RigKeeper:
             self._pairs[pair] = replace(self._pairs[pair], window=what)
 
     def _grow(self) -> None:
-        """There is one more pair."""
+        """There is one more pair, or edge between two LiDARs."""
+        measured = [known.edge for known in self._lidars.values() if known.looks]
         try:
             told = {name: (joined.config, joined.nominal) for name, joined in self._pairs.items()}
-            self._graph = graph_of(told, self._links)
+            self._graph = graph_of(told, self._links, measured)
         except ValueError as error:
             self._rig, self._why = None, (Reason("no_rig", f"The pairs are not put together: {error}."),)
             return
@@ -259,6 +288,8 @@ class RigKeeper:
             return
         self._why = self._file.damage
         serves = {name: joined.serves for name, joined in self._pairs.items()}
+        # As built; it is no pose that the first look, which is one of many, were to replace.
+        serves |= {edge.name: Served(edge.T_a_b, KNOWN_BEFORE, order.NEVER_NS) for edge in measured}
         windows = {name: joined.window for name, joined in self._pairs.items() if joined.window is not None}
         fresh = self._file.recalled(vehicle.begun(self._graph, serves, windows))
         self._rig = fresh if self._rig is None else vehicle.grown(self._rig, fresh)
@@ -286,7 +317,8 @@ class RigKeeper:
             stamp_ns = self._order.taken_ns
             losses = {**self._losses, **self._order.losses}
         known = stamp_ns if stamp_ns > order.NEVER_NS // 2 else None
-        self._tell(RigKnown(self._graph, self._rig, self._why, known, self._from_ns, losses))
+        lidars = tuple(self._lidars[name] for name in sorted(self._lidars))
+        self._tell(RigKnown(self._graph, self._rig, self._why, known, self._from_ns, lidars, losses))
 
     def _save_in_time(self, before: VehicleRig | None, stamp_ns: int) -> None:
         rig = self._rig

@@ -28,8 +28,8 @@ from coec.schemas.replies import Row4
 
 FILE = "sensors.json"
 
-MOST_PAIRS = 64
-"""In a file that is looked at: twice as many as a vehicle may have."""
+MOST_PAIRS = 128
+"""In a file that is looked at: twice as many as a vehicle may have, and as many edges between its LiDARs."""
 
 Rows = tuple[Row4, Row4, Row4, Row4]
 Sigma = Annotated[float, Field(gt=0, lt=MOST_SIGMA)]

@@ -18,7 +18,18 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from coec.calibration.types import Reason
 from coec.errors import DecodeError
-from coec.runtime.worker.jobs import ANSWERS, Answer, Checked, Commissioned, Drawn, Kind, Solved, WrittenFile
+from coec.geometry import se3
+from coec.runtime.worker.jobs import (
+    ANSWERS,
+    Answer,
+    Checked,
+    Commissioned,
+    Drawn,
+    Kind,
+    Registered,
+    Solved,
+    WrittenFile,
+)
 from coec.schemas.base import from_msgpack, to_msgpack
 
 ARRAY = 1
@@ -96,7 +107,7 @@ def _solved(wire: _SolvedOnTheWire) -> Solved:
 def _reader() -> TypeAdapter[Any]:
     """Reads a map into the dataclass that has just its fields. Made at the first answer, as only the service reads."""
     settings = ConfigDict(arbitrary_types_allowed=True, extra="forbid")
-    return TypeAdapter(_SolvedOnTheWire | Checked | Drawn | Commissioned | Reason, config=settings)
+    return TypeAdapter(_SolvedOnTheWire | Checked | Drawn | Commissioned | Registered | Reason, config=settings)
 
 
 def _read(form: type, value: Any) -> Any:
@@ -118,6 +129,11 @@ def _read(form: type, value: Any) -> Any:
 def _check_shapes(read: object) -> None:
     if isinstance(read, Commissioned) and not (read.pose.shape == (4, 4) and np.isfinite(read.pose).all()):
         raise MalformedAnswerError("its pose is not 4×4 finite numbers")
+    if isinstance(read, Registered):
+        if not se3.is_rigid(read.T_a_b):
+            raise MalformedAnswerError("its pose is no rigid transform")
+        if read.covariance.shape != (6, 6) or not np.isfinite(read.covariance).all():
+            raise MalformedAnswerError("its covariance is not 6×6 finite numbers")
     if isinstance(read, Checked):
         parts = (read.observation, read.observation.drift)
         values = (getattr(part, field.name) for part in parts if part is not None for field in fields(part))

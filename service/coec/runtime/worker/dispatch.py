@@ -52,6 +52,8 @@ def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
             case Kind.COMMISSION:
                 paths = [Path(path) for path in message["paths"]]
                 return solver.commission(_configuration(message), message["pose"], paths)
+            case Kind.REGISTER:
+                return solver.register(message["lidars"], message["frames"])
             case jobs.PREFETCH:
                 solver.prefetch(message["pair"], message["frame"])
                 return None

@@ -13,10 +13,14 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.lidar_to_lidar.types import LidarRig, RangeBias, SweepPair
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.types import FramePair, Matrix4, Reason
 from coec.config import CalibrationConfig
-from coec.runtime.worker.messages import pack_pairs, pack_pose
+from coec.runtime.worker.messages import pack_lidars, pack_pairs, pack_pose, pack_sweeps
 
 if TYPE_CHECKING:
     from coec.schemas.replies import CalibrationResult
@@ -30,6 +34,7 @@ class Kind(StrEnum):
     OVERLAY = "overlay"
     PICTURE = "picture"
     COMMISSION = "commission"
+    REGISTER = "register"
 
 
 PREFETCH = "prefetch"
@@ -51,11 +56,12 @@ DEADLINE_S = {
     Kind.OVERLAY: 60.0,
     Kind.PICTURE: 60.0,
     Kind.COMMISSION: 1800.0,
+    Kind.REGISTER: 180.0,
 }
 """From asking to the last moment of an answer, s. A live window: the two attempts of 120 s that `worker` allows by
 default, behind another window that has them, and two minutes for new processes. A check: the first start of a
-worker, which compiles its kernels for a minute and a half on two busy cores, twice over. A picture: six solves of 10 s.
-A commissioning: twice `COMMISSIONING_TIMEOUT_S`."""
+worker, which compiles its kernels for a minute and a half on two busy cores, twice over. The registration of
+two LiDARs, the same. A picture: six solves of 10 s. A commissioning: twice `COMMISSIONING_TIMEOUT_S`."""
 
 BACKLOG_DEADLINE_S = 86_400.0
 """Of a window of an earlier run: it waits behind everything else, and is asked for again after the next start."""
@@ -110,7 +116,21 @@ class Commissioned:
     pairs: int
 
 
-Answer = Solved | Checked | Drawn | Commissioned
+@dataclass(frozen=True, slots=True, eq=False)
+class Registered:
+    """Two LiDARs a and b were registered; what is told is that of `LidarEdge`."""
+
+    T_a_b: Matrix4
+    covariance: NDArray[np.float64]
+    range_bias: RangeBias
+    rms_m: float
+    points: int
+    share: float
+    pairs: int
+    reasons: tuple[Reason, ...]
+
+
+Answer = Solved | Checked | Drawn | Commissioned | Registered
 
 ANSWERS: dict[Kind, type[Answer]] = {
     Kind.SOLVE: Solved,
@@ -118,6 +138,7 @@ ANSWERS: dict[Kind, type[Answer]] = {
     Kind.OVERLAY: Drawn,
     Kind.PICTURE: Drawn,
     Kind.COMMISSION: Commissioned,
+    Kind.REGISTER: Registered,
 }
 """What each kind is answered with."""
 
@@ -227,6 +248,12 @@ def commission(pair: str, configuration: CalibrationConfig, pose: Matrix4, paths
     """Learn the rig's baseline at an extrinsic (4, 4) from windows' files; answered with `Commissioned`."""
     body = {"configuration": _packed(configuration), "pose": pack_pose(pose), "paths": [str(path) for path in paths]}
     return Job(Kind.COMMISSION, pair, "commissioning", body, done, timeout_s=COMMISSIONING_TIMEOUT_S)
+
+
+def register(edge: str, rig: LidarRig, pairs: Sequence[SweepPair], done: Done) -> Job:
+    """Find where one LiDAR sits in another from pairs of their sweeps; answered with `Registered`."""
+    body = {"lidars": pack_lidars(rig), "frames": pack_sweeps(pairs)}
+    return Job(Kind.REGISTER, edge, "lidars", body, done)
 
 
 def _packed(configuration: CalibrationConfig) -> dict[str, Any]:

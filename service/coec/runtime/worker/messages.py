@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import overload
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Generic, TypeVar, overload
+
+import numpy as np
 
 from coec.adapters.frames.msgpack_frames import (
     decode_camera,
@@ -13,19 +15,36 @@ from coec.adapters.frames.msgpack_frames import (
     encode_ego,
     encode_lidar,
 )
-from coec.calibration.types import FramePair, Matrix4
+from coec.calibration.lidar_to_lidar.types import LidarRig, SweepPair
+from coec.calibration.types import FramePair, Matrix4, SweepTiming
 from coec.config import LimitsConfig
+
+T = TypeVar("T")
 
 
 def pack_pairs(pairs: Sequence[FramePair]) -> Sequence[list[bytes | None]]:
     """Camera, LiDAR and ego-motion frame of each pair, native msgpack, packed anew whenever an entry is asked for: the
     pairs of a check have 15 MB, and need not be in memory twice."""
-    return _PackedPairs(pairs)
+    return _Packed(pairs, _pair)
 
 
-class _PackedPairs(Sequence[list[bytes | None]]):
-    def __init__(self, pairs: Sequence[FramePair]) -> None:
+def pack_sweeps(pairs: Sequence[SweepPair]) -> Sequence[list[bytes | None]]:
+    """The same of sweeps of two LiDARs."""
+    return _Packed(pairs, _sweeps)
+
+
+def _pair(pair: FramePair) -> list[bytes | None]:
+    return [encode_camera(pair.camera), encode_lidar(pair.lidar), encode_ego(pair.motion) if pair.motion else None]
+
+
+def _sweeps(pair: SweepPair) -> list[bytes | None]:
+    return [encode_lidar(pair.a), encode_lidar(pair.b), encode_ego(pair.motion) if pair.motion else None]
+
+
+class _Packed(Sequence[list[bytes | None]], Generic[T]):
+    def __init__(self, pairs: Sequence[T], pack: Callable[[T], list[bytes | None]]) -> None:
         self._pairs = tuple(pairs)
+        self._pack = pack
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -33,13 +52,11 @@ class _PackedPairs(Sequence[list[bytes | None]]):
     @overload
     def __getitem__(self, index: int) -> list[bytes | None]: ...
     @overload
-    def __getitem__(self, index: slice) -> _PackedPairs: ...
-    def __getitem__(self, index: int | slice) -> list[bytes | None] | _PackedPairs:
+    def __getitem__(self, index: slice) -> _Packed[T]: ...
+    def __getitem__(self, index: int | slice) -> list[bytes | None] | _Packed[T]:
         if isinstance(index, slice):
-            return _PackedPairs(self._pairs[index])
-        pair = self._pairs[index]
-        motion = encode_ego(pair.motion) if pair.motion else None
-        return [encode_camera(pair.camera), encode_lidar(pair.lidar), motion]
+            return _Packed(self._pairs[index], self._pack)
+        return self._pack(self._pairs[index])
 
 
 def unpack_pairs(frames: Sequence[Sequence[bytes | None]], limits: LimitsConfig) -> tuple[FramePair, ...]:
@@ -56,6 +73,49 @@ def unpack_pairs(frames: Sequence[Sequence[bytes | None]], limits: LimitsConfig)
         )
         for camera, lidar, motion in frames
     )
+
+
+def unpack_sweeps(frames: Sequence[Sequence[bytes | None]], limits: LimitsConfig) -> tuple[SweepPair, ...]:
+    """The pairs that `pack_sweeps` packed.
+
+    Raises:
+        DecodeError: a frame cannot be decoded.
+    """
+    return tuple(
+        SweepPair(
+            decode_lidar(a or b"", limits),
+            decode_lidar(b or b"", limits),
+            decode_ego(motion, limits) if motion else None,
+        )
+        for a, b, motion in frames
+    )
+
+
+def pack_lidars(rig: LidarRig) -> dict[str, Any]:
+    """Two LiDARs as they were mounted."""
+    return {
+        "a": rig.a,
+        "b": rig.b,
+        "T_a_b": pack_pose(rig.T_a_b_nominal),
+        "T_a_ego": pack_pose(rig.T_a_ego),
+        "sweep_a": _packed_timing(rig.sweep_a),
+        "sweep_b": _packed_timing(rig.sweep_b),
+    }
+
+
+def unpack_lidars(packed: Mapping[str, Any]) -> LidarRig:
+    """What `pack_lidars` packed."""
+    return LidarRig(
+        packed["a"],
+        packed["b"],
+        np.array(packed["T_a_b"], dtype=np.float64),
+        np.array(packed["T_a_ego"], dtype=np.float64),
+        *(None if packed[name] is None else SweepTiming(*packed[name]) for name in ("sweep_a", "sweep_b")),
+    )
+
+
+def _packed_timing(timing: SweepTiming | None) -> list[float] | None:
+    return None if timing is None else [timing.period_s, timing.sign, timing.stamp_azimuth_rad]
 
 
 def pack_pose(T: Matrix4) -> list[list[float]]:

@@ -20,15 +20,17 @@ class Lane(Enum):
 
     CHECK = "check"
     LIVE = "live"
+    LIDARS = "lidars"
     ERRAND = "errand"
     BACKLOG = "backlog"
 
 
-WAITING = {Lane.CHECK: 4, Lane.LIVE: 2, Lane.ERRAND: 8, Lane.BACKLOG: 64}
-"""Jobs that may wait, per pair: checks and windows of this run (the service waits for answers before it asks more;
-these are for a worker that does not answer), pictures and commissionings, unsolved windows of earlier runs."""
+WAITING = {Lane.CHECK: 4, Lane.LIVE: 2, Lane.LIDARS: 2, Lane.ERRAND: 8, Lane.BACKLOG: 64}
+"""Jobs that may wait, per pair: checks, windows and registrations of LiDARs of this run (the service waits for answers
+before it asks more; these are for a worker that does not answer), pictures and commissionings, unsolved windows of
+earlier runs."""
 
-SUPERSEDING = frozenset({Lane.CHECK, Lane.LIVE})
+SUPERSEDING = frozenset({Lane.CHECK, Lane.LIVE, Lane.LIDARS})
 """Where the newest is worth most."""
 
 PREFETCHES_WAITING, PREFETCH_BYTES_WAITING = 8, 32 * 2**20
@@ -265,7 +267,8 @@ class JobQueue:
         windows_turn = live and (self._check_was_fatal or now_s - live[0].asked_s > WINDOW_WAITS_S)
         if checks and not windows_turn:
             return checks.popleft()
-        for waiting in (live, self._lanes[Lane.ERRAND], self._prefetches, self._lanes[Lane.BACKLOG]):
+        lidars, errands, backlog = (self._lanes[lane] for lane in (Lane.LIDARS, Lane.ERRAND, Lane.BACKLOG))
+        for waiting in (live, lidars, errands, self._prefetches, backlog):
             if waiting:
                 return waiting.popleft()
         return None
@@ -308,5 +311,7 @@ def _lane_of(job: Job) -> Lane:
             return Lane.CHECK
         case Kind.SOLVE:
             return Lane.LIVE if job.live else Lane.BACKLOG
+        case Kind.REGISTER:
+            return Lane.LIDARS
         case Kind.OVERLAY | Kind.PICTURE | Kind.COMMISSION:
             return Lane.ERRAND

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +16,13 @@ from coec.adapters.files.baseline_file import BASELINES, baseline_of, save_basel
 from coec.adapters.files.rig import rig_of
 from coec.adapters.frames.msgpack_frames import decode_camera
 from coec.adapters.images.codec import CachedGreys, GreyImages, decode_bgr, encode_jpeg
+from coec.adapters.registration.nearest import Trees, installed
 from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.baseline import Baseline, learned_hash, mismatch
 from coec.calibration.commissioning.learning import commission
 from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.lidar_to_lidar.registration import register
+from coec.calibration.lidar_to_lidar.types import LidarEdge, LidarRig, SweepPair
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose, observe
 from coec.calibration.ports import Silence
 from coec.calibration.types import (
@@ -40,8 +44,8 @@ from coec.geometry.cameras import scaled
 from coec.geometry.edges.alignment import EdgeFrames, alignment_of_parts
 from coec.geometry.projection import project
 from coec.reports.overlay import draw
-from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Solved, WrittenFile
-from coec.runtime.worker.messages import unpack_pairs
+from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Registered, Solved, WrittenFile
+from coec.runtime.worker.messages import unpack_lidars, unpack_pairs, unpack_sweeps
 
 _log = logging.getLogger(__name__)
 
@@ -104,6 +108,15 @@ class Solver:
                 diagnose(_invented_window(rig), _Ramp(), self._images, configuration, None)
             with contextlib.suppress(CalibrationError, DecodeError):
                 calibrate(_invented_window(rig), _Ramp(), self._images, configuration, Silence())
+        if self._config.lidar_edges.period_s > 0.0 and len({pair.lidar.place for pair in self._config.pairs}) > 1:
+            self._warm_up_lidars()
+
+    def _warm_up_lidars(self) -> None:
+        if not installed():
+            return
+        window = _invented_window(self._rigs[self._config.pairs[0].name])
+        pairs = [SweepPair(pair.lidar, pair.lidar, pair.motion) for pair in window.pairs[:1]]
+        register(LidarRig("a", "b", np.eye(4), np.eye(4)), pairs, Trees())
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infer the depth of a camera frame (native msgpack) that was chosen for an open window.
@@ -218,6 +231,15 @@ class Solver:
         saved = save_baseline(self._config.state.directory / BASELINES, baseline)
         return Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
 
+    def register(self, lidars: Mapping[str, Any], frames: Sequence[Sequence[bytes | None]]) -> Registered:
+        """Where one LiDAR sits in another, with both and pairs of their sweeps as `messages` packs them.
+
+        Raises:
+            SourceError: the optional extra is not installed.
+            DecodeError: a frame cannot be decoded.
+        """
+        return _registered(register(unpack_lidars(lidars), unpack_sweeps(frames, self._config.limits), Trees()))
+
     def _drawn(
         self,
         rig: Rig,
@@ -250,6 +272,19 @@ class Solver:
         if config not in self._networks:
             self._networks[config] = CachedDepth(open_depth(config, self._config.limits), self._depth_maps_kept)
         return self._networks[config]
+
+
+def _registered(edge: LidarEdge) -> Registered:
+    return Registered(
+        edge.T_a_b,
+        edge.covariance,
+        edge.range_bias,
+        edge.rms_m,
+        edge.points,
+        edge.share,
+        edge.pairs,
+        edge.reasons,
+    )
 
 
 class _Ramp:

@@ -1,0 +1,215 @@
+"""Which sweeps of two LiDARs make a look at where the one sits in the other: decided by sensor stamps alone.
+
+A look is of sweeps a few seconds apart, once in each period of sensor time, counted from its zero: a service that was
+restarted, and a replay at any rate, take the same ones. A sweep of a is taken with the one of b that is nearest to it,
+once later ones cannot be nearer. Sweeps are large, so only those are kept that may still be taken.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+
+from coec.calibration.frames.pairing import MOTION_LATE_NS, MOTION_SAMPLES, NS_PER_S, TimeLine, motion_at
+from coec.calibration.lidar_to_lidar.types import SweepPair
+from coec.calibration.types import EgoMotion, LidarFrame
+
+PAIRS = 2
+"""Pairs of sweeps of one look: on simulated streets one has too few points in common now and then, and five tell no
+more than two, as what the first two leave open the surroundings do not tell."""
+
+SPACING_NS = 2 * NS_PER_S
+"""Between them: some ten metres further other surfaces are in view, and hardly ever is a mount hit in between."""
+
+APART_NS = 60_000_000
+"""By which their stamps may differ: half a turn at 10 Hz, and a little."""
+
+LATEST_NS = 400_000_000
+"""After its instant a sweep of a is looked for: two turns at 5 Hz."""
+
+SWEEPS_HELD = 12
+"""Sweeps of b that may wait for those of a: those of the instants above at 20 Hz, and one more."""
+
+CANDIDATES_HELD = 2
+"""Sweeps of a that may wait for those of b."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Pairs of sweeps, in the order of their stamps."""
+
+    pairs: tuple[SweepPair, ...]
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of its first sweep."""
+        return min(self.pairs[0].a.stamp_ns, self.pairs[0].b.stamp_ns)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the last sweep of a."""
+        return self.pairs[-1].a.stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Missed:
+    """A sweep of a that was to be taken and was not: `no_sweep` of b is near it, `no_ego_motion` with a velocity is
+    known, the vehicle is `standing`, or points have no time (`no_point_time`)."""
+
+    stamp_ns: int
+    cause: str
+
+
+Found = list[Look | Missed]
+
+
+class SweepSampler:
+    """Of two LiDARs a and b. Holds at most `CANDIDATES_HELD` and `PAIRS` sweeps of a, and `SWEEPS_HELD` and `PAIRS` of
+    b.
+
+    Attributes:
+        losses: sweeps of a that were to be taken and were not, by cause; `incomplete`: whose look came to nothing.
+    """
+
+    def __init__(
+        self,
+        period_s: float,
+        motion_tolerance_s: float,
+        max_jump_s: float,
+        min_speed_mps: float,
+        *,
+        timed_a: bool = False,
+        timed_b: bool = False,
+    ) -> None:
+        """Of a vehicle that is slower than `min_speed_mps`, which sees again what it saw, no look is taken. `timed_a`,
+        `timed_b`: whether it is known when points were measured of sweeps that do not tell it."""
+        self._period_ns = max(round(period_s * NS_PER_S), PAIRS * SPACING_NS)
+        self._motion_tolerance_ns = round(motion_tolerance_s * NS_PER_S)
+        self._min_speed_mps = min_speed_mps
+        self._timed_a, self._timed_b = timed_a, timed_b
+        jump_ns = round(max_jump_s * NS_PER_S)
+        self._time_a, self._time_b, self._time_motion = TimeLine(jump_ns), TimeLine(jump_ns), TimeLine(jump_ns)
+        self._candidates: deque[LidarFrame] = deque()
+        self._sweeps: deque[LidarFrame] = deque()
+        self._motions: deque[EgoMotion] = deque(maxlen=MOTION_SAMPLES)
+        self._taken: list[SweepPair] = []
+        self._instant: tuple[int, int] | None = None
+        self.losses: Counter[str] = Counter()
+
+    @property
+    def latest_ns(self) -> int | None:
+        """Stamp of the latest sweep of a; None before the first."""
+        return self._time_a.latest_ns
+
+    @property
+    def held(self) -> int:
+        """Sweeps that are kept."""
+        return len(self._candidates) + len(self._sweeps) + 2 * len(self._taken)
+
+    def push_a(self, sweep: LidarFrame) -> Found:
+        """The next sweep of a; what became certain by it."""
+        before_ns = self._time_a.latest_ns
+        if self._time_a.refusal(sweep.stamp_ns) is not None:
+            return []
+        if before_ns is not None and sweep.stamp_ns < before_ns:
+            self._begin_new_time()
+        instant, late_ns = self._instant_before(sweep.stamp_ns)
+        if late_ns <= LATEST_NS and instant != self._instant:
+            self._instant = instant
+            self._candidates.append(sweep)
+            if len(self._candidates) > CANDIDATES_HELD:
+                self._candidates.popleft()
+                self.losses["overrun"] += 1
+        return self._decided()
+
+    def push_b(self, sweep: LidarFrame) -> Found:
+        """The same of b."""
+        before_ns = self._time_b.latest_ns
+        if self._time_b.refusal(sweep.stamp_ns) is not None:
+            return []
+        if before_ns is not None and sweep.stamp_ns < before_ns:
+            self._sweeps.clear()
+        _, after_ns = self._instant_before(sweep.stamp_ns + APART_NS)
+        if after_ns <= LATEST_NS + 2 * APART_NS:
+            self._sweeps.append(sweep)
+            if len(self._sweeps) > SWEEPS_HELD:
+                self._sweeps.popleft()
+        return self._decided()
+
+    def push_motion(self, motion: EgoMotion) -> Found:
+        """The next ego-motion."""
+        before_ns = self._time_motion.latest_ns
+        if self._time_motion.refusal(motion.stamp_ns) is not None:
+            return []
+        if before_ns is not None and motion.stamp_ns < before_ns:
+            self._motions.clear()
+        self._motions.append(motion)
+        return self._decided()
+
+    def _begin_new_time(self) -> None:
+        """Sensor time has stepped back: what was kept is of the old one."""
+        self._candidates.clear()
+        self._taken.clear()
+        self._instant = None
+
+    def _instant_before(self, stamp_ns: int) -> tuple[tuple[int, int], int]:
+        """The instant, by its period and its number there, at or after which a stamp lies, and by how much."""
+        period, within_ns = divmod(stamp_ns, self._period_ns)
+        number = min(within_ns // SPACING_NS, PAIRS - 1)
+        return (period, number), within_ns - number * SPACING_NS
+
+    def _decided(self) -> Found:
+        found: Found = []
+        while self._candidates and self._is_certain(self._candidates[0].stamp_ns):
+            taken = self._take(self._candidates.popleft())
+            if taken is not None:
+                found.append(taken)
+        self._forget()
+        return found
+
+    def _is_certain(self, stamp_ns: int) -> bool:
+        """Whether later frames cannot change what belongs to a sweep of a; or they are overdue."""
+        latest_ns = self._time_a.latest_ns
+        if latest_ns is not None and latest_ns - stamp_ns > MOTION_LATE_NS:
+            return True
+        others = (self._time_b.latest_ns, self._time_motion.latest_ns)
+        return all(other_ns is not None and other_ns >= stamp_ns for other_ns in others)
+
+    def _take(self, a: LidarFrame) -> Look | Missed | None:
+        """What becomes of a sweep of a; None where it is one of a look that is not complete."""
+        (period, number), _ = self._instant_before(a.stamp_ns)
+        if self._taken and (number == 0 or self._taken[0].a.stamp_ns // self._period_ns != period):
+            self.losses["incomplete"] += len(self._taken)
+            self._taken.clear()
+        pair = self._pair_of(a)
+        if isinstance(pair, Missed):
+            self.losses[pair.cause] += 1
+            return pair
+        self._taken.append(pair)
+        if len(self._taken) < PAIRS:
+            return None
+        look = Look(tuple(self._taken))
+        self._taken.clear()
+        return look
+
+    def _pair_of(self, a: LidarFrame) -> SweepPair | Missed:
+        b = min(self._sweeps, key=lambda sweep: abs(sweep.stamp_ns - a.stamp_ns), default=None)
+        motion = motion_at(list(self._motions), a.stamp_ns, self._motion_tolerance_ns)
+        if b is None or abs(b.stamp_ns - a.stamp_ns) > APART_NS:
+            return Missed(a.stamp_ns, "no_sweep")
+        if motion is None or motion.linear_mps is None:
+            return Missed(a.stamp_ns, "no_ego_motion")
+        if motion.stays_below(self._min_speed_mps):
+            return Missed(a.stamp_ns, "standing")
+        if any(sweep.time_offset_s is None and not timed for sweep, timed in ((a, self._timed_a), (b, self._timed_b))):
+            return Missed(a.stamp_ns, "no_point_time")
+        return SweepPair(a, b, motion)
+
+    def _forget(self) -> None:
+        """Sweeps of b that no sweep of a can be taken with any more."""
+        latest_ns = self._time_a.latest_ns
+        if latest_ns is None:
+            return
+        needed_ns = (self._candidates[0].stamp_ns if self._candidates else latest_ns) - APART_NS
+        while self._sweeps and self._sweeps[0].stamp_ns < needed_ns:
+            self._sweeps.popleft()

@@ -1,0 +1,76 @@
+"""Which LiDARs are looked at together, where they were built, and why some are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coec.adapters.registration import nearest
+from coec.geometry import se3
+from coec.runtime.edges import plan
+from coec.runtime.edges.plan import planned
+from lidar_bench import LIDARS, MOUNTED, LidarBench, pair_of, with_extra
+
+__all__ = ["with_extra"]
+
+
+@pytest.mark.usefixtures("with_extra")
+def test_every_two_lidars_of_the_pairs_in_their_order() -> None:
+    found = planned([pair_of(lidar) for lidar in LIDARS], 15.0)
+    assert [one.edge.name for one in found] == ["roof to bumper", "roof to trunk", "bumper to trunk"]
+    for one in found:
+        assert one.why_not is None
+        truth = MOUNTED[one.rig.a] @ se3.inverse(MOUNTED[one.rig.b])
+        np.testing.assert_allclose(one.rig.T_a_b_nominal, truth, atol=1e-9)
+    assert planned([pair_of("roof")], 15.0) == ()
+
+
+@pytest.mark.fault("the extra lidars is not installed", "said in status and rig; nothing breaks")
+def test_what_is_not_installed_is_said_and_breaks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nearest, "installed", lambda: False)
+    bench = LidarBench(tmp_path)
+    bench.drive(0.0, 20.0)
+    assert bench.edges.trouble is not None
+    assert bench.edges.trouble.code == "lidars_not_installed"
+    assert {one.state for one in bench.reply.lidars} == {"not_measured"}
+    (reason,) = bench.between("roof to bumper").reasons
+    assert "extra lidars is not installed" in reason.text
+    assert bench.worker.stamps == []
+
+
+@pytest.mark.usefixtures("with_extra")
+def test_what_is_switched_off_or_cannot_be_is_said(tmp_path: Path) -> None:
+    off = LidarBench(tmp_path / "off", period_s=0.0)
+    assert [reason.code for reason in off.between("roof to bumper").reasons] == ["switched_off"]
+    assert off.edges.trouble is None
+    without = LidarBench(tmp_path / "without", ego=False)
+    assert [reason.code for reason in without.between("roof to bumper").reasons] == ["no_ego_motion"]
+    rear = pair_of("bumper")
+    rear = rear.model_copy(update={"camera": rear.camera.model_copy(update={"name": "rear", "key": "in/rear"})})
+    (apart,) = planned([pair_of("roof"), rear], 15.0)
+    assert apart.why_not is not None
+    assert apart.why_not.code == "no_nominal_pose"
+
+
+@pytest.mark.usefixtures("with_extra")
+def test_their_number_is_bounded() -> None:
+    lidars = [pair_of("roof")]
+    for number in range(4):
+        lidar = lidars[0].lidar.model_copy(update={"name": f"lidar{number}", "key": f"in/lidar{number}"})
+        lidars.append(lidars[0].model_copy(update={"name": f"front-lidar{number}", "lidar": lidar}))
+    found = planned(lidars, 15.0)
+    assert [one.why_not for one in found].count(None) == plan.MOST
+    assert {one.why_not.code for one in found if one.why_not is not None} == {"too_many"}
+
+
+@pytest.mark.usefixtures("with_extra")
+def test_lidars_of_pairs_that_are_found_later_join(tmp_path: Path) -> None:
+    bench = LidarBench(tmp_path, lidars=("roof", "bumper"))
+    bench.join("trunk")
+    bench.edges.grow([pair_of(lidar) for lidar in LIDARS])
+    bench.settle()
+    assert len(bench.reply.lidars) == 3
+    bench.drive(0.0, 30.0)
+    assert {one.state for one in bench.reply.lidars} == {"measured"}
