@@ -188,7 +188,7 @@ def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
     the one sits in the other: it is where that was found.
 
     Raises:
-        ValueError: as `after_look` and `after_window`.
+        ValueError: it is of no edge of the rig.
     """
     measured = window.measurement
     found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns)
