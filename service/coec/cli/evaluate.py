@@ -14,8 +14,6 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.ports import DepthModel
 from coec.calibration.types import Matrix4, Window
-from coec.cli import calibrate as calibrate_command
-from coec.cli.commands import calibrate
 from coec.cli.commands.evaluate import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
 from coec.errors import CalibrationError, UsageError
@@ -26,6 +24,9 @@ from coec.evaluation.normalised_errors import NormalisedErrors
 from coec.evaluation.split_halves import Halves
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
 from coec.geometry.cameras import name_of
+from coec.library import choices
+from coec.library.camera_fit import refitted
+from coec.library.choices import Choices
 from coec.reports import console, evaluation_tables
 from coec.reports.evaluation_documents import (
     angle_spread_of,
@@ -119,13 +120,13 @@ def configuration_of(options: Options, recorded: CalibrationConfig | None) -> Ca
     Raises:
         UsageError: a value that does not exist, or starts too far for any search box.
     """
-    configuration = calibrate_command.configuration_of(
-        calibrate.Options(
-            source=options.source,
+    dof = "6" if options.dof is None and options.translation_m > 0 else options.dof
+    configuration = choices.configuration_of(
+        Choices(
             depth=options.depth,
             objective=options.objective,
-            dof="6" if options.dof is None and options.translation_m > 0 else options.dof,
-            no_motion_compensation=options.no_motion_compensation,
+            dof=None if dof is None else int(dof),
+            motion_compensation=False if options.no_motion_compensation else None,
         ),
         recorded,
     )
@@ -156,7 +157,7 @@ def _subject(options: Options, stages: Stages) -> _Subject:
     if options.detection:
         require_enough(len(window.pairs))
     if options.camera_model is not None:
-        window, _ = calibrate_command.refitted(window, options.camera_model)
+        window, _ = refitted(window, options.camera_model)
     if options.steps and loaded.configuration is None:  # a recorded window has what was recorded
         window = with_between(window, open_source(options.source), WindowConfig())
     model = open_depth(configuration_of(_first_of(options), loaded.configuration).depth, LimitsConfig())
