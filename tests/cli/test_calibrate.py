@@ -87,10 +87,10 @@ def test_without_a_network_the_one_that_comes_with_coec_is_used(coec: Coec) -> N
 @pytest.mark.parametrize(
     ("arguments", "module"),
     [
-        (("evaluate", SMALL, "--rotation-deg", 1), "evaluate"),
-        (("commission", SMALL), "commission"),
-        (("diagnose", SMALL), "commission"),
-        (("paper", SMALL), "paper"),
+        (("evaluate", SMALL, "--rotation-deg", 1), "library.evaluating"),
+        (("commission", SMALL), "cli.commission"),
+        (("diagnose", SMALL), "cli.commission"),
+        (("paper", SMALL), "cli.paper"),
     ],
 )
 def test_so_do_the_other_commands(
@@ -102,7 +102,7 @@ def test_so_do_the_other_commands(
         asked.append(config)
         raise UsageError("enough")
 
-    monkeypatch.setattr(f"coec.cli.{module}.open_depth", enough)
+    monkeypatch.setattr(f"coec.{module}.open_depth", enough)
     assert coec(*arguments).status == 2
     assert asked == [DepthConfig()]
 

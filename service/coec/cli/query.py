@@ -14,7 +14,6 @@ from typing import Any
 
 import zenoh
 
-from coec.adapters.files.output import OutputError
 from coec.adapters.tls.conversation import Credentials, Speaker
 from coec.adapters.zenoh.bus import JSON, MSGPACK
 from coec.adapters.zenoh.client import (
@@ -34,7 +33,7 @@ from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.cli.commands.query import Options
 from coec.config import Config, ZenohConfig, load_config
-from coec.errors import NotFoundError, UsageError
+from coec.errors import NotFoundError, OutputError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, VERSION_CHUNK, Keys

@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from os import PathLike, fspath
+from typing import Any, TypedDict
 
 from pydantic import ValidationError
 
 from coec.config import CalibrationConfig, describe
 from coec.errors import UsageError
+from coec.library.progress import Progress
+
+
+class Options(TypedDict, total=False):
+    """The keyword arguments of `coec.calibrate`, each explained there."""
+
+    depth: str | PathLike[str] | None
+    objective: str | None
+    dof: int | None
+    perturb: Sequence[float] | None
+    motion_compensation: bool | None
+    camera_model: str | None
+    time_offset: bool
+    configuration: CalibrationConfig | None
+    progress: Progress | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +43,17 @@ class Choices:
     objective: str | None = None
     dof: int | None = None
     motion_compensation: bool | None = None
+
+    @classmethod
+    def of(cls, options: Options) -> Choices:
+        """What the keyword arguments choose."""
+        depth = options.get("depth")
+        return cls(
+            depth=None if depth is None else fspath(depth),
+            objective=options.get("objective"),
+            dof=options.get("dof"),
+            motion_compensation=options.get("motion_compensation"),
+        )
 
 
 def configuration_of(choices: Choices, recorded: CalibrationConfig | None) -> CalibrationConfig:

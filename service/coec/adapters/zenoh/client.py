@@ -13,7 +13,7 @@ import zenoh
 
 from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.settings_file import read_settings
-from coec.errors import CoecError, DecodeError, NotFoundError, UsageError
+from coec.errors import ConnectionFailedError, DecodeError, NotFoundError, RemoteError, UsageError
 from coec.schemas.base import from_json, from_msgpack
 from coec.schemas.keys import Keys
 from coec.schemas.replies import ErrorReply
@@ -24,20 +24,6 @@ ENDPOINT = re.compile(r"[a-z0-9-]+/[^\s/].*")
 
 TIMEOUT_PAYLOAD = b"Timeout"
 """What Zenoh itself replies with when nobody finished the query in time."""
-
-
-class ConnectionFailedError(CoecError):
-    """There is no router to connect to."""
-
-    reply_code = "not_connected"
-
-
-class RemoteError(CoecError):
-    """An error reply. `code` is the sender's."""
-
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.reply_code = code
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,9 +131,10 @@ def ask(
     timeout_s: float,
     payload: bytes | None = None,
     attachment: bytes | None = None,
+    given_up: zenoh.CancellationToken | None = None,
 ) -> list[Reply]:
     """Every answer to a query, in the order of their keys; none is an empty list. The attachment says who asks, for
-    the log of who answers.
+    the log of who answers. What came until the query is given up is returned.
 
     Raises:
         UsageError: the selector does not begin with a key expression.
@@ -160,7 +147,13 @@ def ask(
     replies: list[Reply] = []
     timed_out = False
     asked = session.get(
-        selector, target=target, timeout=timeout_s, payload=payload, encoding=encoding, attachment=attachment
+        selector,
+        target=target,
+        timeout=timeout_s,
+        payload=payload,
+        encoding=encoding,
+        attachment=attachment,
+        cancellation_token=given_up,
     )
     for reply in asked:
         if reply.ok is not None:
