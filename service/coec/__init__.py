@@ -83,15 +83,6 @@ __all__ = [
 # service speaks to nobody it was not told to.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
-TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than everything here
-if TYPE_CHECKING:
-    from coec import client
-    from coec.config import CalibrationConfig
-    from coec.library.calls import calibrate, evaluate
-    from coec.library.recordings import Description, Recording, open
-    from coec.library.results import Result
-    from coec.library.windows import Window
-
 _LATER = {
     "CalibrationConfig": "coec.config",
     "Description": "coec.library.recordings",
@@ -104,18 +95,27 @@ _LATER = {
 }
 """Where the names are that are imported when they are first used."""
 
+TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than everything here
+if TYPE_CHECKING:
+    from coec import client
+    from coec.config import CalibrationConfig
+    from coec.library.calls import calibrate, evaluate
+    from coec.library.recordings import Description, Recording, open
+    from coec.library.results import Result
+    from coec.library.windows import Window
+else:  # a checker that saw this would take every misspelt name for one that is there
 
-def __getattr__(name: str) -> object:
-    """The public names that take long to import, and `client` (PEP 562)."""
-    from importlib import import_module
+    def __getattr__(name: str) -> object:
+        """The public names that take long to import, and `client` (PEP 562)."""
+        from importlib import import_module
 
-    if name == "client":
-        return import_module("coec.client")
-    if name not in _LATER:
-        raise AttributeError(f"module 'coec' has no attribute {name!r}")
-    found: object = getattr(import_module(_LATER[name]), name)
-    globals()[name] = found
-    return found
+        if name == "client":
+            return import_module("coec.client")
+        if name not in _LATER:
+            raise AttributeError(f"module 'coec' has no attribute {name!r}")
+        found: object = getattr(import_module(_LATER[name]), name)
+        globals()[name] = found
+        return found
 
 
 def __dir__() -> list[str]:

@@ -44,8 +44,8 @@ def open(source: str | PathLike[str]) -> Recording:
         >>> import coec
         >>> drive = coec.open("sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lidar=16&depth=yes")
         >>> print(drive.describe())
-        sim:seed=1: 10.0 s of the pair front
-          camera  6 frames, 0.50 Hz  kannala_brandt, 160 x 160 px, frame camera
+        simulated drive, seed 1: 10.0 s of the pair sim
+          camera  6 frames, 0.50 Hz  double_sphere, 160 x 160 px, frame camera
           LiDAR   6 sweeps, 0.50 Hz  frame lidar
           motion  600 samples, 50.00 Hz
     """
