@@ -15,7 +15,6 @@ import zenoh
 from coec.adapters.frames.msgpack_frames import encode_lidar
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.client import RemoteError
 from coec.calibration.types import LidarFrame
 from coec.config import (
     CalibrationConfig,
@@ -26,6 +25,7 @@ from coec.config import (
     ZenohConfig,
     load_config,
 )
+from coec.errors import RemoteError
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas import last_word
 from coec.schemas.base import from_msgpack

@@ -92,3 +92,35 @@ class DecodeError(CoecError):
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
         self.reason = reason
+
+
+class OutputError(CoecError):
+    """A file that was asked for could not be written."""
+
+    reply_code = "output_failed"
+
+
+class NotAcceptedError(CoecError):
+    """A calibration that its own verdict speaks against was to be written into the files of a vehicle."""
+
+    reply_code = "not_accepted"
+
+
+class ConnectionFailedError(CoecError):
+    """There is no router to connect to."""
+
+    reply_code = "not_connected"
+
+
+class RemoteError(CoecError):
+    """An error reply. `code` is the sender's."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.reply_code = code
+
+
+class NotProvenError(CoecError):
+    """Who speaks has not shown a certificate that is taken here."""
+
+    reply_code = "not_proven"

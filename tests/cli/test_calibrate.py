@@ -10,9 +10,7 @@ import pytest
 from cli.conftest import SMALL, Coec
 from coec.adapters.depth.maps import open_depth
 from coec.calibration.ports import DepthModel
-from coec.cli.calibrate import configuration_of
-from coec.cli.commands.calibrate import Options
-from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig
+from coec.config import DepthConfig, LimitsConfig
 from coec.errors import UsageError
 from coec.sources.windows import evenly, vector_of
 
@@ -89,10 +87,10 @@ def test_without_a_network_the_one_that_comes_with_coec_is_used(coec: Coec) -> N
 @pytest.mark.parametrize(
     ("arguments", "module"),
     [
-        (("evaluate", SMALL, "--rotation-deg", 1), "evaluate"),
-        (("commission", SMALL), "commission"),
-        (("diagnose", SMALL), "commission"),
-        (("paper", SMALL), "paper"),
+        (("evaluate", SMALL, "--rotation-deg", 1), "library.evaluating"),
+        (("commission", SMALL), "cli.commission"),
+        (("diagnose", SMALL), "cli.commission"),
+        (("paper", SMALL), "cli.paper"),
     ],
 )
 def test_so_do_the_other_commands(
@@ -104,7 +102,7 @@ def test_so_do_the_other_commands(
         asked.append(config)
         raise UsageError("enough")
 
-    monkeypatch.setattr(f"coec.cli.{module}.open_depth", enough)
+    monkeypatch.setattr(f"coec.{module}.open_depth", enough)
     assert coec(*arguments).status == 2
     assert asked == [DepthConfig()]
 
@@ -117,16 +115,6 @@ def test_unknown_objective_is_a_usage_error(coec: Coec) -> None:
 
 def test_unknown_camera_model_is_a_usage_error(coec: Coec) -> None:
     assert coec("calibrate", SMALL, "--depth", "stereo", "--camera-model", "eucm").status == 2
-
-
-def test_options_override_the_recorded_configuration_and_nothing_else() -> None:
-    recorded = CalibrationConfig(depth=DepthConfig(model="stereo", threads=7), search=SearchConfig(dof=3, step_deg=1.0))
-    assert configuration_of(Options(source=""), recorded) == recorded
-    assert configuration_of(Options(source=""), None) == CalibrationConfig()
-    changed = configuration_of(Options(source="", dof="6", no_motion_compensation=True), recorded)
-    assert changed.search == SearchConfig(dof=6, step_deg=1.0)
-    assert changed.depth == recorded.depth
-    assert not changed.motion_compensation
 
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", ""])

@@ -17,10 +17,6 @@ from numpy.typing import NDArray
 from cli.conftest import SMALL, Coec
 from coec.calibration.commissioning import learning
 from coec.calibration.types import LidarFrame
-from coec.cli.commands.evaluate import Options
-from coec.cli.evaluate import MARGIN_DEG, MARGIN_M, configuration_of
-from coec.config import CalibrationConfig, SearchConfig
-from coec.errors import UsageError
 from coec.evaluation import experiments, steps
 from coec.evaluation.starts import perturbations
 from coec.geometry import se3
@@ -207,31 +203,6 @@ def test_fitted_camera_and_uncompensated_clouds(coec: Coec) -> None:
 
 def test_needs_a_radius(coec: Coec) -> None:
     assert coec("evaluate", SMALL, "--depth", "stereo").status == 2
-
-
-def test_search_box_holds_the_starts() -> None:
-    def search(rotation_deg: float, translation_m: float = 0.0) -> SearchConfig:
-        options = Options(
-            source="", depth="stereo", directions=1, rotation_deg=rotation_deg, translation_m=translation_m
-        )
-        return configuration_of(options, None).search
-
-    default = SearchConfig()
-    assert search(1.0).rotation_deg == default.rotation_deg
-    assert search(25.0).rotation_deg == 25.0 + MARGIN_DEG
-    assert search(5.0, 0.5).translation_m == 0.5 + MARGIN_M
-    assert search(5.0, 0.5).dof == 6
-    assert search(25.0).dof == 3
-
-
-def test_degrees_of_freedom_are_those_that_were_asked_for() -> None:
-    options = Options(source="", depth="stereo", directions=1, rotation_deg=5.0, translation_m=0.5, dof="3")
-    assert configuration_of(options, CalibrationConfig()).search.dof == 3
-
-
-def test_starts_too_far_for_any_box_are_a_usage_error() -> None:
-    with pytest.raises(UsageError, match=r"search\.rotation_deg"):
-        configuration_of(Options(source="", depth="stereo", directions=1, rotation_deg=50.0), None)
 
 
 def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,10 +18,10 @@ from cli.conftest import Coec
 from coec.adapters.images.codec import encode_jpeg
 from coec.adapters.mcap.windows import WindowWriter, write_result
 from coec.adapters.zenoh.bus import Answer
-from coec.adapters.zenoh.client import RemoteError, connected
+from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.window_fetch import PIECE_BYTES, Recording, fetch_window
 from coec.config import UplinkConfig, ZenohConfig
-from coec.errors import NotFoundError, UsageError
+from coec.errors import NotFoundError, RemoteError, UsageError
 from coec.runtime.api.uplink import BURST_BYTES
 from coec.runtime.recording.digests import DigestReader
 from coec.schemas.base import to_json

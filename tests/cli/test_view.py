@@ -26,10 +26,9 @@ from coec.adapters.foxglove import topics
 from coec.adapters.foxglove.topics import POINTS, TOPICS, Pose
 from coec.adapters.frames.msgpack_frames import encode_lidar
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.client import ConnectionFailedError
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Rig
-from coec.errors import ConfigError, SourceError, UnavailableError, UsageError
+from coec.errors import ConfigError, ConnectionFailedError, SourceError, UnavailableError, UsageError
 from coec.geometry import se3
 from coec.reports import console
 from coec.schemas.base import to_json

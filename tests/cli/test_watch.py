@@ -14,8 +14,7 @@ import zenoh
 
 from cli.conftest import Coec
 from coec.adapters.zenoh.bus import MSGPACK
-from coec.adapters.zenoh.client import ConnectionFailedError
-from coec.errors import ConfigError
+from coec.errors import ConfigError, ConnectionFailedError
 from coec.reports import console
 from coec.schemas.base import to_msgpack
 from coec.schemas.keys import Keys

@@ -22,9 +22,10 @@ from typing import Any
 import psutil
 
 from coec import geometry
-from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected, connected_by
+from coec.adapters.zenoh.client import ask, ask_one, connected, connected_by
 from coec.cli.query import asked_of
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig, load_config
+from coec.errors import RemoteError
 from coec.geometry.compiler import kernel_cache_directory
 from coec.reports.commented_yaml import commented_yaml
 from conftest import REPOSITORY

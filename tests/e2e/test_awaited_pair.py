@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from coec.adapters.zenoh.client import RemoteError, ask_one, connected
+from coec.adapters.zenoh.client import ask_one, connected
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.errors import RemoteError
 from coec.geometry import se3
 from e2e.drives import Drive, rendered
 from e2e.processes import PATIENCE_S, Router, Service, service

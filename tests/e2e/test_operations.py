@@ -16,13 +16,14 @@ import pytest
 from ruamel.yaml import YAML
 
 from certificates import TestAuthority, make_authority
-from coec.adapters.tls.conversation import NotProvenError, Speaker
+from coec.adapters.tls.conversation import Speaker
 from coec.adapters.zenoh.bus import JSON, open_session
-from coec.adapters.zenoh.client import RemoteError, ask_one
+from coec.adapters.zenoh.client import ask_one
 from coec.adapters.zenoh.proven import give
 from coec.cli.check_config import template
 from coec.cli.doctor import examine
 from coec.config import LimitsConfig, SenderConfig, ZenohConfig, load_config
+from coec.errors import NotProvenError, RemoteError
 from e2e.processes import COMMAND, PATIENCE_S, Router, Service, environment
 from fakes import wait_until
 from open_metrics import parse

@@ -12,10 +12,11 @@ from pydantic import BaseModel
 
 from certificates import TestAuthority
 from coec.adapters.tls.conversation import Credentials, Speaker
-from coec.adapters.zenoh.client import JSON, RemoteError, Reply, ask_one
+from coec.adapters.zenoh.client import JSON, Reply, ask_one
 from coec.adapters.zenoh.proven import give
 from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.config import Config, DepthConfig, SnippetsConfig, UplinkConfig, load_config
+from coec.errors import RemoteError
 from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import NS_PER_S, SECONDS, STEP_S, STEPPED, Drive, rendered, stepped_configuration
 from e2e.planted import plant, said, written

@@ -10,8 +10,7 @@ import duckdb
 import pytest
 
 from coec.adapters.files import durable
-from coec.adapters.files.output import OutputError
-from coec.errors import SourceError, UsageError
+from coec.errors import OutputError, SourceError, UsageError
 from coec.fleet import results, tables
 from coec.fleet.desk import Desk
 from coec.fleet.places import Job

@@ -15,14 +15,13 @@ from coec.adapters.images.codec import GreyImages, decode_bgr
 from coec.calibration.estimators import Sight, sight_of
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.types import Window
-from coec.cli import calibrate as calibrate_command
-from coec.cli.commands import calibrate
 from coec.cli.commands.models_assess import Options
 from coec.config import LimitsConfig, WindowConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.evaluation import depth_quality
 from coec.evaluation.depth_quality import DepthQuality
 from coec.evaluation.experiments import Stages
+from coec.library.choices import Choices, configuration_of
 from coec.reports import console
 from coec.reports.evaluation_documents import number
 from coec.schemas.base import to_json
@@ -47,8 +46,7 @@ def run(options: Options) -> int:
         load = stages.begin("load", None)
         loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         window = loaded.window
-        asked = calibrate.Options(source=options.source, depth=options.model, objective="mi", dof="3")
-        configuration = calibrate_command.configuration_of(asked, loaded.configuration)
+        configuration = configuration_of(Choices(depth=options.model, objective="mi", dof=3), loaded.configuration)
         depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
         took_ms = _infer(window, depth, stages)
         sight = sight_of(window, depth, GreyImages(LimitsConfig()), configuration, Silence())

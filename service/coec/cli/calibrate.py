@@ -2,71 +2,25 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
-from rich.progress import Progress, TaskID
 
-from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
-from coec.adapters.files.conversions import result_of
-from coec.adapters.images.codec import GreyImages
-from coec.calibration.calibrator import calibrate
-from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
-from coec.calibration.types import Rig, Window
+from coec.calibration.frames.time_offset import TimeOffset
+from coec.calibration.types import Window
 from coec.cli.commands.calibrate import Options
-from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
-from coec.errors import UsageError
+from coec.config import CalibrationConfig, WindowConfig
 from coec.geometry import se3
-from coec.geometry.cameras import name_of
-from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
+from coec.library.calibrating import calibrated
+from coec.library.camera_fit import CameraFit
+from coec.library.choices import Choices
 from coec.reports import console, pictures
+from coec.reports.stage_times import StageTimes
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationReport, CalibrationResult
 from coec.sources import windows
-
-FITTED = "double_sphere"
-"""The one model that can be fitted to the others."""
-
-
-@dataclass(frozen=True, slots=True)
-class CameraFit:
-    """What a fitted camera model misses of the one it stands for, pixels. `coverage`: share of the source's pixels."""
-
-    model: str
-    of: str
-    residual_rms_px: float
-    residual_max_px: float
-    coverage: float
-
-
-class StageTimes:
-    """Progress bars and the seconds that each stage took. A stage ends with its last step."""
-
-    def __init__(self, bars: Progress) -> None:
-        self._bars = bars
-        self._tasks: dict[str, TaskID] = {}
-        self._mark_s = self._start_s = time.perf_counter()
-        self._elapsed_s: dict[str, float] = {}
-
-    def step(self, stage: str, done: int, total: int) -> None:
-        """See `ports.Progress`. The number of evaluations of a search is not known before it ends."""
-        now_s = time.perf_counter()
-        self._elapsed_s[stage] = self._elapsed_s.get(stage, 0.0) + now_s - self._mark_s
-        self._mark_s = now_s
-        if stage not in self._tasks:
-            open_end = stage == "search"
-            self._tasks[stage] = self._bars.add_task(stage, total=None if open_end else total, note="")
-        note = f"{done} evaluations" if stage == "search" else ""
-        self._bars.update(self._tasks[stage], completed=done, note=note)
-
-    def elapsed_s(self) -> dict[str, float]:
-        """By stage, and `total`."""
-        return {**self._elapsed_s, "total": time.perf_counter() - self._start_s}
 
 
 def run(options: Options) -> int:
@@ -81,61 +35,35 @@ def run(options: Options) -> int:
         loaded = windows.load(
             options.source, options.frames, WindowConfig().pairs, lambda done, total: times.step("load", done, total)
         )
-        configuration = configuration_of(options, loaded.configuration)
-        window = loaded.window if xi is None else windows.started_at(loaded.window, xi)
-        window, fit = (window, None) if options.camera_model is None else refitted(window, options.camera_model)
-        depth = open_depth(configuration.depth, LimitsConfig())
-        times.step("prepare", 1, 1)
-        images = GreyImages(LimitsConfig())
-        estimate = calibrate(window, depth, images, configuration, times)
-        offset = None
-        if options.time_offset:
-            offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
-            times.step("time offset", 1, 1)
-    result = result_of(estimate, window.rig, loaded.vehicle)
-    document = _document(result, times.elapsed_s(), fit, offset)
+        done = calibrated(
+            loaded,
+            choices_of(options),
+            times,
+            perturbation=xi,
+            camera_model=options.camera_model,
+            time_offset=options.time_offset,
+        )
+    document = _document(done.result, times.elapsed_s(), done.fit, done.offset)
     if options.output is not None:
-        _write(options.output, window, result, configuration, document)
+        _write(options.output, done.window, done.result, done.configuration, document)
     if options.as_json:
         console.print_json(document)
     else:
-        _show(window, result, document, fit, offset)
+        _show(done.window, done.result, document, done.fit, done.offset)
     if loaded.unpaired:
         causes = ", ".join(f"{count} {cause}" for cause, count in sorted(loaded.unpaired.items()))
         console.say(f"coec: frames without a partner: {causes}")
-    return 0 if result.verdict.decision == "accepted" else 1
+    return 0 if done.result.verdict.decision == "accepted" else 1
 
 
-def configuration_of(options: Options, recorded: CalibrationConfig | None) -> CalibrationConfig:
-    """The recorded configuration, or the defaults, with what was given on the command line.
-
-    Raises:
-        UsageError: a value that does not exist.
-    """
-    values: dict[str, Any] = (recorded or CalibrationConfig()).model_dump()
-    if options.depth is not None:
-        values["depth"]["model"] = options.depth
-    if options.objective is not None:
-        values["objective"]["kind"] = options.objective
-    if options.dof is not None:
-        values["search"]["dof"] = int(options.dof)
-    if options.no_motion_compensation:
-        values["motion_compensation"] = False
-    try:
-        return CalibrationConfig.model_validate(values)
-    except ValidationError as error:
-        raise UsageError(f"the options do not fit: {describe(error)}") from error
-
-
-def refitted(window: Window, model: str) -> tuple[Window, CameraFit]:
-    """The window seen through another camera model that was fitted to its own."""
-    if model != FITTED:
-        raise UsageError(f"--camera-model {model}: only {FITTED} can be fitted")
-    rig: Rig = window.rig
-    fit = fit_double_sphere(rig.camera)
-    quality = CameraFit(FITTED, name_of(rig.camera), fit.residual_rms_px, fit.residual_max_px, fit.coverage)
-    fitted = replace(rig, camera=fit.camera, camera_residual_px=fit.residual_max_px)
-    return replace(window, rig=fitted), quality
+def choices_of(options: Options) -> Choices:
+    """What was given on the command line."""
+    return Choices(
+        depth=options.depth,
+        objective=options.objective,
+        dof=None if options.dof is None else int(options.dof),
+        motion_compensation=False if options.no_motion_compensation else None,
+    )
 
 
 def _document(

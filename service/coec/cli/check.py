@@ -12,12 +12,12 @@ from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
 from coec.calibration.search.mount_prior import MOUNT_RAD
 from coec.calibration.types import Estimate
-from coec.cli import calibrate as calibrate_command
-from coec.cli.commands.calibrate import Options
 from coec.config import LimitsConfig
 from coec.errors import CalibrationError, SourceError
 from coec.evaluation.fitness import Cadence, Fitness, Remark, fitness_of
+from coec.library.choices import Choices, configuration_of
 from coec.reports import console
+from coec.reports.stage_times import StageTimes
 from coec.sources import Recording, open_source, windows
 from coec.sources.spec import is_bag, parse_spec
 
@@ -41,7 +41,7 @@ def run(source: str, *, depth: str | None, as_json: bool) -> int:
             _show_topics(source)
         raise
     with console.progress() as bars:
-        times = calibrate_command.StageTimes(bars)
+        times = StageTimes(bars)
         seen = fitness_of(recording)
         times.step("look", 1, 1)
         failed = any(remark.level == "fail" for remark in seen.remarks)
@@ -54,11 +54,10 @@ def run(source: str, *, depth: str | None, as_json: bool) -> int:
     return int(failed or isinstance(trial, CalibrationError))
 
 
-def _trial(recording: Recording, depth: str | None, times: calibrate_command.StageTimes) -> Estimate | CalibrationError:
+def _trial(recording: Recording, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
     """A calibration of a few pairs about the recording's own extrinsic: how sharply this scene tells the pose."""
     loaded = windows.chosen_from(recording, PAIRS, lambda done, total: times.step("load", done, total))
-    options = Options(source=recording.name, depth=depth)
-    configuration = calibrate_command.configuration_of(options, loaded.configuration)
+    configuration = configuration_of(Choices(depth=depth), loaded.configuration)
     limits = LimitsConfig()
     window = replace(loaded.window, start_known_to_rad=MOUNT_RAD)
     try:

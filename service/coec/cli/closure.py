@@ -17,6 +17,7 @@ from coec.evaluation import experiments
 from coec.evaluation.closure import Between, Closure, Solve, between, close
 from coec.evaluation.experiments import Bench, Stages
 from coec.geometry import se3
+from coec.library.evaluating import configuration_of
 from coec.reports import console, evaluation_tables
 from coec.reports.evaluation_documents import closure_of, in_degrees
 from coec.schemas.base import to_json
@@ -80,7 +81,7 @@ def relative_of(text: str) -> Matrix4:
 def _bench(options: Options, name: str, stages: Stages) -> Bench:
     load = stages.begin(f"load {name}", None)
     loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
-    configuration = evaluate.configuration_of(options, loaded.configuration)
+    configuration = configuration_of(evaluate.plan_of(options), evaluate.choices_of(options), loaded.configuration)
     model = open_depth(configuration.depth, LimitsConfig())
     depth = experiments.inferred(loaded.window, model, stages.begin(f"depth {name}", len(loaded.window.pairs)))
     return Bench(loaded.window, depth, experiments.greys_of(loaded.window), configuration)

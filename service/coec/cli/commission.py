@@ -15,12 +15,12 @@ from coec.calibration.commissioning.baseline import Baseline
 from coec.calibration.commissioning.learning import MAX_PAIRS, commission
 from coec.calibration.ports import DepthModel, ImageReader
 from coec.calibration.types import Window
-from coec.cli import calibrate as calibrate_command
-from coec.cli.commands import calibrate
 from coec.cli.commands.commission import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import UsageError
+from coec.library.choices import Choices, configuration_of
 from coec.reports import console
+from coec.reports.stage_times import StageTimes
 from coec.sources import windows
 
 
@@ -42,7 +42,7 @@ def run(options: Options) -> int:
     """
     sensors = sensors_of(options.sensors or ())
     with console.progress() as bars:
-        times = calibrate_command.StageTimes(bars)
+        times = StageTimes(bars)
         rigged = load(options.sources, options, times)
         baseline = commission(
             rigged.windows,
@@ -62,7 +62,7 @@ def run(options: Options) -> int:
     return 0
 
 
-def load(sources: Sequence[str], options: Options, times: calibrate_command.StageTimes) -> Rigged:
+def load(sources: Sequence[str], options: Options, times: StageTimes) -> Rigged:
     """The windows of all sources, with the configuration of the first.
 
     Raises:
@@ -74,10 +74,9 @@ def load(sources: Sequence[str], options: Options, times: calibrate_command.Stag
         windows.load(source, options.frames, WindowConfig().pairs, lambda done, total: times.step("load", done, total))
         for source in sources
     ]
-    configuration = calibrate_command.configuration_of(
-        calibrate.Options(source=sources[0], depth=options.depth, objective=options.objective, dof=options.dof),
-        loaded[0].configuration,
-    )
+    dof = None if options.dof is None else int(options.dof)
+    choices = Choices(depth=options.depth, objective=options.objective, dof=dof)
+    configuration = configuration_of(choices, loaded[0].configuration)
     depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), MAX_PAIRS)
     images = CachedGreys(GreyImages(LimitsConfig()), MAX_PAIRS)
     found = tuple(replace(one.window, T_camera_lidar_start=one.window.rig.T_camera_lidar_nominal) for one in loaded)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from coec.adapters.depth.maps import STEREO
-from coec.adapters.files.output import OutputError, write
+from coec.adapters.files.output import write
 from coec.adapters.files.rig import intrinsics_config, mask_to_png, matrix_rows
 from coec.adapters.mcap.bag_writer import write_bag
 from coec.adapters.zenoh.player import Streams
@@ -28,7 +28,7 @@ from coec.config import (
     SweepConfig,
     WindowConfig,
 )
-from coec.errors import UsageError
+from coec.errors import OutputError, UsageError
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
 from coec.sources import Recording, open_source

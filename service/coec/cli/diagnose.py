@@ -15,7 +15,6 @@ from coec.calibration.commissioning.learning import FAR_RAD
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.check import gather
 from coec.calibration.monitor.check_verdict import diagnose
-from coec.cli import calibrate as calibrate_command
 from coec.cli import commission
 from coec.cli.commands import commission as commission_options
 from coec.cli.commands.diagnose import Options
@@ -24,6 +23,7 @@ from coec.evaluation.detection import try_detection
 from coec.geometry import se3
 from coec.reports import console, evaluation_tables
 from coec.reports.evaluation_documents import detection_of
+from coec.reports.stage_times import StageTimes
 from coec.sources import windows
 
 
@@ -34,7 +34,7 @@ def run(options: Options) -> int:
         CoecError: nothing can be seen.
     """
     with console.progress() as bars:
-        times = calibrate_command.StageTimes(bars)
+        times = StageTimes(bars)
         of_source = commission_options.Options(
             sources=[options.source], output=Path(), depth=options.depth, frames=options.frames
         )
@@ -44,7 +44,7 @@ def run(options: Options) -> int:
         return _check(rigged, options)
 
 
-def _tabulate(rigged: commission.Rigged, options: Options, times: calibrate_command.StageTimes) -> int:
+def _tabulate(rigged: commission.Rigged, options: Options, times: StageTimes) -> int:
     window = rigged.windows[0]
     evidence = gather(sight_of(window, rigged.depth, rigged.images, rigged.configuration, times), FAR_RAD)
     tried = try_detection(

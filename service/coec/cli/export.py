@@ -5,9 +5,8 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from coec.adapters.exports import FORMATS
 from coec.adapters.exports.extrinsic import Extrinsic
-from coec.adapters.exports.told import Frames, NotAcceptedError, of_reply, of_result, pose_of
+from coec.adapters.exports.told import Frames, of_reply, of_result, pose_of
 from coec.adapters.files import output
 from coec.adapters.files.rig import intrinsics_config
 from coec.adapters.mcap.windows import read_result, read_window
@@ -16,6 +15,7 @@ from coec.cli.commands.export import Options
 from coec.cli.one_pair import pair_named
 from coec.config import CameraIntrinsics, Config, load_config
 from coec.errors import DecodeError, SourceError, UsageError
+from coec.library.exporting import MAX_BYTES, accepted, known, text_of
 from coec.reports import console
 from coec.runtime.api.exports import exported
 from coec.runtime.decisions.state_store import STATE_FILE, read_pairs
@@ -23,9 +23,6 @@ from coec.runtime.nominal.kept import with_kept
 from coec.schemas.base import from_json
 from coec.schemas.replies import CalibrationResult, ExtrinsicReply
 from coec.sources.reading import read_bytes
-
-MAX_BYTES = 64 * 2**20
-"""Of a file that is read, or of another program's that is changed: a robot's URDF has below one million."""
 
 
 def run(options: Options) -> int:
@@ -37,15 +34,10 @@ def run(options: Options) -> int:
         NotAcceptedError: it is not accepted, and `--force` was not given.
         OutputError: the file cannot be written, or what it holds cannot be changed.
     """
-    if options.format not in FORMATS:
-        raise UsageError(f"--format {options.format}: known are {', '.join(FORMATS)}")
+    known(options.format)
     extrinsic = _read(options)
-    if extrinsic.origin.objections and not options.force:
-        raise NotAcceptedError(
-            f"{options.source}: not accepted: {' '.join(extrinsic.origin.objections)} "
-            "`--force` exports it all the same, and says so in the file."
-        )
-    text = FORMATS[options.format].text(extrinsic, None if options.output is None else _held(options.output))
+    accepted(extrinsic, str(options.source), "--force", force=options.force)
+    text = text_of(extrinsic, options.format, options.output)
     if options.output is not None:
         output.replace(options.output, text.encode())
     if options.as_json:
@@ -56,20 +48,6 @@ def run(options: Options) -> int:
     else:
         console.show(f"{options.output}  {extrinsic.child} in {extrinsic.parent}, {extrinsic.origin.provenance}")
     return 0
-
-
-def _held(path: Path) -> str | None:
-    """What is in the file that is to be changed; None where there is none.
-
-    Raises:
-        SourceError: it cannot be read, or is no text.
-    """
-    if not path.exists():
-        return None
-    try:
-        return read_bytes(path, MAX_BYTES).decode()
-    except UnicodeDecodeError as error:
-        raise SourceError(f"{path} is no text in UTF-8: it cannot be changed") from error
 
 
 def _read(options: Options) -> Extrinsic:

@@ -21,12 +21,12 @@ from coec import __version__
 from coec.adapters.files import output
 from coec.adapters.images.codec import probe
 from coec.adapters.mcap.windows import read_result
-from coec.adapters.zenoh.client import RemoteError, ask, ask_one, connected_by, nobody
+from coec.adapters.zenoh.client import ask, ask_one, connected_by, nobody
 from coec.adapters.zenoh.window_fetch import Recording, fetch_window
 from coec.cli.commands.fetch import Options
 from coec.cli.query import OF_PAIR, asked_of
 from coec.config import LimitsConfig
-from coec.errors import CoecError, DecodeError, NotFoundError, UsageError, WindowError
+from coec.errors import CoecError, DecodeError, NotFoundError, OutputError, RemoteError, UsageError, WindowError
 from coec.reports import console, incident_page, replies
 from coec.reports.fleet_board import duration
 from coec.schemas.base import SCHEMA_VERSION, Message, from_json, to_json
@@ -303,7 +303,7 @@ class _Fetch:
     def _try(self, what: str, fetch: Callable[[], None]) -> None:
         try:
             fetch()
-        except output.OutputError:
+        except OutputError:
             raise
         except CoecError as error:
             self.absent.append(Absent(what=what, why=str(error)))

@@ -14,8 +14,6 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.estimators import depth_features, sight_of
 from coec.calibration.ports import Silence
-from coec.cli import calibrate as calibrate_command
-from coec.cli.commands import calibrate
 from coec.cli.commands.paper import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import SourceError
@@ -23,6 +21,7 @@ from coec.evaluation import paper, paper_published, starts, statistics
 from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
 from coec.evaluation.paper_speed import run_times
 from coec.evaluation.statistics import Outcome
+from coec.library.choices import Choices, configuration_of
 from coec.reports import console, paper_plots, plots
 from coec.sources import open_source, windows
 
@@ -46,10 +45,8 @@ def run(options: Options) -> int:
         stages = Stages(bars)
         load = stages.begin("load", None)
         loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
-        configuration = calibrate_command.configuration_of(
-            calibrate.Options(source=options.source, depth=options.depth, objective=options.objective),
-            loaded.configuration,
-        )
+        choices = Choices(depth=options.depth, objective=options.objective)
+        configuration = configuration_of(choices, loaded.configuration)
         window = loaded.window
         depth = inferred(
             window, open_depth(configuration.depth, LimitsConfig()), stages.begin("depth", len(window.pairs))

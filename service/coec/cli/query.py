@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import getpass
 import json
 import math
 import re
-import socket
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from coec.adapters.files.output import OutputError
 from coec.adapters.tls.conversation import Credentials, Speaker
 from coec.adapters.zenoh.bus import JSON, MSGPACK
 from coec.adapters.zenoh.client import (
@@ -25,7 +21,9 @@ from coec.adapters.zenoh.client import (
     connected_by,
     is_alive,
     key_expression,
+    myself,
     nobody,
+    patience_ms,
     single_key,
 )
 from coec.adapters.zenoh.proven import give
@@ -34,10 +32,10 @@ from coec.adapters.zenoh.settings_file import credentials_in, read_settings
 from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.cli.commands.query import Options
 from coec.config import Config, ZenohConfig, load_config
-from coec.errors import NotFoundError, UsageError
+from coec.errors import NotFoundError, OutputError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
-from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, VERSION_CHUNK, Keys
+from coec.schemas.keys import VERSION_CHUNK, Keys
 from coec.schemas.replies import StatusReply
 
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
@@ -48,9 +46,6 @@ JPEG = "image/jpeg"
 PATIENCE_S = 60.0
 """With a window of which no piece comes; what has come waits for the next attempt."""
 
-ON_SITE = 0.9
-"""Share of the time that a command's acknowledgement is waited for that the service may take; the rest is for the way
-there and back."""
 OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d{1,19}(\.snippet)?", re.ASCII)
 """What windows, snippets and red events are called: their pair, and a time in nanoseconds."""
 
@@ -132,7 +127,7 @@ def _answers(session: zenoh.Session, key: str, options: Options, asked: Asked) -
     if not _is_command(key):
         return ask(session, selector, options.timeout_s, payload)
     if credentials is None or options.anonymous:
-        return ask(session, selector, options.timeout_s, payload, _myself())
+        return ask(session, selector, options.timeout_s, payload, myself())
     speaker = Speaker(credentials, asked.vehicle)
     encoding = MSGPACK if "format=msgpack" in (options.params or ()) else JSON
     try:
@@ -143,13 +138,6 @@ def _answers(session: zenoh.Session, key: str, options: Options, asked: Asked) -
 
 def _is_command(key: str) -> bool:
     return key.split("/")[-2] == "command"
-
-
-def _myself() -> bytes:
-    """Who says that he gives a command: for the log, and for a rate of his own. It proves nothing."""
-    with suppress(OSError, KeyError):  # a user without a name
-        return f"{getpass.getuser()}@{socket.gethostname()}".encode("ascii", errors="replace")
-    return socket.gethostname().encode("ascii", errors="replace")
 
 
 def _keys(options: Options, asked: Asked) -> Keys:
@@ -210,8 +198,7 @@ def _params(key: str, options: Options) -> tuple[str, ...]:
     given = tuple(options.params or ())
     if not _is_command(key) or any(item.startswith("timeout_ms=") for item in given):
         return given
-    timeout_ms = min(max(round(options.timeout_s * 1e3 * ON_SITE), 1), MAX_COMMAND_TIMEOUT_MS)
-    return (*given, f"timeout_ms={timeout_ms}")
+    return (*given, f"timeout_ms={patience_ms(options.timeout_s)}")
 
 
 def _selector(key: str, params: tuple[str, ...]) -> str:

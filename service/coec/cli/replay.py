@@ -10,10 +10,10 @@ from coec.adapters.files.conversions import comparable, result_of
 from coec.adapters.images.codec import GreyImages
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.calibrator import calibrate
-from coec.cli.calibrate import StageTimes
 from coec.config import LimitsConfig
 from coec.errors import WindowError
 from coec.reports import console
+from coec.reports.stage_times import StageTimes
 from coec.schemas.base import to_json
 
 

@@ -7,14 +7,14 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from coec.adapters.files.output import OutputError, write
+from coec.adapters.files.output import write
 from coec.adapters.mcap.bag_writer import write_bag
 from coec.adapters.ros import messages, outgoing
 from coec.adapters.ros.topics import Frame
 from coec.calibration.types import CameraFrame
 from coec.cli.commands import sim_view
 from coec.cli.commands.sim_drive import Options
-from coec.errors import UsageError
+from coec.errors import OutputError, UsageError
 from coec.reports import console
 from coec.simulation.source import open_rig, open_sim
 

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coec.adapters.files.output import OutputError, write
+from coec.adapters.files.output import write
 from coec.adapters.files.rig import mask_to_png
 from coec.adapters.mcap.bag_writer import write_messages
 from coec.adapters.ros import messages, outgoing
@@ -18,7 +18,7 @@ from coec.adapters.ros.topics import TopicMessage
 from coec.calibration.types import CameraFrame
 from coec.cli.commands.sim_drive import Options
 from coec.cli.sim import MOST_PROCESSES, TRUTH_TOPIC, opened_rig
-from coec.errors import UsageError
+from coec.errors import OutputError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.se3 import inverse
 from coec.reports import console

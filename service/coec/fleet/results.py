@@ -13,8 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from coec.adapters.files import durable, output
-from coec.adapters.files.output import OutputError
-from coec.errors import DecodeError, UsageError
+from coec.errors import DecodeError, OutputError, UsageError
 from coec.fleet import tables
 from coec.fleet.terms import Terms
 from coec.schemas.base import from_json, to_json

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from coec.adapters.files.output import write
 from coec.adapters.images.codec import decode_bgr, encode_png
 from coec.calibration.frames.motion_compensation import compensate
@@ -27,11 +30,19 @@ def write_overlays(
         OutputError: the folder or a file cannot be written.
         DecodeError: the image cannot be decoded.
     """
+    return [
+        write(folder / f"{name}.png", encode_png(overlay(window, T_camera_lidar, title, compensated)))
+        for name, (T_camera_lidar, title) in poses.items()
+    ]
+
+
+def overlay(window: Window, T_camera_lidar: Matrix4, title: str, compensated: bool) -> NDArray[np.uint8]:
+    """(height, width, 3) BGR: points at the pose (4, 4) on the image of the middle pair, with a title.
+
+    Raises:
+        DecodeError: the image cannot be decoded.
+    """
     pair, rig = middle(window), window.rig
     image = decode_bgr(pair.camera.image, LimitsConfig())
     cloud = compensate(pair, rig, enabled=compensated)
-    written = []
-    for name, (T_camera_lidar, title) in poses.items():
-        picture = draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, title)
-        written.append(write(folder / f"{name}.png", encode_png(picture)))
-    return written
+    return draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, title)

@@ -26,6 +26,10 @@ RECORDED_GAP_S = 1e9
 """Frames that were chosen from a recording may be any time apart; its order is already certain."""
 
 
+class NoPairsError(SourceError):
+    """Camera frames were taken, or none, but no pair can be made of them."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Loaded:
     """A window and what came with it.
@@ -86,7 +90,7 @@ def chosen_from(
     pairs += pairer.flush()
     heard(len(pairs), len(chosen))
     if not pairs:
-        raise SourceError(
+        raise NoPairsError(
             f"{recording.name}: none of {len(chosen)} camera frames has a sweep within "
             f"{PairingConfig().tolerance_s} s: check the stamps of both"
         )
@@ -111,11 +115,20 @@ def vector_of(option: str, text: str) -> NDArray[np.float64]:
         UsageError: it is not three or six finite numbers; names the option.
     """
     try:
-        values = np.array([float(part) for part in text.split(",")])
+        values = [float(part) for part in text.split(",")]
     except ValueError as error:
         raise UsageError(f"{option} {text}: {error}") from error
+    return xi_of(f"{option} {text}", values)
+
+
+def xi_of(what: str, values: Sequence[float]) -> NDArray[np.float64]:
+    """ξ (6,) in radians and metres from `rx, ry, rz[, tx, ty, tz]` in degrees and metres.
+
+    Raises:
+        UsageError: it is not three or six finite numbers; begins with `what`.
+    """
     if len(values) not in (3, 6) or not np.isfinite(values).all():
-        raise UsageError(f"{option} {text}: give three numbers (degrees), or six (degrees, then metres)")
+        raise UsageError(f"{what}: give three numbers (degrees), or six (degrees, then metres)")
     xi = np.zeros(6)
     xi[: len(values)] = values
     xi[:3] = np.radians(xi[:3])
@@ -143,7 +156,7 @@ def _recorded(path: Path, frames: int | None, between_s: tuple[float, float]) ->
     window, configuration = read_window(path)
     within = _within([pair.stamp_ns for pair in window.pairs], between_s)
     if not within:
-        raise SourceError(f"{path}: no pair was recorded {between_s[0]:g} to {between_s[1]:g} s after the first")
+        raise NoPairsError(f"{path}: no pair was recorded {between_s[0]:g} to {between_s[1]:g} s after the first")
     window = replace(window, pairs=tuple(window.pairs[index] for index in within))
     if frames is not None:
         window = replace(window, pairs=tuple(window.pairs[index] for index in evenly(len(window.pairs), frames)))

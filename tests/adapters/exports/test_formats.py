@@ -20,7 +20,7 @@ from ruamel.yaml import YAML
 
 from coec.adapters.exports import FORMATS
 from coec.adapters.exports.extrinsic import roll_pitch_yaw
-from coec.adapters.files.output import OutputError
+from coec.errors import OutputError
 from exported import extrinsic
 
 Matrix = NDArray[np.float64]

@@ -19,10 +19,9 @@ from coec.adapters.tls.conversation import (
     CrowdedError,
     Heard,
     Listener,
-    NotProvenError,
     Speaker,
 )
-from coec.errors import ConfigError
+from coec.errors import ConfigError, NotProvenError
 
 TEXT = b"hold everything"
 

@@ -28,13 +28,13 @@ from zenoh.ext import (
 from certificates import TestAuthority, make_authority
 from coec.adapters.tls.conversation import Speaker
 from coec.adapters.zenoh.bus import JSON, open_session
-from coec.adapters.zenoh.client import ConnectionFailedError, Way, connected_by, is_alive
+from coec.adapters.zenoh.client import Way, connected_by, is_alive
 from coec.adapters.zenoh.inputs import on_key
 from coec.adapters.zenoh.presence import Presence
 from coec.adapters.zenoh.proven import give
 from coec.adapters.zenoh.ros_side import RosSide
 from coec.config import IDENTITY, Config, SenderConfig, ZenohConfig
-from coec.errors import UnavailableError
+from coec.errors import ConnectionFailedError, UnavailableError
 from doors import Door, opened
 from fakes import wait_until
 from ros_nodes import Driver, described

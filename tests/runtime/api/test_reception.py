@@ -16,11 +16,12 @@ import pytest
 import zenoh
 
 from certificates import TestAuthority
-from coec.adapters.tls.conversation import NotProvenError, Speaker
+from coec.adapters.tls.conversation import Speaker
 from coec.adapters.zenoh.bus import JSON, WAITING, Lane, open_session
-from coec.adapters.zenoh.client import RemoteError, ask_one, connected
+from coec.adapters.zenoh.client import ask_one, connected
 from coec.adapters.zenoh.proven import give
 from coec.config import AuthorityConfig, SenderConfig, ZenohConfig
+from coec.errors import NotProvenError, RemoteError
 from coec.runtime.api import commands
 from coec.runtime.api.rate_limit import BURST, RateLimit
 from coec.schemas.base import to_json

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.error import YAMLError
 
-from coec.adapters.files.output import OutputError
+from coec.errors import OutputError
 
 INDENT = "  "
 

@@ -8,7 +8,7 @@ import json
 from typing import Any
 
 from coec.adapters.exports.extrinsic import Extrinsic, quaternion_wxyz, quaternion_xyzw, translation_m
-from coec.adapters.files.output import OutputError
+from coec.errors import OutputError
 
 NUSCENES_DIRECTION = "pose of the child (optical: z forward) in the parent (nuScenes: ego); rotation w x y z"
 OPENLABEL_DIRECTION = "pose of the child (optical: z forward) in the parent; quaternion x y z w"

@@ -6,8 +6,8 @@ import re
 
 from coec.adapters.exports.blocks import set_entry
 from coec.adapters.exports.extrinsic import Extrinsic
-from coec.adapters.files.output import OutputError
 from coec.config import CameraIntrinsics
+from coec.errors import OutputError
 
 DIRECTION = "T_cam_lidar maps coordinates in the parent to the optical camera frame (z forward); rows of a 4x4 matrix"
 

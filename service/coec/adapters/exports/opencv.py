@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from coec.adapters.exports.extrinsic import Extrinsic
-from coec.adapters.files.output import OutputError
+from coec.errors import OutputError
 
 HEAD = "%YAML:1.0\n---\n"
 DIRECTION = "maps coordinates in the parent to the optical camera frame (z forward); row by row"

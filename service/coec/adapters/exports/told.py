@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 import coec
 from coec.adapters.exports.extrinsic import AXES, Extrinsic, Origin
 from coec.adapters.files.conversions import estimate_of, matrix_of
-from coec.adapters.files.output import OutputError
 from coec.config import CameraIntrinsics
-from coec.errors import CoecError
+from coec.errors import OutputError
 from coec.geometry import se3
 from coec.schemas.replies import CalibrationResult, ExtrinsicReply
 
@@ -25,12 +24,6 @@ NOMINAL = "It is the nominal calibration: nothing has been accepted yet."
 
 PITCH_HEIGHT, YAW_SIDE = (0, 4), (1, 3)
 """Axes of the two correlations that a reply tells."""
-
-
-class NotAcceptedError(CoecError):
-    """A calibration that its own verdict speaks against was to be written into the files of a vehicle."""
-
-    reply_code = "not_accepted"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

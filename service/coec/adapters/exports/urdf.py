@@ -7,7 +7,7 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from coec.adapters.exports.extrinsic import Extrinsic, roll_pitch_yaw, translation_m
-from coec.adapters.files.output import OutputError
+from coec.errors import OutputError
 
 DIRECTION = "origin: pose of the child (optical: z forward) in the parent; rpy in rad, R = Rz(y) Ry(p) Rx(r)"
 

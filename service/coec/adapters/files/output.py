@@ -5,14 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from coec.adapters.files import durable
-from coec.errors import CoecError, DecodeError
+from coec.errors import DecodeError, OutputError
 from coec.schemas.base import M, from_json
-
-
-class OutputError(CoecError):
-    """A file that was asked for could not be written."""
-
-    reply_code = "output_failed"
 
 
 def write(path: Path, data: bytes) -> Path:

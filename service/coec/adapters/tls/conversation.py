@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from coec.config import AuthorityConfig
-from coec.errors import CoecError, ConfigError
+from coec.errors import CoecError, ConfigError, NotProvenError
 
 WAITED_S = 5.0
 """For the second question: what comes later is not heard. A carrier that keeps it back gains no more than this."""
@@ -39,12 +39,6 @@ MAX_SAID = 16_384
 LEFT_S = 1.0
 """For so long nobody's conversation is given up for another's: two queries take some milliseconds, and a busy computer
 a hundred times that."""
-
-
-class NotProvenError(CoecError):
-    """Who speaks has not shown a certificate that is taken here."""
-
-    reply_code = "not_proven"
 
 
 class CrowdedError(CoecError):

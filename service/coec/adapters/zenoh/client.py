@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import socket
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,31 +15,21 @@ import zenoh
 
 from coec.adapters.zenoh.endpoints import redacted
 from coec.adapters.zenoh.settings_file import read_settings
-from coec.errors import CoecError, DecodeError, NotFoundError, UsageError
+from coec.errors import ConnectionFailedError, DecodeError, NotFoundError, RemoteError, UsageError
 from coec.schemas.base import from_json, from_msgpack
-from coec.schemas.keys import Keys
+from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, Keys
 from coec.schemas.replies import ErrorReply
 
 JSON = "application/json"
 ENDPOINT = re.compile(r"[a-z0-9-]+/[^\s/].*")
 """PROTOCOL/ADDRESS, as Zenoh writes it."""
 
+ON_SITE = 0.9
+"""Share of the time that a command's acknowledgement is waited for that the service may take; the rest is for the way
+there and back."""
+
 TIMEOUT_PAYLOAD = b"Timeout"
 """What Zenoh itself replies with when nobody finished the query in time."""
-
-
-class ConnectionFailedError(CoecError):
-    """There is no router to connect to."""
-
-    reply_code = "not_connected"
-
-
-class RemoteError(CoecError):
-    """An error reply. `code` is the sender's."""
-
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.reply_code = code
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,15 +145,35 @@ def ask(
         UsageError: the selector does not begin with a key expression.
         RemoteError: somebody replied with an error, or did not answer within `timeout_s` and nobody else did.
     """
-    # The nearest complete queryable answers for a key; a key expression is meant for all of them.
+    asked = session.get(
+        selector,
+        target=target_of(selector),
+        timeout=timeout_s,
+        payload=payload,
+        encoding=JSON if payload is not None else None,
+        attachment=attachment,
+    )
+    return answered(selector, timeout_s, asked)
+
+
+def target_of(selector: str) -> zenoh.QueryTarget:
+    """Who is asked: the nearest complete queryable answers for a key; a key expression is meant for all of them.
+
+    Raises:
+        UsageError: the selector does not begin with a key expression.
+    """
     key = key_expression(selector.partition("?")[0])
-    target = zenoh.QueryTarget.ALL if "*" in key else zenoh.QueryTarget.BEST_MATCHING
-    encoding = JSON if payload is not None else None
+    return zenoh.QueryTarget.ALL if "*" in key else zenoh.QueryTarget.BEST_MATCHING
+
+
+def answered(selector: str, timeout_s: float, asked: Iterable[zenoh.Reply]) -> list[Reply]:
+    """What came in answer to a query, in the order of its keys.
+
+    Raises:
+        RemoteError: somebody replied with an error, or did not answer within `timeout_s` and nobody else did.
+    """
     replies: list[Reply] = []
     timed_out = False
-    asked = session.get(
-        selector, target=target, timeout=timeout_s, payload=payload, encoding=encoding, attachment=attachment
-    )
     for reply in asked:
         if reply.ok is not None:
             sample = reply.ok
@@ -172,8 +184,26 @@ def ask(
                 raise _remote_error(content, str(reply.err.encoding))
             timed_out = True
     if timed_out and not replies:
-        raise RemoteError("timeout", f"no answer to {selector} within {timeout_s:g} s: the service is too busy")
+        raise too_late(selector, timeout_s)
     return sorted(replies, key=lambda reply: reply.key)
+
+
+def too_late(selector: str, timeout_s: float) -> RemoteError:
+    """The error of a query that somebody could have answered, and did not in time."""
+    return RemoteError("timeout", f"no answer to {selector} within {timeout_s:g} s: the service is too busy")
+
+
+def myself() -> bytes:
+    """Who says that he gives a command: for the log, and for a rate of his own. It proves nothing."""
+    with suppress(OSError, KeyError):  # a user without a name
+        return f"{getpass.getuser()}@{socket.gethostname()}".encode("ascii", errors="replace")
+    return socket.gethostname().encode("ascii", errors="replace")
+
+
+def patience_ms(timeout_s: float) -> int:
+    """For how long a service may take over a command whose acknowledgement is waited for, ms: what it could not begin
+    by then is not done."""
+    return min(max(round(timeout_s * 1e3 * ON_SITE), 1), MAX_COMMAND_TIMEOUT_MS)
 
 
 def ask_one(session: zenoh.Session, selector: str, timeout_s: float, payload: bytes | None = None) -> Reply:

@@ -7,8 +7,9 @@ import time
 
 import zenoh
 
-from coec.adapters.tls.conversation import NotProvenError, Speaker
-from coec.adapters.zenoh.client import RemoteError, Reply, ask_one
+from coec.adapters.tls.conversation import Speaker
+from coec.adapters.zenoh.client import Reply, ask_one
+from coec.errors import NotProvenError, RemoteError
 from coec.schemas.base import to_json
 from coec.schemas.commands import ProvenCommand
 

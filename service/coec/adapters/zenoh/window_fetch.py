@@ -15,9 +15,8 @@ from typing import Final
 
 import zenoh
 
-from coec.adapters.files.output import OutputError
-from coec.adapters.zenoh.client import RemoteError, ask_one
-from coec.errors import CoecError, NotFoundError
+from coec.adapters.zenoh.client import ask_one
+from coec.errors import CoecError, NotFoundError, OutputError, RemoteError
 from coec.schemas.base import from_json
 from coec.schemas.keys import Keys
 from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply

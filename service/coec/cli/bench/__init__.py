@@ -27,12 +27,12 @@ from coec.calibration.objective.mutual_information import MutualInformation, Sea
 from coec.calibration.ports import Silence
 from coec.calibration.search.local_search import box_of, maximise
 from coec.cli.bench import live, look, recording, rig, rows, scene, worker
-from coec.cli.calibrate import StageTimes
 from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, SearchConfig, WindowConfig
 from coec.geometry import se3
 from coec.geometry.mutual_information import mutual_information
 from coec.geometry.plain_forms import by_numpy, by_scalar_loop
 from coec.reports import console
+from coec.reports.stage_times import StageTimes
 from coec.simulation.source import require_extra
 from coec.sources import windows
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import zenoh
 
-from coec.adapters.zenoh.client import ConnectionFailedError, ask_one
-from coec.errors import NotFoundError
+from coec.adapters.zenoh.client import ask_one
+from coec.errors import ConnectionFailedError, NotFoundError
 from coec.runtime.worker.child import PACKAGE_ROOT
 from coec.schemas.keys import Keys
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import zenoh
 
-from coec.adapters.zenoh.client import RemoteError, ask, ask_one
+from coec.adapters.zenoh.client import ask, ask_one
 from coec.calibration.types import Matrix4
 from coec.cli.demo.pace import NS_PER_S, Pace, at_rest
-from coec.errors import NotFoundError
+from coec.errors import NotFoundError, RemoteError
 from coec.geometry import se3
 from coec.schemas import replies
 from coec.schemas.base import from_json

@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable
 
 from coec.adapters.exports import FORMATS
-from coec.adapters.exports.told import Frames, NotAcceptedError
+from coec.adapters.exports.told import Frames
 from coec.adapters.files.conversions import result_of
 from coec.adapters.zenoh.bus import Answer
 from coec.calibration.lifecycle import Health, HealthState
 from coec.calibration.types import Reason, Rig
 from coec.config import Config, PairConfig, config_hash
-from coec.errors import NotFoundError
+from coec.errors import NotAcceptedError, NotFoundError
 from coec.runtime.api import streams
 from coec.runtime.api.exports import exported
 from coec.runtime.api.extrinsic import extrinsic_of

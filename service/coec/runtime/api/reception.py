@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from pydantic import BaseModel
 
-from coec.adapters.tls.conversation import Heard, Listener, NotProvenError
+from coec.adapters.tls.conversation import Heard, Listener
 from coec.adapters.zenoh.bus import Answer, Request
-from coec.errors import UsageError
+from coec.errors import NotProvenError, UsageError
 from coec.runtime.api import payloads
 from coec.runtime.api.authority import Authority, NotAllowedError
 from coec.runtime.api.awaited import AwaitedCommands

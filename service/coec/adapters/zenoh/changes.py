@@ -1,0 +1,108 @@
+"""What is so at a vehicle, and every change from then on, as it comes over a router."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Literal
+
+import zenoh
+
+from coec.adapters.zenoh.client import JSON
+from coec.errors import DecodeError
+from coec.schemas.base import from_json, from_msgpack
+from coec.schemas.keys import Keys
+from coec.schemas.replies import ExtrinsicReply, HealthReply
+
+MAX_BYTES = 2**20
+"""Of one document that is taken in; health with all its figures has some 10 kB."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One thing that was said of a pair.
+
+    Attributes:
+        key: whole key on the bus.
+        pair: name of the pair.
+        kind: `extrinsic`, `health`, or `alive`: whether the pair is served.
+        value: the reply as if it had been asked for; of `alive` True or False.
+        lost: changes before this one that were not taken: they came faster than they were, or were none of ours.
+    """
+
+    key: str
+    pair: str
+    kind: Literal["extrinsic", "health", "alive"]
+    value: ExtrinsicReply | HealthReply | bool
+    lost: int = 0
+
+
+@contextmanager
+def listening(
+    session: zenoh.Session,
+    keys: Keys,
+    pair: str,
+    timeout_s: float,
+    take: Callable[[Change], None],
+    refuse: Callable[[], None],
+) -> Iterator[None]:
+    """Until the end of the block `take` is called for what a pair (`*`: each) says now, and for every change; and
+    `refuse` for what is no document of ours. Both are called on Zenoh's threads and must not wait. Nothing waits for
+    the answers of now, which come within `timeout_s` or not at all."""
+    changed: set[str] = set()
+    order = threading.Lock()
+
+    def give(sample: zenoh.Sample) -> None:
+        try:
+            change = _change(sample)
+        except DecodeError:
+            refuse()
+        else:
+            take(change)
+
+    def hear(sample: zenoh.Sample) -> None:
+        with order:
+            changed.add(str(sample.key_expr))
+            give(sample)
+
+    def answered(reply: zenoh.Reply) -> None:
+        with order:
+            # What has changed meanwhile is newer than this answer, or the same.
+            if reply.ok is not None and str(reply.ok.key_expr) not in changed:
+                give(reply.ok)
+
+    handler = zenoh.handlers.Callback(hear, indirect=False)
+    told = (keys.health(pair), keys.extrinsic(pair))
+    given_up = zenoh.CancellationToken()
+    with ExitStack() as stack:
+        for key in told:
+            stack.callback(session.declare_subscriber(key, handler).undeclare)
+        tokens = session.liveliness().declare_subscriber(keys.alive(pair), handler, history=True)
+        stack.callback(tokens.undeclare)
+        stack.callback(given_up.cancel)
+        for key in told:
+            session.get(
+                key,
+                zenoh.handlers.Callback(answered, indirect=False),
+                target=zenoh.QueryTarget.ALL,
+                timeout=timeout_s,
+                cancellation_token=given_up,
+            )
+        yield
+
+
+def _change(sample: zenoh.Sample) -> Change:
+    """Raises: DecodeError: no document of ours."""
+    key = str(sample.key_expr)
+    _, pair, kind = key.rsplit("/", 2)
+    if kind == "alive":
+        return Change(key, pair, "alive", sample.kind == zenoh.SampleKind.PUT)
+    if len(sample.payload) > MAX_BYTES:
+        raise DecodeError("message_too_large", f"a document of more than {MAX_BYTES} bytes")
+    read = from_json if str(sample.encoding).startswith(JSON) else from_msgpack
+    payload = sample.payload.to_bytes()
+    if kind == "health":
+        return Change(key, pair, "health", read(HealthReply, payload))
+    return Change(key, pair, "extrinsic", read(ExtrinsicReply, payload))

@@ -1,0 +1,392 @@
+"""A service that runs, for a program with an event loop.
+
+    import asyncio
+    from coec.client import Vehicle
+
+    async def main() -> None:
+        async with Vehicle("shuttle-7", connect="tcp/192.168.1.2:7447") as vehicle:
+            print((await vehicle.extrinsic()).camera_from_lidar.matrix)
+            async for change in vehicle.changes():
+                print(change.pair, change.kind, change.value)
+
+    asyncio.run(main())
+
+Replies are the pydantic models of `coec.schemas.replies`, as CONTRACT and `schemas/v1` have them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import threading
+from collections import deque
+from collections.abc import AsyncGenerator, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import zenoh
+from pydantic import BaseModel
+
+from coec.adapters.tls.conversation import Speaker
+from coec.adapters.zenoh.bus import MSGPACK
+from coec.adapters.zenoh.changes import Change, listening
+from coec.adapters.zenoh.client import (
+    JSON,
+    Reply,
+    Way,
+    answered,
+    connected_by,
+    myself,
+    nobody,
+    patience_ms,
+    single_key,
+    target_of,
+    too_late,
+)
+from coec.adapters.zenoh.proven import give
+from coec.adapters.zenoh.settings import connected_of
+from coec.adapters.zenoh.settings_file import credentials_in, read_settings
+from coec.config import Config, ZenohConfig
+from coec.errors import UsageError
+from coec.schemas.base import from_msgpack
+from coec.schemas.commands import NAMES, CommandName
+from coec.schemas.keys import MAX_LENGTH, Keys
+from coec.schemas.replies import Acknowledgement, ExtrinsicReply, HealthReply, HistoryReply, StatusReply, WindowsReply
+
+__all__ = ["Change", "Vehicle"]
+
+WAITING = 1024
+"""Changes that may wait to be taken, some 10 MB; of more the oldest go, and are counted."""
+
+MAX_MESSAGE_BYTES = 2 * MAX_LENGTH
+"""Of one that is taken in."""
+
+MAX_REPLIES = 16
+"""To a question that is put to one service."""
+
+GRACE_S = 1.0
+"""Beyond the time of a question: Zenoh ends it itself, unless its session hangs."""
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Vehicle:
+    """A running service of one vehicle: questions, commands and changes.
+
+    It is an asynchronous context manager, and what is asked is asked within it. Any number of questions may be under
+    way at once, of one event loop. A task that is cancelled gives its question up at once; a command that was
+    cancelled may have been carried out.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        connect: str | Sequence[str] | None = None,
+        prefix: str | None = None,
+        settings: str | PathLike[str] | None = None,
+        timeout_s: float = 5.0,
+    ) -> None:
+        """Nothing is connected yet.
+
+        Args:
+            name: of the vehicle, as its configuration has it.
+            connect: Zenoh endpoints of the router, of which the first that answers is taken; None: those of the file,
+                else `tcp/127.0.0.1:7447`.
+            prefix: of all keys; None: `coec`.
+            settings: file with the Zenoh configuration of the session (JSON5). With a certificate in it, commands are
+                proven with it.
+            timeout_s: for the router to answer, and for each question, unless told otherwise there.
+
+        Raises:
+            UsageError: the name or the prefix makes no key, or `timeout_s` is no time.
+            ConfigError: the file cannot be used.
+        """
+        fields = Config.model_fields
+        self._keys = Keys(fields["prefix"].default if prefix is None else prefix, name)
+        single_key(self._keys.status)  # every other key is below it
+        self._timeout_s = _seconds(timeout_s)
+        file = None if settings is None else Path(settings)
+        read = None if file is None else read_settings(file)
+        given = (connect,) if isinstance(connect, str) else tuple(connect or ())
+        endpoints = given or (() if read is None else connected_of(read)) or ZenohConfig().router
+        self._way = Way(tuple(endpoints), file)
+        self._credentials = None if read is None else credentials_in(read)
+        self._connection: AbstractContextManager[zenoh.Session] | None = None
+        self._open: zenoh.Session | None = None
+        self._listeners: set[_Waiting] = set()
+
+    def __repr__(self) -> str:
+        return f"<coec.client.Vehicle {self._keys.root}>"
+
+    async def __aenter__(self) -> Self:
+        """Connects.
+
+        Raises:
+            ConnectionFailedError: no router answered within `timeout_s`.
+            UsageError: an endpoint is malformed.
+        """
+        if self._connection is not None:
+            raise UsageError("the vehicle is connected already: a second connection is a second Vehicle")
+        connection = connected_by(self._way, self._timeout_s, MAX_MESSAGE_BYTES)
+        opening = asyncio.get_running_loop().run_in_executor(None, connection.__enter__)
+        try:
+            self._open = await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            opening.add_done_callback(lambda done: _abandon(done, connection))
+            raise
+        self._connection = connection
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Disconnects: whoever iterates over `changes` comes to the end."""
+        connection, self._connection, self._open = self._connection, None, None
+        for waiting in tuple(self._listeners):
+            waiting.end()
+        if connection is not None:
+            closing = asyncio.get_running_loop().run_in_executor(None, connection.__exit__, None, None, None)
+            await asyncio.shield(closing)
+
+    async def pairs(self) -> tuple[str, ...]:
+        """Names of the pairs that are served.
+
+        Raises:
+            NotFoundError, RemoteError: as `extrinsic`.
+        """
+        return tuple(pair.name for pair in (await self.status()).pairs)
+
+    async def status(self, *, timeout_s: float | None = None) -> StatusReply:
+        """Of the service: its worker, storage, and the counters of each pair.
+
+        Raises:
+            NotFoundError, RemoteError: as `extrinsic`.
+        """
+        return await self._reply(StatusReply, self._keys.status, timeout_s)
+
+    async def extrinsic(self, pair: str | None = None, *, timeout_s: float | None = None) -> ExtrinsicReply:
+        """The calibration to use now. There is one before the first result: the nominal one.
+
+        Args:
+            pair: which; None: the vehicle's only one.
+            timeout_s: for the answer; None: as the vehicle was made.
+
+        Raises:
+            UsageError: no such name, or there are several pairs to choose from; or the vehicle is not connected.
+            NotFoundError: nobody answered: the vehicle is not there, or the router's rules do not allow it.
+            RemoteError: the service refuses; `reply_code` is its code, `timeout` where it did not answer in time.
+            DecodeError: what came is no such reply.
+        """
+        return await self._reply(ExtrinsicReply, self._keys.extrinsic(await self._pair(pair)), timeout_s)
+
+    async def health(self, pair: str | None = None, *, timeout_s: float | None = None) -> HealthReply:
+        """Whether the calibration is right, and how that is known. Arguments and errors as `extrinsic`."""
+        return await self._reply(HealthReply, self._keys.health(await self._pair(pair)), timeout_s)
+
+    async def windows(self, pair: str | None = None, *, timeout_s: float | None = None) -> WindowsReply:
+        """Recorded windows, oldest first. Arguments and errors as `extrinsic`."""
+        return await self._reply(WindowsReply, self._keys.windows(await self._pair(pair)), timeout_s)
+
+    async def history(
+        self, pair: str | None = None, *, limit: int = 100, timeout_s: float | None = None
+    ) -> HistoryReply:
+        """Past results and what else happened, oldest first: the newest `limit` of them. Arguments and errors as
+        `extrinsic`."""
+        key = self._keys.history(await self._pair(pair))
+        return await self._reply(HistoryReply, f"{key}?limit={limit}", timeout_s)
+
+    async def command(
+        self,
+        name: CommandName,
+        pair: str | None = None,
+        payload: Mapping[str, Any] | None = None,
+        *,
+        timeout_s: float | None = None,
+    ) -> Acknowledgement:
+        """Gives a command, and waits for its acknowledgement, which says whether it is carried out, and why not.
+
+        Args:
+            name: `calibrate`, `apply`, `rollback`, `reset`, `commission` or `hold`.
+            pair: which; None: the vehicle's only one.
+            payload: arguments of the command, as JSON takes them.
+            timeout_s: for the acknowledgement; what the service could not begin by then is not done.
+
+        Raises:
+            UsageError: no such command, or a payload that is no JSON; else as `extrinsic`.
+            NotProvenError: whoever answered is not the service (with a certificate).
+            NotFoundError, RemoteError, DecodeError: as `extrinsic`.
+        """
+        if name not in NAMES:
+            raise UsageError(f"no command {name!r}: known are {', '.join(NAMES)}")
+        waits_s = self._timeout_s if timeout_s is None else _seconds(timeout_s)
+        key = self._keys.command(await self._pair(pair), name)
+        selector = f"{single_key(key)}?timeout_ms={patience_ms(waits_s)};format=msgpack"
+        try:
+            said = None if payload is None else json.dumps(dict(payload), allow_nan=False).encode()
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"payload of {name}: {error}") from error
+        if self._credentials is None:
+            return from_msgpack(Acknowledgement, (await self._ask(selector, waits_s, said, myself())).payload)
+        speaker = Speaker(self._credentials, self._keys.vehicle)
+        session = self._session
+        reply = await asyncio.get_running_loop().run_in_executor(
+            None, lambda: give(session, selector, said, waits_s, speaker, MSGPACK)
+        )
+        return from_msgpack(Acknowledgement, reply.payload)
+
+    async def changes(self, pair: str | None = None) -> AsyncGenerator[Change]:
+        """What is so now (`extrinsic`, `health`, `alive` of each pair), then every change as it comes, until the loop
+        over it ends or the vehicle is disconnected. A vehicle that is not there says nothing until it comes; one that
+        goes says `alive` False, and is heard again when it is back.
+
+        At most 1024 changes wait; of more the oldest are left out, and `Change.lost` of the next one counts them.
+
+        Args:
+            pair: which; None: all of them.
+
+        Raises:
+            UsageError: no such name, or the vehicle is not connected.
+        """
+        if pair is not None:
+            single_key(pair)
+        waiting = _Waiting(asyncio.get_running_loop())
+        of = listening(self._session, self._keys, pair or "*", self._timeout_s, waiting.take, waiting.refuse)
+        self._listeners.add(waiting)
+        try:
+            with of:
+                while (change := await waiting.next()) is not None:
+                    yield change
+        finally:
+            self._listeners.discard(waiting)
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _session(self) -> zenoh.Session:
+        if self._open is None:
+            raise UsageError("the vehicle is not connected: `async with Vehicle(...) as vehicle:`")
+        return self._open
+
+    async def _pair(self, pair: str | None) -> str:
+        if pair is not None:
+            return single_key(pair)
+        names = await self.pairs()
+        if len(names) != 1:
+            raise UsageError(f"the vehicle serves {len(names)} pairs, name one: {', '.join(names)}")
+        return names[0]
+
+    async def _reply(self, model: type[M], selector: str, timeout_s: float | None) -> M:
+        single_key(selector.partition("?")[0])
+        waits_s = self._timeout_s if timeout_s is None else _seconds(timeout_s)
+        return from_msgpack(model, (await self._ask(selector, waits_s)).payload)
+
+    async def _ask(
+        self, selector: str, timeout_s: float, payload: bytes | None = None, attachment: bytes | None = None
+    ) -> Reply:
+        loop = asyncio.get_running_loop()
+        ended = asyncio.Event()
+        replies: list[zenoh.Reply] = []
+
+        def hear(reply: zenoh.Reply) -> None:
+            if len(replies) < MAX_REPLIES:
+                replies.append(reply)
+
+        def end() -> None:
+            with suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(ended.set)
+
+        given_up = zenoh.CancellationToken()
+        self._session.get(
+            selector,
+            zenoh.handlers.Callback(hear, end, indirect=False),
+            target=target_of(selector),
+            timeout=timeout_s,
+            payload=payload,
+            encoding=None if payload is None else JSON,
+            attachment=attachment,
+            cancellation_token=given_up,
+        )
+        try:
+            async with asyncio.timeout(timeout_s + GRACE_S):
+                await ended.wait()
+        except TimeoutError:
+            raise too_late(selector, timeout_s) from None
+        finally:
+            given_up.cancel()
+        came = answered(selector, timeout_s, replies)
+        if not came:
+            raise nobody(selector)
+        return came[0]
+
+
+class _Waiting:
+    """Changes between Zenoh's threads and one loop."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._lock = threading.Lock()
+        self._changes: deque[Change] = deque()
+        self._lost = 0
+        self._wakes = False
+        self._woken = asyncio.Event()
+        self._ended = False
+
+    def take(self, change: Change) -> None:
+        """On any thread."""
+        with self._lock:
+            if len(self._changes) >= WAITING:
+                self._changes.popleft()
+                self._lost += 1
+            self._changes.append(change)
+            wakes, self._wakes = self._wakes, True
+        if not wakes:  # one call waits for a loop that is busy, not one for each change
+            with suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._wake)
+
+    def refuse(self) -> None:
+        """On any thread."""
+        with self._lock:
+            self._lost += 1
+
+    def end(self) -> None:
+        """On the loop: nothing comes any more."""
+        self._ended = True
+        self._woken.set()
+
+    async def next(self) -> Change | None:
+        """The next one; None: there is none any more."""
+        while True:
+            self._woken.clear()
+            with self._lock:
+                if self._changes:
+                    change, lost, self._lost = self._changes.popleft(), self._lost, 0
+                    return replace(change, lost=lost)
+            if self._ended:
+                return None
+            await self._woken.wait()
+
+    def _wake(self) -> None:
+        with self._lock:
+            self._wakes = False
+        self._woken.set()
+
+
+def _abandon(opening: asyncio.Future[zenoh.Session], connection: AbstractContextManager[zenoh.Session]) -> None:
+    """What was opened when nobody waited for it any more is closed again."""
+    if not opening.cancelled() and opening.exception() is None:
+        threading.Thread(target=connection.__exit__, args=(None, None, None), daemon=True).start()
+
+
+def _seconds(timeout_s: float) -> float:
+    if not 0.0 < timeout_s < math.inf:
+        raise UsageError(f"timeout_s={timeout_s!r}: give seconds, above 0")
+    return timeout_s

@@ -1,0 +1,273 @@
+"""One recording, one known pose, many starts around it: the flow of an evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import degrees, radians
+from typing import Any, cast
+
+from pydantic import ValidationError
+
+from coec.adapters.depth.maps import open_depth
+from coec.calibration.ports import DepthModel
+from coec.calibration.types import Matrix4, Window
+from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
+from coec.errors import CalibrationError, UsageError
+from coec.evaluation import experiments, normalised_errors, split_halves, statistics
+from coec.evaluation.detection import require_enough
+from coec.evaluation.experiments import Bench, Stages
+from coec.evaluation.normalised_errors import NormalisedErrors
+from coec.evaluation.split_halves import Halves
+from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
+from coec.geometry.cameras import name_of
+from coec.library import choices
+from coec.library.camera_fit import refitted
+from coec.library.choices import Choices
+from coec.reports.evaluation_documents import (
+    angle_spread_of,
+    detection_of,
+    frames_point_of,
+    halves_of,
+    in_degrees,
+    normalised_of,
+    slice_point_of,
+    spread_of,
+    steps_of,
+    verdicts_of,
+)
+from coec.schemas.evaluation import DetectionReport, EvaluationReport, StepRow
+from coec.schemas.replies import Vector6
+from coec.sources import open_source, windows
+from coec.sources.between import with_between
+from coec.sources.recording import KnowsTruth
+
+MARGIN_DEG, MARGIN_M = 5.0, 0.2
+REACH_MARGIN_DEG, REACH_MARGIN_M = 3.0, 0.15
+"""How far the search box reaches beyond the starts at least, so that the reference never lies on its bound and a search
+may overshoot."""
+
+SIMULATED_TRUTH, OWN_CALIBRATION = "the simulated truth", "the source's own calibration"
+OTHER_HALF = "the other half of the frames"
+"""What normalised errors are counted from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is tried. 0 and False: not.
+
+    Attributes:
+        rotation_deg, translation_m: radii of the spheres of starts.
+        directions: number of starts.
+        against_frames, against_slice: windows of fewer frames, and slices of the recording, too.
+        halves: random splits of the frames into disjoint halves.
+        nees: windows whose errors are held against what they claim, one after the other.
+        detection: splits over which moved extrinsics are to be seen.
+        steps: knocks of each kind.
+    """
+
+    rotation_deg: float
+    translation_m: float = 0.0
+    directions: int = 200
+    against_frames: bool = False
+    against_slice: bool = False
+    halves: int = 0
+    nees: int = 0
+    detection: int = 0
+    steps: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """What is evaluated: the window and its depth (`model` infers that of other frames, `depth` remembers), of so many
+    camera frames of a source (None: as many as usual)."""
+
+    source: str
+    frames: int | None
+
+    window: Window
+    model: DepthModel
+    depth: DepthModel
+    recorded: CalibrationConfig | None
+    vehicle: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Experiments:
+    """What came of the experiments that were asked for."""
+
+    from_reference: Outcome
+    outcomes: list[Outcome]
+    frames: tuple[FramesPoint, ...]
+    slices: tuple[SlicePoint, ...]
+    halves: Halves | None
+    normalised: dict[str, NormalisedErrors]
+    detection: DetectionReport | None
+    steps: tuple[StepRow, ...]
+
+
+def configuration_of(plan: Plan, chosen: Choices, recorded: CalibrationConfig | None) -> CalibrationConfig:
+    """As for `coec calibrate`, with a search box that holds the starts; a translated start is searched in six degrees
+    of freedom unless told otherwise.
+
+    Raises:
+        UsageError: a value that does not exist, or starts too far for any search box.
+    """
+    dof = 6 if chosen.dof is None and plan.translation_m > 0 else chosen.dof
+    configuration = choices.configuration_of(replace(chosen, dof=dof), recorded)
+    values: dict[str, Any] = configuration.model_dump()
+    search = values["search"]
+    search["rotation_deg"] = max(search["rotation_deg"], plan.rotation_deg + MARGIN_DEG)
+    search["translation_m"] = max(search["translation_m"], plan.translation_m + MARGIN_M)
+    # The protocol tells how far away the starts are; the global stage looks no further.
+    search["reach_deg"] = plan.rotation_deg + REACH_MARGIN_DEG
+    search["reach_m"] = plan.translation_m + REACH_MARGIN_M
+    try:
+        return CalibrationConfig.model_validate(values)
+    except ValidationError as error:
+        raise UsageError(
+            f"the search box must reach {MARGIN_DEG:g} deg and {MARGIN_M:g} m beyond the starts: {describe(error)}"
+        ) from error
+
+
+def subject_of(
+    source: str,
+    frames: int | None,
+    loaded: windows.Loaded,
+    plan: Plan,
+    chosen: Choices,
+    camera_model: str | None,
+    stages: Stages,
+) -> Subject:
+    """A window that was loaded, with its depth. What it is too short for is refused before anything is inferred.
+
+    Raises:
+        UsageError: a value that does not exist.
+        CalibrationError: detection is asked for and the pairs are too few, or a frame has no depth.
+    """
+    window = loaded.window
+    if plan.detection:
+        require_enough(len(window.pairs))
+    if camera_model is not None:
+        window, _ = refitted(window, camera_model)
+    if plan.steps and loaded.configuration is None:  # a recorded window has what was recorded
+        window = with_between(window, open_source(source), WindowConfig())
+    model = open_depth(configuration_of(plan, chosen, loaded.configuration).depth, LimitsConfig())
+    depth = experiments.inferred(window, model, stages.begin("depth", len(window.pairs)))
+    return Subject(source, frames, window, model, depth, loaded.configuration, loaded.vehicle)
+
+
+def bench_of(subject: Subject, plan: Plan, chosen: Choices) -> Bench:
+    """What all solves share.
+
+    Raises:
+        UsageError: as `configuration_of`.
+    """
+    configuration = configuration_of(plan, chosen, subject.recorded)
+    return Bench(subject.window, subject.depth, experiments.greys_of(subject.window), configuration)
+
+
+def tried(subject: Subject, plan: Plan, bench: Bench, stages: Stages) -> Experiments:
+    """Every experiment that was asked for.
+
+    Raises:
+        CalibrationError: there is no result even from the source's calibration.
+    """
+
+    def cut(begin_s: float, end_s: float) -> Window:
+        between_s = (begin_s, end_s)
+        loaded = windows.load(subject.source, subject.frames, WindowConfig().pairs, lambda *_: None, between_s)
+        # With the rig of the whole: it may have another camera model.
+        return replace(loaded.window, rig=subject.window.rig)
+
+    poses = experiments.poses_of(bench, plan.directions, plan.rotation_deg, plan.translation_m)
+    from_reference = experiments.from_reference(bench, stages)
+    outcomes = experiments.from_starts(bench, poses, stages)
+    frames = experiments.against_frames(bench, poses, stages) if plan.against_frames else ()
+    slices = experiments.against_slice(bench, subject.model, cut, poses, stages) if plan.against_slice else ()
+    radii = (radians(plan.rotation_deg), plan.translation_m)
+    splits = plan.halves or plan.nees
+    halved = experiments.in_halves(bench, splits, *radii, stages) if splits else []
+    halves = None
+    if plan.halves:
+        halves = split_halves.compare(halved, len(bench.window.pairs) // 2, bench.configuration.search.dof)
+    normalised = {}
+    if plan.nees:
+        against, true_pose = _truth(subject.source, bench)
+        starts = experiments.poses_of(bench, plan.nees, plan.rotation_deg, plan.translation_m)
+        apart = experiments.in_windows(bench, subject.model, cut, starts, true_pose, stages)
+        normalised[against] = normalised_errors.normalise(normalised_errors.of_outcomes(apart), len(apart))
+        # Every split sees the same frames: they count as one.
+        normalised[OTHER_HALF] = normalised_errors.normalise(normalised_errors.of_differences(halved), independent=1)
+    detection = None
+    if plan.detection:
+        seen = experiments.detected(bench, plan.detection, experiments.CHECKS, stages)
+        detection = detection_of(seen, plan.detection, len(bench.window.pairs))
+    knocked = experiments.knocked(bench, plan.steps, stages) if plan.steps else []
+    return Experiments(from_reference, outcomes, frames, slices, halves, normalised, detection, steps_of(knocked))
+
+
+def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
+    """What the errors of windows are counted from, and its name: the truth where the source knows it, else its own
+    calibration."""
+    recording = open_source(source)
+    if isinstance(recording, KnowsTruth):
+        return SIMULATED_TRUTH, recording.truth
+    return OWN_CALIBRATION, lambda _: bench.reference
+
+
+def report_of(
+    subject: Subject, plan: Plan, bench: Bench, done: Experiments, elapsed_s: dict[str, float]
+) -> EvaluationReport:
+    """The document of an evaluation.
+
+    Raises:
+        CalibrationError: there is no estimate from the source's calibration.
+    """
+    summary = statistics.summarise(done.outcomes)
+    search = bench.configuration.search
+    solved = done.from_reference.trial.estimate
+    if solved is None:
+        raise CalibrationError("there is no estimate from the source's calibration itself")
+    return EvaluationReport(
+        source=subject.source,
+        vehicle=subject.vehicle,
+        pair=bench.window.rig.pair,
+        window_id=bench.window.window_id,
+        pairs=len(bench.window.pairs),
+        camera_model=name_of(bench.window.rig.camera),
+        objective=bench.configuration.objective.kind,
+        dof=search.dof,
+        start_rotation_deg=plan.rotation_deg,
+        start_translation_m=plan.translation_m,
+        search_rotation_deg=search.rotation_deg,
+        search_translation_m=search.translation_m if search.dof == 6 else 0.0,
+        hit_rotation_deg=degrees(statistics.HIT_RAD),
+        hit_translation_m=statistics.HIT_M if search.dof == 6 else None,
+        starts=summary.starts,
+        hits=summary.hits,
+        hit_rate=summary.hit_rate,
+        rotation_deg=angle_spread_of(summary.rotation_rad),
+        translation_m=spread_of(summary.translation_m),
+        median=cast("Vector6", in_degrees(summary.median)),
+        bias=in_degrees(summary.bias),
+        std=in_degrees(summary.std),
+        rms=in_degrees(summary.rms),
+        sigma=in_degrees(summary.sigma),
+        from_reference=cast("Vector6", in_degrees(done.from_reference.error)),
+        solve_s=spread_of(summary.solve_s),
+        evaluations=spread_of(summary.evaluations),
+        classified_correctly=summary.classified_correctly,
+        verdicts=verdicts_of(summary.verdicts),
+        stop_reasons=summary.stop_reasons,
+        worst_start=statistics.worst(done.outcomes),
+        frames=tuple(frames_point_of(point) for point in done.frames),
+        slices=tuple(slice_point_of(point) for point in done.slices),
+        halves=None if done.halves is None else halves_of(done.halves),
+        detection=done.detection,
+        steps=done.steps,
+        normalised=tuple(normalised_of(against, found) for against, found in done.normalised.items()),
+        depth_identity=solved.depth_identity,
+        config_hash=solved.config_hash,
+        elapsed_s=elapsed_s,
+    )
