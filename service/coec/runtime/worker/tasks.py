@@ -15,6 +15,7 @@ from coec.adapters.files.baseline_file import BASELINES, baseline_of, save_basel
 from coec.adapters.files.rig import rig_of
 from coec.adapters.frames.msgpack_frames import decode_camera
 from coec.adapters.images.codec import CachedGreys, GreyImages, decode_bgr, encode_jpeg
+from coec.adapters.images.range_colours import RangeScale, kept_or, scale_of
 from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.baseline import Baseline, learned_hash, mismatch
 from coec.calibration.commissioning.learning import commission
@@ -39,6 +40,7 @@ from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError
 from coec.geometry.cameras import scaled
 from coec.geometry.edges.alignment import EdgeFrames, alignment_of_parts
 from coec.geometry.projection import project
+from coec.geometry.vectors import lengths
 from coec.reports.overlay import draw
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Solved, WrittenFile
 from coec.runtime.worker.messages import unpack_pairs
@@ -75,6 +77,7 @@ class Solver:
         self._depth_maps_kept = depth_maps_kept
         self._images = GreyImages(config.limits)
         self._networks: dict[DepthConfig, CachedDepth] = {}
+        self._scales: dict[str, RangeScale] = {}
         self.use(config)
 
     def use(self, config: Config) -> None:
@@ -193,7 +196,7 @@ class Solver:
             DecodeError: a frame cannot be decoded.
         """
         (drawn,) = unpack_pairs(frames, self._config.limits)
-        return self._drawn(self._rigs[pair], configuration, pose, drawn, title)
+        return self._drawn(self._rigs[pair], configuration, pose, drawn, title, self._scale(pair, drawn.lidar))
 
     def commission(
         self, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
@@ -225,12 +228,19 @@ class Solver:
         pose: Sequence[Sequence[float]],
         pair: FramePair,
         title: str,
+        scale: RangeScale | None = None,
     ) -> Drawn:
         xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
         image = decode_bgr(pair.camera.image, self._config.limits)
         T_camera_lidar = np.array(pose, dtype=np.float64)
-        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title)
+        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title, scale)
         return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
+
+    def _scale(self, pair: str, sweep: LidarFrame) -> RangeScale:
+        """Of the colours of a stream, which do not change from picture to picture."""
+        scale = kept_or(self._scales.get(pair), scale_of(lengths(sweep.xyz_m)))
+        self._scales[pair] = scale
+        return scale
 
     def _baseline(
         self, pair: str, configuration: CalibrationConfig, depth_identity: str
