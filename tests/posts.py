@@ -10,6 +10,7 @@ import numpy as np
 from coec.adapters.images.codec import encode_png
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame, Matrix4, Rig, Window
 from coec.geometry.cameras import Camera, build
+from coec.geometry.edges.range_edges import SPILL_RAD
 from coec.geometry.projection import unproject
 
 T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -38,9 +39,11 @@ def window(
     return Window("front-1", rig, T_camera_lidar, (pair,))
 
 
-def _is_post(azimuth: np.ndarray, elevation: np.ndarray, posts_deg: Sequence[float]) -> np.ndarray:
+def _is_post(
+    azimuth: np.ndarray, elevation: np.ndarray, posts_deg: Sequence[float], spill_rad: float = 0.0
+) -> np.ndarray:
     aside = np.min([np.abs(azimuth - radians(post)) for post in (*posts_deg, 1e3)], axis=0)
-    return np.asarray((aside < HALF_POST_RAD) & (np.abs(elevation) < HALF_HEIGHT_RAD))
+    return np.asarray((aside < HALF_POST_RAD + spill_rad) & (np.abs(elevation) < HALF_HEIGHT_RAD))
 
 
 def _picture(camera: Camera, posts_deg: Sequence[float]) -> np.ndarray:
@@ -57,7 +60,7 @@ def _sweep(posts_deg: Sequence[float], stamp_ns: int) -> LidarFrame:
     elevation, azimuth = np.meshgrid(np.arange(-30, 31) * LINES_RAD, np.arange(-900, 900) * COLUMN_RAD, indexing="ij")
     ring = np.repeat(np.arange(len(elevation)), elevation.shape[1]).astype(np.uint16)
     azimuth, elevation = azimuth.ravel(), elevation.ravel()
-    range_m = np.where(_is_post(azimuth, elevation, posts_deg), POST_M, WALL_M)
+    range_m = np.where(_is_post(azimuth, elevation, posts_deg, SPILL_RAD), POST_M, WALL_M)
     direction = np.column_stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )

@@ -49,7 +49,7 @@ def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path)
     outcome = coec("calibrate", SMALL, "--depth", "stereo", "--output", tmp_path / "out", "--json")
     written = tmp_path / "out"
     assert json.loads((written / "result.json").read_text())["correction"] == outcome.document["correction"]
-    for name in ("overlay_before.png", "overlay_after.png"):
+    for name in ("overlay_before.png", "overlay_after.png", "close_ups.png", "residuals.png"):
         assert (written / name).read_bytes().startswith(b"\x89PNG")
 
 

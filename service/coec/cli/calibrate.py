@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from rich.progress import Progress, TaskID
 
@@ -25,6 +26,7 @@ from coec.geometry import se3
 from coec.geometry.cameras import name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.reports import console, pictures
+from coec.reports.close_ups import Caption
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationReport, CalibrationResult
 from coec.sources import windows
@@ -170,15 +172,24 @@ def _finite(value: float) -> float | None:
 def _write(
     folder: Path, window: Window, result: CalibrationResult, configuration: CalibrationConfig, document: dict[str, Any]
 ) -> None:
+    caption = Caption(
+        before="start",
+        after=f"result, {result.verdict.decision}",
+        sigma=_sigma_of(result),
+        network=pictures.network_text(configuration.depth.model, result.depth_identity),
+    )
     T_found = np.array(result.camera_from_lidar.matrix)
-    moved_deg = windows.rotation_error_deg(T_found, window.T_camera_lidar_start)
-    where = f"{window.rig.pair}  {pictures.middle(window).stamp_ns} ns"
-    poses = {
-        "overlay_before": (window.T_camera_lidar_start, f"{where}  start"),
-        "overlay_after": (T_found, f"{where}  {result.verdict.decision}, {moved_deg:.2f} deg from the start"),
-    }
-    pictures.write_overlays(folder, window, poses, configuration.motion_compensation)
+    pictures.write_comparison(
+        folder, window, window.T_camera_lidar_start, T_found, caption, configuration.motion_compensation
+    )
     output.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
+
+
+def _sigma_of(result: CalibrationResult) -> NDArray[np.float64]:
+    """(6,) in radians and metres; NaN where there is none."""
+    sigma = np.array([np.nan if value is None else value for value in result.sigma], dtype=np.float64)
+    sigma[:3] = np.radians(sigma[:3])
+    return np.where(np.array(result.solved), sigma, np.nan)
 
 
 def _show(

@@ -1,4 +1,4 @@
-"""Overlays for people: points on the image, before and after."""
+"""Pictures of a window for people: points on the image before and after, close-ups, what is left at the result."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from pathlib import Path
 
 from coec.adapters.files.output import write
 from coec.adapters.images.codec import decode_bgr, encode_png
+from coec.adapters.images.range_colours import scale_of
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import FramePair, Matrix4, Window
 from coec.config import LimitsConfig
+from coec.geometry.vectors import lengths
+from coec.reports.close_ups import Caption, close_ups, difference_text
+from coec.reports.instants import instant
 from coec.reports.overlay import draw
+from coec.reports.residual_map import residual_map
 
 
 def middle(window: Window) -> FramePair:
@@ -21,7 +26,8 @@ def middle(window: Window) -> FramePair:
 def write_overlays(
     folder: Path, window: Window, poses: Mapping[str, tuple[Matrix4, str]], compensated: bool
 ) -> list[Path]:
-    """`<name>.png` for each name: points at the pose (4, 4) on the image of the middle pair, with its title.
+    """`<name>.png` for each name: points at the pose (4, 4) on the image of the middle pair, with its title; all in the
+    same colours.
 
     Raises:
         OutputError: the folder or a file cannot be written.
@@ -30,8 +36,42 @@ def write_overlays(
     pair, rig = middle(window), window.rig
     image = decode_bgr(pair.camera.image, LimitsConfig())
     cloud = compensate(pair, rig, enabled=compensated)
+    scale = scale_of(lengths(cloud))
     written = []
     for name, (T_camera_lidar, title) in poses.items():
-        picture = draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, title)
+        picture = draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, title, scale)
         written.append(write(folder / f"{name}.png", encode_png(picture)))
     return written
+
+
+def write_comparison(
+    folder: Path, window: Window, T_before: Matrix4, T_after: Matrix4, caption: Caption, compensated: bool
+) -> list[Path]:
+    """Two extrinsics (4, 4) of a window: overlay_before.png, overlay_after.png, close_ups.png, and residuals.png at the
+    second one.
+
+    Raises:
+        OutputError: the folder or a file cannot be written.
+        DecodeError: an image cannot be decoded.
+        CalibrationError: an image is not of the camera's size.
+    """
+    where = f"{window.rig.pair}  {instant(middle(window).stamp_ns)}"
+    # Overlays are lettered in ASCII.
+    apart = difference_text(T_before, T_after).replace("\u00b0", " deg")
+    poses = {
+        "overlay_before": (T_before, f"{where}  {caption.before}\n{apart} from {caption.after}"),
+        "overlay_after": (T_after, f"{where}  {caption.after}\n{apart} from {caption.before}"),
+    }
+    near = close_ups(window, T_before, T_after, compensated=compensated, caption=caption)
+    left = residual_map(window, T_after, compensated=compensated, name=caption.after)
+    return [
+        *write_overlays(folder, window, poses, compensated),
+        write(folder / "close_ups.png", encode_png(near)),
+        write(folder / "residuals.png", encode_png(left)),
+    ]
+
+
+def network_text(model: str, identity: str) -> str:
+    """A depth network for people: its name without the folder, and the beginning of its identity; `identity` is what an
+    estimate says of it."""
+    return f"{Path(model).name} ({identity[:12]})"
