@@ -79,13 +79,20 @@ PLAIN = Caption()
 
 
 def close_ups(
-    window: Window, T_before: Matrix4, T_after: Matrix4, *, compensated: bool = True, caption: Caption = PLAIN
+    window: Window,
+    T_before: Matrix4,
+    T_after: Matrix4,
+    *,
+    compensated: bool = True,
+    caption: Caption = PLAIN,
+    limits: LimitsConfig | None = None,
 ) -> NDArray[np.uint8]:
     """The image of a pair, and the parts of it in which two extrinsics (4, 4) differ most, at the one and at the other.
 
     Args:
         window: with one pair at least; the most telling one is shown.
         compensated: whether sweeps are compensated for motion.
+        limits: of images that are decoded; None: the usual ones.
 
     Returns:
         (H, W, 3) uint8 BGR, about 1080 px wide, on white.
@@ -100,10 +107,11 @@ def close_ups(
     )
     camera = window.rig.camera
     size = (max(8, round(PANEL_PX[0] / enlarged)), max(8, round(PANEL_PX[1] / enlarged)))
-    images = GreyImages(LimitsConfig())
+    bounds = LimitsConfig() if limits is None else limits
+    images = GreyImages(bounds)
     telling = places(window, images, T_before, T_after, size, PLACES, compensated=compensated)
     pair = window.pairs[telling.index]
-    image = decode_bgr(pair.camera.image, LimitsConfig())
+    image = decode_bgr(pair.camera.image, bounds)
     lines = sentences(window, telling, shift, T_before, T_after, caption)
 
     width = 2 * (AXIS_PX + PANEL_PX[0]) + 3 * GAP_PX

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from coec.adapters.files.output import write
 from coec.adapters.images.codec import decode_bgr, encode_png
-from coec.adapters.images.range_colours import scale_of
+from coec.adapters.images.range_colours import NEAREST_M, scale_of
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import FramePair, Matrix4, Window
 from coec.config import LimitsConfig
-from coec.geometry.vectors import lengths
+from coec.geometry.in_view import points_in_view
 from coec.reports.close_ups import Caption, close_ups, difference_text
 from coec.reports.instants import instant
 from coec.reports.overlay import draw
@@ -36,7 +36,8 @@ def write_overlays(
     pair, rig = middle(window), window.rig
     image = decode_bgr(pair.camera.image, LimitsConfig())
     cloud = compensate(pair, rig, enabled=compensated)
-    scale = scale_of(lengths(cloud))
+    first = next(iter(poses.values()), (window.T_camera_lidar_start, ""))[0]
+    scale = scale_of(points_in_view(rig.camera, first, cloud, rig.mask, NEAREST_M).range_m)
     written = []
     for name, (T_camera_lidar, title) in poses.items():
         picture = draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, title, scale)

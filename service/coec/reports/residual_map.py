@@ -40,6 +40,9 @@ FADED = 0.45
 COVER = 0.6
 """Of the colour of a cell over the image."""
 
+MOST = 0.9
+"""Of the parts that tell, so many are within the scale of colours."""
+
 LEAST_END_PX = 3.0
 """Of the scale of colours, at least: less is what range edges scatter by."""
 
@@ -83,12 +86,12 @@ def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
         return lines
     right, down = np.median(shifts.shift_px[shifts.told], axis=0).tolist()
     beside = shifts.shift_px[shifts.told] - (right, down)
-    spread = float(np.sqrt((beside**2).sum(axis=1).mean()))
+    spread = float(np.median(np.hypot(*beside.T)))
     pixel_deg = degrees(pixel_rad(window.rig.camera))
     lines += [
         f"{told} of {asked} parts tell, from {pairs}. They lie {np.median(shifts.size_px[shifts.told]):.1f} px beside "
         f"(median; a pixel is {pixel_deg:.3f}° on the axis).",
-        f"In common to all: {right:+.1f} px right, {down:+.1f} px down; from that they differ by {spread:.1f} px rms.",
+        f"In common to all: {right:+.1f} px right, {down:+.1f} px down; half of them are within {spread:.1f} px of it.",
         "Arrows: where range edges would lie best, enlarged. Figures: how far that is, and of how many range edges. "
         "No colour: not told.",
     ]
@@ -110,13 +113,15 @@ def _drawn(grey: NDArray[np.uint8], shifts: LocalShifts, lines: list[str]) -> ND
     axes.imshow(pale, cmap="gray", vmin=0, vmax=255, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axes.set_axis_off()
-    largest = float(np.nanmax(shifts.size_px)) if shifts.told.any() else 0.0
-    end_px = max(LEAST_END_PX, largest)
+    # A part that is taken in by a rival does not pale all others.
+    large = float(np.quantile(shifts.size_px[shifts.told], MOST)) if shifts.told.any() else 0.0
+    end_px = max(LEAST_END_PX, large)
     colours = ScalarMappable(Normalize(0.0, end_px), COLOURS)
     for row, column in np.ndindex(shifts.edges.shape):
         _cell(axes, shifts, (row, column), (width, height), colours, end_px)
     bar = box(figure, MARGIN_PX + PICTURE_PX[0] // 4, top + shown[1] + MARGIN_PX, PICTURE_PX[0] // 2, BAR_PX)
-    figure.colorbar(colours, cax=bar, orientation="horizontal", label="range edges beside edges of the image, px")
+    label = "range edges beside edges of the image, px"
+    figure.colorbar(colours, cax=bar, orientation="horizontal", extend="max", label=label)
     return bgr_of(figure)
 
 
@@ -142,7 +147,8 @@ def _cell(
         size = f"{length:.1f} px\n"
         colour = colours.to_rgba(np.array(length))
         axes.add_patch(Rectangle((left, top), width, height, facecolor=colour, edgecolor="none", alpha=COVER))
-        right, down = (ARROW_SHARE * min(width, height) / end_px * shifts.shift_px[row, column]).tolist()
+        longest = ARROW_SHARE * min(width, height) / max(end_px, length)
+        right, down = (longest * shifts.shift_px[row, column]).tolist()
         for line_width, line_colour in ((4.0, "white"), (1.8, "black")):
             arrow = {"arrowstyle": "->", "color": line_colour, "linewidth": line_width, "shrinkA": 0, "shrinkB": 0}
             middle = (u, v - 0.15 * height)

@@ -41,6 +41,7 @@ from coec.geometry.cameras import scaled
 from coec.geometry.edges.alignment import EdgeFrames, alignment_of_parts
 from coec.geometry.projection import project
 from coec.geometry.vectors import lengths
+from coec.reports.instants import instant
 from coec.reports.overlay import draw
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Solved, WrittenFile
 from coec.runtime.worker.messages import unpack_pairs
@@ -182,6 +183,29 @@ class Solver:
         window, configuration = read_window(path)
         return self._drawn(window.rig, configuration, pose, window.pairs[-1], title)
 
+    def comparison(self, path: Path, poses: Sequence[Sequence[Sequence[float]]], names: Sequence[str]) -> Drawn:
+        """JPEG of two extrinsics (rows of the (4, 4) matrices) side by side on a window, where they differ most.
+
+        Raises:
+            WindowError, DecodeError, CalibrationError: the window or an image of it cannot be used.
+        """
+        from coec.adapters.mcap.windows import read_window
+
+        # Matplotlib takes 0.3 s and 30 MB: most workers never draw one of these.
+        from coec.reports.close_ups import Caption, close_ups
+
+        window, configuration = read_window(path)
+        before, after = (np.array(pose, dtype=np.float64) for pose in poses)
+        picture = close_ups(
+            window,
+            before,
+            after,
+            compensated=configuration.motion_compensation,
+            caption=Caption(before=names[0], after=names[1]),
+            limits=self._config.limits,
+        )
+        return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
+
     def picture(
         self,
         pair: str,
@@ -233,7 +257,8 @@ class Solver:
         xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
         image = decode_bgr(pair.camera.image, self._config.limits)
         T_camera_lidar = np.array(pose, dtype=np.float64)
-        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title, scale)
+        told = f"{title}\n{instant(pair.camera.stamp_ns)}"
+        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, told, scale)
         return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
 
     def _scale(self, pair: str, sweep: LidarFrame) -> RangeScale:
