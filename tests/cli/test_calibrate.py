@@ -53,8 +53,10 @@ def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path)
         assert (written / name).read_bytes().startswith(b"\x89PNG")
 
 
-def test_fitted_double_sphere_reports_its_residual(coec: Coec) -> None:
-    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--camera-model", "double_sphere", "--json")
+def test_fitted_double_sphere_reports_its_residual(coec: Coec, tmp_path: Path) -> None:
+    fitted = ("--camera-model", "double_sphere", "--output", tmp_path)
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", *fitted, "--json")
+    assert (tmp_path / "lens_residual.png").read_bytes().startswith(b"\x89PNG")
     fit = outcome.document["camera_fit"]
     assert fit["model"] == "double_sphere"
     assert 0 <= fit["residual_rms_px"] <= fit["residual_max_px"] < 1e-6

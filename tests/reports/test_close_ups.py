@@ -70,7 +70,15 @@ def test_a_cloud_without_points_is_a_picture_with_words() -> None:
 
 
 @pytest.mark.parametrize("model", posts.LENSES)
-def test_every_camera_has_its_picture(model: str) -> None:
+def test_outlines_are_found_through_every_camera(model: str) -> None:
+    window = posts.window((-14.0, 10.0), posts.LENSES[model])
+    truth = window.T_camera_lidar_start
+    before, after = _said(window, se3.perturb(truth, TURN), truth, Caption())[-1].split("shown: ")[1].split(", ")
+    assert float(before.split()[1]) < 0.7 < 1.5 < float(after.split()[1])
+
+
+@pytest.mark.parametrize("model", ["pinhole", "double_sphere"])
+def test_each_extrinsic_is_drawn_in_its_colour_on_its_side(model: str) -> None:
     window = posts.window((-14.0, 10.0), posts.LENSES[model])
     truth = window.T_camera_lidar_start
     picture = close_ups(window, se3.perturb(truth, TURN), truth)

@@ -98,6 +98,8 @@ def run(options: Options) -> int:
     document = _document(result, times.elapsed_s(), fit, offset)
     if options.output is not None:
         _write(options.output, window, result, configuration, document)
+        if fit is not None:
+            pictures.write_lens(options.output, loaded.window.rig.camera, window.rig.camera)
     if options.as_json:
         console.print_json(document)
     else:

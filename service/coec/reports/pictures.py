@@ -11,9 +11,11 @@ from coec.adapters.images.range_colours import NEAREST_M, scale_of
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import FramePair, Matrix4, Window
 from coec.config import LimitsConfig
+from coec.geometry.cameras import Camera
 from coec.geometry.in_view import points_in_view
 from coec.reports.close_ups import Caption, close_ups, difference_text
 from coec.reports.instants import instant
+from coec.reports.lens_residual import lens_residual
 from coec.reports.overlay import draw
 from coec.reports.residual_map import residual_map
 
@@ -70,6 +72,15 @@ def write_comparison(
         write(folder / "close_ups.png", encode_png(near)),
         write(folder / "residuals.png", encode_png(left)),
     ]
+
+
+def write_lens(folder: Path, camera: Camera, fitted: Camera) -> Path:
+    """lens_residual.png: what a fitted camera model misses of the one that it stands for.
+
+    Raises:
+        OutputError: the folder or the file cannot be written.
+    """
+    return write(folder / "lens_residual.png", encode_png(lens_residual(camera, fitted)))
 
 
 def network_text(model: str, identity: str) -> str:
