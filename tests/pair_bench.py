@@ -124,7 +124,7 @@ RIG = rig_of(configuration(Path("state")).pairs[0])
 @dataclass
 class KnowingWorker:
     """Answers at once, and rightly. `cost_s`: processor time that work of a kind takes, for which `pay` is told;
-    `checked` are the stamps of the pairs of each check."""
+    `checked` are the stamps of the pairs of each check, `drawn` the questions for pictures."""
 
     cause: str | None = None
     baseline_not_used: str | None = None
@@ -135,6 +135,7 @@ class KnowingWorker:
     cost_s: dict[Kind, float] = field(default_factory=dict)
     pay: Callable[[Cost], None] = lambda _: None
     checked: list[tuple[int, ...]] = field(default_factory=list)
+    drawn: list[Job] = field(default_factory=list)
 
     def ask(self, job: Job) -> None:
         if job.kind in self.cost_s:
@@ -177,6 +178,7 @@ class KnowingWorker:
         return Checked(observation, self.baseline_not_used)
 
     def _draw(self, job: Job) -> Drawn:
+        self.drawn.append(job)
         return Drawn(b"jpeg " + job.subject.encode())
 
     def _solve(self, job: Job) -> Solved:

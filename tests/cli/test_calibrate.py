@@ -47,12 +47,14 @@ def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path)
     outcome = coec("calibrate", SMALL, "--depth", "stereo", "--output", tmp_path / "out", "--json")
     written = tmp_path / "out"
     assert json.loads((written / "result.json").read_text())["correction"] == outcome.document["correction"]
-    for name in ("overlay_before.png", "overlay_after.png"):
+    for name in ("overlay_before.png", "overlay_after.png", "close_ups.png", "residuals.png"):
         assert (written / name).read_bytes().startswith(b"\x89PNG")
 
 
-def test_fitted_double_sphere_reports_its_residual(coec: Coec) -> None:
-    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--camera-model", "double_sphere", "--json")
+def test_fitted_double_sphere_reports_its_residual(coec: Coec, tmp_path: Path) -> None:
+    fitted = ("--camera-model", "double_sphere", "--output", tmp_path)
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", *fitted, "--json")
+    assert (tmp_path / "lens_residual.png").read_bytes().startswith(b"\x89PNG")
     fit = outcome.document["camera_fit"]
     assert fit["model"] == "double_sphere"
     assert 0 <= fit["residual_rms_px"] <= fit["residual_max_px"] < 1e-6

@@ -95,7 +95,7 @@ def test_output_folder_holds_table_report_and_pictures(coec: Coec, tmp_path: Pat
     )  # fmt: skip
     written = tmp_path / "out"
     assert json.loads((written / "report.json").read_text()) == outcome.document
-    for name in ("bullseye", "profiles", "frames", "overlay_before", "overlay_after"):
+    for name in ("bullseye", "profiles", "frames", "overlay_before", "overlay_after", "close_ups", "residuals"):
         assert (written / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert [point["frames"] for point in outcome.document["frames"]] == [1, 2]
 

@@ -5,19 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from coec.adapters.images.range_colours import WHOLE, RangeScale
 from coec.geometry.cameras import build
-from coec.reports.overlay import draw
+from coec.reports.overlay import LINE_SHARE, draw
 
 WIDTH, HEIGHT = 960, 540
 CAMERA = build("pinhole", width=WIDTH, height=HEIGHT, fx=400.0, fy=400.0, cx=480.0, cy=270.0)
 T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-TITLE_ROWS = round(WIDTH / 34)
+TITLE_ROWS = round(WIDTH * LINE_SHARE) + round(WIDTH * LINE_SHARE) // 4
 
 
-def _drawn(*points: tuple[float, float, float], mask: np.ndarray | None = None) -> np.ndarray:
+def _drawn(
+    *points: tuple[float, float, float], mask: np.ndarray | None = None, scale: RangeScale | None = WHOLE
+) -> np.ndarray:
     """The picture without title and bar, on black."""
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    picture = draw(image, CAMERA, T_CAMERA_LIDAR, np.array(points, np.float32), mask, "title")
+    picture = draw(image, CAMERA, T_CAMERA_LIDAR, np.array(points, np.float32), mask, "title", scale)
     assert not image.any()
     return picture[TITLE_ROWS : TITLE_ROWS + HEIGHT]
 
@@ -37,10 +40,28 @@ def test_the_nearer_of_two_points_is_on_top_whatever_their_order() -> None:
     assert (_drawn(near)[270, 480] != _drawn(far)[270, 480]).any()
 
 
-def test_near_is_red_and_far_is_blue() -> None:
+def test_near_is_yellow_and_far_is_violet() -> None:
     near, far = _drawn((2.5, 0, 0))[270, 480].astype(int), _drawn((79.0, 0, 0))[270, 480].astype(int)
-    assert near[2] > near[0]
-    assert far[0] > far[2]
+    assert min(near[1], near[2]) > near[0]
+    assert far[0] > far[2] > far[1]
+
+
+def test_colours_follow_the_ranges_in_view_and_not_those_outside() -> None:
+    """What is 10 m away is far in a room, and near on a square; what is behind the camera is not in the picture."""
+    room = [(x, -0.5, 0.1) for x in np.linspace(3.0, 10.0, 200)]
+    square = [(x, -0.5, 0.1) for x in np.linspace(10.0, 75.0, 200)]
+    seen = (10.0, 1.0, 0.5)
+    in_room, on_square = _drawn(seen, *room, scale=None), _drawn(seen, *square, scale=None)
+    assert in_room[250, 440, 2] < 150 < on_square[250, 440, 2]
+    behind = [(-x, 0.0, 0.0) for x in np.linspace(20.0, 75.0, 400)]
+    np.testing.assert_array_equal(_drawn(seen, *room, *behind, scale=None), in_room)
+
+
+def test_a_title_of_two_lines_is_higher_and_a_long_one_no_wider() -> None:
+    image, nothing = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.zeros((0, 3), np.float32)
+    one, two = (draw(image, CAMERA, T_CAMERA_LIDAR, nothing, None, text) for text in ("a", "a\n" + 400 * "b"))
+    assert two.shape[0] - one.shape[0] == round(WIDTH * LINE_SHARE)
+    assert one.shape[1] == two.shape[1] == WIDTH
 
 
 def test_points_behind_outside_and_masked_are_left_out() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from baselines import a_baseline
 from coec.adapters.files.baseline_file import save_baseline
+from coec.adapters.files.conversions import matrix_of
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.commissioning.baseline import learned_hash
 from coec.calibration.monitor.change_detector import alarm_levels
@@ -278,6 +279,16 @@ def test_a_red_event_leaves_evidence(bench: Bench) -> None:
     assert event.overlays == ("before", "after")
     assert event.window_after is not None
     assert start_ns_of(event.window_before) < STEP_S * S <= start_ns_of(event.window_after)
+    served = matrix_of(event.camera_from_lidar).tolist()
+    before, after = (job for job in bench.worker.drawn if "poses" in job.body)
+    assert (before.subject, after.subject) == (event.window_before, event.window_after)
+    # One place, both extrinsics, the same two on either side: the first is right before, the second after.
+    assert before.body["poses"] == after.body["poses"]
+    assert before.body["names"] == after.body["names"]
+    assert before.body["poses"][0] == served
+    told = bench.worker.estimates[event.window_after].optimum.T_camera_lidar
+    np.testing.assert_allclose(before.body["poses"][1], told, atol=1e-12)
+    assert "accepted" in before.body["names"][1]
     (whole,) = (each for each in bench.store.incidents.events() if each.event_id == event.event_id)
     assert {point.state for point in whole.metrics} >= {"healthy", "suspect"}
     bench.restart()

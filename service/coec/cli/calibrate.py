@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coec.adapters.files import output
 from coec.calibration.frames.time_offset import TimeOffset
@@ -17,6 +18,7 @@ from coec.library.calibrating import calibrated
 from coec.library.camera_fit import CameraFit
 from coec.library.choices import Choices
 from coec.reports import console, pictures
+from coec.reports.close_ups import Caption
 from coec.reports.stage_times import StageTimes
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationReport, CalibrationResult
@@ -46,6 +48,8 @@ def run(options: Options) -> int:
     document = _document(done.result, times.elapsed_s(), done.fit, done.offset)
     if options.output is not None:
         _write(options.output, done.window, done.result, done.configuration, document)
+        if done.fit is not None:
+            pictures.write_lens(options.output, loaded.window.rig.camera, done.window.rig.camera)
     if options.as_json:
         console.print_json(document)
     else:
@@ -98,15 +102,24 @@ def _finite(value: float) -> float | None:
 def _write(
     folder: Path, window: Window, result: CalibrationResult, configuration: CalibrationConfig, document: dict[str, Any]
 ) -> None:
+    caption = Caption(
+        before="start",
+        after=f"result, {result.verdict.decision}",
+        sigma=_sigma_of(result),
+        network=pictures.network_text(configuration.depth.model, result.depth_identity),
+    )
     T_found = np.array(result.camera_from_lidar.matrix)
-    moved_deg = windows.rotation_error_deg(T_found, window.T_camera_lidar_start)
-    where = f"{window.rig.pair}  {pictures.middle(window).stamp_ns} ns"
-    poses = {
-        "overlay_before": (window.T_camera_lidar_start, f"{where}  start"),
-        "overlay_after": (T_found, f"{where}  {result.verdict.decision}, {moved_deg:.2f} deg from the start"),
-    }
-    pictures.write_overlays(folder, window, poses, configuration.motion_compensation)
+    pictures.write_comparison(
+        folder, window, window.T_camera_lidar_start, T_found, caption, configuration.motion_compensation
+    )
     output.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
+
+
+def _sigma_of(result: CalibrationResult) -> NDArray[np.float64]:
+    """(6,) in radians and metres; NaN where there is none."""
+    sigma = np.array([np.nan if value is None else value for value in result.sigma], dtype=np.float64)
+    sigma[:3] = np.radians(sigma[:3])
+    return np.where(np.array(result.solved), sigma, np.nan)
 
 
 def _show(

@@ -180,4 +180,5 @@ class Result:
             raise UsageError(f"at={at!r}: known are {', '.join(poses)}")
         title = f"{self.document.window_id}: {self.verdict.decision if at == 'result' else at}"
         compensated = self.configuration.motion_compensation
-        return np.ascontiguousarray(pictures.overlay(window, poses[at], title, compensated)[:, :, ::-1])
+        (drawn,) = pictures.overlays(window, [(poses[at], title)], compensated)
+        return np.ascontiguousarray(drawn[:, :, ::-1])

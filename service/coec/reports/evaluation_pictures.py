@@ -15,6 +15,7 @@ from coec.evaluation.experiments import SUBSETS, Bench
 from coec.evaluation.normalised_errors import NormalisedErrors
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
 from coec.reports import curves, normalised_plots, pictures, plots
+from coec.reports.close_ups import Caption
 from coec.reports.evaluation_tables import setting, verdict
 from coec.sources import windows
 
@@ -40,8 +41,8 @@ def write(
     slices: Sequence[SlicePoint],
     heard: Callable[[int, str], None],
 ) -> None:
-    """Bullseye, landscapes, errors against the amount of data where they were asked for, and the worst start before
-    and after.
+    """Bullseye, landscapes, errors against the amount of data where they were asked for, and the worst start beside
+    where it ended.
 
     Raises:
         OutputError: the folder or a file cannot be written.
@@ -104,9 +105,16 @@ def _write_overlays(folder: Path, bench: Bench, outcomes: Sequence[Outcome]) -> 
     outcome = outcomes[index]
     start_deg = windows.rotation_error_deg(outcome.trial.start, bench.reference)
     end_deg = degrees(outcome.rotation_rad)
-    where = f"{bench.window.rig.pair}  worst start {index}"
-    poses = {
-        "overlay_before": (outcome.trial.start, f"{where}  {start_deg:.2f} deg off"),
-        "overlay_after": (outcome.T_camera_lidar, f"{where}  {verdict(outcome)}, {end_deg:.2f} deg off"),
-    }
-    pictures.write_overlays(folder, bench.window, poses, bench.configuration.motion_compensation)
+    caption = Caption(
+        before=f"worst start, number {index}, {start_deg:.2f} deg off",
+        after=f"its end, {verdict(outcome)}, {end_deg:.2f} deg off",
+        network=pictures.network_text(bench.configuration.depth.model, bench.depth.identity),
+    )
+    pictures.write_comparison(
+        folder,
+        bench.window,
+        outcome.trial.start,
+        outcome.T_camera_lidar,
+        caption,
+        bench.configuration.motion_compensation,
+    )

@@ -6,23 +6,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.adapters.images.range_colours import FURTHEST_M, NEAREST_M, colours_bgr, share_of
+from coec.adapters.images.range_colours import NEAREST_M, RangeScale, scale_of
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import Camera
 from coec.geometry.in_view import points_in_view
 
-TICKS_M = (2, 5, 10, 20, 40, 80)
-
 MIN_WIDTH_PX = 960
 """Narrower images are enlarged by a whole factor, so that the title is legible."""
+
+LINES = 2
+"""Of a title, at most."""
 
 POINT_SHARE = 1 / 1200
 """Radius of a point as a share of the width: 1.2 px on 1408, so that neighbouring rings stay apart."""
 
-TITLE_SHARE, BAR_SHARE = 1 / 34, 1 / 40
-"""Height of the title, and of the bar of ranges, as shares of the width."""
+LINE_SHARE, BAR_SHARE = 1 / 44, 1 / 36
+"""Height of a line of the title, and of the bar of ranges, as shares of the width."""
 
-INK, PAPER = (235, 235, 235), (24, 24, 24)
+INK, PAPER = (24, 24, 24), (250, 250, 250)
 
 Pixels = NDArray[np.uint8]
 
@@ -34,6 +35,7 @@ def draw(
     xyz_m: NDArray[np.floating],
     mask: NDArray[np.bool_] | None,
     title: str,
+    scale: RangeScale | None = None,
 ) -> Pixels:
     """The image with the points of a sweep on it, coloured by range, near ones on top of far ones.
 
@@ -42,7 +44,8 @@ def draw(
         T_camera_lidar: (4, 4).
         xyz_m: (N, 3) LiDAR frame, compensated to the instant of the image.
         mask: (height, width) or None; points on pixels that are False are left out.
-        title: one line of ASCII above the image; cut off where it is too long.
+        title: a line of ASCII above the image, or two; cut off where they are too long.
+        scale: of the colours; None: that of the points in view.
 
     Returns:
         (height', width', 3) uint8: title, picture, bar of ranges. Small images are enlarged by a whole factor.
@@ -52,11 +55,18 @@ def draw(
     uv_px, range_m, _ = points_in_view(camera, T_camera_lidar, xyz_m, mask, NEAREST_M)
     # Pixel centres are integers: the middle of an enlarged pixel is not at factor · u.
     centres = np.rint((uv_px + 0.5) * factor - 0.5).astype(np.int64)
-    _stamp(picture, centres, range_m, radius_px=picture.shape[1] * POINT_SHARE)
-    return np.vstack([_title(picture.shape[1], title), picture, _bar(picture.shape[1])])
+    shown = scale_of(range_m) if scale is None else scale
+    _stamp(picture, centres, range_m, shown, radius_px=picture.shape[1] * POINT_SHARE)
+    return np.vstack([_title(picture.shape[1], title), picture, _bar(picture.shape[1], shown)])
 
 
-def _stamp(picture: Pixels, centres: NDArray[np.int64], range_m: NDArray[np.float64], radius_px: float) -> None:
+def _stamp(
+    picture: Pixels,
+    centres: NDArray[np.int64],
+    range_m: NDArray[np.float64],
+    scale: RangeScale,
+    radius_px: float,
+) -> None:
     """A disc of its colour for every point. All pixels of all discs are written at once, far to near."""
     reach = int(radius_px)
     offsets = [
@@ -72,27 +82,32 @@ def _stamp(picture: Pixels, centres: NDArray[np.int64], range_m: NDArray[np.floa
     at = at[inside]
     # Of equal indices NumPy keeps the last value assigned.
     order = np.argsort(-range_m[point], kind="stable")
-    picture[at[order, 1], at[order, 0]] = colours_bgr(range_m)[point[order]]
+    picture[at[order, 1], at[order, 0]] = scale.colours_bgr(range_m)[point[order]]
 
 
 def _title(width: int, title: str) -> Pixels:
-    strip = np.full((round(width * TITLE_SHARE), width, 3), PAPER, dtype=np.uint8)
-    _write(strip, title, 0.01 * width, strip.shape[0])
+    height = round(width * LINE_SHARE)
+    lines = title.split("\n")[:LINES]
+    strip = np.full((height * len(lines) + height // 4, width, 3), PAPER, dtype=np.uint8)
+    for number, line in enumerate(lines):
+        _write(strip[number * height :], line, 0.01 * width, height)
     return strip
 
 
-def _bar(width: int) -> Pixels:
-    """The colours of the ranges, with a figure where each of `TICKS_M` is."""
-    height = round(width * BAR_SHARE)
-    range_m = NEAREST_M * (FURTHEST_M / NEAREST_M) ** np.linspace(0.0, 1.0, width)
-    ramp = np.repeat(colours_bgr(range_m)[None], max(2, height // 4), axis=0)
-    scale = np.full((height - len(ramp), width, 3), PAPER, dtype=np.uint8)
-    for tick_m in TICKS_M:
-        place = min(max(float(share_of(tick_m)) - 0.01, 0.005), 0.965)
-        _write(scale, f"{tick_m} m", place * width, scale.shape[0])
-    return np.vstack([ramp, scale])
+def _bar(width: int, scale: RangeScale) -> Pixels:
+    """The colours of the ranges, with a figure at each round one. What lies beyond an end has its colour."""
+    height, left, right = round(width * BAR_SHARE), round(0.02 * width), round(0.96 * width)
+    strip = np.full((height, width, 3), PAPER, dtype=np.uint8)
+    ramp = scale.colours_bgr(scale.range_at(np.linspace(0.0, 1.0, right - left)))
+    strip[height // 8 : height // 2 - 1, left:right] = ramp
+    for tick_m in scale.ticks_m():
+        place = left + float(scale.share_of(tick_m)) * (right - left - 1)
+        strip[height // 8 : height // 2 + 2, round(place)] = INK
+        _write(strip[height // 2 :], f"{tick_m:g} m", place - 0.012 * width, height // 2)
+    return strip
 
 
 def _write(strip: Pixels, text: str, x_px: float, height_px: int) -> None:
-    font, scale = cv2.FONT_HERSHEY_SIMPLEX, height_px / 40
-    cv2.putText(strip, text, (round(x_px), round(0.72 * height_px)), font, scale, INK, 1, cv2.LINE_AA)
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, height_px / 32
+    where = (max(0, round(x_px)), round(0.8 * height_px))
+    cv2.putText(strip, text, where, font, scale, INK, max(1, round(height_px / 20)), cv2.LINE_AA)

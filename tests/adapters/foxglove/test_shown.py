@@ -94,8 +94,8 @@ def test_the_near_is_drawn_over_the_far_and_in_another_colour() -> None:
     pair, rig = pair_with(LENSES["pinhole"]), rig_with(LENSES["pinhole"])
     plain = replace(pair, lidar=LidarFrame(0, "velo", np.array([[WALL_M, 0, 0], [BOARD_M, 1, 0]], np.float32)))
     far, near = shown(plain, rig)[Pose.NOMINAL].bands
-    assert near.rgb[0] > near.rgb[2], "near is red"
-    assert far.rgb[2] > far.rgb[0], "far is blue"
+    assert near.rgb[1] > far.rgb[1], "near is more yellow"
+    assert far.rgb[2] > near.rgb[2], "far is more violet"
     np.testing.assert_array_equal(far.uv_corner_px - 0.5, projected(rig.camera, NOMINAL, plain.lidar.xyz_m[:1]))
 
 

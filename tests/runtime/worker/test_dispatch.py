@@ -25,12 +25,16 @@ class FaultySolver:
     def overlay(self, *_: object) -> None:
         raise self._fault
 
+    def comparison(self, *_: object) -> None:
+        raise self._fault
+
     def solve(self, _: object) -> None:
         raise self._fault
 
 
 CHECK = {"id": 3, "kind": "check", "pair": "front", "configuration": {}, "pose": [], "frames": []}
 OVERLAY = {"id": 4, "kind": "overlay", "path": "w", "pose": [], "title": ""}
+COMPARISON = {"id": 7, "kind": "overlay", "path": "w", "poses": [[], []], "names": ["a", "b"]}
 SOLVE = {"id": 5, "kind": "solve", "pair": "front", "path": "w"}
 
 
@@ -44,6 +48,9 @@ class Painter:
     def overlay(self, _path: object, _pose: object, title: str) -> Drawn:
         return Drawn(title.encode())
 
+    def comparison(self, _path: object, poses: list[object], names: list[str]) -> Drawn:
+        return Drawn(f"{len(poses)} {' '.join(names)}".encode())
+
     def picture(self, pair: str, _configuration: object, _pose: object, frames: list[object], title: str) -> Drawn:
         return Drawn(f"{pair} {len(frames)} {title}".encode())
 
@@ -56,6 +63,7 @@ def test_an_answer_goes_under_the_number_of_its_question() -> None:
     assert dispatch.answer(painter, {**OVERLAY, "title": "a"}) == {"id": 4, "result": {"jpeg": b"a"}}
     picture = {**CHECK, "kind": "picture", "frames": [[]], "title": "b"}
     assert dispatch.answer(painter, picture) == {"id": 3, "result": {"jpeg": b"front 1 b"}}
+    assert dispatch.answer(painter, COMPARISON) == {"id": 7, "result": {"jpeg": b"2 a b"}}
     prefetch = {"id": 6, "kind": "prefetch", "pair": "front", "frame": b""}
     assert dispatch.answer(painter, prefetch) == {"id": 6, "result": None}
 
@@ -67,7 +75,7 @@ def test_a_question_that_nobody_knows_is_refused() -> None:
 
 
 @pytest.mark.fault("a fault of our own in the worker", "it is an answer, and the worker goes on")
-@pytest.mark.parametrize("message", [CHECK, OVERLAY])
+@pytest.mark.parametrize("message", [CHECK, OVERLAY, COMPARISON])
 def test_a_fault_of_the_program_is_an_answer(message: dict[str, Any]) -> None:
     told = answer(ZeroDivisionError("division by zero"), message)
     assert told.keys() == {"id", "refused"}
@@ -76,7 +84,7 @@ def test_a_fault_of_the_program_is_an_answer(message: dict[str, Any]) -> None:
     assert "ZeroDivisionError: division by zero" in told["refused"]["text"]
 
 
-@pytest.mark.parametrize("message", [CHECK, OVERLAY, SOLVE])
+@pytest.mark.parametrize("message", [CHECK, OVERLAY, COMPARISON, SOLVE])
 def test_what_is_wrong_with_the_data_is_told_under_its_own_code(message: dict[str, Any]) -> None:
     told = answer(CalibrationError("no pairs"), message)
     refused = {"code": CalibrationError.reply_code, "text": "no pairs"}

@@ -13,7 +13,7 @@ from coec.adapters.foxglove import topics
 from coec.adapters.foxglove.topics import Pose
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import decode_bgr, encode_jpeg
-from coec.adapters.images.range_colours import FURTHEST_M, NEAREST_M, colours_bgr, share_of
+from coec.adapters.images.range_colours import NEAREST_M, WHOLE
 from coec.adapters.images.raw import BYTES_PER_PIXEL
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import EncodedImage, FramePair, ImageFormat, LidarFrame, Matrix4, Rig
@@ -42,9 +42,7 @@ POINT_SHARE, SILHOUETTE_SHARE = 1 / 1000, 1 / 600
 LEAST_WIDTH_PX = 720
 """Points on narrower images are no smaller than on this."""
 
-BAND_RGB = (
-    colours_bgr(NEAREST_M * (FURTHEST_M / NEAREST_M) ** ((np.arange(BANDS) + 0.5) / BANDS))[:, ::-1] / 255
-).tolist()
+BAND_RGB = (WHOLE.colours_bgr(WHOLE.range_at((np.arange(BANDS) + 0.5) / BANDS))[:, ::-1] / 255).tolist()
 """Colour in the middle of each, from near to far: red, green, blue; 0 to 1."""
 
 CORNER_PX = 0.5
@@ -160,7 +158,7 @@ def silhouettes_of(sweep: LidarFrame) -> NDArray[np.bool_]:
 
 def _bands(uv_px: NDArray[np.float64], range_m: NDArray[np.float64], radius_px: float) -> Iterator[Band]:
     """By range, from far to near."""
-    number = np.minimum((share_of(range_m) * BANDS).astype(np.int64), BANDS - 1)
+    number = np.minimum((WHOLE.share_of(range_m) * BANDS).astype(np.int64), BANDS - 1)
     for band in range(BANDS - 1, -1, -1):
         if (number == band).any():
             red, green, blue = BAND_RGB[band]

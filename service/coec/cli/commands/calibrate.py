@@ -32,7 +32,12 @@ class Options:
         bool, typer.Option("--time-offset", help="Also estimate the offset of the camera's clock, if turns show it.")
     ] = False
     output: Annotated[
-        Path | None, typer.Option(help="Write overlay_before.png, overlay_after.png and result.json.", metavar="DIR")
+        Path | None,
+        typer.Option(
+            help="Write overlay_before.png, overlay_after.png, close_ups.png, residuals.png and result.json; with "
+            "--camera-model lens_residual.png, too.",
+            metavar="DIR",
+        ),
     ] = None
     as_json: Json = False
 

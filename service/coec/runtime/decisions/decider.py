@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from coec.adapters.files.conversions import check_of, estimate_of
+from coec.adapters.files.conversions import check_of, estimate_of, matrix_of
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.system.threads import ServiceThread
 from coec.calibration import lifecycle
@@ -385,7 +385,7 @@ class Decider:
             completed=False,
             question=question,
         )
-        self._add_window_after(result.window_id)
+        self._add_window_after(result)
         effect = self._step(
             lambda state: lifecycle.after_estimate(state, estimate, start_ns, self._rules),
             result.data_stamp_ns,
@@ -464,17 +464,18 @@ class Decider:
             self._rig.serves(_due_ns(question), after)
         red, event = HealthState.MISCALIBRATED, self._store.incidents.newest
         if after.health is red and before.health is not red and event is not None:
-            self._pictures.draw_both(event)
+            self._pictures.draw(event)
         return partial(self._go_on_with, taken, by_check)
 
-    def _add_window_after(self, window_id: str) -> None:
+    def _add_window_after(self, result: CalibrationResult) -> None:
         """The first window that began after a red event did is part of its evidence."""
         waiting, since_ns = self._store.incidents.awaiting, self._store.state.flagged_since_ns
-        if waiting is None or start_ns_of(window_id) < (waiting.stamp_ns if since_ns is None else since_ns):
+        if waiting is None or start_ns_of(result.window_id) < (waiting.stamp_ns if since_ns is None else since_ns):
             return
-        self._store.incidents.add_window_after(window_id)
+        event = self._store.incidents.add_window_after(result.window_id)
         self._store.protect()
-        self._pictures.draw(waiting, window_id, "after")
+        if event is not None:
+            self._pictures.compare(event, matrix_of(result.camera_from_lidar), result.verdict.decision)
 
     # --- on the stream's thread -------------------------------------------------------------------------------------
 

@@ -1,4 +1,5 @@
-"""Pictures for the evidence of a red event: the windows before and after it, at what was served when it began."""
+"""Pictures for the evidence of a red event: the windows before and after it, each at what was served and at what is
+true since."""
 
 from __future__ import annotations
 
@@ -7,11 +8,15 @@ from functools import partial
 
 from coec.adapters.files.conversions import matrix_of
 from coec.adapters.system.logs import LossCounter
+from coec.calibration.types import Matrix4
 from coec.runtime.decisions.incidents import Side
 from coec.runtime.decisions.questions import Questions
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.jobs import Drawn, JobOutcome
 from coec.schemas.replies import EvidenceEvent
+
+SERVED = "what was served when it turned red"
+"""What the first extrinsic is called."""
 
 
 class IncidentPictures:
@@ -30,18 +35,23 @@ class IncidentPictures:
         self._questions = questions
         self._losses = losses
 
-    def draw_both(self, event: EvidenceEvent) -> None:
-        """Of the windows that the event has so far."""
+    def draw(self, event: EvidenceEvent) -> None:
+        """The window before it, at what was served when it began: all that is known then."""
+        if event.window_before is not None:
+            pose, title = matrix_of(event.camera_from_lidar), f"{event.window_before}  at {SERVED}"
+            done = partial(self._drawn, event.event_id, "before")
+            self._questions.overlay(self._folder.path(event.window_before), pose, title, done)
+
+    def compare(self, event: EvidenceEvent, found: Matrix4, decision: str) -> None:
+        """The windows before and after it, each at what was served and at what the window after it tells, (4, 4): the
+        one fits what was seen before, and the other what is seen since."""
+        poses = (matrix_of(event.camera_from_lidar), found)
+        names = (SERVED, f"told by the window after it ({decision})")
         sides: tuple[tuple[Side, str | None], ...] = (("before", event.window_before), ("after", event.window_after))
         for side, window_id in sides:
             if window_id is not None:
-                self.draw(event, window_id, side)
-
-    def draw(self, event: EvidenceEvent, window_id: str, side: Side) -> None:
-        """Of one window."""
-        pose, title = matrix_of(event.camera_from_lidar), f"{window_id}  {side} {event.event_id}"
-        done = partial(self._drawn, event.event_id, side)
-        self._questions.overlay(self._folder.path(window_id), pose, title, done)
+                done = partial(self._drawn, event.event_id, side)
+                self._questions.comparison(self._folder.path(window_id), poses, names, done)
 
     def _drawn(self, event_id: str, side: Side, outcome: JobOutcome) -> None:
         if isinstance(outcome.answer, Drawn):

@@ -98,7 +98,7 @@ class Incidents:
             return self._keep(event.model_copy(update={"window_after": window_id}))
 
     def add_overlay(self, event_id: str, side: Side, jpeg: bytes) -> None:
-        """A picture of one of the windows, at the extrinsic that was served when the event began."""
+        """A picture of one of the windows; it takes the place of an earlier one."""
         with self._lock:
             event = self._events.get(event_id)
             if event is None:

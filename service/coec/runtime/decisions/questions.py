@@ -175,6 +175,12 @@ class Questions:
         """Draw a window at an extrinsic (4, 4)."""
         self._worker.ask(jobs.overlay(self._pair.name, path, pose, title, self._post(done)))
 
+    def comparison(
+        self, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Callable[[JobOutcome], None]
+    ) -> None:
+        """Draw a window at two extrinsics (4, 4) that are called so."""
+        self._worker.ask(jobs.comparison(self._pair.name, path, poses, names, self._post(done)))
+
     def commission(self, pose: Matrix4, paths: list[Path], done: Callable[[JobOutcome], None]) -> None:
         """Learn the baseline of the rig at an extrinsic (4, 4) from windows."""
         self._worker.ask(jobs.commission(self._pair.name, self._pair.calibration, pose, paths, self._post(done)))

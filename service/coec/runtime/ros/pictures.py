@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from functools import partial
 from typing import Protocol
 
@@ -54,10 +53,9 @@ class Pictures:
         topic = self._topics.get(pair.name)
         if topic is None or not topic.is_heard or not self._begin(pair.name):
             return
-        taken = datetime.fromtimestamp(drawn.camera.stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
         done = partial(self._drawn, pair.name, drawn.camera.stamp_ns, drawn.camera.frame_id)
         self._worker.ask(
-            jobs.picture(pair.name, pair.calibration, T_camera_lidar, drawn, f"{pair.name}  {taken}  current", done)
+            jobs.picture(pair.name, pair.calibration, T_camera_lidar, drawn, f"{pair.name}  current", done)
         )
 
     def _begin(self, pair: str) -> bool:

@@ -43,6 +43,8 @@ def _errand(solver: Solver, message: dict[str, Any]) -> Answer | Reason | None:
         match message["kind"]:
             case Kind.CHECK:
                 return solver.observe(message["pair"], _configuration(message), message["pose"], message["frames"])
+            case Kind.OVERLAY if "poses" in message:
+                return solver.comparison(Path(message["path"]), message["poses"], message["names"])
             case Kind.OVERLAY:
                 return solver.overlay(Path(message["path"]), message["pose"], message["title"])
             case Kind.PICTURE:

@@ -231,6 +231,13 @@ def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadli
     return Job(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
 
 
+def comparison(pair: str, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Done) -> Job:
+    """Draw two extrinsics (4, 4), which are called so, on a window's file where they differ most; answered with
+    `Drawn`."""
+    body = {"path": str(path), "poses": [pack_pose(pose) for pose in poses], "names": list(names)}
+    return Job(Kind.OVERLAY, pair, path.stem, body, done)
+
+
 def picture(
     pair: str, configuration: CalibrationConfig, pose: Matrix4, drawn: FramePair, title: str, done: Done
 ) -> Job:

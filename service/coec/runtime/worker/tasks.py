@@ -16,6 +16,7 @@ from coec.adapters.files.baseline_file import BASELINES, baseline_of, save_basel
 from coec.adapters.files.rig import rig_of
 from coec.adapters.frames.msgpack_frames import decode_camera
 from coec.adapters.images.codec import CachedGreys, GreyImages, decode_bgr, encode_jpeg
+from coec.adapters.images.range_colours import RangeScale, kept_or, scale_of
 from coec.adapters.registration.nearest import Trees, installed
 from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.baseline import Baseline, learned_hash, mismatch
@@ -43,6 +44,8 @@ from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError
 from coec.geometry.cameras import scaled
 from coec.geometry.edges.alignment import EdgeFrames, alignment_of_parts
 from coec.geometry.projection import project
+from coec.geometry.vectors import lengths
+from coec.reports.instants import instant
 from coec.reports.overlay import draw
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Registered, Solved, WrittenFile
 from coec.runtime.worker.messages import unpack_lidars, unpack_pairs, unpack_sweeps
@@ -79,6 +82,7 @@ class Solver:
         self._depth_maps_kept = depth_maps_kept
         self._images = GreyImages(config.limits)
         self._networks: dict[DepthConfig, CachedDepth] = {}
+        self._scales: dict[str, RangeScale] = {}
         self.use(config)
 
     def use(self, config: Config) -> None:
@@ -192,6 +196,29 @@ class Solver:
         window, configuration = read_window(path)
         return self._drawn(window.rig, configuration, pose, window.pairs[-1], title)
 
+    def comparison(self, path: Path, poses: Sequence[Sequence[Sequence[float]]], names: Sequence[str]) -> Drawn:
+        """JPEG of two extrinsics (rows of the (4, 4) matrices) side by side on a window, where they differ most.
+
+        Raises:
+            WindowError, DecodeError, CalibrationError: the window or an image of it cannot be used.
+        """
+        from coec.adapters.mcap.windows import read_window
+
+        # Matplotlib takes 0.3 s and 30 MB: most workers never draw one of these.
+        from coec.reports.close_ups import Caption, close_ups
+
+        window, configuration = read_window(path)
+        before, after = (np.array(pose, dtype=np.float64) for pose in poses)
+        picture = close_ups(
+            window,
+            before,
+            after,
+            compensated=configuration.motion_compensation,
+            caption=Caption(before=names[0], after=names[1]),
+            limits=self._config.limits,
+        )
+        return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
+
     def picture(
         self,
         pair: str,
@@ -206,7 +233,7 @@ class Solver:
             DecodeError: a frame cannot be decoded.
         """
         (drawn,) = unpack_pairs(frames, self._config.limits)
-        return self._drawn(self._rigs[pair], configuration, pose, drawn, title)
+        return self._drawn(self._rigs[pair], configuration, pose, drawn, title, self._scale(pair, drawn.lidar))
 
     def commission(
         self, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
@@ -247,12 +274,20 @@ class Solver:
         pose: Sequence[Sequence[float]],
         pair: FramePair,
         title: str,
+        scale: RangeScale | None = None,
     ) -> Drawn:
         xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
         image = decode_bgr(pair.camera.image, self._config.limits)
         T_camera_lidar = np.array(pose, dtype=np.float64)
-        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, title)
+        told = f"{title}\n{instant(pair.camera.stamp_ns)}"
+        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, told, scale)
         return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
+
+    def _scale(self, pair: str, sweep: LidarFrame) -> RangeScale:
+        """Of the colours of a stream, which do not change from picture to picture."""
+        scale = kept_or(self._scales.get(pair), scale_of(lengths(sweep.xyz_m)))
+        self._scales[pair] = scale
+        return scale
 
     def _baseline(
         self, pair: str, configuration: CalibrationConfig, depth_identity: str

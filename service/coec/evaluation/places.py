@@ -1,0 +1,254 @@
+"""Where in the pictures of a window two extrinsics differ most, for whoever is to see which of them is right.
+
+A shift along an outline cannot be seen, nor one where no outline is: what counts is the area that outlines sweep
+between one extrinsic and the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.ports import ImageReader
+from coec.calibration.types import Matrix4, Rig, Window
+from coec.errors import CalibrationError
+from coec.evaluation.outlines import Outlines, drawn_at, outlines_of
+from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales, Rectangle
+
+STRIDES = 4
+"""Rectangles are tried at every fourth of their width and height."""
+
+UNTOLD = 0.05
+"""What is swept counts so much, standard deviations, where the image tells nothing: of two wrong extrinsics neither has
+outlines on edges."""
+
+LEAST_LENGTH_PX = 1e-9
+"""Shorter pieces have no direction."""
+
+FRAMES = 12
+"""Pairs of a window that are looked at, at most, evenly chosen: a second of work on a large sweep."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Swept:
+    """What the pieces (L,) of the outlines of a pair sweep between two extrinsics.
+
+    Attributes:
+        middle_px: (L, 2) in the middle between the two.
+        length_px: (L,) there.
+        across_px: (L,) the shift across the piece.
+        area_px2: (L,) swept, weighted as range edges are.
+        strength: (L, 2) of the image's edges under the whole outline at the one and at the other, in standard
+            deviations from their mean.
+    """
+
+    middle_px: NDArray[np.float64]
+    length_px: NDArray[np.float64]
+    across_px: NDArray[np.float64]
+    area_px2: NDArray[np.float64]
+    strength: NDArray[np.float64]
+
+    @property
+    def worth(self) -> NDArray[np.float64]:
+        """(L,) the area times how clearly the image tells the two apart, whichever it prefers, px² · σ². The square:
+        one clear outline shows more than many vague ones."""
+        told = np.abs(self.strength[:, 0] - self.strength[:, 1])
+        return self.area_px2 * (UNTOLD + np.where(self.strength.max(axis=1, initial=0.0) > 0.0, told, 0.0)) ** 2
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A part of an image, and of what is swept there, weighted by worth.
+
+    Attributes:
+        worth: in all, px² · σ².
+        across_px: the median shift across outlines.
+        strength: of the image's edges under them at the one and at the other extrinsic, standard deviations.
+    """
+
+    part: Rectangle
+    worth: float
+    across_px: float
+    strength: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """The most telling ones of one pair of a window, the best first; none where it has no outline in view.
+
+    Attributes:
+        index: of the pair.
+        outlines: its range edges.
+        frames: how many pairs were looked at.
+        strength: of the image's edges under all outlines of all of them, chosen or not, at the one and at the other
+            extrinsic, standard deviations; NaN without an outline.
+    """
+
+    index: int
+    outlines: Outlines
+    found: tuple[Place, ...]
+    frames: int
+    strength: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """Of range edges in the image: the median and the largest, pixels."""
+
+    median_px: float
+    largest_px: float
+
+
+def swept(outlines: Outlines, edges: NDArray[np.int8], rig: Rig, T_one: Matrix4, T_other: Matrix4) -> Swept:
+    """Between two extrinsics (4, 4), where both have the outline in the image; `edges` (height, width) is what
+    `EdgePyramid.sharp` has of it."""
+    one, other = drawn_at(outlines, rig, T_one), drawn_at(outlines, rig, T_other)
+    in_both = (one.seen & other.seen)[outlines.pieces].all(axis=1)
+    lower, upper = outlines.pieces[in_both].T
+    between = 0.5 * (one.uv_px + other.uv_px)
+    along = between[upper] - between[lower]
+    length = np.hypot(along[:, 0], along[:, 1])
+    shift = other.uv_px - one.uv_px
+    normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length, LEAST_LENGTH_PX)[:, None]
+    across = np.abs((0.5 * (shift[lower] + shift[upper]) * normal).sum(axis=1))
+    weight = np.sqrt(outlines.weight[lower].astype(np.float64) * outlines.weight[upper])
+    of_outline = np.unique(outlines.outline[in_both], return_inverse=True)[1]
+    under = [
+        _under_outlines(edges, 0.5 * (at.uv_px[lower] + at.uv_px[upper]), of_outline, length) for at in (one, other)
+    ]
+    strength = np.column_stack([each[of_outline] for each in under])
+    return Swept(0.5 * (between[lower] + between[upper]), length, across, weight * length * across, strength)
+
+
+def _under_outlines(
+    edges: NDArray[np.int8], uv_px: NDArray[np.float64], of_outline: NDArray[np.int64], length: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Of each outline the mean strength of the image's edges under its pieces, standard deviations."""
+    columns, rows = np.rint(uv_px).astype(np.int64).T
+    at = edges[np.clip(rows, 0, edges.shape[0] - 1), np.clip(columns, 0, edges.shape[1] - 1)]
+    strength = np.where(at == VOID, 0.0, at / STRENGTH_STEPS)
+    outlines = int(of_outline.max(initial=-1)) + 1
+    total = np.bincount(of_outline, length, outlines)
+    return np.bincount(of_outline, length * strength, outlines) / np.maximum(total, LEAST_LENGTH_PX)
+
+
+def places(
+    window: Window,
+    images: ImageReader,
+    T_one: Matrix4,
+    T_other: Matrix4,
+    size_px: tuple[int, int],
+    count: int,
+    *,
+    compensated: bool,
+) -> Places:
+    """The pair, and at most `count` rectangles of (width, height) `size_px` in its image that do not overlap, in which
+    two extrinsics (4, 4) differ most.
+
+    Raises:
+        DecodeError: an image cannot be decoded.
+        CalibrationError: an image is not of the camera's size.
+    """
+    if not window.pairs:
+        raise ValueError("a window without pairs has no places")
+    best_worth = -1.0
+    total, weight = np.zeros(2), 0.0
+    rig, camera = window.rig, window.rig.camera
+    lit = rig.mask if rig.mask is not None else np.ones((camera.height, camera.width), np.bool_)
+    scales = EdgeScales(lit, 0, 0, upright=rig.T_camera_lidar_nominal[:2, 2])
+    looked_at = evenly(len(window.pairs), FRAMES)
+    for index in looked_at:
+        outlines = outlines_of(window.pairs[index], rig, compensated=compensated)
+        grey = images.grey(window.pairs[index].camera)
+        if grey.shape != scales.shape:
+            (height, width), model = grey.shape, f"{camera.width} x {camera.height}"
+            raise CalibrationError(f"an image has {width} x {height} px, the camera model {model} px")
+        seen = swept(outlines, scales.pyramid(grey).sharp, rig, T_one, T_other)
+        total += seen.length_px @ seen.strength
+        weight += float(seen.length_px.sum())
+        found = _largest(seen, (camera.width, camera.height), size_px, count)
+        worth = sum(place.worth for place in found)
+        if worth > best_worth:
+            chosen, best_worth = (index, outlines, found), worth
+    strength = total / weight if weight > 0.0 else np.full(2, np.nan)
+    return Places(*chosen, len(looked_at), (float(strength[0]), float(strength[1])))
+
+
+def shift_px(window: Window, T_one: Matrix4, T_other: Matrix4, *, compensated: bool) -> Shift | None:
+    """How far apart two extrinsics (4, 4) put the range edges of the middle pair; None where none is in the image at
+    both."""
+    outlines = outlines_of(window.pairs[len(window.pairs) // 2], window.rig, compensated=compensated)
+    one, other = (drawn_at(outlines, window.rig, T) for T in (T_one, T_other))
+    both = one.seen & other.seen
+    if not both.any():
+        return None
+    apart = np.linalg.norm(one.uv_px[both] - other.uv_px[both], axis=1)
+    return Shift(float(np.median(apart)), float(apart.max()))
+
+
+def evenly(count: int, wanted: int) -> list[int]:
+    """At most `wanted` of `count` indices, each in the middle of its share."""
+    return [int((2 * k + 1) * count / (2 * min(wanted, count))) for k in range(min(wanted, count))]
+
+
+def _largest(seen: Swept, image_px: tuple[int, int], size_px: tuple[int, int], count: int) -> tuple[Place, ...]:
+    width, height = (min(size, whole) for size, whole in zip(size_px, image_px, strict=True))
+    worth = seen.worth
+    found: list[Place] = []
+    while len(found) < count and worth.any():
+        part = _about_its_middle(
+            _best(seen.middle_px, worth, image_px, (width, height)), seen.middle_px, worth, image_px
+        )
+        inside = _within(seen.middle_px[:, 0], part.left, width) & _within(seen.middle_px[:, 1], part.top, height)
+        weight = worth[inside]
+        strength = weight @ seen.strength[inside] / weight.sum()
+        across_px = _weighted_median(seen.across_px[inside], weight)
+        found.append(Place(part, float(weight.sum()), across_px, (float(strength[0]), float(strength[1]))))
+        # What overlaps it would show the same once more.
+        beside = np.abs(seen.middle_px - (part.left + width / 2, part.top + height / 2)) < (width, height)
+        worth[beside.all(axis=1)] = 0.0
+    return tuple(found)
+
+
+def _best(
+    middle_px: NDArray[np.float64], area: NDArray[np.float64], image_px: tuple[int, int], size_px: tuple[int, int]
+) -> Rectangle:
+    """The rectangle of this size with the largest sum of areas, of those that begin at every fourth of it; it lies in
+    the image."""
+    steps = [max(1.0, size / STRIDES) for size in size_px]
+    bins = [max(STRIDES, int(np.ceil(whole / step))) for whole, step in zip(image_px, steps, strict=True)]
+    cells = np.minimum(((middle_px + 0.5) / steps).astype(np.int64), np.array(bins) - 1)
+    sums = np.zeros((bins[0] + 1, bins[1] + 1))
+    np.add.at(sums, (cells[:, 0] + 1, cells[:, 1] + 1), area)
+    sums = sums.cumsum(axis=0).cumsum(axis=1)
+    boxes = (
+        sums[STRIDES:, STRIDES:] - sums[:-STRIDES, STRIDES:] - sums[STRIDES:, :-STRIDES] + sums[:-STRIDES, :-STRIDES]
+    )
+    column, row = np.unravel_index(int(np.argmax(boxes)), boxes.shape)
+    left = min(round(int(column) * steps[0]), image_px[0] - size_px[0])
+    top = min(round(int(row) * steps[1]), image_px[1] - size_px[1])
+    return Rectangle(left, top, *size_px)
+
+
+def _about_its_middle(
+    part: Rectangle, middle_px: NDArray[np.float64], worth: NDArray[np.float64], image_px: tuple[int, int]
+) -> Rectangle:
+    """A rectangle of the same size whose middle is that of what the other holds, as far as the image allows."""
+    inside = _within(middle_px[:, 0], part.left, part.width) & _within(middle_px[:, 1], part.top, part.height)
+    u, v = worth[inside] @ middle_px[inside] / worth[inside].sum()
+    left = min(max(round(u - part.width / 2), 0), image_px[0] - part.width)
+    top = min(max(round(v - part.height / 2), 0), image_px[1] - part.height)
+    return Rectangle(left, top, part.width, part.height)
+
+
+def _within(values: NDArray[np.float64], first: int, size: int) -> NDArray[np.bool_]:
+    """Pixels are a pixel wide: those from half a pixel before the first one's centre."""
+    return (values >= first - 0.5) & (values < first + size - 0.5)
+
+
+def _weighted_median(values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weight[order])
+    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])

@@ -1,0 +1,241 @@
+"""Two extrinsics side by side, enlarged where they differ most: which of them is right is seen at one glance.
+
+Over the grey image lie the range edges of the sweep, and lines where they make an outline: a few pixels beside the edge
+of a pole show, where ten thousand coloured points do not. Both colours are of Okabe and Ito's palette (2008): told
+apart with any colour vision, and neither occurs in a grey image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import degrees
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle as Frame
+from numpy.typing import NDArray
+
+from coec.adapters.images.codec import GreyImages, decode_bgr
+from coec.calibration.types import Matrix4, Rig, Window
+from coec.config import LimitsConfig
+from coec.evaluation.outlines import Outlines, drawn_at
+from coec.evaluation.places import Place, Places, Shift, places, shift_px
+from coec.geometry import se3
+from coec.geometry.edges.image_edges import Rectangle
+from coec.reports.canvas import DPI, bgr_of, box, scale_bar
+from coec.reports.instants import instant
+
+COLOURS = ("#E69F00", "#56B4E9")
+"""Of the two extrinsics: orange, sky blue."""
+
+PLACES = 3
+"""Close-ups, at most."""
+
+NAMES = "ABC"
+
+PANEL_PX = (490, 350)
+"""Width and height of one."""
+
+SHOWN_PX = 20.0
+"""How far apart the two extrinsics are to be on the screen: several times the width of a line."""
+
+ENLARGED = (1.5, 10.0)
+"""At least and at most: a pixel of the image is not to fill the picture, nor the image to shrink."""
+
+OVERVIEW_PX = 340
+"""Height of the whole image, at most."""
+
+GAP_PX, AXIS_PX, TITLE_PX, LINE_PX = 12, 44, 26, 20
+"""Between panels; left of and below a panel, for its axes; above it; a line of text."""
+
+SAME_PX = 0.05
+"""Extrinsics that differ by less, everywhere in the image, look the same at any enlargement."""
+
+CONTRAST_SHARE = 0.3
+"""Greys of the image are kept off black and white by so much of their range, so that lines stand out on all of them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Caption:
+    """What the picture says of the two extrinsics.
+
+    Attributes:
+        before, after: what they are called.
+        sigma: (6,) standard deviations of the second one, radians and metres, NaN where there is none; None: not known.
+        network: the depth network that took part; empty: none, or not known.
+    """
+
+    before: str = "before"
+    after: str = "after"
+    sigma: NDArray[np.float64] | None = None
+    network: str = ""
+
+
+PLAIN = Caption()
+
+
+def close_ups(
+    window: Window,
+    T_before: Matrix4,
+    T_after: Matrix4,
+    *,
+    compensated: bool = True,
+    caption: Caption = PLAIN,
+    limits: LimitsConfig | None = None,
+) -> NDArray[np.uint8]:
+    """The image of a pair, and the parts of it in which two extrinsics (4, 4) differ most, at the one and at the other.
+
+    Args:
+        window: with one pair at least; the most telling one is shown.
+        compensated: whether sweeps are compensated for motion.
+        limits: of images that are decoded; None: the usual ones.
+
+    Returns:
+        (H, W, 3) uint8 BGR, about 1080 px wide, on white.
+
+    Raises:
+        DecodeError: an image cannot be decoded.
+        CalibrationError: an image is not of the camera's size.
+    """
+    shift = shift_px(window, T_before, T_after, compensated=compensated)
+    enlarged = (
+        ENLARGED[0] if shift is None else min(max(SHOWN_PX / max(shift.median_px, SAME_PX), ENLARGED[0]), ENLARGED[1])
+    )
+    camera = window.rig.camera
+    size = (max(8, round(PANEL_PX[0] / enlarged)), max(8, round(PANEL_PX[1] / enlarged)))
+    bounds = LimitsConfig() if limits is None else limits
+    images = GreyImages(bounds)
+    telling = places(window, images, T_before, T_after, size, PLACES, compensated=compensated)
+    pair = window.pairs[telling.index]
+    image = decode_bgr(pair.camera.image, bounds)
+    lines = sentences(window, telling, shift, T_before, T_after, caption)
+
+    width = 2 * (AXIS_PX + PANEL_PX[0]) + 3 * GAP_PX
+    overview = _fitted(camera.width, camera.height, (width - 2 * GAP_PX, OVERVIEW_PX))
+    row_px = TITLE_PX + PANEL_PX[1] + AXIS_PX
+    height = GAP_PX + LINE_PX * len(lines) + GAP_PX + overview[1] + GAP_PX + row_px * len(telling.found)
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
+    for index, line in enumerate(lines):
+        weight = "bold" if index == 0 else "normal"
+        figure.text(GAP_PX / width, 1 - (GAP_PX + LINE_PX * index) / height, line, va="top", weight=weight, size=10)
+    top = GAP_PX + LINE_PX * len(lines) + GAP_PX
+    _overview(box(figure, (width - overview[0]) // 2, top, *overview), image, telling.found)
+    for row, place in enumerate(telling.found):
+        below = top + overview[1] + GAP_PX + row_px * row + TITLE_PX
+        for column, (T, name) in enumerate(((T_before, caption.before), (T_after, caption.after))):
+            left = GAP_PX + AXIS_PX + column * (PANEL_PX[0] + GAP_PX + AXIS_PX)
+            axes = box(figure, left, below, *_fitted(place.part.width, place.part.height, PANEL_PX))
+            _panel(axes, image, window.rig, telling.outlines, T, place.part, COLOURS[column])
+            told = f"edges under the outlines {place.strength[column]:+.1f} σ"
+            axes.set_title(f"{NAMES[row]}  {name}: {told}", loc="left", size=10, pad=5, color="black")
+    return bgr_of(figure)
+
+
+def difference_text(T_before: Matrix4, T_after: Matrix4) -> str:
+    """How far apart two extrinsics (4, 4) are: the angle, and the way between the two centres of the camera."""
+    angle_deg = degrees(se3.rotation_angle_rad(T_after @ se3.inverse(T_before)))
+    moved_m = float(np.linalg.norm(se3.inverse(T_after)[:3, 3] - se3.inverse(T_before)[:3, 3]))
+    return f"{angle_deg:.2f}° and {100 * moved_m:.1f} cm"
+
+
+def sentences(
+    window: Window, telling: Places, shift: Shift | None, T_before: Matrix4, T_after: Matrix4, caption: Caption
+) -> list[str]:
+    """The lines above the picture."""
+    where = f"{window.rig.pair}, {instant(window.pairs[telling.index].stamp_ns)}"
+    names = f"{caption.before} and {caption.after}"
+    if shift is not None and shift.largest_px < SAME_PX:
+        lines = [f"{where}: no difference between {names}: less than {SAME_PX:g} px anywhere in the image"]
+    else:
+        on_image = "" if shift is None else f", mostly {shift.median_px:.1f} px in the image"
+        lines = [f"{where}: {names} are {difference_text(T_before, T_after)} apart{on_image}"]
+        lines.append(
+            f"{caption.after} − {caption.before}: {_axes_text(se3.difference(T_after, T_before), caption.sigma)}"
+        )
+    if caption.network:
+        lines.append(f"depth network: {caption.network}")
+    if telling.found:
+        lines.append(
+            "Lines: outlines of near things that the LiDAR saw; dots: its other range edges. They belong on edges of "
+            "the image."
+        )
+        lines.append("σ: how much stronger these are under the outlines than on average, 0 is chance. Axes: pixels.")
+        before, after = telling.strength
+        lines.append(
+            f"All outlines of {telling.frames} images, not only those shown: {caption.before} {before:+.2f} σ, "
+            f"{caption.after} {after:+.2f} σ."
+        )
+    else:
+        lines.append("No outline of a near thing is in view at both extrinsics: there is nothing to enlarge.")
+    return lines
+
+
+def _axes_text(apart: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> str:
+    """The shift by axis; each with its standard deviation where that is known. Translations only where there are
+    any."""
+    spread = np.full(6, np.nan) if sigma is None else sigma
+    told = []
+    for axis, name in enumerate(("pitch", "yaw", "roll", "right", "down", "forward")):
+        factor, unit, digits = (degrees(1.0), "°", 2) if axis < 3 else (100.0, " cm", 1)
+        if axis < 3 or np.isfinite(spread[axis]) or np.abs(apart[3:]).max() * factor >= 0.05:
+            known = f" ± {factor * spread[axis]:.{digits}f}" if np.isfinite(spread[axis]) else ""
+            told.append(f"{name} {factor * apart[axis]:+.{digits}f}{known}{unit}")
+    return ", ".join(told)
+
+
+def _fitted(width: int, height: int, within: tuple[int, int]) -> tuple[int, int]:
+    """The largest size of this shape."""
+    factor = min(within[0] / width, within[1] / height)
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+def _overview(axes: Axes, image_bgr: NDArray[np.uint8], found: Sequence[Place]) -> None:
+    height, width = image_bgr.shape[:2]
+    axes.imshow(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2RGB), extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+    axes.set_axis_off()
+    for name, place in zip(NAMES, found, strict=False):
+        part = place.part
+        for colour, line_width in (("black", 3.5), ("white", 1.5)):
+            corner = (part.left - 0.5, part.top - 0.5)
+            axes.add_patch(Frame(corner, part.width, part.height, fill=False, ec=colour, lw=line_width))
+        axes.text(
+            part.left, part.top, name, size=11, weight="bold", va="bottom" if part.top > 0.1 * height else "top",
+            bbox={"facecolor": "white", "edgecolor": "black", "pad": 2}, clip_on=True,
+        )  # fmt: skip
+
+
+def _panel(
+    axes: Axes,
+    image_bgr: NDArray[np.uint8],
+    rig: Rig,
+    outlines: Outlines,
+    T_camera_lidar: Matrix4,
+    part: Rectangle,
+    colour: str,
+) -> None:
+    left, right = part.left - 0.5, part.left + part.width - 0.5
+    top, bottom = part.top - 0.5, part.top + part.height - 0.5
+    grey = cv2.cvtColor(np.ascontiguousarray(image_bgr[part.slices]), cv2.COLOR_BGR2GRAY)
+    darkest, brightest = np.percentile(grey, (1.0, 99.0))
+    margin = CONTRAST_SHARE * max(1.0, brightest - darkest)
+    axes.imshow(
+        grey, cmap="gray", vmin=darkest - margin, vmax=brightest + margin, extent=(left, right, bottom, top),
+        interpolation="bicubic",
+    )  # fmt: skip
+    at = drawn_at(outlines, rig, T_camera_lidar)
+    pieces = at.uv_px[outlines.pieces[at.seen[outlines.pieces].all(axis=1)]]
+    for colour_of_line, line_width in (("black", 4.5), (colour, 2.5)):
+        axes.add_collection(
+            LineCollection(list(pieces), colors=colour_of_line, linewidths=line_width, capstyle="round")
+        )
+    alone = at.seen.copy()
+    alone[outlines.pieces.ravel()] = False
+    u, v = at.uv_px[alone].T
+    axes.scatter(u, v, s=14, c=colour, edgecolors="black", linewidths=0.7, zorder=2)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    axes.tick_params(labelsize=9)
+    scale_bar(axes, rig.camera, part)

@@ -1,0 +1,69 @@
+"""What is left at an extrinsic, and of a lens that was fitted: figures in words, and that there is a picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import radians
+
+import numpy as np
+import pytest
+
+import posts
+from coec.adapters.images.codec import GreyImages
+from coec.calibration.types import LidarFrame
+from coec.config import LimitsConfig
+from coec.evaluation.local_shifts import local_shifts
+from coec.geometry import se3
+from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
+from coec.reports import lens_residual as lens
+from coec.reports.residual_map import residual_map, sentences
+
+
+def test_the_words_tell_what_all_parts_have_in_common() -> None:
+    window = posts.window(tuple(np.arange(-36.0, 37.0, 4.0).tolist()))
+    window = replace(window, pairs=window.pairs * 4)
+    moved = se3.perturb(window.T_camera_lidar_start, np.array([0, radians(0.5), 0, 0, 0, 0]))
+    shifts = local_shifts(window, GreyImages(LimitsConfig()), moved, compensated=True)
+    lines = sentences(window, shifts, "start")
+    when = "2020-09-13T12:26:40.123Z"
+    assert lines[0] == f"front, {when} to {when}: range edges on edges of the image at start"
+    assert "from 4 pairs" in lines[1]
+    assert "a pixel is 0.143° on the axis" in lines[1]
+    right_px = float(lines[2].split("to all: ")[1].split(" px")[0])
+    assert right_px == pytest.approx(-400.0 * np.tan(radians(0.5)), abs=1.0)
+
+
+def test_a_picture_without_a_range_edge_says_that_nothing_is_told() -> None:
+    window = posts.window((0.0,))
+    (pair,) = window.pairs
+    empty = LidarFrame(0, "lidar", np.zeros((0, 3), np.float32))
+    window = replace(window, pairs=(replace(pair, lidar=empty),))
+    shifts = local_shifts(window, GreyImages(LimitsConfig()), window.T_camera_lidar_start, compensated=True)
+    assert "No part of the image tells" in sentences(window, shifts, "")[1]
+    picture = residual_map(window, window.T_camera_lidar_start)
+    assert picture.dtype == np.uint8
+    assert (picture[:4] == 255).all()  # light ground
+
+
+def test_an_exact_fit_leaves_nothing_and_another_what_the_fit_says() -> None:
+    exact = posts.LENSES["double_sphere"]
+    assert "0 px" in lens.sentences(exact, exact, np.zeros(4))[0]
+    fisheye = posts.LENSES["kannala_brandt"]
+    fit = fit_double_sphere(fisheye)
+    cells = (np.arange(64) + 0.5) / 64  # as the fit compares them
+    u, v = np.meshgrid(640 * cells - 0.5, 360 * cells - 0.5)
+    apart = lens.residuals_px(fisheye, fit.camera, np.column_stack([u.ravel(), v.ravel()]))
+    size = np.linalg.norm(apart, axis=1)
+    assert np.sqrt((size**2).mean()) == pytest.approx(fit.residual_rms_px, rel=1e-6)
+    assert 0.5 * fit.residual_max_px < size.max() <= fit.residual_max_px
+    picture = lens.lens_residual(fisheye, fit.camera)
+    assert picture.shape[2] == 3
+    assert (picture[:4] == 255).all()
+
+
+def test_where_one_has_no_pixel_nothing_is_told() -> None:
+    wide, narrow = posts.LENSES["double_sphere"], posts.LENSES["mei"]
+    corner = np.array([[-5000.0, -5000.0], [320.0, 180.0]])
+    apart = lens.residuals_px(narrow, wide, corner)
+    assert np.isnan(apart[0]).all()
+    assert np.isfinite(apart[1]).all()
