@@ -53,6 +53,7 @@ def test_every_option_of_every_command_stands_there_once() -> None:
         told = Counter(re.findall(r"--[a-z0-9-]+", " ".join(terms)))
         assert told == Counter(options), name
         assert len(terms) == len(command.params), name
+        assert [one.name for one in command.params if not one.help] == [], name
     groups = {name for name, command in tree.items() if getattr(command, "commands", None)}
     assert set(tree) - groups <= set(shown) <= set(tree)
 

@@ -53,7 +53,7 @@ def _section(words: tuple[str, ...], command: Any) -> str:
 
 
 def _item(term: str, parameter: Any) -> str:
-    remarks = [prose(parameter.help)] if parameter.help else []
+    remarks = [prose(parameter.help)]
     choices = get_args(parameter.type_descriptor.annotation)
     if choices and all(isinstance(choice, str) for choice in choices):
         remarks.append(f"One of {', '.join(map(code, choices))}.")
@@ -62,7 +62,7 @@ def _item(term: str, parameter: Any) -> str:
         remarks.append(f"Default: {code(default)}.")
     elif parameter.required and term.startswith("-"):
         remarks.append("Required.")
-    return f"`{term}`\n:   {' '.join(remarks) or 'As its name says.'}\n\n"
+    return f"`{term}`\n:   {' '.join(remarks)}\n\n"
 
 
 def _default(parameter: Any) -> object | None:
