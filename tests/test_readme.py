@@ -1,9 +1,11 @@
-"""The README and docs/recordings.md as somebody meets them who types them: every command is run, and what it says is
+"""The README and the pages of docs as somebody meets them who types them: every command is run, and what it says is
 compared with what is shown.
 
-A fenced block is `console` (typed here) or `text` (not). In a console block a line `$ COMMAND  # remark` is typed, the
-lines below it are what it says, and a line `…` stands for any number of lines. Every command runs as it is written,
-except those of `FORMS`; each block runs in a folder of its own, beside which the sample recordings lie.
+A fenced block is `console` (typed here), `yaml` (read in tests/docs), `python` (compiled here) or `text` (neither). In
+a console block a line `$ COMMAND  # remark` is typed, the lines below it are what it says, and a line `…` stands for
+any number of lines. Every command runs as it is written, except those of `FORMS`; each block runs in a folder of its
+own, beside which the sample recordings lie, unless a line `<!-- goes on -->` above it says that it goes on where the
+block before it ended.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import re
 import shlex
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import psutil
@@ -23,7 +25,9 @@ from conftest import REPOSITORY
 from e2e.processes import environment
 from ports import free_port
 
-PAGES = (REPOSITORY / "README.md", REPOSITORY / "docs" / "recordings.md")
+PAGES = (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md")))
+LANGUAGES = ("console", "python", "text", "yaml")
+GOES_ON = "<!-- goes on -->"
 SAMPLES = "../shared/data"
 ELLIPSIS = "…"
 
@@ -48,11 +52,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page."""
+    """A fenced block of a page, with those that go on from it."""
 
     page: Path
     line: int
     language: str
+    text: str
     steps: tuple[Step, ...]
 
 
@@ -130,16 +135,24 @@ def blocks(page: Path) -> list[Block]:
     """Of a page, in order."""
     found: list[Block] = []
     inside: list[str] | None = None
-    begin, language = 0, ""
+    begin, language, goes_on = 0, "", False
     for number, line in enumerate(page.read_text().splitlines(), start=1):
         if not line.startswith("```"):
             if inside is not None:
                 inside.append(line)
+            elif line.strip():
+                goes_on = line == GOES_ON
         elif inside is None:
             inside, begin, language = [], number, line.removeprefix("```")
         else:
-            found.append(Block(page, begin, language, steps(inside) if language == "console" else ()))
-            inside = None
+            typed_here = steps(inside) if language == "console" else ()
+            block = Block(page, begin, language, "\n".join(inside), typed_here)
+            if goes_on:
+                assert {found[-1].language, language} == {"console"}, f"{page}:{begin} goes on from nothing"
+                before = found.pop()
+                block = replace(before, steps=(*before.steps, *typed_here))
+            found.append(block)
+            inside, goes_on = None, False
     assert inside is None, f"the block of line {begin} has no end"
     return found
 
@@ -175,8 +188,13 @@ def name_of(block: Block) -> str:
 
 
 def test_every_block_says_whether_it_is_typed() -> None:
-    assert [name_of(block) for block in BLOCKS if block.language not in ("console", "text")] == []
+    assert [name_of(block) for block in BLOCKS if block.language not in LANGUAGES] == []
     assert all(block.steps for block in CONSOLE)
+
+
+@pytest.mark.parametrize("block", [block for block in BLOCKS if block.language == "python"], ids=name_of)
+def test_python_that_is_shown_is_python(block: Block) -> None:
+    compile(block.text, str(block.page), "exec")
 
 
 def test_no_form_is_left_of_a_command_that_is_gone() -> None:

@@ -27,12 +27,11 @@ def pairs() -> list[str]:
     return [pair["name"] for pair in shipped("coec.yaml")["pairs"]]
 
 
-def test_the_configuration_is_the_one_of_the_pages_and_speaks_to_ros() -> None:
+def test_the_configuration_is_the_one_of_the_page_and_speaks_to_ros() -> None:
     (shown,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
     document = shipped("coec.yaml")
 
     assert parse_yaml(shown) == document
-    assert f"```text\n{shown}```" in (REPOSITORY / "README.md").read_text()
     assert len([line for line in shown.splitlines() if not line.startswith("ros:")]) <= 8 - 1
     assert RosConfig.model_validate(document["ros"]).publish == ("diagnostics", "tf_static", "camera_info", "overlay")
     assert set(document) <= set(Config.model_fields)

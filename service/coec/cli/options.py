@@ -58,8 +58,8 @@ ServiceConfig = Annotated[
     Path | None,
     typer.Option("--config", help="Of the service: names the vehicle, the prefix and the router.", metavar="FILE"),
 ]
-Vehicle = Annotated[str | None, typer.Option(show_default="vehicle")]
-Prefix = Annotated[str | None, typer.Option(show_default="coec")]
+Vehicle = Annotated[str | None, typer.Option(help="Name of the vehicle.", show_default="vehicle")]
+Prefix = Annotated[str | None, typer.Option(help="What all keys begin with.", show_default="coec")]
 SessionFile = Annotated[
     Path | None,
     typer.Option("--zenoh", help="Zenoh configuration of the session (JSON5): endpoint, certificate.", metavar="FILE"),

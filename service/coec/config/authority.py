@@ -16,8 +16,10 @@ CommonName = Annotated[str, Field(pattern=r"^[A-Za-z0-9 ._:/@+=,-]{1,64}$")]
 class SenderConfig(Stage):
     """Somebody who may give commands, by the common name of his certificate."""
 
-    name: CommonName
-    commands: tuple[CommandName, ...] = Field(default=NAMES, min_length=1)
+    name: CommonName = Field(description="common name of the certificate")
+    commands: tuple[CommandName, ...] = Field(
+        default=NAMES, min_length=1, description="that may be given; all, unless they are listed"
+    )
 
 
 class AuthorityConfig(Stage):
@@ -28,7 +30,9 @@ class AuthorityConfig(Stage):
     open nowhere else. What other doors that router has the service cannot see: where it has some, they are what its own
     access control lets in, or `never` shuts them."""
 
-    anonymous: Literal["never", "loopback", "always"] = "loopback"
+    anonymous: Literal["never", "loopback", "always"] = Field(
+        default="loopback", description="when commands are taken from whoever proves nothing"
+    )
     senders: tuple[SenderConfig, ...] = Field(default=(), max_length=64, description="by `name`, and their `commands`")
     certificate: FilePath | None = Field(
         default=None, description="of the service; its common name is the vehicle's name"

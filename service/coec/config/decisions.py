@@ -38,7 +38,10 @@ class PolicyConfig(Stage):
     """What may become current without a person: an estimate is one thing, applying it another. What is not applied
     waits for `command/apply`. Limits are per axis; those of a day count every step of the last 24 h of sensor time."""
 
-    apply: Literal["never", "within_limits", "always"] = "within_limits"
+    apply: Literal["never", "within_limits", "always"] = Field(
+        default="within_limits",
+        description="of an accepted estimate that differs: by a person, by the limits below, or at once",
+    )
     max_step_deg: float = Field(default=10.0, gt=0, description="largest step of a rotation, degrees (within_limits)")
     max_step_m: float = Field(default=0.3, gt=0, description="largest step of a translation, m (within_limits)")
     max_per_day_deg: float = Field(default=20.0, gt=0, description="sum of all steps of a day, degrees (within_limits)")

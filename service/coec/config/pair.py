@@ -27,7 +27,7 @@ class OpenPairConfig(Stage):
     intrinsics (`CameraInfo`) and how the sensors lie to one another (`/tf_static`). `points: TEXT` is short for
     `lidar: {topic: TEXT}`."""
 
-    name: Name
+    name: Name = Field(description="of the pair, a part of its keys and files")
     camera: OpenCameraConfig
     lidar: OpenLidarConfig
     ego: OpenEgoConfig | None = None

@@ -55,14 +55,14 @@ class FieldOfView(Stage):
 class RigCamera(OpenCameraConfig):
     """A camera of the vehicle."""
 
-    name: Name
+    name: Name = Field(description="of the camera")
     T_vehicle_camera: Pose | None = Field(default=None, description="pose of the camera in the vehicle's frame")
 
 
 class RigLidar(OpenLidarConfig):
     """A LiDAR of the vehicle."""
 
-    name: Name
+    name: Name = Field(description="of the LiDAR")
     T_vehicle_lidar: Pose | None = Field(default=None, description="pose of the LiDAR in the vehicle's frame")
     field_of_view: FieldOfView = FieldOfView()
 
@@ -88,8 +88,8 @@ class RigStages(Stage):
 class RigPair(RigStages):
     """A camera and a LiDAR that make a pair."""
 
-    camera: Name
-    lidar: Name
+    camera: Name = Field(description="name of the camera")
+    lidar: Name = Field(description="name of the LiDAR")
     name: Name | None = Field(default=None, description="of the pair, where it is not to be that of its sensors")
 
 
@@ -104,14 +104,14 @@ def _listed(value: Any) -> Any:
 class RigConfig(Stage):
     """The sensors of a vehicle."""
 
-    cameras: tuple[RigCamera, ...] = Field(min_length=1, max_length=MAX_SENSORS)
-    lidars: tuple[RigLidar, ...] = Field(min_length=1, max_length=MAX_SENSORS)
+    cameras: tuple[RigCamera, ...] = Field(min_length=1, max_length=MAX_SENSORS, description="each told once")
+    lidars: tuple[RigLidar, ...] = Field(min_length=1, max_length=MAX_SENSORS, description="each told once")
     ego: RigEgo | None = None
     pairs: Annotated[tuple[RigPair, ...] | None, BeforeValidator(_listed)] = Field(
         description="`all` that see something in common; or a list"
     )
     stages: RigStages = Field(default=RigStages(), description="of every pair, unless it says otherwise")
-    links: tuple[LinkConfig, ...] = Field(default=(), max_length=MAX_LINKS)
+    links: tuple[LinkConfig, ...] = Field(default=(), max_length=MAX_LINKS, description="as in the whole configuration")
 
     @model_validator(mode="after")
     def _each_once(self) -> Self:

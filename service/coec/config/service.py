@@ -15,7 +15,7 @@ class LimitsConfig(Stage):
 
     max_message_bytes: int = Field(default=32 * 2**20, ge=2**16, le=2**30, description="as Zenoh's max_message_size")
     max_image_pixels: int = Field(default=33_000_000, ge=2**12, description="8K UHD")
-    max_points: int = Field(default=1_000_000, ge=2**10)
+    max_points: int = Field(default=1_000_000, ge=2**10, description="of a cloud")
     max_waiting_bytes: int = Field(
         default=128 * 2**20,
         ge=2**20,
@@ -31,14 +31,16 @@ class LimitsConfig(Stage):
 class StateConfig(Stage):
     """The state directory; deleting it returns the vehicle to nominal."""
 
-    directory: FilePath = Path("coec-state")
+    directory: FilePath = Field(
+        default=Path("coec-state"), description="what is remembered over a restart, and the windows"
+    )
     model: FilePath | None = Field(
         default=None,
         description="baselines of this model of vehicle (`coec fleet commission`): a pair that is not commissioned "
         "itself starts from them",
     )
     max_bytes: int = Field(default=4 * 2**30, ge=2**20, description="windows kept, bytes; the oldest go first")
-    max_age_days: float = Field(default=90.0, gt=0)
+    max_age_days: float = Field(default=90.0, gt=0, description="of windows; older ones go")
     min_free_bytes: int = Field(
         default=512 * 2**20, ge=0, description="left free on the disk; no window starts below it"
     )
@@ -105,20 +107,22 @@ class WorkerConfig(Stage):
     attempts: int = Field(
         default=2, ge=1, le=10, description="workers that may die on one window before it is given up"
     )
-    threads: int = Field(default=2, ge=1, le=64)
+    threads: int = Field(default=2, ge=1, le=64, description="of the kernels that score a pose")
     niceness: int = Field(default=10, ge=0, le=19, description="so that queries are answered first")
 
 
 class ZenohConfig(Stage):
     """The session. `file` is a Zenoh configuration (JSON5) for TLS, access control and the like."""
 
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[str, ...] = Field(default=("tcp/127.0.0.1:7447",), description="endpoints of the router")
     embedded_router: bool = Field(default=False, description="be the router and listen on `listen`")
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    listen: tuple[str, ...] = Field(
+        default=("tcp/127.0.0.1:7447",), description="where it is the router; loopback, or TLS with certificates"
+    )
     insecure: bool = Field(
         default=False, description="listen even where whoever comes is let in without a certificate; health says so"
     )
-    file: FilePath | None = None
+    file: FilePath | None = Field(default=None, description="Zenoh's own configuration: endpoints, certificate")
 
     @property
     def router(self) -> tuple[str, ...]:
@@ -129,7 +133,9 @@ class ZenohConfig(Stage):
 class LogConfig(Stage):
     """The log, on standard output."""
 
-    level: Literal["debug", "info", "warning", "error"] = "info"
+    level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="lines of less weight are left out"
+    )
     format: Literal["auto", "json", "human"] = Field(
         default="auto", description="auto: for people where it goes to a terminal, else JSON lines"
     )

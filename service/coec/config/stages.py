@@ -31,9 +31,11 @@ MAX_SLICE_S = 3600.0
 class WindowConfig(Stage):
     """How a window is chosen from the stream (the paper: 25 pairs over three minutes)."""
 
-    pairs: int = Field(default=25, ge=1, le=400)
+    pairs: int = Field(default=25, ge=1, le=400, description="of a full window")
     min_pairs: int = Field(default=10, ge=1, le=400, description="a slice that ends with fewer makes no window")
-    slice_s: float = Field(default=180.0, gt=0, le=MAX_SLICE_S)
+    slice_s: float = Field(
+        default=180.0, gt=0, le=MAX_SLICE_S, description="of sensor time, over which the pairs are spread, s"
+    )
     require_motion: bool = Field(default=True, description="skip pairs taken while the vehicle is known to stand")
     min_speed_mps: float = Field(default=0.5, ge=0, description="slower counts as standing")
     min_sharpness: float = Field(
@@ -72,7 +74,7 @@ class DepthConfig(Stage):
     providers: tuple[Literal["cpu", "cuda", "tensorrt"], ...] = Field(
         default=("cpu",), min_length=1, description="tried in this order; cpu is always the last resort"
     )
-    threads: int = Field(default=2, ge=1, le=64)
+    threads: int = Field(default=2, ge=1, le=64, description="of the inference")
 
 
 class ObjectiveConfig(Stage):
@@ -82,8 +84,8 @@ class ObjectiveConfig(Stage):
         default="fused",
         description="fused: edges and depth, from far away; mi: the paper's; intensity: reflectance against grey value",
     )
-    depth_bins: int = Field(default=32, ge=2, le=4096)
-    range_bins: int = Field(default=32, ge=2, le=4096)
+    depth_bins: int = Field(default=32, ge=2, le=4096, description="of the joint histogram, along depth")
+    range_bins: int = Field(default=32, ge=2, le=4096, description="of the joint histogram, along range")
     min_range_m: float = Field(default=2.0, ge=0, description="nearer points are the vehicle itself")
     max_range_m: float = Field(default=80.0, gt=0, description="further points are too sparse to carry information")
 
@@ -97,7 +99,7 @@ class ObjectiveConfig(Stage):
 class SearchConfig(Stage):
     """The box and the steps of BOBYQA."""
 
-    dof: Literal[3, 6] = 3
+    dof: Literal[3, 6] = Field(default=3, description="3: rotation, the translation is known; 6: both")
     rotation_deg: float = Field(
         default=10.0, gt=0, le=45, description="half-width of the box about the start, per axis"
     )
@@ -105,7 +107,9 @@ class SearchConfig(Stage):
     step_deg: float = Field(default=2.0, gt=0, description="first trust region, rotation")
     step_m: float = Field(default=0.05, gt=0, description="first trust region, translation")
     tolerance_deg: float = Field(default=0.002, gt=0, description="last trust region, rotation")
-    max_evaluations: int = Field(default=600, ge=20, le=100_000)
+    max_evaluations: int = Field(
+        default=600, ge=20, le=100_000, description="of the objective in one climb; then it ends where it is"
+    )
     reach_deg: float = Field(
         default=28.0, gt=0, le=60, description="radius of the global stage about the start (fused)"
     )
@@ -185,7 +189,9 @@ class CalibrationConfig(Stage):
     search: SearchConfig = SearchConfig()
     verdict: VerdictConfig = VerdictConfig()
     time_offset: TimeOffsetConfig = TimeOffsetConfig()
-    motion_compensation: bool = True
+    motion_compensation: bool = Field(
+        default=True, description="move each point to where it was when the image was taken, by ego-motion and its time"
+    )
 
 
 class TrackerConfig(Stage):

@@ -12,24 +12,28 @@ from coec.config.base import IDENTITY, FilePath, KeyExpression, Matrix4x4, Name,
 class CameraIntrinsics(Stage):
     """Intrinsics as in `dataset.yaml`; which of the optional parameters are needed depends on `model`."""
 
-    model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"]
+    model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"] = Field(
+        description="of the lens"
+    )
     width: int = Field(gt=0, le=16384, description="image width, px")
     height: int = Field(gt=0, le=16384, description="image height, px")
     fx: float = Field(gt=0, description="focal length, px")
     fy: float = Field(gt=0, description="focal length, px")
     cx: float = Field(description="principal point, px; pixel centres at integers")
     cy: float = Field(description="principal point, px; pixel centres at integers")
-    xi: float | None = None
-    alpha: float | None = None
-    beta: float | None = None
-    k1: float | None = None
-    k2: float | None = None
-    k3: float | None = None
-    k4: float | None = None
-    k5: float | None = None
-    k6: float | None = None
-    p1: float | None = None
-    p2: float | None = None
+    xi: float | None = Field(
+        default=None, description="shift of the second sphere (double_sphere), of the mirror (mei)"
+    )
+    alpha: float | None = Field(default=None, description="from pinhole to sphere (double_sphere, eucm), 0 to 1")
+    beta: float | None = Field(default=None, description="form of the ellipsoid (eucm)")
+    k1: float | None = Field(default=None, description="radial (radtan, rational, mei); of θ³ (kannala_brandt)")
+    k2: float | None = Field(default=None, description="radial (radtan, rational, mei); of θ⁵ (kannala_brandt)")
+    k3: float | None = Field(default=None, description="radial (radtan, rational); of θ⁷ (kannala_brandt)")
+    k4: float | None = Field(default=None, description="radial, below the fraction (rational); of θ⁹ (kannala_brandt)")
+    k5: float | None = Field(default=None, description="radial, below the fraction (rational)")
+    k6: float | None = Field(default=None, description="radial, below the fraction (rational)")
+    p1: float | None = Field(default=None, description="tangential (radtan, rational, mei)")
+    p2: float | None = Field(default=None, description="tangential (radtan, rational, mei)")
 
     def parameters(self) -> dict[str, float]:
         """Every intrinsic that was given, by name, without `model`."""
@@ -53,7 +57,7 @@ class PointTimeConfig(Stage):
     """How the points of a `PointCloud2` are timed, where their values leave it open."""
 
     field: str = Field(min_length=1, max_length=64, description="name of the field")
-    unit: TimeUnit
+    unit: TimeUnit = Field(description="of its values")
     base: TimeBase = Field(
         default="stamp", description="counted since the cloud's stamp, or on the clock that its stamp is of"
     )

@@ -35,8 +35,8 @@ MAX_PAIRS = 32
 class Config(Stage):
     """The one configuration file of a daemon."""
 
-    vehicle: Name = "vehicle"
-    prefix: KeyExpression = "coec"
+    vehicle: Name = Field(default="vehicle", description="its name, a part of every key: one vehicle, one name")
+    prefix: KeyExpression = Field(default="coec", description="what all keys begin with")
     zenoh: ZenohConfig = ZenohConfig()
     middleware: Literal["native", "rmw_zenoh", "ros2dds"] = Field(
         default="native", description="how topics lie on the bus: native keys, or as ROS 2 nodes or a bridge put them"
@@ -55,7 +55,9 @@ class Config(Stage):
     log: LogConfig = LogConfig()
     metrics: MetricsConfig = MetricsConfig()
     uplink: UplinkConfig = UplinkConfig()
-    pairs: tuple[PairConfig, ...] = Field(default=(), max_length=MAX_PAIRS)
+    pairs: tuple[PairConfig, ...] = Field(
+        default=(), max_length=MAX_PAIRS, description="what is calibrated: each a camera and a LiDAR"
+    )
     awaited: tuple[OpenPairConfig, ...] = Field(
         default=(),
         max_length=MAX_PAIRS,

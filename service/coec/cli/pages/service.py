@@ -1,19 +1,15 @@
-"""`python -m coec.cli.pages docs`: pages of the documentation, from the tables that the code runs on."""
+"""The pages on a running service: its metrics; how it ends, what may ail it, what it takes while it runs."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 from coec.cli.exit_codes import EXIT_CODES
+from coec.cli.pages.markdown import WRITTEN, table
 from coec.runtime.api.metrics import FAMILIES
 from coec.runtime.api.troubles import TROUBLES
 from coec.runtime.reload import RELOADED
 from coec.runtime.timings import LONG_S, QUICK_S
-
-WRITTEN = "Written by `python -m coec.cli.pages docs`; do not edit.\n"
-
 
 METRICS = """\
 # Metrics
@@ -36,7 +32,7 @@ OPERATIONS = """\
 {codes}
 ## What may ail the service
 
-Reasons in `health` and `status`, beside those of the calibration itself (`docs/health.md`).
+Reasons in `health` and `status`, beside those of the calibration itself ([health](health.md)).
 
 {troubles}
 ## What a reload takes
@@ -56,44 +52,21 @@ def metrics_page() -> str:
         (f"`{one.name}`", one.kind, one.unit, ", ".join(f"`{label}`" for label in one.labels), one.help)
         for one in FAMILIES
     ]
-    return METRICS.format(written=WRITTEN, quick=_seconds(QUICK_S), long=_seconds(LONG_S), table=_table(heads, rows))
+    return METRICS.format(written=WRITTEN, quick=_seconds(QUICK_S), long=_seconds(LONG_S), table=table(heads, rows))
 
 
 def operations_page() -> str:
     """Markdown: exit codes, troubles, values that are reloaded."""
     return OPERATIONS.format(
         written=WRITTEN,
-        codes=_table(("code", "meaning"), [(str(code), meaning) for code, meaning in EXIT_CODES.items()]),
-        troubles=_table(
+        codes=table(("code", "meaning"), [(str(code), meaning) for code, meaning in EXIT_CODES.items()]),
+        troubles=table(
             ("code", "meaning", "what to do"),
             [(f"`{code}`", trouble.meaning, trouble.advice) for code, trouble in TROUBLES.items()],
         ),
-        reloaded=_table(("value", "holds"), [(f"`{place}`", when) for place, when in RELOADED.items()]),
+        reloaded=table(("value", "holds"), [(f"`{place}`", when) for place, when in RELOADED.items()]),
     )
-
-
-PAGES = {"metrics.md": metrics_page, "operations.md": operations_page}
-"""What makes each, by its file."""
-
-
-def main(arguments: list[str]) -> int:
-    """Writes every page into the folder that is the only argument."""
-    if len(arguments) != 1:
-        sys.stderr.write("usage: python -m coec.cli.pages DIR\n")
-        return 2
-    for name, page in PAGES.items():
-        (Path(arguments[0]) / name).write_text(page(), encoding="utf-8")
-    return 0
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
 
 
 def _seconds(bounds_s: Sequence[float]) -> str:
     return ", ".join(f"{bound_s:g}" for bound_s in bounds_s)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
