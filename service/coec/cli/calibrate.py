@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from pydantic import ValidationError
@@ -24,9 +25,10 @@ from coec.errors import UsageError
 from coec.geometry import se3
 from coec.geometry.cameras import name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
-from coec.reports import console, pictures
+from coec.reports import console, page, pictures, provenance
+from coec.reports.calibration_page import calibration_page
 from coec.schemas.base import to_json
-from coec.schemas.replies import CalibrationReport, CalibrationResult
+from coec.schemas.replies import CalibrationReport, CalibrationResult, Vector6
 from coec.sources import windows
 
 FITTED = "double_sphere"
@@ -95,7 +97,8 @@ def run(options: Options) -> int:
     result = result_of(estimate, window.rig, loaded.vehicle)
     document = _document(result, times.elapsed_s(), fit, offset)
     if options.output is not None:
-        _write(options.output, window, result, configuration, document)
+        remarks = _remarks(fit, offset)
+        _write(options.output, window, result, configuration, document, remarks)
     if options.as_json:
         console.print_json(document)
     else:
@@ -168,7 +171,12 @@ def _finite(value: float) -> float | None:
 
 
 def _write(
-    folder: Path, window: Window, result: CalibrationResult, configuration: CalibrationConfig, document: dict[str, Any]
+    folder: Path,
+    window: Window,
+    result: CalibrationResult,
+    configuration: CalibrationConfig,
+    document: dict[str, Any],
+    remarks: Sequence[str],
 ) -> None:
     T_found = np.array(result.camera_from_lidar.matrix)
     moved_deg = windows.rotation_error_deg(T_found, window.T_camera_lidar_start)
@@ -177,8 +185,13 @@ def _write(
         "overlay_before": (window.T_camera_lidar_start, f"{where}  start"),
         "overlay_after": (T_found, f"{where}  {result.verdict.decision}, {moved_deg:.2f} deg from the start"),
     }
-    pictures.write_overlays(folder, window, poses, configuration.motion_compensation)
-    output.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
+    drawn = pictures.write_overlays(folder, window, poses, configuration.motion_compensation)
+    report = CalibrationReport.model_validate(document)
+    output.write(folder / "result.json", to_json(report))
+    page.write(
+        folder / "report.html",
+        calibration_page(report, window, _start(window), drawn, remarks, provenance.here()),
+    )
 
 
 def _show(
@@ -188,8 +201,7 @@ def _show(
     fit: CameraFit | None,
     offset: TimeOffset | None,
 ) -> None:
-    start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
-    start[:3] = np.degrees(start[:3])
+    start = _start(window)
     console.show(f"{window.window_id}: {result.pairs} pairs, {result.points_in_view} points in view")
     axes = console.table("axis", "start", "correction", "± σ", "unit", right=(1, 2, 3))
     for axis, name in enumerate(console.AXIS_NAMES):
@@ -199,18 +211,32 @@ def _show(
         axes.add_row(name, console.figure(start[axis], sign=True), found, spread, console.UNITS[axis])
     console.out.print(axes)
     console.show_verdict(result)
-    if fit is not None:
-        console.show(
-            f"{fit.model} fitted to {fit.of}: {fit.residual_rms_px:.4f} px rms, {fit.residual_max_px:.4f} px at most"
-        )
-    if offset is not None:
-        console.show(f"camera after its stamp: {_offset_text(offset)}")
+    for remark in _remarks(fit, offset):
+        console.show(remark)
     if result.independent_looks is not None:
         console.show(
             f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent looks{_together(result)}"
         )
     stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in document["elapsed_s"].items())
     console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")
+
+
+def _start(window: Window) -> Vector6:
+    """Where the search began, from the recording's own calibration: degrees and metres."""
+    start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
+    start[:3] = np.degrees(start[:3])
+    return cast("Vector6", tuple(float(value) for value in start))
+
+
+def _remarks(fit: CameraFit | None, offset: TimeOffset | None) -> list[str]:
+    said = []
+    if fit is not None:
+        said.append(
+            f"{fit.model} fitted to {fit.of}: {fit.residual_rms_px:.4f} px rms, {fit.residual_max_px:.4f} px at most"
+        )
+    if offset is not None:
+        said.append(f"camera after its stamp: {_offset_text(offset)}")
+    return said
 
 
 def _together(result: CalibrationResult) -> str:

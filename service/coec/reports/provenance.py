@@ -1,0 +1,78 @@
+"""Where a result comes from: what it was made of, by what, when and how, so that anybody can make it again."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import shlex
+import struct
+import sys
+import time
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+
+from coec import __version__
+from coec.calibration.types import FramePair, Window
+from coec.reports.page.words import instant
+
+CALCULATING = ("numpy", "numba", "nlopt", "onnxruntime")
+"""Packages that a decision is made with: it is theirs as well."""
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """By what, when and how a document was made.
+
+    Attributes:
+        command: as it was typed.
+        wall_ns: wall clock, ns since 1970.
+        versions: by package, `coec` first.
+        machine: system and processor.
+    """
+
+    command: str
+    wall_ns: int
+    versions: dict[str, str]
+    machine: str
+
+    def items(self) -> tuple[tuple[str, str], ...]:
+        """For people."""
+        versions = ", ".join(f"{package} {number}" for package, number in self.versions.items())
+        return (
+            ("Command", self.command),
+            ("Made", instant(self.wall_ns)),
+            ("Versions", versions),
+            ("On", self.machine),
+        )
+
+
+def here() -> Made:
+    """By this process, now."""
+    command = shlex.join(["coec", *sys.argv[1:]])
+    return Made(
+        command,
+        time.time_ns(),
+        _versions(),
+        f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+    )
+
+
+def content_hash(window: Window) -> str:
+    """sha256 (hexadecimal) of what a window saw: every image, every point, every stamp, in their order; the same
+    wherever the window was read from."""
+    digest = hashlib.sha256()
+    for pair in window.pairs:
+        for part in _parts(pair):
+            digest.update(part)
+    return digest.hexdigest()
+
+
+def _parts(pair: FramePair) -> tuple[bytes, ...]:
+    stamps = struct.pack("<qq", pair.camera.stamp_ns, pair.lidar.stamp_ns)
+    return stamps, bytes(pair.camera.image.data), pair.lidar.xyz_m.tobytes()
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {"coec": __version__, **{package: version(package) for package in CALCULATING}}
