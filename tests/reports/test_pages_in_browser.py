@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,6 @@ from reports import pages
 WIDTHS_PX = (360, 768, 1600)
 MOST_BYTES = 3_000_000
 
-KINDS: dict[str, Callable[[Path], pages_room.Page]] = {
-    "calibration": pages.calibration,
-    "refusal": lambda folder: pages.calibration(folder, accepted=False),
-    "hostile": lambda folder: pages.calibration(folder, vehicle=pages.EVIL),
-}
-
 LOOK = """() => ({
     wide: document.scrollingElement.scrollWidth, inner: innerWidth,
     headings: [...document.querySelectorAll("h1,h2,h3,h4")].map(h => Number(h.tagName[1])),
@@ -33,7 +27,7 @@ LOOK = """() => ({
     lost: [...document.querySelectorAll("a[href^='#']")].map(a => a.getAttribute("href").slice(1))
         .filter(id => !document.getElementById(id)),
     away: [...document.querySelectorAll("a[href],[src]")].map(a => a.getAttribute("href") || a.getAttribute("src"))
-        .filter(to => /^[a-z]+:|^\\/\\//i.test(to) && !to.startsWith("data:image/")),
+        .filter(to => to && /^[a-z]+:|^\\/\\//i.test(to) && !to.startsWith("data:image/")),
     ids: [...document.querySelectorAll("[id]")].map(e => e.id),
     small: [...document.querySelectorAll("svg.plot")].filter(s => s.getBoundingClientRect().width > 0)
         .map(s => 12 * s.getBoundingClientRect().width / s.viewBox.baseVal.width),
@@ -71,9 +65,9 @@ def opened(browser: Browser, path: Path, **context: Any) -> tuple[Tab, list[str]
     return tab, wrong
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", pages.KINDS)
 def test_a_page_fits_every_screen_and_loads_nothing(browser: Browser, tmp_path: Path, kind: str) -> None:
-    path = pages_room.write(tmp_path / "report.html", KINDS[kind](tmp_path))
+    path = pages_room.write(tmp_path / "report.html", pages.KINDS[kind](tmp_path))
     assert path.stat().st_size <= MOST_BYTES
     tab, wrong = opened(browser, path)
     for width in WIDTHS_PX:

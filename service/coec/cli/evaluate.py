@@ -26,7 +26,7 @@ from coec.evaluation.normalised_errors import NormalisedErrors
 from coec.evaluation.split_halves import Halves
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
 from coec.geometry.cameras import name_of
-from coec.reports import console, evaluation_tables
+from coec.reports import console, evaluation_page, evaluation_tables, provenance
 from coec.reports.evaluation_documents import (
     angle_spread_of,
     detection_of,
@@ -103,6 +103,7 @@ def run(options: Options) -> int:
             document, _ = _evaluate(options, subject, stages)
     if options.output is not None:
         output.write(options.output / "report.json", to_json(document))
+        evaluation_page.write(options.output, document, provenance.here())
     if options.as_json:
         console.print_json(document.model_dump(mode="json"))
     elif isinstance(document, ComparisonReport):
@@ -191,6 +192,7 @@ def _compare(options: Options, subject: _Subject, bars: Progress, stages: Stages
             continue
         if folder is not None:
             output.write(folder / "report.json", to_json(reports[method]))
+            evaluation_page.write(folder, reports[method], provenance.here())
         heard(1, "")
     if not reports:
         raise CalibrationError("; ".join(f"{method}: {reason}" for method, reason in not_evaluated.items()))

@@ -23,7 +23,8 @@ from coec.evaluation import paper, paper_published, starts, statistics
 from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
 from coec.evaluation.paper_speed import run_times
 from coec.evaluation.statistics import Outcome
-from coec.reports import console, paper_plots, plots
+from coec.reports import console, page, paper_plots, plots, provenance
+from coec.reports.paper_page import paper_page
 from coec.sources import open_source, windows
 
 FAR_DEG, DRIVE_DEG = 25.0, (5.0, 10.0)
@@ -37,7 +38,7 @@ DRIVE_PAIRS = 5
 
 
 def run(options: Options) -> int:
-    """Writes metrics.png, bullseye.png, drive.png and report.json, and prints what is in them.
+    """Writes metrics.png, bullseye.png, drive.png, report.json and report.html, and prints what is in them.
 
     Raises:
         CoecError: an experiment cannot be done.
@@ -66,6 +67,8 @@ def run(options: Options) -> int:
             "published": paper_published.document(),
         }
     written = output.write(options.output / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
+    drawn = [options.output / f"{name}.png" for name in ("metrics", "bullseye", "drive")]
+    page.write(options.output / "report.html", paper_page(document, drawn, provenance.here()))
     if options.as_json:
         console.print_json(document)
     else:

@@ -60,7 +60,7 @@ def calibration_page(
             ),
         ),
         Section("How it was found", (_search(report),)),
-        Section("Provenance", (_provenance(report, window, made),)),
+        made.section(_origin(report, window)),
     )
     verdict = _verdict(report)
     return Page("coec calibrate", f"Calibration of {report.vehicle} / {report.pair}", (verdict,), sections)
@@ -135,15 +135,12 @@ def _search(report: CalibrationReport) -> Facts:
     return Facts(rows)
 
 
-def _provenance(report: CalibrationReport, window: Window, made: Made) -> Facts:
+def _origin(report: CalibrationReport, window: Window) -> tuple[tuple[str, str], ...]:
     first, last = window.pairs[0].stamp_ns, window.pairs[-1].stamp_ns
-    items = (
+    return (
         ("Window", report.window_id),
         ("Sensor time", f"{instant(first)} to {instant(last)}"),
         ("Window, sha256 of images, points and stamps", content_hash(window)),
         ("Depth network, sha256", report.depth_identity),
         ("Configuration, hash", report.config_hash),
-        *made.items(),
     )
-    codes = {name for name, _ in items if "sha256" in name or "hash" in name} | {"Command"}
-    return Facts(items, frozenset(codes))

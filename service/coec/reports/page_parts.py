@@ -67,6 +67,14 @@ CAPTIONS: Mapping[str, tuple[str, str]] = {
         "LiDAR points drawn on the camera image at the extrinsic that was checked",
         "Points at the extrinsic that was checked, coloured by range. Where it is right they end where things end.",
     ),
+    "closeup_before": (
+        "Part of the camera image with LiDAR points where the service put them before the repair",
+        "Before the repair: LiDAR points where the service put them, coloured by range.",
+    ),
+    "closeup_after": (
+        "The same part of the same image with the points after the repair",
+        "After it, on the same picture.",
+    ),
     "close_ups": (
         "Enlarged parts of the image with the range edges of the LiDAR, at the start and at the result",
         "Close-ups where both extrinsics differ most: range edges should lie on the edges of the image.",
@@ -113,8 +121,17 @@ def file_picture(path: Path) -> Picture:
         OutputError: it cannot be read any more.
     """
     alt, caption = CAPTIONS.get(path.stem) or (path.stem.replace("_", " "), path.stem.replace("_", " ").capitalize())
+    return Picture(read(path), alt, caption)
+
+
+def read(path: Path) -> bytes:
+    """A file that was just written.
+
+    Raises:
+        OutputError: it cannot be read any more.
+    """
     try:
-        return Picture(path.read_bytes(), alt, caption)
+        return path.read_bytes()
     except OSError as error:
         raise OutputError(f"cannot read {path}, which was just written: {error.strerror}") from error
 
@@ -214,6 +231,14 @@ def figures_block(
     nothing follows: no advice."""
     lines = [_figure(name, metric, name in compared) for name, metric in metrics.items()]
     return Figures(caption, tuple(sorted(lines, key=lambda line: line.met is not False)))
+
+
+def title_of(name: str) -> str:
+    """What a figure is called, with its name in documents."""
+    known = FIGURES.get(name)
+    if known is None:
+        return name
+    return f"{known.title}, {known.unit} ({name})" if known.unit else f"{known.title} ({name})"
 
 
 def advice_of(reasons: Sequence[Reason]) -> tuple[str, ...]:

@@ -8,12 +8,14 @@ import shlex
 import struct
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 
 from coec import __version__
 from coec.calibration.types import FramePair, Window
+from coec.reports.page import Facts, Section
 from coec.reports.page.words import instant
 
 CALCULATING = ("numpy", "numba", "nlopt", "onnxruntime")
@@ -46,6 +48,13 @@ class Made:
             ("On", self.machine),
         )
 
+    def section(self, of: Sequence[tuple[str, str]] = ()) -> Section:
+        """The last section of a page: what it is made `of` (names and values; those that name a hash are read letter by
+        letter), and this."""
+        items = (*of, *self.items())
+        codes = {name for name, _ in items if "sha256" in name or "hash" in name}
+        return Section("Provenance", (Facts(items, frozenset({*codes, "Command"})),))
+
 
 def here() -> Made:
     """By this process, now."""
@@ -53,7 +62,7 @@ def here() -> Made:
     return Made(
         command,
         time.time_ns(),
-        _versions(),
+        versions(),
         f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
     )
 
@@ -74,5 +83,6 @@ def _parts(pair: FramePair) -> tuple[bytes, ...]:
 
 
 @cache
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Of everything that a decision is made with, by package, `coec` first."""
     return {"coec": __version__, **{package: version(package) for package in CALCULATING}}

@@ -32,7 +32,8 @@ class Options:
         bool, typer.Option("--time-offset", help="Also estimate the offset of the camera's clock, if turns show it.")
     ] = False
     output: Annotated[
-        Path | None, typer.Option(help="Write overlay_before.png, overlay_after.png and result.json.", metavar="DIR")
+        Path | None,
+        typer.Option(help="Write report.html, overlay_before.png, overlay_after.png and result.json.", metavar="DIR"),
     ] = None
     as_json: Json = False
 

@@ -102,7 +102,7 @@ class Picture:
     """A picture within the page.
 
     Attributes:
-        data: bytes of a PNG, JPEG or WebP file.
+        data: bytes of a PNG or JPEG file.
         alt: what is seen, for who does not see it.
         href: file beside the page that it leads to; empty for none.
     """
@@ -199,14 +199,15 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells; the columns whose index is in `numbers` are numbers. Wide ones scroll in a region of their own,
-    which the keyboard reaches."""
+    """Rows of cells; the columns whose index is in `numbers` are numbers, in `prose` sentences, which are folded. Wide
+    ones scroll in a region of their own, which the keyboard reaches."""
 
     template: ClassVar = "table"
     caption: str
     heads: tuple[str, ...]
     rows: Sequence[Sequence[str | Cell]]
     numbers: frozenset[int] = frozenset()
+    prose: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,6 +98,9 @@ SMALL = Size("small", 344, 168, 5, 4)
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 14, 42
 """Room around the axes for their labels, px."""
 
+ROW_PX = 15.0
+"""Height of a line of labels."""
+
 LETTER_PX = 6.5
 """Width of a letter of a label, about: 12 px sans-serif."""
 
@@ -132,16 +135,17 @@ class Area:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """At `at` px, with a label that begins (or ends) at its side."""
+    """At `at` px, with a label at `row_y` px that begins (or ends) at its side."""
 
     at: float
     name: str
     anchor: str
+    row_y: float
 
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """All coordinates of a chart at one size, px."""
+    """All coordinates of a chart at one size, px; `limits` are heights."""
 
     size: Size
     left: float
@@ -154,16 +158,19 @@ class Drawing:
     bands: tuple[Path, ...]
     paths: tuple[Path, ...]
     marks: tuple[Line, ...]
-    limits: tuple[Line, ...]
+    limits: tuple[float, ...]
 
 
-def legend(chart: Chart) -> list[tuple[str, str]]:
-    """(class, name) of what has to be named beside the plot: series where there are several, grounds, limits."""
-    named = [(f"s{number} {each.shape}", each.name) for number, each in enumerate(chart.series)]
-    if len(named) == 1 and not (chart.grounds or chart.limits):
-        named = []
-    tones = dict.fromkeys((f"ground {each.tone}", each.name) for each in chart.grounds)
-    return [*named, *(("limit", each.name) for each in chart.limits), *tones]
+def legend(charts: Sequence[Chart]) -> list[tuple[str, str]]:
+    """(class, name) of what has to be named beside some plots, each once: series where a plot has several, limits,
+    grounds."""
+    named: dict[tuple[str, str], None] = {}
+    for chart in charts:
+        if len(chart.series) > 1:
+            named |= {(f"s{number} {each.shape}", each.name): None for number, each in enumerate(chart.series)}
+        named |= {("limit", each.name): None for each in chart.limits}
+        named |= {(f"ground {each.tone}", each.name): None for each in chart.grounds}
+    return list(named)
 
 
 def drawn(chart: Chart, size: Size) -> Drawing:
@@ -175,10 +182,13 @@ def drawn(chart: Chart, size: Size) -> Drawing:
     ys += [each.at for each in chart.limits if _shown(each.at, chart)]
     x_low, x_high = _ends(xs, chart.log_x, 0.0, False)
     y_low, y_high = _ends(ys, chart.log_y, 0.06, chart.from_zero)
-    left, right, top, bottom = float(LEFT), float(size.width - RIGHT), float(TOP), float(size.height - BOTTOM)
+    left, right, bottom = float(LEFT), float(size.width - RIGHT), float(size.height - BOTTOM)
 
     def x_of(x: float) -> float:
         return left + (right - left) * _share(x, x_low, x_high, chart.log_x)
+
+    marks = _marks([(x_of(each.at), each.name) for each in chart.marks if x_low <= each.at <= x_high], right)
+    top = max((line.row_y + ROW_PX / 2 for line in marks if line.name), default=float(TOP))
 
     def y_of(y: float) -> float:
         return bottom - (bottom - top) * _share(y, y_low, y_high, chart.log_y)
@@ -204,8 +214,7 @@ def drawn(chart: Chart, size: Size) -> Drawing:
         x_ticks=_apart([Tick(round(x_of(x), 1), text) for x, text in chosen]),
         y_ticks=tuple(Tick(round(y_of(y), 1), ticks.label(y)) for y in y_marks),
         grounds=grounds, bands=tuple(bands), paths=tuple(paths),
-        marks=tuple(_mark(x_of(each.at), each.name, right) for each in chart.marks if x_low <= each.at <= x_high),
-        limits=tuple(Line(round(y_of(each.at), 1), each.name, "") for each in chart.limits if _shown(each.at, chart)),
+        marks=marks, limits=tuple(round(y_of(each.at), 1) for each in chart.limits if _shown(each.at, chart)),
     )  # fmt: skip
 
 
@@ -249,9 +258,17 @@ def _apart(every: list[Tick]) -> tuple[Tick, ...]:
     return tuple(kept)
 
 
-def _mark(at: float, name: str, right: float) -> Line:
-    fits = at + LETTER_PX * len(name) + 8 <= right
-    return Line(round(at, 1), name, "start" if fits else "end")
+def _marks(every: Sequence[tuple[float, str]], right: float) -> tuple[Line, ...]:
+    """(x, name) of each above the plot, in as many rows as keep names from running into each other."""
+    ends: list[float] = []
+    lines = []
+    for at, name in sorted(every):
+        length = LETTER_PX * len(name) + 8
+        begin, anchor = (at, "start") if at + length <= right else (at - length, "end")
+        row = next((number for number, end in enumerate(ends) if begin >= end), len(ends))
+        ends[row : row + 1] = [begin + length]
+        lines.append(Line(round(at, 1), name, anchor, TOP + ROW_PX * row))
+    return tuple(lines)
 
 
 def _joined(points: Sequence[Point | None], steps: bool) -> str:

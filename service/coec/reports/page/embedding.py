@@ -8,7 +8,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from coec.adapters.images.codec import decode_bgr, probe
+from coec.calibration.types import EncodedImage
+from coec.config import LimitsConfig
 from coec.errors import DecodeError
 
 BUDGET_BYTES = 2_000_000
@@ -21,8 +25,8 @@ taken. A page is at most 1040 px wide, a screen may have two pixels for each of 
 SMALL_SHARE = 1 / 8
 """Of the budget: what is no larger stays as it is, to the byte."""
 
-KINDS = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp"}
-"""By the first bytes of a file."""
+LIMITS = LimitsConfig()
+"""Of a picture: some come from a vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,40 +39,32 @@ class Embedded:
 
 
 def embedded(pictures: Sequence[bytes], budget_bytes: int = BUDGET_BYTES) -> list[Embedded]:
-    """All pictures of a page (bytes of PNG, JPEG or WebP files), in their order, together within the budget.
+    """All pictures of a page (bytes of PNG or JPEG files), in their order, together within the budget.
 
     Raises:
         DecodeError: one is no such picture, or there are so many that not even the smallest form fits.
     """
-    decoded = [_decoded(data) for data in pictures]
+    probed = [probe(data, LIMITS) for data in pictures]
+    small = [len(data) <= SMALL_SHARE * budget_bytes for data in pictures]
+    pixels = [None if as_is else decode_bgr(image, LIMITS) for image, as_is in zip(probed, small, strict=True)]
     for side_px, quality in LADDER:
         made = [
-            data if len(data) <= SMALL_SHARE * budget_bytes else _smaller(image, side_px, quality)
-            for data, image in zip(pictures, decoded, strict=True)
+            _as_it_is(image) if large is None else _smaller(large, side_px, quality)
+            for image, large in zip(probed, pixels, strict=True)
         ]
-        if sum(map(len, made)) <= budget_bytes:
-            sizes = [image.shape for image in decoded]
-            return [Embedded(_uri(data), width, height) for data, (height, width, _) in zip(made, sizes, strict=True)]
-    raise DecodeError("picture_too_large", f"{len(pictures)} pictures do not fit into one page: leave some out")
+        if sum(len(data) for _, data in made) <= budget_bytes:
+            return [
+                Embedded(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", image.width, image.height)
+                for (kind, data), image in zip(made, probed, strict=True)
+            ]
+    raise DecodeError("pictures_too_large", f"{len(pictures)} pictures do not fit into one page: leave some out")
 
 
-def _decoded(data: bytes) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if _kind(data) else None
-    if image is None:
-        raise DecodeError("picture_malformed", "a picture of the page is no PNG, JPEG or WebP file")
-    return image
+def _as_it_is(image: EncodedImage) -> tuple[str, bytes]:
+    return image.format.value, bytes(image.data)
 
 
-def _smaller(image: np.ndarray, side_px: int, quality: int) -> bytes:
-    share = side_px / max(image.shape[:2])
-    if share < 1.0:
-        image = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-    return bytes(cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])[1])
-
-
-def _kind(data: bytes) -> str | None:
-    return next((kind for magic, kind in KINDS.items() if data.startswith(magic)), None)
-
-
-def _uri(data: bytes) -> str:
-    return f"data:{_kind(data)};base64,{base64.b64encode(data).decode()}"
+def _smaller(pixels: NDArray[np.uint8], side_px: int, quality: int) -> tuple[str, bytes]:
+    share = side_px / max(pixels.shape[:2])
+    shown = cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else pixels
+    return "webp", cv2.imencode(".webp", shown, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
