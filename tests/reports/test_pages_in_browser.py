@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from playwright.sync_api import Browser, sync_playwright
 from playwright.sync_api import Page as Tab
 
+from coec.cli import main
 from coec.reports import page as pages_room
 from reports import pages
 
@@ -186,4 +188,25 @@ def test_the_keyboard_comes_to_the_content_at_once(browser: Browser, tmp_path: P
     assert tab.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     tab.keyboard.press("Enter")
     assert tab.evaluate("document.activeElement.id") == "main"
+    tab.context.close()
+
+
+@pytest.mark.slow
+def test_the_page_of_a_real_result(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From frames to a page, with pictures as large as those of a vehicle."""
+    pytest.importorskip("embreex", reason="needs ray casting")
+    source = "sim:seed=1&seconds=24&camera_hz=0.5&lidar_hz=0.5&camera=fisheye1400&lidar=64&depth=yes"
+    folder = tmp_path / "out"
+    monkeypatch.setattr(
+        sys, "argv", ["coec", "calibrate", source, "--depth", "stereo", "--perturb", "0.3,0,0", "--output", str(folder)]
+    )
+    main()
+    path = folder / "report.html"
+    assert path.stat().st_size <= MOST_BYTES
+    tab, wrong = opened(browser, path)
+    for width in WIDTHS_PX:
+        tab.set_viewport_size({"width": width, "height": 900})
+        assert tab.evaluate("document.scrollingElement.scrollWidth") <= width
+    assert tab.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 600)")
+    assert wrong == []
     tab.context.close()
