@@ -85,7 +85,7 @@ def files(folder: Path, *names: str) -> list[Path]:
     """Pictures on the disk."""
     paths = [folder / f"{name}.png" for name in names]
     for number, path in enumerate(paths):
-        path.write_bytes(png(640, 360, number))
+        path.write_bytes(png(320, 180, number))
     return paths
 
 
@@ -277,7 +277,7 @@ def incident(_: Path, vehicle: str = "truck") -> Page:
     )
     absent = (Absent(what="status.json", why="it did not answer"),)
     story = Story(event, history, None, None, None, (fetched,), absent, False, ("front-7.snippet",))
-    return incident_page.page(story, {"before.jpg": png(640, 360), "after.jpg": png(640, 360, 1)}, MADE)
+    return incident_page.page(story, {"before.jpg": png(320, 180), "after.jpg": png(320, 180, 1)}, MADE)
 
 
 def fleet(_: Path, vehicle: str = "shuttle") -> Page:

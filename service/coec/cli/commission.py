@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ def run(options: Options) -> int:
         )
     save_baseline(options.output, baseline)
     told = page.write(
-        options.output.with_suffix(".html"),
+        _page_beside(options.output),
         baselines_page(
             load_baselines(options.output), baseline.pair, options.sources, options.output.name, provenance.here()
         ),
@@ -67,6 +68,11 @@ def run(options: Options) -> int:
         show(baseline)
         console.show(f"written to {options.output}, with a page of it, {told.name}, beside it")
     return 0
+
+
+def _page_beside(path: Path) -> Path:
+    """`rig.html` for `rig.json`; never the baseline itself."""
+    return path.with_suffix(".page.html" if path.suffix == ".html" else ".html")
 
 
 def load(sources: Sequence[str], options: Options, times: calibrate_command.StageTimes) -> Rigged:

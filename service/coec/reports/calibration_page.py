@@ -17,7 +17,7 @@ from coec.reports.page_parts import (
     pictures_of,
     turn_and_shift,
 )
-from coec.reports.provenance import Made, content_hash
+from coec.reports.provenance import Made, content_hash, depth_items
 from coec.schemas.replies import CalibrationReport, CalibrationResult, Vector6
 
 USE = (
@@ -141,6 +141,6 @@ def _origin(report: CalibrationReport, window: Window) -> tuple[tuple[str, str],
         ("Window", report.window_id),
         ("Sensor time", f"{instant(first)} to {instant(last)}"),
         ("Window, sha256 of images, points and stamps", content_hash(window)),
-        ("Depth network, sha256", report.depth_identity),
+        *depth_items(report.depth_identity),
         ("Configuration, hash", report.config_hash),
     )

@@ -16,7 +16,7 @@ from coec.reports.evaluation_page import detection_table
 from coec.reports.page import Page, Section, Text, Verdict
 from coec.reports.page.words import count, instant, number
 from coec.reports.page_parts import advice_of, axes_table, figures_block, pictures_of, turn_and_shift
-from coec.reports.provenance import Made, content_hash
+from coec.reports.provenance import Made, content_hash, depth_items
 from coec.schemas.evaluation import DetectionReport
 from coec.schemas.replies import Reason
 
@@ -69,7 +69,7 @@ def check_page(
                 ("Window", window.window_id),
                 ("Sensor time", f"{instant(seen.pair_stamps_ns[0])} to {instant(seen.stamp_ns)}"),
                 ("Window, sha256 of images, points and stamps", content_hash(window)),
-                ("Depth network, sha256", depth_identity),
+                *depth_items(depth_identity),
                 ("Configuration, hash", config_hash),
             )
         ),

@@ -25,7 +25,7 @@ from coec.reports.page import (
 )
 from coec.reports.page.words import count, number, percent
 from coec.reports.page_parts import DIGITS, SHOWN_UNITS, SLID, pictures_of
-from coec.reports.provenance import Made
+from coec.reports.provenance import Made, depth_items
 from coec.schemas.evaluation import (
     ComparisonReport,
     DetectionReport,
@@ -349,6 +349,6 @@ def _origin(report: EvaluationReport) -> tuple[tuple[str, str], ...]:
     return (
         ("Source", report.source),
         ("Window", report.window_id),
-        ("Depth network, sha256", report.depth_identity),
+        *depth_items(report.depth_identity),
         ("Configuration, hash", report.config_hash),
     )

@@ -14,6 +14,8 @@ from functools import cache
 from importlib.metadata import version
 
 from coec import __version__
+from coec.adapters.depth.maps import PRECOMPUTED
+from coec.adapters.depth.model_cards import built_in_cards
 from coec.calibration.types import FramePair, Window
 from coec.reports.page import Facts, Section
 from coec.reports.page.words import instant
@@ -65,6 +67,14 @@ def here() -> Made:
         versions(),
         f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
     )
+
+
+def depth_items(identity: str) -> tuple[tuple[str, str], ...]:
+    """What depth comes from, by the `depth_identity` of a result: name and sha256 of the network."""
+    if identity == PRECOMPUTED:
+        return (("Depth", "precomputed: the maps of the source"),)
+    name = next((card.name for card in built_in_cards().values() if card.sha256 == identity), "a network of your own")
+    return (("Depth network", name), ("Depth network, sha256", identity))
 
 
 def content_hash(window: Window) -> str:
