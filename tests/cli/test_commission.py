@@ -13,17 +13,20 @@ RIG = "sim:seed=1&seconds=16&camera_hz=0.5&lidar_hz=0.5&camera=fisheye320&lidar=
 """Eight frames, two seconds apart, with edges enough for a check."""
 
 
-def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec) -> None:
+def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec, tmp_path: Path) -> None:
     right = coec("diagnose", RIG, "--depth", "stereo", "--json")
     assert right.status == 0
     assert right.document["causes"] == []
     assert right.document["flagged_by_paper"] is None
     assert right.document["drift"] is None
     assert [len(right.document[name]) for name in ("first_derivative", "second_derivative")] == [6, 6]
-    wrong = coec("diagnose", RIG, "--depth", "stereo", "--perturb", "2,-2,1", "--json")
+    wrong = coec("diagnose", RIG, "--depth", "stereo", "--perturb", "2,-2,1", "--json", "--output", tmp_path)
     assert wrong.status == 1
     assert wrong.document["flagged"]
     assert wrong.document["metrics"]["distance_rotation"]["value"] > 1.0
+    page = (tmp_path / "report.html").read_text()
+    assert "the camera is not where this extrinsic has it" in page
+    assert page.count("data:image/") == 1
 
 
 def test_a_baseline_that_is_not_there(coec: Coec, tmp_path: Path) -> None:
@@ -52,6 +55,7 @@ def test_the_published_experiments(coec: Coec, tmp_path: Path) -> None:
     assert outcome.document["published"]["run_times_ms"]["25"] == [21.5, 4222.0]
     for name in ("metrics.png", "bullseye.png", "drive.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "report.html").read_text().count("data:image/") == 3
 
 
 def test_the_published_experiments_on_every_window_of_a_drive(coec: Coec, tmp_path: Path) -> None:

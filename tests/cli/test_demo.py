@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,12 +18,14 @@ from coec.calibration.types import EgoMotion
 from coec.cli.demo import report, story
 from coec.cli.demo.outcome import Ending, outcome_of
 from coec.cli.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
+from coec.cli.demo.page import demo_page
 from coec.cli.demo.screen import BARS, curve
 from coec.cli.demo.vehicle import NS_PER_S, paced
 from coec.cli.demo.watch import Moment
 from coec.config import WindowConfig
-from coec.reports.timeline_plot import timeline
+from coec.reports.page import render
 from coec.schemas import replies
+from reports.pages import MADE
 
 KNOCK_S, MAX_ERROR_DEG = story.KNOCK_S, story.MAX_ERROR_DEG
 
@@ -149,18 +152,24 @@ def test_the_curve_has_the_height_of_the_error_and_the_colour_of_the_health() ->
     assert curve([]).plain == ""
 
 
-def test_the_page_needs_no_other_file(tmp_path: Path) -> None:
+def test_the_page_needs_no_other_file() -> None:
     moments = [START, HEALTHY, KNOCKED, ALARM, REPAIRED]
-    plot = tmp_path / "timeline.png"
-    series = [(moment.drive_s, moment.error_deg, moment.health) for moment in moments]
-    plot.write_bytes(timeline(series, [(KNOCK_S, "knock")], MAX_ERROR_DEG, "title"))
-    page = report.page({"timeline": plot}, moments, outcome(*moments), None, None)
-    assert page.count("src=") == page.count('src="data:image/png;base64,') == 1
-    assert "noticed and repaired" in page
-    assert "href" not in page
+    text = told(moments)
+    assert "src=" not in text
+    assert "noticed and repaired" in text
+    assert re.findall(r'href="(?!#)', text) == []
     for moment in moments:
-        assert f"{moment.error_deg:.3f}°" in page
-    assert "never noticed" in report.page({"timeline": plot}, moments[:3], outcome(*moments[:3]), None, None)
+        assert f"{moment.error_deg:.3f}°" in text
+    assert "never noticed" in told(moments[:3])
+    assert "error of the thing" in text
+
+
+def told(moments: Sequence[Moment]) -> str:
+    """The document."""
+    series = [(moment.drive_s, moment.error_deg, moment.health) for moment in moments]
+    happened = [(moment, "") for moment in moments]
+    summary = [("error of the thing", "1°")]
+    return render(demo_page("A mount", series, happened, summary, outcome(*moments), None, [], MADE))
 
 
 def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,6 +98,9 @@ def test_output_folder_holds_table_report_and_pictures(coec: Coec, tmp_path: Pat
     for name in ("bullseye", "profiles", "frames", "overlay_before", "overlay_after", "close_ups", "residuals"):
         assert (written / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert [point["frames"] for point in outcome.document["frames"]] == [1, 2]
+    page = (written / "report.html").read_text()
+    assert page.count("data:image/") == 4
+    assert "How many frames it takes" in page
 
     rows = list(csv.DictReader((written / "starts.csv").read_text().splitlines()))
     wanted = perturbations(3, np.radians(2.0), 0.1)
@@ -125,6 +128,8 @@ def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
         assert set(method) >= CONTRACT
         assert json.loads((tmp_path / "out" / name / "report.json").read_text()) == method
         assert (tmp_path / "out" / name / "profiles.png").is_file()
+        assert (tmp_path / "out" / name / "report.html").is_file()
+        assert f'href="{name}/report.html"' in (tmp_path / "out" / "report.html").read_text()
     assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
     assert (tmp_path / "out" / "bullseye.png").read_bytes().startswith(b"\x89PNG")
 

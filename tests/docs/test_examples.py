@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from coec.adapters.depth.model_cards import ModelCard
+from coec.calibration.figures import FIGURES
 from coec.calibration.types import INTRINSICS_OFF, MOVED
-from coec.calibration.verdict import _MEANING as FIGURES
 from coec.config import config_of
 from coec.config.yaml_text import parse_yaml
 from coec.sources.manifest import ManifestDocument

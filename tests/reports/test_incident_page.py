@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import pytest
 
 from coec.cli.fetch import chain_holds
-from coec.reports.incident_page import Story, instant, page, sentences
+from coec.reports.incident_page import Story, page, sentences
+from coec.reports.page import render
+from coec.reports.page.words import instant
 from coec.runtime.decisions.chain import GENESIS
 from coec.schemas.base import to_json
 from coec.schemas.incident import Absent
@@ -22,9 +26,9 @@ from coec.schemas.replies import (
     Reason,
     Transform,
 )
+from reports.pages import EVIL, MADE, png
 
 S = 1_000_000_000
-EVIL = "<script>alert(1)</script>'\"><img src=http://evil/x>"
 IDENTITY = Transform(
     matrix=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
     translation_m=(0, 0, 0),
@@ -49,13 +53,18 @@ EVENT = EvidenceEvent(
 STORY = Story(EVENT, None, None, None, None, (), (), None)
 
 
+def told(story: Story, pictures: Mapping[str, bytes] = MappingProxyType({})) -> str:
+    """The document."""
+    return render(page(story, pictures, MADE))
+
+
 def test_the_story_is_what_the_documents_say() -> None:
-    told = " ".join(sentences(STORY))
-    assert "At 1970-01-01 00:01:40Z of sensor time the pair front of truck turned red" in told
-    assert "The mount is bent. (bent_mount)" in told
-    assert "The window before it is front-7; nothing is told of what was decided of it." in told
-    assert "There is no window after it." in told
-    assert "It had not ended when this was fetched." in told
+    said = " ".join(sentences(STORY))
+    assert "At 1970-01-01 00:01:40Z of sensor time the pair front of truck turned red" in said
+    assert "The mount is bent. (bent_mount)" in said
+    assert "The window before it is front-7; nothing is told of what was decided of it." in said
+    assert "There is no window after it." in said
+    assert "It had not ended when this was fetched." in said
     resolved = replace(
         STORY, event=EVENT.model_copy(update={"resolved_stamp_ns": 160 * S, "resolution": "healthy: ok"})
     )
@@ -63,11 +72,11 @@ def test_the_story_is_what_the_documents_say() -> None:
 
 
 def test_figures_are_drawn_on_one_axis_of_time_with_the_event_in_it() -> None:
-    text = page(STORY, ["before.jpg"])
-    assert text.count("<rect") == len(EVENT.metrics)
-    (points,) = re.findall(r"<polyline points='([^']*)'", text)
-    assert len(points.split()) == len(EVENT.metrics), "a figure that was not told is not drawn"
-    assert text.count("class=zero") == 2
+    text = told(STORY, {"before.jpg": png()})
+    (line,) = re.findall(r'<path class="line [^"]*" d="(M[^"]*L[^"]*)"', text)
+    assert len(re.findall("[ML]", line)) == len(EVENT.metrics), "a figure that was not told is not drawn"
+    assert re.findall(r'<rect class="ground (\w+)" x=', text) == ["good", "unsure"], "each state once"
+    assert text.count('<line class="mark"') == 1
     assert "8.000 to 11.500" in text
 
 
@@ -88,8 +97,8 @@ def test_what_a_vehicle_says_is_text() -> None:
         vehicle="v", pair="p", total=0, results=(), entries=(ChainedEntry(sha256=EVIL, entry=entry),)
     )
     story = Story(event, history, None, None, None, (), (Absent(what=EVIL, why=EVIL),), False)
-    text = page(story, [])
-    assert "<script" not in text
+    text = told(story)
+    assert text.count("<script") == 1, "that of the page itself"
     assert "<img" not in text
     assert "something was changed, taken out or put in" in text
     assert instant(2**90) == f"{2**90} ns"
@@ -126,6 +135,6 @@ def test_entries_are_held_against_their_hashes() -> None:
 
 
 def test_snippets_are_links_into_the_folder() -> None:
-    text = page(replace(STORY, snippets=("front-7.snippet", "<b>")), [])
-    assert "href='windows/front-7.snippet.mcap'" in text
+    text = told(replace(STORY, snippets=("front-7.snippet", "<b>")))
+    assert 'href="windows/front-7.snippet.mcap"' in text
     assert "<b>" not in text

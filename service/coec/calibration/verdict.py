@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.confidence.loosened import LENS_FREE, Loosened
+from coec.calibration.figures import FIGURES
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
@@ -32,21 +33,6 @@ COUNTED = "range_edges"
 
 UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
 """Codes of reasons that more scenes would remedy."""
-
-_MEANING = {
-    "mi_over_unrelated": "depth and LiDAR agree no better than a cloud with the depth map of another frame",
-    "range_edges": "too little structure: the sweeps have too few independent jumps in range",
-    "edge_contrast": "no pose stands out from the others",
-    "runner_up": "ambiguous: another pose explains the window nearly as well",
-    "newton_step_deg": "the objective is not at a maximum on every rotation axis",
-    "newton_step_m": "the objective is not at a maximum on every translation axis",
-    "peakedness_per_deg2": "the objective is too flat on at least one rotation axis",
-    "sigma_deg": "what was seen does not settle a rotation, or is too little to tell",
-    "sigma_m": "what was seen does not settle a translation, or is too little to tell",
-    "overlap": "too few LiDAR points are in view",
-    MOVED: "the camera moved while the window was taken",
-    INTRINSICS_OFF: "another lens explains the window better than the intrinsics of the rig",
-}
 
 
 SAME_SCENE = 0.5
@@ -128,7 +114,7 @@ def judge(
     reasons = [
         Reason(
             metric.name,
-            f"{_MEANING[metric.name]}{details.get(metric.name, '')}: {metric.value:.3g}, limit {metric.limit:.3g}",
+            f"{FIGURES[metric.name].fails}{details.get(metric.name, '')}: {metric.value:.3g}, limit {metric.limit:.3g}",
         )
         for metric in metrics
         if not metric.passed

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +13,18 @@ from coec.adapters.files import output
 from coec.calibration.frames.time_offset import TimeOffset
 from coec.calibration.types import Window
 from coec.cli.commands.calibrate import Options
-from coec.config import CalibrationConfig, WindowConfig
+from coec.config import WindowConfig
 from coec.geometry import se3
-from coec.library.calibrating import calibrated
+from coec.geometry.cameras import Camera
+from coec.library.calibrating import Calibrated, calibrated
 from coec.library.camera_fit import CameraFit
 from coec.library.choices import Choices
-from coec.reports import console, pictures
+from coec.reports import console, page, pictures, provenance
+from coec.reports.calibration_page import calibration_page
 from coec.reports.close_ups import Caption
 from coec.reports.stage_times import StageTimes
 from coec.schemas.base import to_json
-from coec.schemas.replies import CalibrationReport, CalibrationResult
+from coec.schemas.replies import CalibrationReport, CalibrationResult, Vector6
 from coec.sources import windows
 
 
@@ -47,9 +50,8 @@ def run(options: Options) -> int:
         )
     document = _document(done.result, times.elapsed_s(), done.fit, done.offset)
     if options.output is not None:
-        _write(options.output, done.window, done.result, done.configuration, document)
-        if done.fit is not None:
-            pictures.write_lens(options.output, loaded.window.rig.camera, done.window.rig.camera)
+        lens = None if done.fit is None else (loaded.window.rig.camera, done.window.rig.camera)
+        _write(options.output, done, document, _remarks(done.fit, done.offset), lens)
     if options.as_json:
         console.print_json(document)
     else:
@@ -100,8 +102,14 @@ def _finite(value: float) -> float | None:
 
 
 def _write(
-    folder: Path, window: Window, result: CalibrationResult, configuration: CalibrationConfig, document: dict[str, Any]
+    folder: Path,
+    done: Calibrated,
+    document: dict[str, Any],
+    remarks: Sequence[str],
+    lens: tuple[Camera, Camera] | None,
 ) -> None:
+    """`lens`: the recording's camera and the one that was fitted to it."""
+    window, result, configuration = done.window, done.result, done.configuration
     caption = Caption(
         before="start",
         after=f"result, {result.verdict.decision}",
@@ -109,10 +117,17 @@ def _write(
         network=pictures.network_text(configuration.depth.model, result.depth_identity),
     )
     T_found = np.array(result.camera_from_lidar.matrix)
-    pictures.write_comparison(
+    drawn = pictures.write_comparison(
         folder, window, window.T_camera_lidar_start, T_found, caption, configuration.motion_compensation
     )
-    output.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
+    if lens is not None:
+        drawn.append(pictures.write_lens(folder, *lens))
+    report = CalibrationReport.model_validate(document)
+    output.write(folder / "result.json", to_json(report))
+    page.write(
+        folder / "report.html",
+        calibration_page(report, window, _start(window), drawn, remarks, provenance.here()),
+    )
 
 
 def _sigma_of(result: CalibrationResult) -> NDArray[np.float64]:
@@ -129,8 +144,7 @@ def _show(
     fit: CameraFit | None,
     offset: TimeOffset | None,
 ) -> None:
-    start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
-    start[:3] = np.degrees(start[:3])
+    start = _start(window)
     console.show(f"{window.window_id}: {result.pairs} pairs, {result.points_in_view} points in view")
     axes = console.table("axis", "start", "correction", "± σ", "unit", right=(1, 2, 3))
     for axis, name in enumerate(console.AXIS_NAMES):
@@ -140,18 +154,32 @@ def _show(
         axes.add_row(name, console.figure(start[axis], sign=True), found, spread, console.UNITS[axis])
     console.out.print(axes)
     console.show_verdict(result)
-    if fit is not None:
-        console.show(
-            f"{fit.model} fitted to {fit.of}: {fit.residual_rms_px:.4f} px rms, {fit.residual_max_px:.4f} px at most"
-        )
-    if offset is not None:
-        console.show(f"camera after its stamp: {_offset_text(offset)}")
+    for remark in _remarks(fit, offset):
+        console.show(remark)
     if result.independent_looks is not None:
         console.show(
             f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent looks{_together(result)}"
         )
     stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in document["elapsed_s"].items())
     console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")
+
+
+def _start(window: Window) -> Vector6:
+    """Where the search began, from the recording's own calibration: degrees and metres."""
+    start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
+    start[:3] = np.degrees(start[:3])
+    return cast("Vector6", tuple(float(value) for value in start))
+
+
+def _remarks(fit: CameraFit | None, offset: TimeOffset | None) -> list[str]:
+    said = []
+    if fit is not None:
+        said.append(
+            f"{fit.model} fitted to {fit.of}: {fit.residual_rms_px:.4f} px rms, {fit.residual_max_px:.4f} px at most"
+        )
+    if offset is not None:
+        said.append(f"camera after its stamp: {_offset_text(offset)}")
+    return said
 
 
 def _together(result: CalibrationResult) -> str:

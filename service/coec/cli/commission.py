@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coec.adapters.depth.maps import CachedDepth, open_depth
-from coec.adapters.files.baseline_file import baseline_hash, baseline_to_json, save_baseline
+from coec.adapters.files.baseline_file import baseline_hash, baseline_to_json, load_baselines, save_baseline
 from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.commissioning.baseline import Baseline
 from coec.calibration.commissioning.learning import MAX_PAIRS, commission
@@ -19,7 +20,8 @@ from coec.cli.commands.commission import Options
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import UsageError
 from coec.library.choices import Choices, configuration_of
-from coec.reports import console
+from coec.reports import console, page, provenance
+from coec.reports.baseline_page import baselines_page
 from coec.reports.stage_times import StageTimes
 from coec.sources import windows
 
@@ -54,12 +56,23 @@ def run(options: Options) -> int:
             progress=times,
         )
     save_baseline(options.output, baseline)
+    told = page.write(
+        _page_beside(options.output),
+        baselines_page(
+            load_baselines(options.output), baseline.pair, options.sources, options.output.name, provenance.here()
+        ),
+    )
     if options.as_json:
         console.print_json(document_of(baseline))
     else:
         show(baseline)
-        console.show(f"written to {options.output}")
+        console.show(f"written to {options.output}, with a page of it, {told.name}, beside it")
     return 0
+
+
+def _page_beside(path: Path) -> Path:
+    """`rig.html` for `rig.json`; never the baseline itself."""
+    return path.with_suffix(".page.html" if path.suffix == ".html" else ".html")
 
 
 def load(sources: Sequence[str], options: Options, times: StageTimes) -> Rigged:

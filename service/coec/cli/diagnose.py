@@ -13,15 +13,19 @@ from coec.adapters.files.conversions import metric_of
 from coec.calibration.commissioning.baseline import learned_hash, mismatch
 from coec.calibration.commissioning.learning import FAR_RAD
 from coec.calibration.estimators import sight_of
+from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import gather
 from coec.calibration.monitor.check_verdict import diagnose
+from coec.calibration.types import Window
 from coec.cli import commission
 from coec.cli.commands import commission as commission_options
 from coec.cli.commands.diagnose import Options
+from coec.config import config_hash
 from coec.errors import UsageError
 from coec.evaluation.detection import try_detection
 from coec.geometry import se3
-from coec.reports import console, evaluation_tables
+from coec.reports import console, evaluation_tables, page, pictures, provenance
+from coec.reports.check_page import check_page, detection_page
 from coec.reports.evaluation_documents import detection_of
 from coec.reports.stage_times import StageTimes
 from coec.sources import windows
@@ -56,6 +60,8 @@ def _tabulate(rigged: commission.Rigged, options: Options, times: StageTimes) ->
         lambda done, total: times.step("splits", done, total),
     )
     report = detection_of(tried, options.detection, len(evidence.pairs))
+    if options.output is not None:
+        page.write(options.output / "report.html", detection_page(report, options.source, provenance.here()))
     if options.as_json:
         console.print_json({"source": options.source, **report.model_dump(mode="json")})
     else:
@@ -77,6 +83,8 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
         if against is not None:
             raise UsageError(f"{options.rig} does not hold for this recording: {against}")
     seen = diagnose(window, rigged.depth, rigged.images, rigged.configuration, baseline)
+    if options.output is not None:
+        _write(options.output, seen, window, rigged)
     wrong = seen.flagged or bool(seen.causes)
     status = "failed" if wrong else "not_accepted" if seen.undecided else "accepted"
     metrics = {metric.name: metric_of(metric) for metric in seen.metrics}
@@ -113,6 +121,15 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
         console.show(f"  {cause.code}: {cause.text}", "yellow")
     console.show_metrics(metrics)
     return int(status != "accepted")
+
+
+def _write(folder: Path, seen: Observation, window: Window, rigged: commission.Rigged) -> None:
+    poses = {"overlay": (window.T_camera_lidar_start, f"{window.rig.pair}  the extrinsic that was checked")}
+    drawn = pictures.write_overlays(folder, window, poses, rigged.configuration.motion_compensation)
+    of_check = check_page(
+        seen, window, rigged.depth.identity, config_hash(rigged.configuration), drawn, provenance.here()
+    )
+    page.write(folder / "report.html", of_check)
 
 
 def _in_degrees(rad_m: Any) -> list[float]:

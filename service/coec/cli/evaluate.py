@@ -14,7 +14,7 @@ from coec.evaluation.experiments import Stages
 from coec.evaluation.statistics import Outcome
 from coec.library.choices import Choices
 from coec.library.evaluating import Plan, Subject, bench_of, report_of, subject_of, tried
-from coec.reports import console, evaluation_tables
+from coec.reports import console, evaluation_page, evaluation_tables, provenance
 from coec.schemas.base import to_json
 from coec.schemas.evaluation import ComparisonReport, EvaluationReport
 from coec.sources import windows
@@ -47,6 +47,7 @@ def run(options: Options) -> int:
             document, _ = _evaluate(options, subject, stages)
     if options.output is not None:
         output.write(options.output / "report.json", to_json(document))
+        evaluation_page.write(options.output, document, provenance.here())
     if options.as_json:
         console.print_json(document.model_dump(mode="json"))
     elif isinstance(document, ComparisonReport):
@@ -108,6 +109,7 @@ def _compare(options: Options, subject: Subject, bars: Progress, stages: Stages)
             continue
         if folder is not None:
             output.write(folder / "report.json", to_json(reports[method]))
+            evaluation_page.write(folder, reports[method], provenance.here())
         heard(1, "")
     if not reports:
         raise CalibrationError("; ".join(f"{method}: {reason}" for method, reason in not_evaluated.items()))

@@ -19,7 +19,7 @@ import zenoh
 
 from coec import __version__
 from coec.adapters.files import output
-from coec.adapters.images.codec import probe
+from coec.adapters.images.codec import decode_bgr, probe
 from coec.adapters.mcap.windows import read_result
 from coec.adapters.zenoh.client import ask, ask_one, connected_by, nobody
 from coec.adapters.zenoh.window_fetch import Recording, fetch_window
@@ -27,8 +27,9 @@ from coec.cli.commands.fetch import Options
 from coec.cli.query import OF_PAIR, asked_of
 from coec.config import LimitsConfig
 from coec.errors import CoecError, DecodeError, NotFoundError, OutputError, RemoteError, UsageError, WindowError
-from coec.reports import console, incident_page, replies
+from coec.reports import console, incident_page, provenance, replies
 from coec.reports.fleet_board import duration
+from coec.reports.page import render
 from coec.schemas.base import SCHEMA_VERSION, Message, from_json, to_json
 from coec.schemas.incident import Absent, FetchedFile, FetchedWindow, IncidentReport
 from coec.schemas.keys import MAX_LENGTH, Keys
@@ -195,8 +196,8 @@ class _Fetch:
         holds = None if history is None else chain_holds(history)
         told = (event, history, health, extrinsic, status)
         story = incident_page.Story(*told, tuple(windows), tuple(self.absent), holds, snippets)
-        pictures = [name for name in ("before.jpg", "after.jpg") if name in self.files]
-        self._keep(PAGE, incident_page.page(story, pictures).encode())
+        pictures = {name: (self.folder / name).read_bytes() for name in incident_page.PICTURED if name in self.files}
+        self._keep(PAGE, render(incident_page.page(story, pictures, provenance.here())).encode())
         report = IncidentReport(
             folder=str(self.folder),
             vehicle=keys.vehicle,
@@ -240,7 +241,7 @@ class _Fetch:
 
     def _picture(self, event_id: str, side: str) -> None:
         data = self._answer(f"{self.keys.evidence_of(self.pair, event_id)}?overlay={side}")
-        probe(data, PICTURE)
+        decode_bgr(probe(data, PICTURE), PICTURE)
         self._keep(f"{side}.jpg", data)
 
     def _window(self, window_id: str, history: HistoryReply | None) -> FetchedWindow | None:

@@ -8,7 +8,7 @@ from coec.adapters.files import output
 from coec.cli.commands.fleet_report import Options
 from coec.errors import DecodeError, UsageError
 from coec.fleet import questions, report
-from coec.reports import console, fleet_page
+from coec.reports import console, fleet_page, page, provenance
 from coec.reports.console import figure
 from coec.schemas.base import from_json, to_json
 from coec.schemas.fleet import AXES, FleetReport
@@ -32,8 +32,8 @@ def run(options: Options) -> int:
     now = None if options.now is None else _said(options.now)
     told = report.report(options.results, options.against, now)
     if options.output is not None:
-        page = fleet_page.page(told, f"coec fleet: {options.results.resolve().name}")
-        output.write(options.output / "report.html", page.encode())
+        of_fleet = fleet_page.page(told, f"Fleet: {options.results.resolve().name}", provenance.here())
+        page.write(options.output / "report.html", of_fleet)
         output.write(options.output / "report.json", to_json(told))
     if options.as_json:
         console.print_json(told.model_dump(mode="json"))

@@ -22,7 +22,8 @@ from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
 from coec.evaluation.paper_speed import run_times
 from coec.evaluation.statistics import Outcome
 from coec.library.choices import Choices, configuration_of
-from coec.reports import console, paper_plots, plots
+from coec.reports import console, page, paper_plots, plots, provenance
+from coec.reports.paper_page import paper_page
 from coec.sources import open_source, windows
 
 FAR_DEG, DRIVE_DEG = 25.0, (5.0, 10.0)
@@ -36,7 +37,7 @@ DRIVE_PAIRS = 5
 
 
 def run(options: Options) -> int:
-    """Writes metrics.png, bullseye.png, drive.png and report.json, and prints what is in them.
+    """Writes metrics.png, bullseye.png, drive.png, report.json and report.html, and prints what is in them.
 
     Raises:
         CoecError: an experiment cannot be done.
@@ -63,6 +64,8 @@ def run(options: Options) -> int:
             "published": paper_published.document(),
         }
     written = output.write(options.output / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
+    drawn = [options.output / f"{name}.png" for name in ("metrics", "bullseye", "drive")]
+    page.write(options.output / "report.html", paper_page(document, drawn, provenance.here()))
     if options.as_json:
         console.print_json(document)
     else:

@@ -6,10 +6,8 @@ import hashlib
 import logging
 import threading
 import time
-from importlib.metadata import version
 from pathlib import Path
 
-from coec import __version__
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files.conversions import comparable, result_of
 from coec.adapters.images.codec import GreyImages
@@ -21,6 +19,7 @@ from coec.errors import CoecError, SourceError
 from coec.fleet.places import Job, fetched, sha256_of
 from coec.fleet.terms import Terms
 from coec.fleet.trouble import begun, failed
+from coec.reports import provenance
 from coec.schemas.base import to_json
 from coec.schemas.fleet import WindowRow
 from coec.schemas.replies import CalibrationResult
@@ -29,9 +28,6 @@ _log = logging.getLogger(__name__)
 
 NETWORKS_KEPT = 4
 """Open at a time; a fleet has one or two, and each takes a hundred megabytes."""
-
-CALCULATING = ("numpy", "numba", "nlopt", "onnxruntime")
-"""Packages whose versions a row tells: the decision is theirs as well."""
 
 
 class Desk:
@@ -44,7 +40,7 @@ class Desk:
         self._limits = LimitsConfig()
         self._images = GreyImages(self._limits)
         self._networks: dict[DepthConfig, DepthModel] = {}
-        self._versions = {"coec": __version__, **{package: version(package) for package in CALCULATING}}
+        self._versions = provenance.versions()
 
     def row(self, job: Job) -> WindowRow:
         """The row of a window; what is wrong with it stands in the row."""

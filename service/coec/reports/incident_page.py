@@ -1,18 +1,38 @@
-"""The page of a red event: what happened, what was seen, what was decided and why. It loads nothing but the pictures
-beside it, and whatever a vehicle says is text in it."""
+"""The page of a red event: what happened, what was seen, what was decided and why. Whatever a vehicle says is text in
+it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from html import escape
+from itertools import groupby
 
-from coec.reports import html
 from coec.reports.console import AXIS_NAMES, UNITS, figure
+from coec.reports.page import (
+    Block,
+    Cell,
+    Chart,
+    Charts,
+    Compare,
+    Ground,
+    Mark,
+    Page,
+    Picture,
+    Pictures,
+    Section,
+    Series,
+    Table,
+    Text,
+    Tone,
+    Verdict,
+)
+from coec.reports.page.words import NS_PER_S, instant
+from coec.reports.page_parts import TONES, advice_of, axis_value, title_of
+from coec.reports.provenance import Made
 from coec.schemas.incident import Absent, FetchedWindow, IncidentReport
 from coec.schemas.replies import (
     CalibrationResult,
+    ChainedEntry,
     EvidenceEvent,
     ExtrinsicReply,
     HealthReply,
@@ -22,25 +42,14 @@ from coec.schemas.replies import (
     StatusReply,
 )
 
-NS_PER_S = 1_000_000_000
-
-WIDTH, HEIGHT, MARGIN = 640, 48, 3
-"""Of the plot of a figure, px."""
-
-STATE_HEIGHT = 14
-"""Of the strip of states, px."""
-
-COLOURS = {
-    "healthy": "#2e7d32",
-    "suspect": "#f9a825",
-    "degraded": "#ef6c00",
-    "miscalibrated": "#c62828",
-    "stale": "#757575",
-    "unknown": "#9e9e9e",
-}
-
 MAX_PLOTS = 16
 """Figures that are drawn; a vehicle says how many it has."""
+
+PICTURED = {
+    "before.jpg": ("Before", "What the camera saw when the pair turned red, with the points at what was served then."),
+    "after.jpg": ("After", "The first picture of the window after it."),
+}
+"""Name and caption of a picture by its file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,32 +67,30 @@ class Story:
     snippets: tuple[str, ...] = ()
 
 
-def page(story: Story, pictures: Sequence[str]) -> str:
-    """The document; `pictures` are names of files beside it."""
+def page(story: Story, pictures: Mapping[str, bytes], made: Made) -> Page:
+    """The page; `pictures` are files beside it, by their names."""
     event = story.event
-    title = f"{event.vehicle}/{event.pair}: {', '.join(reason.code for reason in event.reasons) or 'red event'}"
-    parts = [html.head(title), *(f"<p>{escape(each)}</p>" for each in sentences(story))]
-    if pictures:
-        parts.append("<h2>What the camera saw, with the points at the calibration that was served</h2>")
-        parts += [
-            f"<figure><img src='{escape(name, quote=True)}' alt='{escape(name)}'><figcaption>{escape(name)}"
-            "</figcaption></figure>"
-            for name in pictures
-        ]
-    parts += ["<h2>Figures around the event</h2>", *_timeline(event)]
+    codes = ", ".join(reason.code for reason in event.reasons) or "red event"
     results = () if story.history is None else story.history.results
-    if results:
-        parts += ["<h2>What was decided, and why</h2>", _results(results, event)]
-        parts += [each for result in results for each in _refusal(result)]
-    if story.history is not None and story.history.entries:
-        parts += ["<h2>What happened, in the vehicle's history</h2>", _chain(story), _entries(story.history)]
-    parts += ["<h2>Recordings</h2>", _windows(story.windows), _snippets(story.snippets)]
+    entries = () if story.history is None else story.history.entries
+    sections = [
+        *((Section("What the camera saw", _pictures(pictures)),) if pictures else ()),
+        Section("Figures around the event", tuple(_timeline(event))),
+        *((Section("What was decided, and why", (_results(results, event), *_refusals(results))),) if results else ()),
+        *((Section("What happened, in the vehicle’s history", (_chain(story), _entries(entries))),) if entries else ()),
+        Section("Recordings", (*_windows(story.windows), *_snippets(story.snippets))),
+    ]
     if story.health is not None:
-        parts += ["<h2>Since then</h2>", *_now(story, story.health)]
+        sections.append(Section("Since then", (_now(story, story.health),)))
     if story.absent:
-        parts.append("<h2>What is not here</h2>")
-        parts.append(html.table(("what", "why"), ((escape(a.what), escape(a.why)) for a in story.absent), set()))
-    return "\n".join((*parts, "</html>"))
+        rows = [(absent.what, absent.why) for absent in story.absent]
+        sections.append(
+            Section("What is not here", (Table("Asked for, and not had", ("What", "Why"), rows, prose=frozenset({1})),))
+        )
+    sections.append(made.section((("Event", event.event_id),)))
+    told = list(sentences(story))
+    opening = (_verdict(story), Text(tuple(told[1:])))
+    return Page("coec fetch", f"{event.vehicle}/{event.pair}: {codes}", opening, tuple(sections))
 
 
 def sentences(story: Story) -> Iterable[str]:
@@ -119,12 +126,11 @@ def sentence(report: IncidentReport) -> str:
     )
 
 
-def instant(stamp_ns: int) -> str:
-    """UTC, to the second; a number that is no time stays a number."""
-    try:
-        return f"{datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S}Z"
-    except (ValueError, OverflowError, OSError):
-        return f"{stamp_ns} ns"
+def _verdict(story: Story) -> Verdict:
+    """What happened in its first sentence, and what to do now, which depends on whether it has ended."""
+    ended = story.event.resolution is not None
+    tone: Tone = "unsure" if ended else "bad"
+    return Verdict(tone, "Over." if ended else "Red.", next(iter(sentences(story))), advice_of(story.event.reasons))
 
 
 def _said(reasons: Sequence[Reason]) -> str:
@@ -136,155 +142,174 @@ def _span(nanoseconds: int) -> str:
     return f"{seconds:.0f} s" if abs(seconds) < 120 else f"{seconds / 60:.0f} min"
 
 
-def _timeline(event: EvidenceEvent) -> Iterable[str]:
-    """The states as a strip, and each figure under it on the same axis of time; the event is a line through all."""
+def _pictures(pictures: Mapping[str, bytes]) -> tuple[Block, ...]:
+    shown = [
+        Picture(data, f"Camera image with LiDAR points, {PICTURED[name][0].lower()} the event", PICTURED[name][1], name)
+        for name, data in pictures.items()
+    ]
+    if len(shown) == len(PICTURED):
+        return (Compare(shown[0], shown[1], "Before and after the event"),)
+    return (Pictures(tuple(shown)),)
+
+
+# --- figures --------------------------------------------------------------------------------------------------------
+
+
+def _timeline(event: EvidenceEvent) -> Iterable[Block]:
+    """Each figure on the same axis of time, the states as its ground; the event is a line through all."""
     points = event.metrics
     if not points:
-        yield "<p class=quiet>No figures are kept of it.</p>"
+        yield Text(("No figures are kept of it.",), quiet=True)
         return
-    first, last = points[0].stamp_ns, max(points[-1].stamp_ns, event.stamp_ns)
+    first, last = points[0].stamp_ns, points[-1].stamp_ns
     states = " ".join(dict.fromkeys(point.state for point in points))
-    yield (
-        f"<p class=quiet>{len(points)} checks, {instant(first)} to {instant(last)}; states: {escape(states)}. The line "
-        "is the event.</p>"
-    )
-    yield _strip(points, event, first, last)
+    yield Text(
+        (f"{len(points)} checks, {instant(first)} to {instant(last)}; states: {states}. The dashed line is the event, "
+         "the ground the state of health.",),
+        quiet=True,
+    )  # fmt: skip
     names = sorted({name for point in points for name in point.metrics})
-    for name in names[:MAX_PLOTS]:
-        told = [(point.stamp_ns, value) for point in points if (value := point.metrics.get(name)) is not None]
-        if told:
-            values = [value for _, value in told]
-            ends = f"{figure(min(values))} to {figure(max(values))}"
-            yield f"<p class=quiet>{escape(name)}: {ends}</p>{_plot(name, told, event, first, last)}"
+    grounds = tuple(_grounds(points, event))
+    charts = [_chart(name, points, event, grounds) for name in names[:MAX_PLOTS]]
+    yield Charts(tuple(chart for chart in charts if chart is not None), small=True)
     if len(names) > MAX_PLOTS:
-        yield f"<p class=quiet>{len(names) - MAX_PLOTS} figures more are in event.json.</p>"
+        yield Text((f"{len(names) - MAX_PLOTS} figures more are in event.json.",), quiet=True)
 
 
-def _x(stamp_ns: int, first: int, last: int) -> float:
-    share = (stamp_ns - first) / (last - first) if last > first else 0.5
-    return MARGIN + (WIDTH - 2 * MARGIN) * min(max(share, 0.0), 1.0)
+def _seconds(stamp_ns: int, event: EvidenceEvent) -> float:
+    return (stamp_ns - event.stamp_ns) / NS_PER_S
 
 
-def _strip(points: Sequence[MetricsPoint], event: EvidenceEvent, first: int, last: int) -> str:
-    ends = [*(point.stamp_ns for point in points[1:]), last]
-    bars = "".join(
-        f"<rect x={_x(point.stamp_ns, first, last):.1f} y=0 height={STATE_HEIGHT} "
-        f"width={max(_x(end, first, last) - _x(point.stamp_ns, first, last), 1.0):.1f} fill='{COLOURS[point.state]}'>"
-        f"<title>{escape(point.state)}</title></rect>"
-        for point, end in zip(points, ends, strict=True)
-    )
-    return (
-        f"<svg width={WIDTH} height={STATE_HEIGHT} role=img aria-label='state'>{bars}"
-        f"{_mark(event, first, last, STATE_HEIGHT)}</svg>"
-    )
+def _grounds(points: Sequence[MetricsPoint], event: EvidenceEvent) -> Iterable[Ground]:
+    ends = [*(point.stamp_ns for point in points[1:]), max(points[-1].stamp_ns, event.stamp_ns)]
+    spans = [(point.state, point.stamp_ns, end) for point, end in zip(points, ends, strict=True)]
+    for state, of_state in groupby(spans, key=lambda span: span[0]):
+        every = list(of_state)
+        yield Ground(_seconds(every[0][1], event), _seconds(every[-1][2], event), TONES.get(state, "none"), state)
 
 
-def _plot(name: str, told: Sequence[tuple[int, float]], event: EvidenceEvent, first: int, last: int) -> str:
-    low, high = min(value for _, value in told), max(value for _, value in told)
-    reach = (high - low) or 1.0
-    line = " ".join(
-        f"{_x(stamp_ns, first, last):.1f},{HEIGHT - MARGIN - (HEIGHT - 2 * MARGIN) * (value - low) / reach:.1f}"
-        for stamp_ns, value in told
-    )
-    return (
-        f"<svg width={WIDTH} height={HEIGHT} role=img aria-label='{escape(name, quote=True)}'>"
-        f"<polyline points='{line}' />{_mark(event, first, last, HEIGHT)}</svg>"
-    )
-
-
-def _mark(event: EvidenceEvent, first: int, last: int, height: int) -> str:
-    x = f"{_x(event.stamp_ns, first, last):.1f}"
-    return f"<line class=zero x1={x} x2={x} y1=0 y2={height} />"
-
-
-def _results(results: Sequence[CalibrationResult], event: EvidenceEvent) -> str:
-    def rows() -> Iterable[Sequence[str]]:
-        for result in results:
-            when = "after" if result.data_stamp_ns > event.stamp_ns else "before"
-            moved = [
-                f"{figure(value, 2 if unit == 'deg' else 3, sign=True)} ± {figure(sigma, 2 if unit == 'deg' else 3)}"
-                for value, sigma, unit in zip(result.correction, result.sigma, UNITS, strict=True)
-            ]
-            verdict = escape(result.verdict.decision)
-            shown = verdict if verdict == "accepted" else f"<span class=bad>{verdict}</span>"
-            yield (instant(result.data_stamp_ns), when, escape(result.window_id), str(result.pairs), shown, *moved)
-
-    heads = [f"{name} [{unit}]" for name, unit in zip(AXIS_NAMES, UNITS, strict=True)]
-    return html.table(
-        ("data until", "the event", "window", "pairs", "verdict", *heads), rows(), set(range(5, 11)) | {3}
-    )
-
-
-def _refusal(result: CalibrationResult) -> Iterable[str]:
-    """Why a window was refused, and the figures that did not keep their limits."""
-    if result.verdict.decision == "accepted":
-        return
-    failed = [
-        f"{name} {figure(metric.value)} ({'≥' if metric.at_least else '≤'} {figure(metric.limit)} asked)"
-        for name, metric in sorted(result.metrics.items())
-        if metric.limit is not None and not metric.passed
+def _chart(
+    name: str, points: Sequence[MetricsPoint], event: EvidenceEvent, grounds: tuple[Ground, ...]
+) -> Chart | None:
+    told = [
+        (_seconds(point.stamp_ns, event), value) for point in points if (value := point.metrics.get(name)) is not None
     ]
-    because = f" Beyond their limits: {', '.join(failed)}." if failed else ""
-    yield f"<p>{escape(f'{result.window_id} was refused: {_said(result.verdict.reasons)}{because}')}</p>"
+    if not told:
+        return None
+    values = [value for _, value in told]
+    return Chart(
+        title=title_of(name),
+        x_label="s from the event",
+        y_label="",
+        series=(Series(name, told),),
+        told=f"{figure(min(values))} to {figure(max(values))}",
+        grounds=grounds,
+        marks=(Mark(0.0, ""),),
+    )
 
 
-def _chain(story: Story) -> str:
+# --- documents ------------------------------------------------------------------------------------------------------
+
+
+def _results(results: Sequence[CalibrationResult], event: EvidenceEvent) -> Table:
+    def row(result: CalibrationResult) -> Sequence[str | Cell]:
+        when = "after" if result.data_stamp_ns > event.stamp_ns else "before"
+        moved = [
+            f"{axis_value(value, axis)} ± {axis_value(sigma, axis, sign=False)}"
+            for axis, (value, sigma) in enumerate(zip(result.correction, result.sigma, strict=True))
+        ]
+        verdict = Cell(result.verdict.decision, tone=TONES.get(result.verdict.decision, "none"))
+        return (instant(result.data_stamp_ns), when, result.window_id, str(result.pairs), verdict, *moved)
+
+    heads = [f"{name}, {unit}" for name, unit in zip(AXIS_NAMES, UNITS, strict=True)]
+    return Table(
+        "Results of windows about the event, as corrections of the nominal calibration",
+        ("Data until", "The event", "Window", "Pairs", "Verdict", *heads),
+        [row(result) for result in results],
+        frozenset({3, *range(5, 11)}),
+    )
+
+
+def _refusals(results: Sequence[CalibrationResult]) -> Iterable[Text]:
+    """Why windows were refused, and the figures that did not keep their limits."""
+    for result in results:
+        if result.verdict.decision == "accepted":
+            continue
+        failed = [
+            f"{name} {figure(metric.value)} ({'≥' if metric.at_least else '≤'} {figure(metric.limit)} asked)"
+            for name, metric in sorted(result.metrics.items())
+            if metric.limit is not None and not metric.passed
+        ]
+        because = f" Beyond their limits: {', '.join(failed)}." if failed else ""
+        yield Text((f"{result.window_id} was refused: {_said(result.verdict.reasons)}{because}",))
+
+
+def _chain(story: Story) -> Block:
     if story.chain_holds is None:
-        return "<p class=quiet>The hashes of these entries could not be checked here.</p>"
+        return Text(("The hashes of these entries could not be checked here.",), quiet=True)
     if story.chain_holds:
-        return "<p class=quiet>Each entry is what its hash says, and holds the hash of the one before it.</p>"
-    return "<p class=bad>The hashes of these entries do not fit: something was changed, taken out or put in.</p>"
+        return Text(("Each entry is what its hash says, and holds the hash of the one before it.",), quiet=True)
+    return Verdict(
+        "bad", "Forged.", "The hashes of these entries do not fit: something was changed, taken out or put in."
+    )
 
 
-def _entries(history: HistoryReply) -> str:
-    rows = (
+def _entries(entries: Sequence[ChainedEntry]) -> Table:
+    rows = [
         (
             str(item.entry.sequence),
             instant(item.entry.wall_ns),
-            "-" if item.entry.stamp_ns is None else instant(item.entry.stamp_ns),
-            escape(item.entry.kind),
-            escape(item.entry.code),
-            escape(item.entry.text),
-            escape(item.entry.sender or ""),
-            escape(item.sha256[:12]),
+            "–" if item.entry.stamp_ns is None else instant(item.entry.stamp_ns),
+            item.entry.kind,
+            item.entry.code,
+            item.entry.text,
+            item.entry.sender or "",
+            Cell(item.sha256[:12], code=True),
         )
-        for item in history.entries
-    )
-    heads = ("#", "vehicle's clock", "sensor time", "what", "outcome", "why", "who", "sha256")
-    return html.table(heads, rows, {0})
+        for item in entries
+    ]
+    heads = ("#", "Vehicle’s clock", "Sensor time", "What", "Outcome", "Why", "Who", "sha256")
+    return Table("Entries about the event, oldest first", heads, rows, frozenset({0}), frozenset({5}))
 
 
-def _windows(windows: Sequence[FetchedWindow]) -> str:
+def _windows(windows: Sequence[FetchedWindow]) -> Iterable[Block]:
     if not windows:
-        return "<p>None was fetched.</p>"
-    told = {True: "the one in the history", False: "<span class=bad>not the one in the history</span>", None: "-"}
-    rows = (
+        yield Text(("None was fetched.",))
+        return
+    told: dict[bool | None, str | Cell] = {
+        True: "the one in the history",
+        False: Cell("not the one in the history", tone="bad"),
+        None: "–",
+    }
+    rows: list[Sequence[str | Cell]] = [
         (
-            f"<a href='windows/{escape(window.window_id, quote=True)}.mcap'>{escape(window.window_id)}</a>",
-            "-" if window.pairs is None else str(window.pairs),
+            Cell(window.window_id, href=f"windows/{window.window_id}.mcap"),
+            "–" if window.pairs is None else str(window.pairs),
             f"{window.size_bytes / 1e6:.1f}",
-            escape(window.decision or "not evaluated"),
+            window.decision or "not evaluated",
             told[window.in_history],
-            f"verified, {escape(window.sha256[:16])}…",
+            Cell(f"verified, {window.sha256[:16]}…", code=True),
         )
         for window in windows
-    )
-    return html.table(("window", "pairs", "MB", "verdict", "its result is", "sha256"), rows, {1, 2}) + (
-        "<p class=quiet>They open in Foxglove, Lichtblick and ROS 2 tools; <code>coec replay windows/ID.mcap</code> "
-        "reaches the recorded decision again.</p>"
-    )
+    ]
+    heads = ("Window", "Pairs", "MB", "Verdict", "Its result is", "sha256")
+    yield Table("Windows before and after the event", heads, rows, frozenset({1, 2}))
+    yield Text(
+        ("They open in Foxglove, Lichtblick and ROS 2 tools; `coec replay windows/ID.mcap` reaches the recorded "
+         "decision again.",),
+        quiet=True,
+    )  # fmt: skip
 
 
-def _snippets(snippets: Sequence[str]) -> str:
-    if not snippets:
-        return ""
-    links = ", ".join(f"<a href='windows/{escape(one, quote=True)}.mcap'>{escape(one)}</a>" for one in snippets)
-    return f"<p>Every frame of the seconds about the event: {links}.</p>"
+def _snippets(snippets: Sequence[str]) -> Iterable[Block]:
+    if snippets:
+        rows = [(Cell(one, href=f"windows/{one}.mcap"),) for one in snippets]
+        yield Table("Every frame of the seconds about the event", ("Recording",), rows)
 
 
-def _now(story: Story, health: HealthReply) -> Iterable[str]:
+def _now(story: Story, health: HealthReply) -> Text:
     served = "" if story.extrinsic is None else f" Served: {story.extrinsic.provenance}."
     why = f" {_said(health.reasons)}" if health.reasons else ""
     version = "" if story.status is None else f" The service is coec {story.status.version}."
     text = f"When this was fetched the pair was {health.state}, since {instant(health.since_ns)}.{why}{served}{version}"
-    yield f"<p>{escape(text)}</p>"
+    return Text((text,))

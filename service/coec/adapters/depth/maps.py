@@ -18,6 +18,9 @@ from coec.errors import DecodeError, ModelError
 STEREO = "stereo"
 """Value of `DepthConfig.model` that means: the maps which the source carries."""
 
+PRECOMPUTED = "precomputed"
+"""Identity of depth that came with the frames."""
+
 
 class PrecomputedDepth:
     """Depth maps that came with the frames. Implements `DepthModel`."""
@@ -28,7 +31,7 @@ class PrecomputedDepth:
     @property
     def identity(self) -> str:
         """Always `precomputed`: the maps themselves are in the window."""
-        return "precomputed"
+        return PRECOMPUTED
 
     def infer(self, frame: CameraFrame) -> DepthMap:
         """The map of the frame, (h, w) float32, NaN where its code is 0.

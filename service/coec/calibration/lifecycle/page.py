@@ -17,7 +17,7 @@ def page() -> str:
     states = "".join(f"- `{state.value}`: {STATES[state]}\n" for state in HealthState)
     events = "".join(f"- `{event.value}`: {meaning}\n" for event, meaning in MEANING.items())
     told = "".join(
-        f"- `{cause.code}`: {cause.text} Then `{_state_of(cause).value}`.\n"
+        f"- `{cause.code}`: {cause.text} Then `{_state_of(cause).value}`. {cause.advice}\n"
         for cause in (BENT_MOUNT, *(cause for cause in CAUSES.values() if cause is not BENT_MOUNT))
     )
     return (

@@ -67,26 +67,67 @@ OPEN_FIELD_RATIO, OPEN_FIELD_EDGES = 0.2, 60
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """A machine-readable code and one sentence."""
+    """A machine-readable code, one sentence, and what to do about it, another."""
 
     code: str
     text: str
+    advice: str
 
     def as_reason(self) -> Reason:
         """As a reason of a verdict or a state of health."""
         return Reason(self.code, self.text)
 
 
-BENT_MOUNT = Cause("bent_mount", "The camera and the LiDAR have moved against each other.")
-LENS_DIRTY = Cause("lens_dirty", "Parts of the image have lost their contrast in every exposure.")
-LENS_COVERED = Cause("lens_covered", "Most of the image shows nothing.")
-CAMERA_FROZEN = Cause("camera_frozen", "The camera repeats the same picture while the vehicle drives.")
-BEAMS_LOST = Cause("lidar_beams_lost", "Some directions of the LiDAR return far fewer points than when commissioned.")
-EGO_MOTION_WRONG = Cause("ego_motion_wrong", "The sweeps fit the images better with another ego-motion.")
-TIME_OFFSET = Cause("time_offset", "The sweeps fit the images better with another time between the sensors.")
-INTRINSICS_WRONG = Cause(INTRINSICS_OFF, "A window fits another lens better than the intrinsics of the rig.")
-DARK = Cause("dark", "It is too dark for the camera.")
-OPEN_FIELD = Cause("open_field", "There is too little structure in reach of the LiDAR.")
+BENT_MOUNT = Cause(
+    "bent_mount",
+    "The camera and the LiDAR have moved against each other.",
+    "See that the mount is tight; the next accepted window corrects the extrinsic, or `coec calibrate` does.",
+)
+LENS_DIRTY = Cause(
+    "lens_dirty",
+    "Parts of the image have lost their contrast in every exposure.",
+    "Clean the lens.",
+)
+LENS_COVERED = Cause(
+    "lens_covered",
+    "Most of the image shows nothing.",
+    "Uncover the lens.",
+)
+CAMERA_FROZEN = Cause(
+    "camera_frozen",
+    "The camera repeats the same picture while the vehicle drives.",
+    "Restart the camera or its driver.",
+)
+BEAMS_LOST = Cause(
+    "lidar_beams_lost",
+    "Some directions of the LiDAR return far fewer points than when commissioned.",
+    "Clean the LiDAR, and see what stands before it.",
+)
+EGO_MOTION_WRONG = Cause(
+    "ego_motion_wrong",
+    "The sweeps fit the images better with another ego-motion.",
+    "See to scale, sign and frame of the ego-motion (`ego.T_lidar_ego`).",
+)
+TIME_OFFSET = Cause(
+    "time_offset",
+    "The sweeps fit the images better with another time between the sensors.",
+    "See to the clocks of camera and LiDAR; `coec calibrate --time-offset` measures the camera's.",
+)
+INTRINSICS_WRONG = Cause(
+    INTRINSICS_OFF,
+    "A window fits another lens better than the intrinsics of the rig.",
+    "Calibrate the intrinsics anew: no extrinsic makes up for wrong ones.",
+)
+DARK = Cause(
+    "dark",
+    "It is too dark for the camera.",
+    "Wait for light.",
+)
+OPEN_FIELD = Cause(
+    "open_field",
+    "There is too little structure in reach of the LiDAR.",
+    "Wait for buildings, poles or cars in reach.",
+)
 
 CAUSES = {
     cause.code: cause

@@ -34,8 +34,8 @@ class Options:
     output: Annotated[
         Path | None,
         typer.Option(
-            help="Write overlay_before.png, overlay_after.png, close_ups.png, residuals.png and result.json; with "
-            "--camera-model lens_residual.png, too.",
+            help="Write report.html, overlay_before.png, overlay_after.png, close_ups.png, residuals.png and "
+            "result.json; with --camera-model lens_residual.png, too.",
             metavar="DIR",
         ),
     ] = None

@@ -16,9 +16,10 @@ class Options:
     """The arguments of the command; None = not given."""
 
     sources: Annotated[list[str], typer.Argument(metavar="SOURCE...", help=SOURCE_HELP, show_default=False)]
-    output: Annotated[Path, typer.Option(help="Baseline to write, or to add the pair to.", metavar="FILE")] = Path(
-        "rig.json"
-    )
+    output: Annotated[
+        Path,
+        typer.Option(help="Baseline to write, or to add the pair to; a page of it lies beside it.", metavar="FILE"),
+    ] = Path("rig.json")
     depth: Depth = None
     objective: Objective = None
     dof: Annotated[DegreesOfFreedom | None, typer.Option(help="Rotation only, or translation too.")] = None

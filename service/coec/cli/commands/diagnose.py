@@ -32,6 +32,9 @@ class Options:
     ] = 0
     checks: Annotated[int, typer.Option(help="Checks per split and move, with --detection.", min=1)] = 10
     frames: Frames = None
+    output: Annotated[
+        Path | None, typer.Option(help="Write report.html and overlay.png.", metavar="DIR", show_default=False)
+    ] = None
     as_json: Json = False
 
 

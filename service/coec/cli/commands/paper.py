@@ -16,9 +16,9 @@ class Options:
     """The arguments of the command; None = not given."""
 
     source: Source
-    output: Annotated[Path, typer.Option(help="Folder for the figures and report.json.", metavar="DIR")] = Path(
-        "coec-paper"
-    )
+    output: Annotated[
+        Path, typer.Option(help="Folder for report.html, report.json and the figures.", metavar="DIR")
+    ] = Path("coec-paper")
     depth: Depth = None
     objective: Annotated[str, typer.Option(help="mi (the paper's) or fused.", metavar="NAME")] = "mi"
     runs: Annotated[int, typer.Option(help="Solves per experiment.", min=1)] = 100

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +14,15 @@ from coec.adapters.images.codec import decode_bgr, encode_png
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Matrix4, Window
-from coec.cli.demo import html, story
+from coec.cli.demo import story
 from coec.cli.demo.outcome import ALARM, Ending, is_repaired
+from coec.cli.demo.page import demo_page
 from coec.cli.demo.watch import Moment, Seen, Watch
 from coec.config import LimitsConfig
 from coec.geometry import cameras
-from coec.reports import console, pictures
+from coec.reports import console, page, pictures, provenance
 from coec.reports.overlay import draw
-from coec.reports.timeline_plot import STATE_COLOURS, timeline
+from coec.reports.timeline_plot import timeline
 from coec.schemas import replies
 from coec.schemas.base import to_json
 from coec.sources import windows
@@ -49,17 +49,16 @@ def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen
     written = [] if window is None else [window]
     plot = write_file(output / "timeline.png", timeline(watch.series, _marks(outcome), story.MAX_ERROR_DEG, _title()))
     written.append(plot)
-    shown = {"timeline": plot}
     result = None
     if window is not None:
         result = read_result(window)
-        pictured = _overlays(output, window, blamed, watch, seen)
-        written += pictured.values()
-        shown |= pictured
+        written += _overlays(output, window, blamed, watch, seen)
     if result is not None:
         written.append(write_file(output / "result.json", to_json(result)))
-    document = page(shown, watch.timeline, outcome, result, window)
-    written.append(write_file(output / "report.html", document.encode()))
+    happened = list(zip(watch.timeline, _happenings(watch.timeline, outcome), strict=True))
+    summary = _summary(outcome, watch.timeline)
+    told = demo_page(_title(), watch.series, happened, summary, outcome, result, written, provenance.here())
+    written.append(page.write(output / "report.html", told))
     return Left(tuple(written), result)
 
 
@@ -85,8 +84,8 @@ def show(moments: Sequence[Moment], outcome: Ending, left: Left) -> None:
         console.out.print(console.styled("accepted"), ": the knock was noticed and repaired by the service", sep="")
 
 
-def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: Seen) -> dict[str, Path]:
-    """Overlays and close-ups, by name."""
+def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: Seen) -> list[Path]:
+    """Overlays and close-ups."""
     window, configuration = read_window(path)
     truth = watch.truth(seen.moment.drive_s)
     before_deg = windows.rotation_error_deg(blamed, truth)
@@ -96,13 +95,11 @@ def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: See
     }
     whole = pictures.write_overlays(output, window, poses, configuration.motion_compensation)
     cloud = compensate(pictures.middle(window), window.rig, enabled=configuration.motion_compensation)
-    near = {
-        f"closeup_{name}": write_file(
-            output / f"closeup_{name}.png", _close_up(window, cloud, *poses[f"overlay_{name}"])
-        )
+    near = [
+        write_file(output / f"closeup_{name}.png", _close_up(window, cloud, *poses[f"overlay_{name}"]))
         for name in ("before", "after")
-    }
-    return dict(zip(poses, whole, strict=True)) | near
+    ]
+    return [*whole, *near]
 
 
 def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matrix4, title: str) -> bytes:
@@ -163,77 +160,3 @@ def _summary(outcome: Ending, moments: Sequence[Moment]) -> list[tuple[str, str]
         ("error after the repair", f"{outcome.error_after_deg:.3f}°"),
         ("in pitch, yaw, roll", axes),
     ]
-
-
-# --- the page -------------------------------------------------------------------------------------------------------
-
-
-def page(
-    shown: Mapping[str, Path],
-    moments: Sequence[Moment],
-    outcome: Ending,
-    result: replies.CalibrationResult | None,
-    window: Path | None,
-) -> str:
-    """One HTML file that needs no other."""
-    verdict = "The knock was noticed and repaired." if outcome.passed else " ".join(outcome.objections())
-    parts = [
-        html.head(_title()),
-        f"<p><b>{escape(verdict)}</b> The vehicle, its street and its sensors are simulated, so the truth is "
-        "known; the service is the one that runs on a vehicle, in a process of its own, and has seen the frames alone. "
-        "Its depth network is the one that comes with it, trained on other streets of the same simulation.",
-        html.table(("", ""), [(escape(name), escape(value)) for name, value in _summary(outcome, moments)]),
-        html.figure(
-            shown["timeline"],
-            "Error of the extrinsic that is served, which the service cannot know; the "
-            "ground is what it says of its calibration.",
-        ),
-    ]
-    if "closeup_before" in shown:
-        parts.append(
-            html.figure(shown["closeup_before"], "LiDAR points where the service put them before the repair …")
-        )
-        parts.append(html.figure(shown["closeup_after"], "… and after it, on the same picture. Colours are ranges."))
-    parts += ["<h2>What the service said</h2>", _timeline(moments, outcome)]
-    if result is not None:
-        parts += ["<h2>The window that repaired it</h2>", _result(result)]
-    if window is not None:
-        parts.append(
-            f"<p><code>{escape(window.name)}</code> is a ROS 2 MCAP file for Foxglove, Lichtblick or Rerun; "
-            f"<code>coec replay {escape(window.name)}</code> reaches the decision again from it alone."
-        )
-    return "\n".join(parts) + "\n"
-
-
-def _timeline(moments: Sequence[Moment], outcome: Ending) -> str:
-    rows = [
-        (
-            f"{moment.t_s:.0f} s",
-            f"{moment.drive_s:.1f} s",
-            f"<span class=state style='background:{_colour(moment.health)}'>{escape(moment.health)}</span>",
-            escape(f"{moment.provenance}, {moment.status}"),
-            f"{moment.error_deg:.3f}°",
-            escape(what),
-        )
-        for moment, what in zip(moments, _happenings(moments, outcome), strict=True)
-    ]
-    return html.table(("elapsed", "drive", "health", "extrinsic", "error", ""), rows, numbers=(0, 1, 4))
-
-
-def _result(result: replies.CalibrationResult) -> str:
-    rows = [
-        (escape(name), console.figure(metric.value), *map(str, console.limit_of(metric)))
-        for name, metric in result.metrics.items()
-    ]
-    told = (
-        f"{result.pairs} pairs, verdict {result.verdict.decision}, configuration {result.config_hash}. The figures of "
-        "its self-diagnosis, without the truth; a result is accepted if it keeps all limits:"
-    )
-    return f"<p>{escape(told)}</p>" + html.table(("figure", "value", "limit", ""), rows, numbers=(1,))
-
-
-def _colour(health: str) -> str:
-    """As in the plot, in the names of CSS."""
-    return {
-        "tab:green": "#bfe3bf", "gold": "#ffe98a", "orange": "#ffd9a0", "tab:red": "#f3b4b4", "silver": "#ddd"
-    }.get(STATE_COLOURS.get(health, ""), "#eee")  # fmt: skip

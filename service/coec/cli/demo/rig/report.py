@@ -4,22 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from html import escape
 from pathlib import Path
 
 from coec.adapters.files.output import write as write_file
-from coec.cli.demo import html
 from coec.cli.demo.rig import story
 from coec.cli.demo.rig.outcome import Outcome
 from coec.cli.demo.rig.story import Act
 from coec.cli.demo.rig.told import Told
 from coec.geometry.se3 import inverse
-from coec.reports import console
+from coec.reports import console, provenance
+from coec.reports.page import Cell, Page, Picture, Pictures, Section, Table, Text, Verdict
+from coec.reports.page import write as write_page
+from coec.reports.page_parts import TONES, read
+from coec.reports.provenance import Made
 from coec.reports.rig_plot import SensorSeen, rig_from_above
 from coec.simulation.rig_drive import RigDrive
 
 TITLE = "Who moved? A knocked LiDAR and a knocked camera"
 LIDAR_VIEW_DEG = 360.0
+
+ABOUT = (
+    "Four fisheyes look at what one LiDAR measures, and each of the four pairs is looked at every five seconds. A "
+    "camera that is knocked puts its own pair wrong; a LiDAR that is knocked puts all pairs wrong, and alike. Which "
+    "sensor explains all looks with the fewest moves is asked after each of them. Vehicle and street are simulated, "
+    f"with pictures of {story.CAMERA_PX} pixels a side, of which those rows are drawn that the LiDAR sees; what "
+    "looks and tells is the service, a process of its own behind a router, as on a vehicle."
+)
+
+PICTURED = "From above. The redder a line, the surer its pair that something has moved."
 
 Performance = tuple[Outcome, Sequence[Told]]
 """An act: what became of it, and all that was told."""
@@ -38,8 +50,7 @@ def write(output: Path, drive: RigDrive, acts: Sequence[Performance]) -> list[Pa
     for outcome, heard in acts:
         path = output / f"{outcome.act.name}_knocked.png"
         pictures.append(write_file(path, picture(drive, outcome.act, heard[-1])))
-    document = page(pictures, acts)
-    return [*pictures, write_file(output / "report.html", document.encode())]
+    return [*pictures, write_page(output / "report.html", page(pictures, acts, provenance.here()))]
 
 
 def picture(drive: RigDrive, act: Act, told: Told) -> bytes:
@@ -119,35 +130,53 @@ def document(acts: Sequence[Performance], files: Sequence[Path], elapsed_s: floa
     }
 
 
-def page(pictures: Sequence[Path], acts: Sequence[Performance]) -> str:
-    """One HTML file that needs no other."""
-    parts = [
-        html.head(TITLE),
-        "<p>Four fisheyes look at what one LiDAR measures, and each of the four pairs is looked at every five seconds. "
-        "A camera that is knocked puts its own pair wrong; a LiDAR that is knocked puts all pairs wrong, and alike. "
-        "Which sensor explains all looks with the fewest moves is asked after each of them. Vehicle and street are "
-        f"simulated, with pictures of {story.CAMERA_PX} pixels a side, of which those rows are drawn that the LiDAR "
-        "sees; what looks and tells is the service, a process of its own behind a router, as on a vehicle.",
+def page(pictures: Sequence[Path], acts: Sequence[Performance], made: Made) -> Page:
+    """All acts.
+
+    Raises:
+        OutputError: a picture cannot be read any more.
+    """
+    sections = [
+        Section(
+            _heading(outcome.act),
+            (
+                Text((summary(outcome),)),
+                Pictures((Picture(read(path), _alt(outcome, heard[-1]), PICTURED),)),
+                _turns_told(heard),
+                Text((heard[-1].sensors[outcome.act.sensor].reason,)),
+            ),
+        )
+        for path, (outcome, heard) in zip(pictures, acts, strict=True)
     ]
-    for path, (outcome, heard) in zip(pictures, acts, strict=True):
-        parts += [
-            f"<h2>{escape(_heading(outcome.act))}</h2><p><b>{escape(summary(outcome))}</b>",
-            html.figure(path, "From above. The redder a line, the surer its pair that something has moved."),
-            html.table(("drive", "looked at", *heard[0].sensors), _rows(heard), numbers=(0,)),
-            f"<p>{escape(heard[-1].sensors[outcome.act.sensor].reason)}",
-        ]
-    return "\n".join(parts) + "\n"
+    objections = [objection for outcome, _ in acts for objection in outcome.objections()]
+    verdict = (
+        Verdict("bad", "Not told.", " ".join(objections))
+        if objections
+        else Verdict("good", "Told apart.", "Both knocks were noticed, and whoever was knocked was named, nobody else.")
+    )
+    return Page("coec demo --rig", TITLE, (verdict, Text((ABOUT,))), (*sections, made.section()))
+
+
+def _alt(outcome: Outcome, told: Told) -> str:
+    states = ", ".join(f"{name} {sensor.state.replace('_', ' ')}" for name, sensor in told.sensors.items())
+    return f"The vehicle from above after {outcome.act.sensor} was turned: {states}"
 
 
 def _heading(act: Act) -> str:
     return "The LiDAR is knocked" if act.sensor == story.LIDAR else f"The camera {act.sensor} is knocked"
 
 
-def _rows(heard: Sequence[Told]) -> list[tuple[str, ...]]:
-    return [
-        (f"{told.second:.1f} s", escape(told.looked_at), *(escape(cell) for cell in _cells(told)))
-        for told in turns(heard)
+def _turns_told(heard: Sequence[Told]) -> Table:
+    rows: list[Sequence[str | Cell]] = [
+        (f"{told.second:.1f} s", told.looked_at, *_toned(told)) for told in turns(heard)
     ]
+    heads = ("Drive", "Looked at", *heard[0].sensors)
+    return Table("What was believed of every sensor, whenever that changed", heads, rows, frozenset({0}))
+
+
+def _toned(told: Told) -> list[Cell]:
+    states = _states(told)
+    return [Cell(text, tone=TONES.get(state, "none")) for text, state in zip(_cells(told), states, strict=True)]
 
 
 def _cells(told: Told) -> list[str]:

@@ -1,0 +1,225 @@
+"""What every figure of self-diagnosis tells, what it means when it does not keep its limit, and what to do then.
+
+One table: reasons of verdicts are worded by it, and reports explain by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from coec.calibration.types import INTRINSICS_OFF, MOVED, StopReason
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure, for people.
+
+    Attributes:
+        unit: of value and limit; empty for a share, a ratio, or a count.
+        tells: what it measures, a sentence.
+        fails: what it means beyond its limit, no full stop.
+        advice: what to do then.
+    """
+
+    title: str
+    unit: str
+    tells: str
+    fails: str
+    advice: str
+
+
+_MORE_SCENES = "Take a longer window, in motion, past objects at different distances."
+_MORE_STRUCTURE = "Take a window where buildings, poles or parked cars are in reach; see that lens and mask are clean."
+_CALIBRATE = "Calibrate: `coec calibrate` on a window of this mount tells where the camera is."
+_COMPARE_ONLY = "Nothing: the paper's figures are told for comparison, the edges decide."
+
+FIGURES: Mapping[str, Figure] = MappingProxyType(
+    {
+        # Of a calibration.
+        "mi_over_unrelated": Figure(
+            "Agreement with depth",
+            "",
+            "Mutual information of the LiDAR's ranges with the depth maps of their own frames, over that with the maps "
+            "of other frames. 1 is chance.",
+            "depth and LiDAR agree no better than a cloud with the depth map of another frame",
+            "Try a depth network that suits the scene (`coec models assess` tells), or a window with more in reach.",
+        ),
+        "range_edges": Figure(
+            "Range edges",
+            "",
+            "Independent jumps in range in the sweeps of the window: what the edges of the images are held against.",
+            "too little structure: the sweeps have too few independent jumps in range",
+            _MORE_SCENES,
+        ),
+        "edge_contrast": Figure(
+            "Edge contrast",
+            "σ",
+            "How far the edges stand out at the result from how they do at other poses, in standard deviations of "
+            "those.",
+            "no pose stands out from the others",
+            _MORE_STRUCTURE,
+        ),
+        "runner_up": Figure(
+            "Runner-up",
+            "",
+            "Edge contrast of the next best pose over that of the best one. 1 is a draw.",
+            "ambiguous: another pose explains the window nearly as well",
+            "Start nearer to the truth, or take a longer window with other scenes in it.",
+        ),
+        "newton_step_deg": Figure(
+            "Slope left, rotation",
+            "°",
+            "How far each rotation axis alone would still go to its maximum; the largest of them.",
+            "the objective is not at a maximum on every rotation axis",
+            "Calibrate again from this result, or take a window with more frames.",
+        ),
+        "newton_step_m": Figure(
+            "Slope left, translation",
+            "m",
+            "How far each translation axis alone would still go to its maximum; the largest of them.",
+            "the objective is not at a maximum on every translation axis",
+            "Calibrate again from this result, or search the rotation only.",
+        ),
+        "peakedness_per_deg2": Figure(
+            "Peakedness",
+            "1/°²",
+            "How sharply the objective falls off beside the result, as a share of its height, on the flattest rotation "
+            "axis.",
+            "the objective is too flat on at least one rotation axis",
+            _MORE_SCENES,
+        ),
+        "sigma_deg": Figure(
+            "σ, rotation",
+            "°",
+            "Standard deviation of the least certain rotation axis.",
+            "what was seen does not settle a rotation, or is too little to tell",
+            _MORE_SCENES,
+        ),
+        "sigma_m": Figure(
+            "σ, translation",
+            "m",
+            "Standard deviation of the least certain translation axis.",
+            "what was seen does not settle a translation, or is too little to tell",
+            "Take a longer window with objects near the camera, or search the rotation only.",
+        ),
+        "overlap": Figure(
+            "Overlap",
+            "",
+            "LiDAR points in view, over the most that any pose within reach would have in view.",
+            "too few LiDAR points are in view",
+            "See that the nominal extrinsic, the image size and the mask are those of this camera.",
+        ),
+        MOVED: Figure(
+            "Moved within the window",
+            "σ",
+            "What two poses, one after the other, score more than one pose for all frames.",
+            "the camera moved while the window was taken",
+            "See that the mount is tight, and take another window: no single pose is right for this one.",
+        ),
+        INTRINSICS_OFF: Figure(
+            "Other intrinsics",
+            "",
+            "How certainly another lens explains the window better than the intrinsics that are given.",
+            "another lens explains the window better than the intrinsics of the rig",
+            "Calibrate the intrinsics anew: no extrinsic makes up for wrong ones.",
+        ),
+        # Of a check.
+        "mi": Figure(
+            "Mutual information",
+            "nats",
+            "MI of the paper's equation (1), of LiDAR ranges and depth maps at the extrinsic that is checked.",
+            "depth and LiDAR agree less than when the rig was commissioned",
+            _COMPARE_ONLY,
+        ),
+        "f1": Figure(
+            "Slope of MI",
+            "nats/rad",
+            "First derivative f' of the paper's equation (2); zero at a maximum.",
+            "mutual information rises beside the extrinsic",
+            _COMPARE_ONLY,
+        ),
+        "f2": Figure(
+            "Curvature of MI",
+            "nats/rad²",
+            "Second derivative f'' of the paper's equation (2); high at a sharp maximum.",
+            "mutual information is flat about the extrinsic",
+            _COMPARE_ONLY,
+        ),
+        "agreement_deg": Figure(
+            "Agreement of the witnesses",
+            "°",
+            "Rotation between where the edges fit best and where depth does.",
+            "edges and depth put the camera in different places",
+            "See whether the depth network suits the scene (`coec models assess`); the edges decide.",
+        ),
+        "distance_rotation": Figure(
+            "Distance, rotation",
+            "of its limit",
+            "How far the rotation at which the edges fit best is from the extrinsic, squared and in the standard "
+            "deviations of a check.",
+            "the edges fit best at another rotation, farther off than a right extrinsic has it",
+            _CALIBRATE,
+        ),
+        "distance_pose": Figure(
+            "Distance, pose",
+            "of its limit",
+            "Likewise of rotation and translation together, on the axis that is farthest off.",
+            "the edges fit best at another pose, farther off than a right extrinsic has it",
+            _CALIBRATE,
+        ),
+        "edge_score": Figure(
+            "Edge score",
+            "σ",
+            "How strongly the image has edges where the LiDAR has them, at the extrinsic that is checked.",
+            "the image has hardly an edge where the LiDAR has them",
+            _MORE_STRUCTURE,
+        ),
+        "edges_per_pair": Figure(
+            "Edges per pair",
+            "σ",
+            "The same where the edges fit best, for each pair of frames.",
+            "the edges are fainter than a check can rely on: it counts less",
+            _MORE_STRUCTURE,
+        ),
+        "edges_kept_rotation": Figure(
+            "Edges kept, rotation",
+            "",
+            "Edge score at the extrinsic, over that at the rotation that fits best. 1: nothing is gained by turning.",
+            "turning the camera gains more edges than chance does",
+            _CALIBRATE,
+        ),
+        "edges_kept_pose": Figure(
+            "Edges kept, pose",
+            "",
+            "Edge score at the extrinsic, over that at the pose that fits best. 1: nothing is gained by moving.",
+            "moving the camera gains more edges than chance does",
+            _CALIBRATE,
+        ),
+        "certainty_rotation": Figure(
+            "Certainty, rotation",
+            "σ",
+            "How certainly the gain of another rotation is more than what frames differ by.",
+            "the frames insist on another rotation",
+            _CALIBRATE,
+        ),
+        "certainty_pose": Figure(
+            "Certainty, pose",
+            "σ",
+            "How certainly the gain of another pose is more than what frames differ by.",
+            "the frames insist on another pose",
+            _CALIBRATE,
+        ),
+    }
+)
+"""By the name of the metric."""
+
+OTHER_ADVICE: Mapping[str, str] = MappingProxyType(
+    {
+        StopReason.AT_BOUND.value: "Start nearer to the truth, or widen the search (`search.rotation_deg`).",
+        StopReason.EVALUATIONS.value: "Start nearer, or allow more evaluations (`search.max_evaluations`).",
+        "motion": "Take the window while the vehicle drives, not where it stands.",
+    }
+)
+"""What to do about reasons of a verdict that are no figure, by their code."""

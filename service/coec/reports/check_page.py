@@ -1,0 +1,112 @@
+"""The page of `coec diagnose`: one check of an extrinsic, or how well wrong ones are seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from coec.adapters.files.conversions import metric_of
+from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.types import Reason as Found
+from coec.calibration.types import Window
+from coec.reports.evaluation_documents import in_degrees
+from coec.reports.evaluation_page import detection_table
+from coec.reports.page import Page, Section, Text, Verdict
+from coec.reports.page.words import count, instant, number
+from coec.reports.page_parts import advice_of, axes_table, figures_block, pictures_of, turn_and_shift
+from coec.reports.provenance import Made, content_hash, depth_items
+from coec.schemas.evaluation import DetectionReport
+from coec.schemas.replies import Reason
+
+OF_PAPER = frozenset({"mi", "f1", "f2"})
+"""Figures that are told for comparison, and decide nothing."""
+
+
+def check_page(
+    seen: Observation, window: Window, depth_identity: str, config_hash: str, pictures: Sequence[Path], made: Made
+) -> Page:
+    """One check.
+
+    Args:
+        window: whose `T_camera_lidar_start` was checked.
+        pictures: files that were drawn of it.
+
+    Raises:
+        OutputError: a picture cannot be read any more.
+    """
+    offset, sigma = in_degrees(seen.offset), in_degrees(seen.sigma)
+    slopes = {
+        "f′": [number(float(value), sign=True) for value in seen.first_derivative],
+        "f″": [number(float(value), sign=True) for value in seen.second_derivative],
+    }
+    table = axes_table(
+        "From the extrinsic to where this check puts the camera, about and along its axes (x right, y down, z "
+        "forward). f′ and f″ are the paper’s derivatives of mutual information, per radian or metre.",
+        "Offset",
+        offset,
+        sigma,
+        more=slopes,
+    )
+    shown = pictures_of(pictures)
+    sections = (
+        *((Section("Pictures", shown),) if shown else ()),
+        Section("Where the check puts the camera", (table,)),
+        Section(
+            "What it rests on",
+            (
+                Text(
+                    ("One check is a look, not a verdict for good: the service adds many of them up before it raises "
+                     "an alarm.",),
+                    quiet=True,
+                ),
+                figures_block("Figures of the check", {m.name: metric_of(m) for m in seen.metrics}, compared=OF_PAPER),
+            ),
+        ),
+        made.section(
+            (
+                ("Window", window.window_id),
+                ("Sensor time", f"{instant(seen.pair_stamps_ns[0])} to {instant(seen.stamp_ns)}"),
+                ("Window, sha256 of images, points and stamps", content_hash(window)),
+                *depth_items(depth_identity),
+                ("Configuration, hash", config_hash),
+            )
+        ),
+    )  # fmt: skip
+    return Page("coec diagnose", f"Check of {window.rig.pair}", (_verdict(seen),), sections)
+
+
+def detection_page(detection: DetectionReport, source: str, made: Made) -> Page:
+    """How well wrong extrinsics are seen on a recording."""
+    checks = sum(row.checks for row in detection.moves)
+    sentence = f"{count(checks, 'check')} at the right extrinsic and at moved ones; see which of them are flagged."
+    sections = (
+        Section("Checks by move", (detection_table(detection),)),
+        made.section((("Source", source),)),
+    )
+    return Page("coec diagnose", "How well a wrong extrinsic is seen", (Verdict("none", "Tried.", sentence),), sections)
+
+
+def _verdict(seen: Observation) -> Verdict:
+    if seen.causes:
+        reasons = [_reason(cause.as_reason()) for cause in seen.causes]
+        sentence = " ".join(cause.text for cause in seen.causes) + " Such a check says nothing of the extrinsic."
+        return Verdict("poor", "Cannot tell:", sentence, advice_of(reasons))
+    where = turn_and_shift(in_degrees(np.nan_to_num(seen.offset)))
+    if seen.flagged:
+        todo = (
+            "See that the mount is tight.",
+            "Calibrate: `coec calibrate` on a window of this mount tells where the camera is.",
+        )
+        return Verdict(
+            "bad", "Wrong:", f"the camera is not where this extrinsic has it. The check puts it {where}.", todo
+        )
+    if seen.undecided:
+        again = ("Take another window, in motion, past objects at different distances.",)
+        return Verdict("unsure", "Undecided:", "this window neither accuses the extrinsic nor acquits it.", again)
+    return Verdict("good", "Right.", "The edges fit this extrinsic as well as a right one.")
+
+
+def _reason(found: Found) -> Reason:
+    return Reason(code=found.code, text=found.text)

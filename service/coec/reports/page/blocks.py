@@ -1,0 +1,249 @@
+"""What a page may be made of. Every text is text: what looks like markup is shown as it is written. In sentences, what
+stands between two backticks is code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from coec.reports.page.charts import Chart
+
+Tone = Literal["good", "unsure", "poor", "bad", "none"]
+"""How something is meant, from what may be used to what must not; `none` says neither. It is a colour beside a word,
+never a colour alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """Paragraphs. `quiet`: a remark that helps to read what follows."""
+
+    template: ClassVar = "text"
+    paragraphs: tuple[str, ...]
+    quiet: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The whole in a sentence.
+
+    Attributes:
+        word: one or two words on the badge: Accepted, Refused.
+        todo: what to do now, a sentence each.
+    """
+
+    template: ClassVar = "verdict"
+    tone: Tone
+    word: str
+    sentence: str
+    todo: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class AxisLine:
+    """One degree of freedom.
+
+    Attributes:
+        value: with its sign, or in words why there is none; `sigma` is empty then.
+        share: of the widest bar of the table, -1 to 1: value and σ as lengths; None without a value.
+        sigma_share: likewise of σ.
+    """
+
+    name: str
+    value: str
+    sigma: str
+    unit: str
+    share: float | None
+    sigma_share: float | None
+    more: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class AxesTable:
+    """The result per axis.
+
+    Attributes:
+        value_name: what the values are: correction, offset, bias.
+        more: heads of further columns of numbers.
+    """
+
+    template: ClassVar = "axes"
+    caption: str
+    value_name: str
+    lines: tuple[AxisLine, ...]
+    more: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Copy:
+    """Something to be taken into another program.
+
+    Attributes:
+        shown: for people, lines of equal width.
+        copied: what the button puts on the clipboard.
+    """
+
+    name: str
+    note: str
+    shown: str
+    copied: str
+
+
+@dataclass(frozen=True, slots=True)
+class Copies:
+    """Several of them."""
+
+    template: ClassVar = "copies"
+    items: tuple[Copy, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture within the page.
+
+    Attributes:
+        data: bytes of a PNG or JPEG file.
+        alt: what is seen, for who does not see it.
+        href: file beside the page that it leads to; empty for none.
+    """
+
+    data: bytes
+    alt: str
+    caption: str
+    href: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """One under the other, as wide as the page."""
+
+    template: ClassVar = "pictures"
+    items: tuple[Picture, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Compare:
+    """Two pictures of one size in one place, of which a slider shows more of the one or of the other; side by side
+    where there is no script, and on paper."""
+
+    template: ClassVar = "compare"
+    before: Picture
+    after: Picture
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Charts:
+    """Plots; small ones stand beside each other where there is room."""
+
+    template: ClassVar = "charts"
+    items: tuple[Chart, ...]
+    small: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FigureLine:
+    """A figure against its limit.
+
+    Attributes:
+        limit: with its sign, empty where there is none; `met` is None then.
+        margin: where it stands between failing (0), its limit (½) and plenty (1); None where that cannot be said.
+        advice: what to do; empty where it is met.
+    """
+
+    code: str
+    title: str
+    value: str
+    unit: str
+    limit: str
+    met: bool | None
+    margin: float | None
+    meaning: str
+    advice: str
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """All that a verdict rests on."""
+
+    template: ClassVar = "figures"
+    caption: str
+    lines: tuple[FigureLine, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Trend:
+    """A plot as small as a word: a line and its band (x, low, middle, high), about `zero`, of at least `least` to each
+    side."""
+
+    title: str
+    points: tuple[tuple[float, float, float, float], ...]
+    zero: float
+    least: float
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Of a table, where it is more than text.
+
+    Attributes:
+        href: file beside the page, or `#place` on it.
+    """
+
+    text: str
+    tone: Tone | None = None
+    href: str = ""
+    trend: Trend | None = None
+    code: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of cells; the columns whose index is in `numbers` are numbers, in `prose` sentences, which are folded. Wide
+    ones scroll in a region of their own, which the keyboard reaches."""
+
+    template: ClassVar = "table"
+    caption: str
+    heads: tuple[str, ...]
+    rows: Sequence[Sequence[str | Cell]]
+    numbers: frozenset[int] = frozenset()
+    prose: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Names and values: where something comes from, how it was found. `codes` are names whose value is to be read
+    letter by letter: hashes, a command."""
+
+    template: ClassVar = "facts"
+    items: tuple[tuple[str, str], ...]
+    codes: frozenset[str] = frozenset()
+
+
+Block = Text | Verdict | AxesTable | Copies | Pictures | Compare | Charts | Figures | Table | Facts
+"""`template` of each names its file in `templates/blocks`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A headline, and what stands under it. `level` 3 belongs to the section before it."""
+
+    title: str
+    blocks: tuple[Block, ...]
+    level: Literal[2, 3] = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A document.
+
+    Attributes:
+        kind: what sort of page it is, above the title.
+        title: of the document and its headline.
+        opening: blocks before the first section; a verdict first.
+    """
+
+    kind: str
+    title: str
+    opening: tuple[Block, ...]
+    sections: tuple[Section, ...]

@@ -1,0 +1,291 @@
+"""Plots as SVG: a few lines of our own, so that their colours follow the page and equal figures give equal bytes.
+
+A chart is drawn twice, for a wide and for a narrow page, each at the size at which its letters are legible; the style
+sheet shows the one that fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite, log10
+from typing import Literal
+
+from coec.reports.page import ticks
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Points in the order of x; where y is not finite the line is broken.
+
+    Attributes:
+        shape: `steps` holds a value until the next, `points` are not joined, `dotted` is a line that is not measured.
+        band: (x, low, high) on the same axes, drawn under the line; empty for none.
+    """
+
+    name: str
+    points: Sequence[Point]
+    shape: Literal["line", "steps", "points", "dotted"] = "line"
+    band: Sequence[tuple[float, float, float]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """What holds from one x to another, as the colour of the ground; `tone` as in `blocks.Tone`."""
+
+    begin: float
+    end: float
+    tone: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """Something that happened at an x."""
+
+    at: float
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A y that something has to keep."""
+
+    at: float
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A plot with its axes.
+
+    Attributes:
+        told: what is to be seen, in a sentence, for who does not see it.
+        log_y: values at or below zero are not drawn then.
+        x_ticks: where others than round numbers are wanted, with their labels.
+        from_zero: y begins at zero.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    series: tuple[Series, ...]
+    told: str
+    grounds: tuple[Ground, ...] = ()
+    marks: tuple[Mark, ...] = ()
+    limits: tuple[Limit, ...] = ()
+    log_y: bool = False
+    log_x: bool = False
+    x_ticks: tuple[tuple[float, str], ...] = ()
+    from_zero: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Of a drawing, px. `letter`: width of one, about."""
+
+    name: str
+    width: int
+    height: int
+    x_ticks: int
+    y_ticks: int
+
+
+WIDE, NARROW = Size("wide", 720, 300, 9, 6), Size("narrow", 344, 240, 5, 5)
+SMALL = Size("small", 344, 168, 5, 4)
+LEFT, RIGHT, TOP, BOTTOM = 54, 12, 14, 42
+"""Room around the axes for their labels, px."""
+
+ROW_PX = 15.0
+"""Height of a line of labels."""
+
+LETTER_PX = 6.5
+"""Width of a letter of a label, about: 12 px sans-serif."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """`at` in px along its axis."""
+
+    at: float
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """`d` of an SVG path; `points` are circles (x, y). `number` chooses the colour."""
+
+    d: str
+    shape: str
+    number: int
+    dots: tuple[Point, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A rectangle over the whole height."""
+
+    x: float
+    width: float
+    tone: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """At `at` px, with a label at `row_y` px that begins (or ends) at its side."""
+
+    at: float
+    name: str
+    anchor: str
+    row_y: float
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """All coordinates of a chart at one size, px; `limits` are heights."""
+
+    size: Size
+    left: float
+    right: float
+    top: float
+    bottom: float
+    x_ticks: tuple[Tick, ...]
+    y_ticks: tuple[Tick, ...]
+    grounds: tuple[Area, ...]
+    bands: tuple[Path, ...]
+    paths: tuple[Path, ...]
+    marks: tuple[Line, ...]
+    limits: tuple[float, ...]
+
+
+def legend(charts: Sequence[Chart]) -> list[tuple[str, str]]:
+    """(class, name) of what has to be named beside some plots, each once: series where a plot has several, limits,
+    grounds."""
+    named: dict[tuple[str, str], None] = {}
+    for chart in charts:
+        if len(chart.series) > 1:
+            named |= {(f"s{number} {each.shape}", each.name): None for number, each in enumerate(chart.series)}
+        named |= {("limit", each.name): None for each in chart.limits}
+        named |= {(f"ground {each.tone}", each.name): None for each in chart.grounds}
+    return list(named)
+
+
+def drawn(chart: Chart, size: Size) -> Drawing:
+    """The chart at a size."""
+    xs = [x for each in chart.series for x, y in each.points if isfinite(x) and isfinite(y)]
+    xs += [x for each in chart.grounds for x in (each.begin, each.end)]
+    ys = [y for each in chart.series for _, y in each.points if _shown(y, chart)]
+    ys += [y for each in chart.series for _, low, high in each.band for y in (low, high) if _shown(y, chart)]
+    ys += [each.at for each in chart.limits if _shown(each.at, chart)]
+    x_low, x_high = _ends(xs, chart.log_x, 0.0, False)
+    y_low, y_high = _ends(ys, chart.log_y, 0.06, chart.from_zero)
+    left, right, bottom = float(LEFT), float(size.width - RIGHT), float(size.height - BOTTOM)
+
+    def x_of(x: float) -> float:
+        return left + (right - left) * _share(x, x_low, x_high, chart.log_x)
+
+    marks = _marks([(x_of(each.at), each.name) for each in chart.marks if x_low <= each.at <= x_high], right)
+    top = max((line.row_y + ROW_PX / 2 for line in marks if line.name), default=float(TOP))
+
+    def y_of(y: float) -> float:
+        return bottom - (bottom - top) * _share(y, y_low, y_high, chart.log_y)
+
+    chosen = chart.x_ticks or tuple((x, ticks.label(x)) for x in _round(x_low, x_high, chart.log_x, size.x_ticks))
+    bands = (
+        Path(_band([(x_of(x), y_of(low), y_of(high)) for x, low, high in each.band]), "band", number)
+        for number, each in enumerate(chart.series)
+        if each.band
+    )
+    paths = []
+    for number, each in enumerate(chart.series):
+        at = [(x_of(x), y_of(y)) if _shown(y, chart) else None for x, y in each.points]
+        dots = tuple((round(p[0], 1), round(p[1], 1)) for p in at if p is not None) if each.shape == "points" else ()
+        paths.append(Path("" if dots else _joined(at, each.shape == "steps"), each.shape, number, dots))
+    grounds = tuple(
+        Area(round(x_of(each.begin), 1), round(max(x_of(each.end) - x_of(each.begin), 1.0), 1), each.tone, each.name)
+        for each in chart.grounds
+    )
+    y_marks = _round(y_low, y_high, chart.log_y, size.y_ticks)
+    return Drawing(
+        size=size, left=left, right=right, top=top, bottom=bottom,
+        x_ticks=_apart([Tick(round(x_of(x), 1), text) for x, text in chosen]),
+        y_ticks=tuple(Tick(round(y_of(y), 1), ticks.label(y)) for y in y_marks),
+        grounds=grounds, bands=tuple(bands), paths=tuple(paths),
+        marks=marks, limits=tuple(round(y_of(each.at), 1) for each in chart.limits if _shown(each.at, chart)),
+    )  # fmt: skip
+
+
+def _shown(y: float, chart: Chart) -> bool:
+    return isfinite(y) and (y > 0 or not chart.log_y)
+
+
+def _ends(values: list[float], log: bool, margin: float, from_zero: bool) -> tuple[float, float]:
+    """Of an axis, with a share of its length as margin; an axis of one value, or none, has a length all the same."""
+    low, high = (min(values), max(values)) if values else (0.0, 1.0)
+    if log:
+        low, high = (low, high) if values and low > 0 else (0.1, 1.0)
+        low, high = (low / 2, high * 2) if high <= low else (low, high)
+        spread = (high / low) ** margin
+        return low / spread, high * spread
+    low = min(low, 0.0) if from_zero else low
+    if high <= low:
+        reach = abs(low) / 2 or 1.0
+        low, high = (low, high + reach) if from_zero else (low - reach, high + reach)
+    reach = margin * (high - low)
+    return (low if from_zero and low == 0.0 else low - reach), high + reach
+
+
+def _share(value: float, low: float, high: float, log: bool) -> float:
+    if log:
+        value, low, high = log10(max(value, low / 10)), log10(low), log10(high)
+    return (value - low) / (high - low)
+
+
+def _round(low: float, high: float, log: bool, most: int) -> list[float]:
+    return ticks.logarithmic(low, high) if log else ticks.linear(low, high, most)
+
+
+def _apart(every: list[Tick]) -> tuple[Tick, ...]:
+    """Those whose labels do not run into each other."""
+    kept: list[Tick] = []
+    for tick in every:
+        room = LETTER_PX * (len(tick.label) + len(kept[-1].label)) / 2 + 6 if kept else 0.0
+        if not kept or tick.at - kept[-1].at >= room:
+            kept.append(tick)
+    return tuple(kept)
+
+
+def _marks(every: Sequence[tuple[float, str]], right: float) -> tuple[Line, ...]:
+    """(x, name) of each above the plot, in as many rows as keep names from running into each other."""
+    ends: list[float] = []
+    lines = []
+    for at, name in sorted(every):
+        length = LETTER_PX * len(name) + 8
+        begin, anchor = (at, "start") if at + length <= right else (at - length, "end")
+        row = next((number for number, end in enumerate(ends) if begin >= end), len(ends))
+        ends[row : row + 1] = [begin + length]
+        lines.append(Line(round(at, 1), name, anchor, TOP + ROW_PX * row))
+    return tuple(lines)
+
+
+def _joined(points: Sequence[Point | None], steps: bool) -> str:
+    """The line through the points, broken where there is none."""
+    parts: list[str] = []
+    before: Point | None = None
+    for point in points:
+        if point is not None:
+            x, y = point
+            if before is None:
+                parts.append(f"M{x:.1f} {y:.1f}")
+            else:
+                parts.append(f"H{x:.1f}V{y:.1f}" if steps else f"L{x:.1f} {y:.1f}")
+        before = point
+    return "".join(parts)
+
+
+def _band(edges: Sequence[tuple[float, float, float]]) -> str:
+    around = [(x, low) for x, low, _ in edges] + [(x, high) for x, _, high in reversed(edges)]
+    return _joined(around, steps=False) + "Z"

@@ -1,0 +1,47 @@
+"""Where an axis has its ticks."""
+
+from __future__ import annotations
+
+from math import ceil, floor, isfinite, log10
+
+STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+"""Between two ticks of a linear axis, times a power of ten."""
+
+LOG_STEPS = ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0))
+"""Of a decade of a logarithmic axis, the sparsest first."""
+
+LOG_ENOUGH = 3
+"""Ticks that a logarithmic axis has at least, if its decades allow."""
+
+
+def linear(low: float, high: float, most: int) -> list[float]:
+    """Round numbers within both ends, at most so many (2 or more), as many as possible."""
+    if not (isfinite(low) and isfinite(high)) or high <= low:
+        return [low]
+    rough = (high - low) / most
+    decade = 10.0 ** floor(log10(rough))
+    for step in (factor * decade * scale for scale in (1.0, 10.0) for factor in STEPS):
+        first, last = ceil(low / step - 1e-9), floor(high / step + 1e-9)
+        if last - first + 1 <= most:
+            return [round(number * step, 12) for number in range(first, last + 1)]
+    return [low, high]
+
+
+def logarithmic(low: float, high: float) -> list[float]:
+    """Round numbers within both ends, which are above zero."""
+    found: list[float] = []
+    for steps in LOG_STEPS:
+        found = [
+            step * 10.0**decade
+            for decade in range(floor(log10(low)), ceil(log10(high)) + 1)
+            for step in steps
+            if low * (1 - 1e-9) <= step * 10.0**decade <= high * (1 + 1e-9)
+        ]
+        if len(found) >= LOG_ENOUGH:
+            return found
+    return found
+
+
+def label(value: float) -> str:
+    """As short as it can be, with a true minus."""
+    return f"{value:g}".replace("-", "−")

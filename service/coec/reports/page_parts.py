@@ -1,0 +1,299 @@
+"""Parts that pages of several commands have in common, from wire models to blocks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+from math import log2
+from pathlib import Path
+
+import numpy as np
+
+from coec.calibration.figures import FIGURES, OTHER_ADVICE
+from coec.calibration.monitor.sensor_faults import CAUSES
+from coec.errors import OutputError
+from coec.geometry import se3
+from coec.reports.console import AXIS_NAMES, UNITS
+from coec.reports.page import (
+    AxesTable,
+    AxisLine,
+    Block,
+    Compare,
+    Copies,
+    Copy,
+    FigureLine,
+    Figures,
+    Picture,
+    Pictures,
+    Tone,
+)
+from coec.reports.page.words import number, significant, size
+from coec.schemas.replies import MetricReply, Reason, Transform
+
+TONES: Mapping[str, Tone] = {
+    "accepted": "good",
+    "healthy": "good",
+    "calibrated": "good",
+    "suspect": "unsure",
+    "undecided": "unsure",
+    "not_accepted": "unsure",
+    "degraded": "poor",
+    "failed": "bad",
+    "miscalibrated": "bad",
+    "camera_moved": "bad",
+    "lidar_moved": "bad",
+}
+"""Of states and decisions; what is not here says neither good nor bad."""
+
+DIGITS = {"deg": 3, "m": 4}
+"""After the point: a thousandth of a degree, a tenth of a millimetre, which is below any σ."""
+
+SHOWN_UNITS = {"deg": "°", "m": "m"}
+
+PLENTY = 4.0
+"""Times its limit a figure is kept by, to stand at the end of its margin; a quarter of it, to stand at the other."""
+
+CAPTIONS: Mapping[str, tuple[str, str]] = {
+    "overlay_before": (
+        "LiDAR points drawn on the camera image at the start",
+        "Before: points at the extrinsic that the search began with, coloured by range.",
+    ),
+    "overlay_after": (
+        "The same LiDAR points on the same image at the result",
+        "After: the same points at the result.",
+    ),
+    "overlay": (
+        "LiDAR points drawn on the camera image at the extrinsic that was checked",
+        "Points at the extrinsic that was checked, coloured by range. Where it is right they end where things end.",
+    ),
+    "closeup_before": (
+        "Part of the camera image with LiDAR points where the service put them before the repair",
+        "Before the repair: LiDAR points where the service put them, coloured by range.",
+    ),
+    "closeup_after": (
+        "The same part of the same image with the points after the repair",
+        "After it, on the same picture.",
+    ),
+    "close_ups": (
+        "Enlarged parts of the image with the range edges of the LiDAR, at the start and at the result",
+        "Close-ups where both extrinsics differ most: range edges should lie on the edges of the image.",
+    ),
+    "residuals": (
+        "Map over the image of how well range edges and image edges agree at the result",
+        "Where in the image range edges and image edges agree at the result, and where they do not.",
+    ),
+    "camera_fit": (
+        "Map over the image of how far the fitted camera model is from the one it stands for",
+        "What the fitted camera model misses, in pixels over the image.",
+    ),
+    "bullseye": (
+        "Start directions coloured by final error, and final errors as seen from the reference",
+        "Left, where the searches started; right, where they ended. Inside the green ring is a hit.",
+    ),
+    "profiles": (
+        "Curves of the objective along each axis about the reference",
+        "The objective and its witnesses along each axis, from afar and from near: a good one has one peak, at zero.",
+    ),
+    "normalised": (
+        "Errors over claimed standard deviations, as histograms and reliability curves",
+        "Errors over what was claimed for them.",
+    ),
+    "metrics": (
+        "The paper's three figures at right and wrong extrinsics, with learned limits",
+        "The three figures of equation (2) at right and at wrong extrinsics.",
+    ),
+    "drive": (
+        "Errors of pitch, yaw and roll along the drive",
+        "Errors of every window along the drive.",
+    ),
+}
+"""Alternative text and caption of a picture by the stem of its file."""
+
+SLID = ("overlay_before", "overlay_after")
+"""Two of one size that are shown in one place."""
+
+
+def file_picture(path: Path) -> Picture:
+    """A picture that lies on the disk, with what `CAPTIONS` says of it.
+
+    Raises:
+        OutputError: it cannot be read any more.
+    """
+    alt, caption = CAPTIONS.get(path.stem) or (path.stem.replace("_", " "), path.stem.replace("_", " ").capitalize())
+    return Picture(read(path), alt, caption)
+
+
+def read(path: Path) -> bytes:
+    """A file that was just written.
+
+    Raises:
+        OutputError: it cannot be read any more.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise OutputError(f"cannot read {path}, which was just written: {error.strerror}") from error
+
+
+def pictures_of(paths: Sequence[Path]) -> tuple[Block, ...]:
+    """The pictures among some files, the two overlays in one place.
+
+    Raises:
+        OutputError: one cannot be read.
+    """
+    shown = {path.stem: file_picture(path) for path in paths if path.suffix == ".png"}
+    blocks: list[Block] = []
+    if all(name in shown for name in SLID):
+        before, after = (shown.pop(name) for name in SLID)
+        blocks.append(Compare(before, after, "Start and result"))
+    if shown:
+        blocks.append(Pictures(tuple(shown.values())))
+    return tuple(blocks)
+
+
+def axis_value(value: float | None, axis: int, sign: bool = True) -> str:
+    """A rotation or translation, with the digits of its unit."""
+    return number(value, DIGITS[UNITS[axis]], sign)
+
+
+def axes_table(
+    caption: str,
+    value_name: str,
+    values: Sequence[float | None],
+    sigmas: Sequence[float | None],
+    words: Mapping[int, str] | None = None,
+    more: Mapping[str, Sequence[str]] | None = None,
+) -> AxesTable:
+    """Six axes, deg and m; `words` stand where there is no value, `more` are further columns by their heads."""
+    words, more = words or {}, more or {}
+    widest = {
+        unit: max(
+            (abs(value) + (sigma or 0.0) for axis, (value, sigma) in enumerate(zip(values, sigmas, strict=True))
+             if value is not None and axis not in words and UNITS[axis] == unit),
+            default=0.0,
+        )
+        for unit in SHOWN_UNITS
+    }  # fmt: skip
+    lines = []
+    for axis, (value, sigma) in enumerate(zip(values, sigmas, strict=True)):
+        unit = UNITS[axis]
+        scale = widest[unit] or 1.0
+        told = value is not None and axis not in words
+        lines.append(
+            AxisLine(
+                name=AXIS_NAMES[axis],
+                value=axis_value(value, axis) if told else words.get(axis, "not told"),
+                sigma=axis_value(sigma, axis, sign=False) if told else "",
+                unit=SHOWN_UNITS[unit],
+                share=value / scale if told and value is not None else None,
+                sigma_share=sigma / scale if told and sigma is not None else None,
+                more=tuple(column[axis] for column in more.values()),
+            )
+        )
+    return AxesTable(caption, value_name, tuple(lines), tuple(more))
+
+
+def copies_of(transform: Transform, camera: str, lidar: str) -> Copies:
+    """A transform in the forms that other programs take."""
+    T_lidar_camera = se3.inverse(np.array(transform.matrix))
+    rows = [list(row) for row in transform.matrix]
+    inverse = [[float(value) for value in row] for row in T_lidar_camera]
+    x, y, z, w = transform.quaternion_xyzw
+    return Copies(
+        (
+            Copy(
+                "T_camera_lidar, 4 × 4",
+                f"p_camera = T · p_lidar, metres: from {lidar} to {camera}. The copy has every digit, as JSON.",
+                _matrix(rows),
+                json.dumps(rows),
+            ),
+            Copy(
+                "Translation and quaternion",
+                "The same as x y z (m) and qx qy qz qw, the order of ROS and Eigen's coefficients.",
+                _matrix((transform.translation_m, (x, y, z, w))),
+                " ".join(repr(value) for value in (*transform.translation_m, x, y, z, w)),
+            ),
+            Copy(
+                "T_lidar_camera, 4 × 4",
+                f"The inverse: from {camera} to {lidar}. As JSON.",
+                _matrix(inverse),
+                json.dumps(inverse),
+            ),
+        )
+    )
+
+
+def figures_block(
+    caption: str, metrics: Mapping[str, MetricReply], *, compared: frozenset[str] = frozenset()
+) -> Figures:
+    """Every figure with its limit, its meaning and, where it fails, what to do; those that fail first. Of `compared`
+    nothing follows: no advice."""
+    lines = [_figure(name, metric, name in compared) for name, metric in metrics.items()]
+    return Figures(caption, tuple(sorted(lines, key=lambda line: line.met is not False)))
+
+
+def title_of(name: str) -> str:
+    """What a figure is called, with its name in documents."""
+    known = FIGURES.get(name)
+    if known is None:
+        return name
+    return f"{known.title}, {known.unit} ({name})" if known.unit else f"{known.title} ({name})"
+
+
+def advice_of(reasons: Sequence[Reason]) -> tuple[str, ...]:
+    """What to do about reasons, each thing once."""
+    return tuple(dict.fromkeys(text for reason in reasons if (text := _advice(reason.code))))
+
+
+def turn_and_shift(correction: Sequence[float | None]) -> str:
+    """How far a correction (deg, m) turns and shifts, in words."""
+    turn, shift = size(correction[:3]), size(correction[3:])
+    told = f"turned by {number(turn, 2)}°"
+    return told if not shift else f"{told} and shifted by {number(100.0 * shift, 1)} cm"
+
+
+def _advice(code: str) -> str:
+    if code in FIGURES:
+        return FIGURES[code].advice
+    if code in CAUSES:
+        return CAUSES[code].advice
+    return OTHER_ADVICE.get(code, "")
+
+
+def _figure(name: str, metric: MetricReply, compared: bool) -> FigureLine:
+    known = FIGURES.get(name)
+    met = None if metric.limit is None else metric.passed
+    meaning = "" if known is None else known.tells
+    if met is False and known is not None:
+        meaning = f"{meaning} Here: {known.fails}."
+    return FigureLine(
+        code=name,
+        title=name if known is None else known.title,
+        value=significant(metric.value),
+        unit="" if known is None else known.unit,
+        limit="" if metric.limit is None else f"{'≥' if metric.at_least else '≤'} {significant(metric.limit)}",
+        met=met,
+        margin=_margin(metric),
+        meaning=meaning,
+        advice="" if met is not False or known is None or compared else known.advice,
+    )
+
+
+def _margin(metric: MetricReply) -> float | None:
+    if metric.value is None or metric.limit is None or metric.limit <= 0.0:
+        return None
+    if metric.value <= 0.0:
+        return 0.0 if metric.at_least else 1.0
+    times = metric.value / metric.limit if metric.at_least else metric.limit / metric.value
+    return min(max(0.5 + 0.5 * log2(times) / log2(PLENTY), 0.0), 1.0)
+
+
+def _matrix(rows: Sequence[Sequence[float]]) -> str:
+    return _columns([[f"{value + 0.0:.9f}" for value in row] for row in rows])
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> str:
+    """Rows as lines, their numbers one under the other."""
+    widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=False)) for row in rows)
