@@ -7,8 +7,9 @@ and nothing else.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
+from typing import Any
 
 import typer
 
@@ -88,7 +89,7 @@ def main() -> int:
     except CoecError as error:
         print(f"coec: {error}", file=sys.stderr)
         if as_json:
-            _print_error(error.reply_code, str(error))
+            _print_error(error.reply_code, str(error), error.details)
         return error.exit_code
     except BrokenPipeError:
         # Whoever read our output has gone; nobody is left to be told, also not by the interpreter at its exit.
@@ -104,7 +105,7 @@ def main() -> int:
     return 0
 
 
-def _print_error(code: str, message: str) -> None:
+def _print_error(code: str, message: str, details: Mapping[str, Any] | None = None) -> None:
     import json
 
-    print(json.dumps({"error": {"code": code, "message": message}}, ensure_ascii=False))
+    print(json.dumps({"error": {"code": code, "message": message}, **(details or {})}, ensure_ascii=False))

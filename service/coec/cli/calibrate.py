@@ -14,17 +14,18 @@ from rich.progress import Progress, TaskID
 from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.adapters.files.conversions import result_of
+from coec.adapters.files.output import OutputError
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.calibrator import calibrate
+from coec.calibration.confidence.lens_limit import require_fit
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.types import Rig, Window
 from coec.cli.commands.calibrate import Options
-from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
+from coec.config import CalibrationConfig, LimitsConfig, VerdictConfig, WindowConfig, describe
 from coec.errors import UsageError
-from coec.geometry import se3
 from coec.geometry.cameras import name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
-from coec.reports import console, pictures
+from coec.reports import calibration, console, pictures
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationReport, CalibrationResult
 from coec.sources import windows
@@ -73,8 +74,10 @@ def run(options: Options) -> int:
     """Prints the result; 1 if its verdict is negative.
 
     Raises:
-        CoecError: there is no result.
+        CoecError: there is no result, or nothing can be written where it is to be.
     """
+    if options.output is not None:
+        output.try_folder(options.output)
     xi = None if options.perturb is None else windows.vector_of("--perturb", options.perturb)
     with console.progress() as bars:
         times = StageTimes(bars)
@@ -94,16 +97,32 @@ def run(options: Options) -> int:
             times.step("time offset", 1, 1)
     result = result_of(estimate, window.rig, loaded.vehicle)
     document = _document(result, times.elapsed_s(), fit, offset)
+    written, not_written = [], None
     if options.output is not None:
-        _write(options.output, window, result, configuration, document)
+        try:
+            written = _write(options.output, window, result, configuration, document)
+        except OutputError as error:
+            not_written = error
+            document["not_written"] = str(error)
     if options.as_json:
         console.print_json(document)
     else:
-        _show(window, result, document, fit, offset)
+        calibration.show(
+            window,
+            result,
+            configuration=configuration,
+            camera_fit=document.get("camera_fit"),
+            time_offset=document.get("time_offset"),
+            elapsed_s=document["elapsed_s"],
+        )
+    if not_written is not None:
+        console.say(f"coec: {not_written}")
+    elif options.output is not None and not options.as_json:
+        calibration.show_written(options.output, written)
     if loaded.unpaired:
         causes = ", ".join(f"{count} {cause}" for cause, count in sorted(loaded.unpaired.items()))
         console.say(f"coec: frames without a partner: {causes}")
-    return 0 if result.verdict.decision == "accepted" else 1
+    return 0 if result.verdict.decision == "accepted" and not_written is None else 1
 
 
 def configuration_of(options: Options, recorded: CalibrationConfig | None) -> CalibrationConfig:
@@ -128,11 +147,17 @@ def configuration_of(options: Options, recorded: CalibrationConfig | None) -> Ca
 
 
 def refitted(window: Window, model: str) -> tuple[Window, CameraFit]:
-    """The window seen through another camera model that was fitted to its own."""
+    """The window seen through another camera model that was fitted to its own.
+
+    Raises:
+        UsageError: there is no such model to fit.
+        LensError: it does not fit the lens.
+    """
     if model != FITTED:
         raise UsageError(f"--camera-model {model}: only {FITTED} can be fitted")
     rig: Rig = window.rig
     fit = fit_double_sphere(rig.camera)
+    require_fit(rig.camera, fit, VerdictConfig().max_sigma_deg)
     quality = CameraFit(FITTED, name_of(rig.camera), fit.residual_rms_px, fit.residual_max_px, fit.coverage)
     fitted = replace(rig, camera=fit.camera, camera_residual_px=fit.residual_max_px)
     return replace(window, rig=fitted), quality
@@ -169,7 +194,7 @@ def _finite(value: float) -> float | None:
 
 def _write(
     folder: Path, window: Window, result: CalibrationResult, configuration: CalibrationConfig, document: dict[str, Any]
-) -> None:
+) -> list[Path]:
     T_found = np.array(result.camera_from_lidar.matrix)
     moved_deg = windows.rotation_error_deg(T_found, window.T_camera_lidar_start)
     where = f"{window.rig.pair}  {pictures.middle(window).stamp_ns} ns"
@@ -177,49 +202,5 @@ def _write(
         "overlay_before": (window.T_camera_lidar_start, f"{where}  start"),
         "overlay_after": (T_found, f"{where}  {result.verdict.decision}, {moved_deg:.2f} deg from the start"),
     }
-    pictures.write_overlays(folder, window, poses, configuration.motion_compensation)
-    output.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))
-
-
-def _show(
-    window: Window,
-    result: CalibrationResult,
-    document: dict[str, Any],
-    fit: CameraFit | None,
-    offset: TimeOffset | None,
-) -> None:
-    start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
-    start[:3] = np.degrees(start[:3])
-    console.show(f"{window.window_id}: {result.pairs} pairs, {result.points_in_view} points in view")
-    axes = console.table("axis", "start", "correction", "± σ", "unit", right=(1, 2, 3))
-    for axis, name in enumerate(console.AXIS_NAMES):
-        unsolved = "not observable" if result.unobservable[axis] else "not searched"
-        found = console.figure(result.correction[axis], sign=True) if result.solved[axis] else unsolved
-        spread = console.figure(result.sigma[axis]) if result.solved[axis] else ""
-        axes.add_row(name, console.figure(start[axis], sign=True), found, spread, console.UNITS[axis])
-    console.out.print(axes)
-    console.show_verdict(result)
-    if fit is not None:
-        console.show(
-            f"{fit.model} fitted to {fit.of}: {fit.residual_rms_px:.4f} px rms, {fit.residual_max_px:.4f} px at most"
-        )
-    if offset is not None:
-        console.show(f"camera after its stamp: {_offset_text(offset)}")
-    if result.independent_looks is not None:
-        console.show(
-            f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent looks{_together(result)}"
-        )
-    stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in document["elapsed_s"].items())
-    console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")
-
-
-def _together(result: CalibrationResult) -> str:
-    """How the errors of turns and shifts go together, where both were solved."""
-    pairs = {"pitch and height": result.correlation_pitch_height, "yaw and side": result.correlation_yaw_side}
-    told = ", ".join(f"{names} {value:+.2f}" for names, value in pairs.items() if value is not None)
-    return f"; correlation of errors: {told}" if told else ""
-
-
-def _offset_text(offset: TimeOffset) -> str:
-    fitted = f"{1e3 * offset.offset_s:+.1f} ± {1e3 * offset.sigma_s:.1f} ms"
-    return f"{fitted}, {offset.reason}" if offset.observable else f"not observable, {offset.reason}"
+    overlays = pictures.write_overlays(folder, window, poses, configuration.motion_compensation)
+    return [*overlays, output.write(folder / "result.json", to_json(CalibrationReport.model_validate(document)))]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, sqrt
+from math import hypot
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.lens_limit import lens_error_px
 from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.geometry.cameras import pixel_rad
 from coec.geometry.edges.range_edges import NEIGHBOUR_RAD
@@ -40,15 +41,11 @@ class Grain:
 
 
 def grain_of(window: Window, T_camera_lidar: Matrix4, held_m: float) -> Grain:
-    """Of a window, its camera at `T_camera_lidar` (4, 4); a centre that is held is known to `held_m`.
-
-    Of a fitted camera any miss up to its largest is as likely as another where the edges happen to lie: they gather on
-    the horizon and at the rim, and the fit was best for all of the image.
-    """
+    """Of a window, its camera at `T_camera_lidar` (4, 4); a centre that is held is known to `held_m`."""
     velocity_mps, turn_radps = _rates(window, T_camera_lidar)
     return Grain(
         pixel_rad=pixel_rad(window.rig.camera),
-        lens_px=hypot(LENS_PX, window.rig.camera_residual_px / sqrt(3.0)),
+        lens_px=hypot(LENS_PX, lens_error_px(window.rig.camera_residual_px)),
         column_rad=column_rad(window.pairs[0].lidar),
         velocity_mps=velocity_mps,
         turn_radps=turn_radps,
