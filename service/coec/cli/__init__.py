@@ -6,6 +6,7 @@ and nothing else.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -16,6 +17,7 @@ import typer
 from coec.cli.declaring import taking
 from coec.cli.exit_codes import BROKEN_PIPE, FAULT
 from coec.errors import CoecError, UsageError
+from coec.reports import plain_text
 
 GROUPS = ("models", "sim", "fleet")
 """Commands that have commands."""
@@ -52,9 +54,11 @@ COMMANDS = (
 def application(words: Sequence[str]) -> typer.Typer:
     """The commands that a command line can mean: the one that its first word names, and all where none is named, for
     the help text or the refusal. To declare one takes a millisecond, and most calls need no other."""
+    plain = plain_text.wants_plain(os.environ) or not plain_text.is_unicode(sys.stdout.encoding)
     app = typer.Typer(
         name="coec",
         no_args_is_help=True,
+        rich_markup_mode=None if plain else "rich",
         pretty_exceptions_enable=False,
         add_completion=False,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -79,8 +83,12 @@ def _coec() -> None:
 def main() -> int:
     """Entry point; returns the exit status."""
     as_json = "--json" in sys.argv[1:]
+    plain_text.never_fail()
     try:
-        application(sys.argv[1:])()
+        command = typer.main.get_command(application(sys.argv[1:]))
+        if not plain_text.is_unicode(sys.stdout.encoding):
+            _with_signs_of(sys.stdout.encoding, command)
+        command(prog_name="coec")
     except SystemExit as ended:
         status = ended.code if isinstance(ended.code, int) else 0
         if status == UsageError.exit_code and as_json:
@@ -103,6 +111,16 @@ def main() -> int:
             _print_error("internal", f"{type(error).__name__}: {error}")
         return FAULT
     return 0
+
+
+def _with_signs_of(encoding: str, command: Any) -> None:
+    """Help texts of a command and of those below it in a locale that lacks signs: they would be sent as UTF-8 all the
+    same."""
+    for told in (command, *command.params):
+        if getattr(told, "help", None):
+            told.help = plain_text.encodable(told.help, encoding)
+    for below in getattr(command, "commands", {}).values():
+        _with_signs_of(encoding, below)
 
 
 def _print_error(code: str, message: str, details: Mapping[str, Any] | None = None) -> None:
