@@ -16,6 +16,7 @@ import typer
 
 from coec.cli.declaring import taking
 from coec.cli.exit_codes import BROKEN_PIPE, FAULT
+from coec.cli.stopping import no_interrupt_lost
 from coec.errors import CoecError, UsageError
 from coec.reports import plain_text
 
@@ -88,9 +89,15 @@ def main() -> int:
         command = typer.main.get_command(application(sys.argv[1:]))
         if not plain_text.is_unicode(sys.stdout.encoding):
             _with_signs_of(sys.stdout.encoding, command)
-        command(prog_name="coec")
+        with no_interrupt_lost():
+            command(prog_name="coec")
     except SystemExit as ended:
         status = ended.code if isinstance(ended.code, int) else 0
+        # A command that ends so by itself has said why.
+        if isinstance(getattr(ended.__context__, "__cause__", None), KeyboardInterrupt):
+            print("coec: interrupted", file=sys.stderr)
+            if as_json:
+                _print_error("interrupted", "ended by Ctrl-C before there was a result")
         if status == UsageError.exit_code and as_json:
             _print_error("bad_request", "the command line does not fit; standard error says how")
         return status

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from math import degrees, radians
 from typing import Any, cast
 
@@ -17,6 +17,7 @@ from coec.calibration.types import Matrix4, Window
 from coec.cli import calibrate as calibrate_command
 from coec.cli.commands import calibrate
 from coec.cli.commands.evaluate import Options
+from coec.cli.exit_codes import INTERRUPTED
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig, describe
 from coec.errors import CalibrationError, UsageError
 from coec.evaluation import experiments, normalised_errors, split_halves, statistics
@@ -73,18 +74,19 @@ class _Subject:
     vehicle: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Experiments:
-    """What came of the experiments that were asked for."""
+    """What has come of the experiments that were asked for. `interrupted`: not of all of them."""
 
     from_reference: Outcome
-    outcomes: list[Outcome]
-    frames: tuple[FramesPoint, ...]
-    slices: tuple[SlicePoint, ...]
-    halves: Halves | None
-    normalised: dict[str, NormalisedErrors]
-    detection: DetectionReport | None
-    steps: tuple[StepRow, ...]
+    outcomes: list[Outcome] = field(default_factory=list)
+    frames: tuple[FramesPoint, ...] = ()
+    slices: tuple[SlicePoint, ...] = ()
+    halves: Halves | None = None
+    normalised: dict[str, NormalisedErrors] = field(default_factory=dict)
+    detection: DetectionReport | None = None
+    steps: tuple[StepRow, ...] = ()
+    interrupted: bool = False
 
 
 def run(options: Options) -> int:
@@ -93,6 +95,8 @@ def run(options: Options) -> int:
     Raises:
         CoecError: there is nothing to evaluate.
     """
+    if options.output is not None:
+        output.try_folder(options.output)
     with console.progress() as bars:
         stages = Stages(bars)
         subject = _subject(options, stages)
@@ -101,15 +105,17 @@ def run(options: Options) -> int:
             document = _compare(options, subject, bars, stages)
         else:
             document, _ = _evaluate(options, subject, stages)
-    if options.output is not None:
-        output.write(options.output / "report.json", to_json(document))
     if options.as_json:
         console.print_json(document.model_dump(mode="json"))
     elif isinstance(document, ComparisonReport):
         evaluation_tables.show_comparison(document)
     else:
         evaluation_tables.show(document)
-    return 0
+    if options.output is not None:
+        output.write(options.output / "report.json", to_json(document))
+    if document.interrupted:
+        console.say("coec: interrupted: the figures are of what was finished")
+    return INTERRUPTED if document.interrupted else 0
 
 
 def configuration_of(options: Options, recorded: CalibrationConfig | None) -> CalibrationConfig:
@@ -192,16 +198,23 @@ def _compare(options: Options, subject: _Subject, bars: Progress, stages: Stages
         if folder is not None:
             output.write(folder / "report.json", to_json(reports[method]))
         heard(1, "")
+        if reports[method].interrupted:
+            break
+    interrupted = any(report.interrupted for report in reports.values())
     if not reports:
         raise CalibrationError("; ".join(f"{method}: {reason}" for method, reason in not_evaluated.items()))
-    if options.output is not None:
+    if options.output is not None and not interrupted:
         # matplotlib takes a second to import.
         from coec.reports import evaluation_pictures
 
         of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
         evaluation_pictures.write_comparison(options.output, subject.window.window_id, of_starts, outcomes)
     return ComparisonReport(
-        source=options.source, methods=reports, not_evaluated=not_evaluated, elapsed_s=stages.elapsed_s()
+        source=options.source,
+        methods=reports,
+        not_evaluated=not_evaluated,
+        interrupted=interrupted,
+        elapsed_s=stages.elapsed_s(),
     )
 
 
@@ -214,7 +227,7 @@ def _evaluate(options: Options, subject: _Subject, stages: Stages) -> tuple[Eval
     configuration = configuration_of(options, subject.recorded)
     bench = Bench(subject.window, subject.depth, experiments.greys_of(subject.window), configuration)
     done = _experiments(options, subject, bench, stages)
-    if options.output is not None:
+    if options.output is not None and not done.interrupted:
         # matplotlib takes a second to import.
         from coec.reports import evaluation_pictures
 
@@ -223,43 +236,59 @@ def _evaluate(options: Options, subject: _Subject, stages: Stages) -> tuple[Eval
         evaluation_pictures.write(options.output, bench, of_starts, done.outcomes, done.frames, done.slices, draw)
         if done.normalised:
             evaluation_pictures.write_normalised(options.output, bench.window.window_id, done.normalised)
+    if options.output is not None:
         table = evaluation_tables.csv_of(bench.reference, done.outcomes)
         output.write(options.output / "starts.csv", table.encode())
     return _report(options, bench, subject.vehicle, done, stages.elapsed_s()), done.outcomes
 
 
 def _experiments(options: Options, subject: _Subject, bench: Bench, stages: Stages) -> _Experiments:
+    """All that were asked for, or after Ctrl-C those that were finished, if at least one start was."""
+    poses = experiments.poses_of(bench, options.directions, options.rotation_deg, options.translation_m)
+    done = _Experiments(experiments.from_reference(bench, stages))
+    try:
+        for outcome in experiments.from_starts(bench, poses, stages):
+            done.outcomes.append(outcome)
+        _add_further(done, options, subject, bench, poses, stages)
+    except KeyboardInterrupt:
+        if not done.outcomes:
+            raise
+        done.interrupted = True
+    return done
+
+
+def _add_further(
+    done: _Experiments, options: Options, subject: _Subject, bench: Bench, poses: Sequence[Matrix4], stages: Stages
+) -> None:
     def cut(begin_s: float, end_s: float) -> Window:
         between_s = (begin_s, end_s)
         loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda *_: None, between_s)
         # With the rig of the whole: it may have another camera model.
         return replace(loaded.window, rig=subject.window.rig)
 
-    poses = experiments.poses_of(bench, options.directions, options.rotation_deg, options.translation_m)
-    from_reference = experiments.from_reference(bench, stages)
-    outcomes = experiments.from_starts(bench, poses, stages)
-    frames = experiments.against_frames(bench, poses, stages) if options.against_frames else ()
-    slices = experiments.against_slice(bench, subject.model, cut, poses, stages) if options.against_slice else ()
+    if options.against_frames:
+        done.frames = experiments.against_frames(bench, poses, stages)
+    if options.against_slice:
+        done.slices = experiments.against_slice(bench, subject.model, cut, poses, stages)
     radii = (radians(options.rotation_deg), options.translation_m)
     splits = options.halves or options.nees
     halved = experiments.in_halves(bench, splits, *radii, stages) if splits else []
-    halves = None
     if options.halves:
-        halves = split_halves.compare(halved, len(bench.window.pairs) // 2, bench.configuration.search.dof)
-    normalised = {}
+        done.halves = split_halves.compare(halved, len(bench.window.pairs) // 2, bench.configuration.search.dof)
     if options.nees:
         against, true_pose = _truth(options.source, bench)
         starts = experiments.poses_of(bench, options.nees, options.rotation_deg, options.translation_m)
         apart = experiments.in_windows(bench, subject.model, cut, starts, true_pose, stages)
-        normalised[against] = normalised_errors.normalise(normalised_errors.of_outcomes(apart), len(apart))
+        done.normalised[against] = normalised_errors.normalise(normalised_errors.of_outcomes(apart), len(apart))
         # Every split sees the same frames: they count as one.
-        normalised[OTHER_HALF] = normalised_errors.normalise(normalised_errors.of_differences(halved), independent=1)
-    detection = None
+        done.normalised[OTHER_HALF] = normalised_errors.normalise(
+            normalised_errors.of_differences(halved), independent=1
+        )
     if options.detection:
         tried = experiments.detected(bench, options.detection, experiments.CHECKS, stages)
-        detection = detection_of(tried, options.detection, len(bench.window.pairs))
-    knocked = experiments.knocked(bench, options.steps, stages) if options.steps else []
-    return _Experiments(from_reference, outcomes, frames, slices, halves, normalised, detection, steps_of(knocked))
+        done.detection = detection_of(tried, options.detection, len(bench.window.pairs))
+    if options.steps:
+        done.steps = steps_of(experiments.knocked(bench, options.steps, stages))
 
 
 def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
@@ -294,6 +323,7 @@ def _report(
         search_translation_m=search.translation_m if search.dof == 6 else 0.0,
         hit_rotation_deg=degrees(statistics.HIT_RAD),
         hit_translation_m=statistics.HIT_M if search.dof == 6 else None,
+        interrupted=done.interrupted,
         starts=summary.starts,
         hits=summary.hits,
         hit_rate=summary.hit_rate,
