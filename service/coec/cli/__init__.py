@@ -6,11 +6,12 @@ and nothing else.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
@@ -61,7 +62,6 @@ def application(words: Sequence[str]) -> typer.Typer:
         no_args_is_help=True,
         rich_markup_mode=None if plain else "rich",
         pretty_exceptions_enable=False,
-        add_completion=False,
         context_settings={"help_option_names": ["-h", "--help"]},
         help="Continuous online extrinsic calibration of a camera and a LiDAR.",
     )
@@ -76,9 +76,30 @@ def application(words: Sequence[str]) -> typer.Typer:
     return app
 
 
-def _coec() -> None:
+def _tell_version(asked: bool) -> None:
+    """Before anything else of the command line is looked at."""
+    if asked:
+        from coec.cli import version as work
+
+        print(json.dumps(work.document(), sort_keys=True) if "--json" in sys.argv[1:] else work.text())
+        raise typer.Exit(0)
+
+
+def _coec(
+    version: Annotated[  # noqa: ARG001  told by its callback
+        bool,
+        typer.Option(
+            "--version",
+            help="Print the version, and those of what decisions are computed with.",
+            callback=_tell_version,
+            is_eager=True,
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --version: one JSON document.")] = False,
+) -> None:
     # Without a callback, Typer takes an application of one command for that command.
-    pass
+    if as_json:
+        raise UsageError("--json before a command belongs to --version; of a command, write it behind its name")
 
 
 def main() -> int:
@@ -131,6 +152,4 @@ def _with_signs_of(encoding: str, command: Any) -> None:
 
 
 def _print_error(code: str, message: str, details: Mapping[str, Any] | None = None) -> None:
-    import json
-
     print(json.dumps({"error": {"code": code, "message": message}, **(details or {})}, ensure_ascii=False))

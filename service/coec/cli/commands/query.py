@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from coec.cli import completing
 from coec.cli.options import Connect, Json, Prefix, ServiceConfig, Vehicle
 
 
@@ -47,6 +48,7 @@ class Options:
         typer.Argument(
             help="One of the keys above, or a whole key expression with @v1 in it.",
             metavar="KEY",
+            autocompletion=completing.query_keys,
             show_default=False,
         ),
     ]
