@@ -12,6 +12,7 @@ from coec.adapters.depth.maps import STEREO
 from coec.calibration.types import Compensation, Window
 from coec.config import CalibrationConfig
 from coec.geometry import se3
+from coec.geometry.edges.scan_lines import telling
 from coec.reports import console
 from coec.schemas.replies import CalibrationResult, Transform
 
@@ -54,6 +55,8 @@ def show(
     show_pose(result.camera_from_lidar, result.lidar_frame, result.camera_frame)
     console.show(settings_text(configuration, result.depth_identity))
     console.show(compensation_text(result.compensation))
+    if any(pair.lidar.ring is not None and telling(pair.lidar.ring) is None for pair in window.pairs):
+        console.show("the field `ring` holds one number and was ignored: beams were told by their elevation", "yellow")
     if camera_fit is not None:
         console.show(
             f"{camera_fit['model']} fitted to {camera_fit['of']}: {camera_fit['residual_rms_px']:.4f} px rms, "

@@ -12,7 +12,7 @@ from coec.calibration.confidence.lens_limit import lens_error_px
 from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.geometry.cameras import pixel_rad
 from coec.geometry.edges.range_edges import NEIGHBOUR_RAD
-from coec.geometry.edges.scan_lines import BAND_RAD
+from coec.geometry.edges.scan_lines import BAND_RAD, telling
 
 LENS_PX = 0.05
 """What a target-based calibration of a lens leaves of its principal point, and of its scale at the rim: half of the 0.1
@@ -54,11 +54,12 @@ def grain_of(window: Window, T_camera_lidar: Matrix4, held_m: float) -> Grain:
 
 
 def column_rad(sweep: LidarFrame) -> float:
-    """Median turn between neighbours of a scan line, radians; where no ring is known, of rows of one elevation. 0 where
-    none has a neighbour."""
+    """Median turn between neighbours of a scan line, radians; where no ring tells beams apart, of rows alike high.
+    0 where none has a neighbour."""
     x, y, z = (sweep.xyz_m[:, axis].astype(np.float64) for axis in range(3))
     azimuth, across = np.arctan2(y, x), np.hypot(x, y)
-    row = np.floor(np.arctan2(z, across) / BAND_RAD) if sweep.ring is None else sweep.ring.astype(np.float64)
+    ring = telling(sweep.ring)
+    row = np.floor(np.arctan2(z, across) / BAND_RAD) if ring is None else ring.astype(np.float64)
     order = np.lexsort((azimuth, row))
     turn = np.diff(azimuth[order])
     neighbours = turn[(np.diff(row[order]) == 0.0) & (turn > 0.0) & (turn < NEIGHBOUR_RAD)]
