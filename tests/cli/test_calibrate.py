@@ -190,7 +190,7 @@ def test_options_override_the_recorded_configuration_and_nothing_else() -> None:
     assert not changed.motion_compensation
 
 
-@pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", ""])
+@pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", "", "200,0,0", "0,0,0,120,-30,0"])
 def test_malformed_perturbation(text: str) -> None:
     with pytest.raises(UsageError):
         vector_of("--perturb", text)
