@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 
 class CoecError(Exception):
     """Base of all deliberate errors. The message says what was wrong, where, and what to do.
@@ -9,10 +12,12 @@ class CoecError(Exception):
     Attributes:
         exit_code: process exit status of a command that ends with this error (CONTRACT, "Command line").
         reply_code: machine-readable code of a Zenoh `reply_err` that carries this error.
+        details: figures that `--json` gives beside the message, by name.
     """
 
     exit_code = 1
     reply_code = "internal"
+    details: Mapping[str, Any] = {}
 
 
 class UsageError(CoecError):
@@ -59,6 +64,16 @@ class CalibrationError(CoecError):
     """A window from which no calibration can be computed (for example: no LiDAR point in view)."""
 
     reply_code = "calibration_failed"
+
+
+class LensError(CalibrationError):
+    """A camera model that does not fit the lens it is to stand for."""
+
+    reply_code = "lens_does_not_fit"
+
+    def __init__(self, message: str, details: Mapping[str, Any]) -> None:
+        super().__init__(message)
+        self.details = details
 
 
 class StateError(CoecError):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
 from coec.adapters.depth.maps import open_depth
+from coec.adapters.images.codec import encode_png
 from coec.calibration.ports import DepthModel
-from coec.config import DepthConfig, LimitsConfig
+from coec.config import DepthConfig, LimitsConfig, VerdictConfig
 from coec.errors import UsageError
 from coec.sources.windows import evenly, vector_of
 
@@ -40,7 +43,65 @@ def test_text_names_axes_verdict_and_reasons(coec: Coec) -> None:
     assert "ry yaw" in outcome.out
     assert "+40.000" in outcome.out
     assert "verdict failed" in outcome.out
+    assert "not to be used" in outcome.out
     assert not outcome.err
+
+
+def test_text_is_what_one_copies(coec: Coec, tmp_path: Path) -> None:
+    arguments = ("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--output", tmp_path / "out")
+    text = coec(*arguments).out
+    found = json.loads((tmp_path / "out" / "result.json").read_text())["camera_from_lidar"]
+    matrix = re.search(r"\[\[.*?\]\]", text, re.DOTALL)
+    quaternion = re.search(r"quaternion x y z w: (\[.*\])", text)
+    assert matrix is not None
+    assert quaternion is not None
+    np.testing.assert_allclose(json.loads(matrix.group()), found["matrix"], atol=1e-9)
+    np.testing.assert_allclose(json.loads(quaternion.group(1)), found["quaternion_xyzw"], atol=1e-9)
+    assert "objective mi, 3 degrees of freedom (rotation only), depth from stereo" in text
+    assert f"written to {tmp_path / 'out'}: overlay_after.png, overlay_before.png, result.json" in text
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(coec: Coec, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    outcome = coec("calibrate", tmp_path / "no such recording", "--output", tmp_path / "file" / "out", "--json")
+    assert outcome.status == 1
+    assert outcome.document["error"]["code"] == "output_failed"
+    assert "--output" in outcome.err
+
+
+def test_a_result_that_cannot_be_written_in_the_end_is_printed(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, _: bytes) -> int:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    arguments = ("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--output", tmp_path)
+    outcome = coec(*arguments, "--json")
+    assert outcome.status == 1
+    assert outcome.document["verdict"]["decision"] == "accepted"
+    assert "No space left" in outcome.document["not_written"]
+    text = coec(*arguments)
+    assert "verdict accepted" in text.out
+    assert "No space left" in text.err
+
+
+def test_a_lens_that_the_fitted_model_does_not_hold_is_refused(coec: Coec, tmp_path: Path) -> None:
+    np.save(tmp_path / "cloud.npy", np.array([[5.0, 0.1 * y, 0.0, 0.5] for y in range(-9, 10)], np.float32))
+    (tmp_path / "image.png").write_bytes(encode_png(np.zeros((1208, 1920, 3), np.uint8)))
+    # A lens of 120 degrees whose distortion turns back on itself in the corners.
+    lens = "fx: 959.5, fy: 960.2, cx: 940.8, cy: 670.7, k1: -0.0978, k2: 0.1414, k3: -0.1484, k4: 0.0559"
+    (tmp_path / "dataset.yaml").write_text(
+        f"pair: front\ncamera: {{model: kannala_brandt, width: 1920, height: 1208, {lens}}}\n"
+        "T_camera_lidar: [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]\n"
+        "frames: [{image: image.png, cloud: cloud.npy, stamp_ns: 0}]\n"
+    )
+    outcome = coec("calibrate", tmp_path, "--camera-model", "double_sphere", "--json")
+    assert outcome.status == 1
+    assert outcome.document["error"]["code"] == "lens_does_not_fit"
+    fit = outcome.document["camera_fit"]
+    assert fit["error_deg"] > fit["limit_deg"] == VerdictConfig().max_sigma_deg
+    assert "--camera-model" in outcome.err
 
 
 def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path) -> None:
@@ -122,7 +183,7 @@ def test_unknown_camera_model_is_a_usage_error(coec: Coec) -> None:
     assert coec("calibrate", SMALL, "--depth", "stereo", "--camera-model", "eucm").status == 2
 
 
-@pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", ""])
+@pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", "", "200,0,0", "0,0,0,120,-30,0"])
 def test_malformed_perturbation(text: str) -> None:
     with pytest.raises(UsageError):
         vector_of("--perturb", text)

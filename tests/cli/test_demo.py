@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import pytest
@@ -19,13 +20,14 @@ from coec.cli.demo import report, story
 from coec.cli.demo.outcome import Ending, outcome_of
 from coec.cli.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
 from coec.cli.demo.page import demo_page
-from coec.cli.demo.screen import BARS, curve
+from coec.cli.demo.screen import BARS, Screen, curve, view
 from coec.cli.demo.vehicle import NS_PER_S, paced
-from coec.cli.demo.watch import Moment
+from coec.cli.demo.watch import Moment, Seen
 from coec.config import WindowConfig
 from coec.reports.page import render
 from coec.schemas import replies
 from reports.pages import MADE
+from statuses import a_status
 
 KNOCK_S, MAX_ERROR_DEG = story.KNOCK_S, story.MAX_ERROR_DEG
 
@@ -254,3 +256,36 @@ def test_the_knock_is_noticed_and_repaired(coec: Coec, tmp_path: Path) -> None:
     assert states[-1] == "healthy"
     assert "miscalibrated" in states
     assert coec("replay", check_files(document)).status == 0
+
+
+def seen_with(worker: str, t_s: float) -> Seen:
+    """What a client sees while the worker of the service is in this state."""
+    status = a_status(
+        worker=replies.WorkerStatus.model_validate({"state": worker}), pairs=(replies.PairStatus(name="sim"),)
+    )
+    health: Any = SimpleNamespace(reasons=(), metrics={})
+    extrinsic: Any = SimpleNamespace()
+    return Seen(replace(START, t_s=t_s), status, health, extrinsic)
+
+
+def test_a_first_run_says_that_it_compiles_and_then_tells_the_story(capsys: pytest.CaptureFixture[str]) -> None:
+    watch: Any = SimpleNamespace(series=[])
+    screen = Screen()
+    for t_s in (3.0, 10.0, 30.0):
+        screen.show(watch, seen_with("starting", t_s))
+    screen.show(watch, seen_with("idle", 35.0))
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 2
+    assert "compiling the kernels, once on this machine" in said[0]
+    assert "0.0 s of driving: unknown, nominal" in said[1]
+
+
+def test_the_live_view_says_why_the_drive_does_not_begin() -> None:
+    watch: Any = SimpleNamespace(series=[])
+    shown = Console(width=140, file=io.StringIO())
+    with shown.capture() as before:
+        shown.print(view(watch, seen_with("starting", 23.0)))
+    assert "waits: kernels are being compiled, once on this machine, 23 s" in before.get()
+    with shown.capture() as after:
+        shown.print(view(watch, seen_with("idle", 36.0)))
+    assert "compiled" not in after.get()

@@ -7,8 +7,10 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from math import radians
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from coec.calibration.commissioning import learning
 from coec.calibration.types import LidarFrame
 from coec.evaluation import experiments, steps
 from coec.evaluation.starts import perturbations
+from coec.evaluation.statistics import Outcome
 from coec.geometry import se3
 from coec.schemas.evaluation import ClosureReport, ComparisonReport, EvaluationReport
 from coec.sources.recording import FramewiseRecording
@@ -204,6 +207,40 @@ def test_fitted_camera_and_uncompensated_clouds(coec: Coec) -> None:
     ).document  # fmt: skip
     assert report["camera_model"] == "double_sphere"
     assert report["std"] == [None] * 6
+
+
+def test_what_was_finished_before_ctrl_c_is_printed_and_written(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solve, solved = experiments.Bench.solve, count()
+
+    def interrupted(self: experiments.Bench, *arguments: Any) -> Outcome:
+        if next(solved) == 3:  # of the reference, and two starts
+            raise KeyboardInterrupt
+        return solve(self, *arguments)
+
+    monkeypatch.setattr(experiments.Bench, "solve", interrupted)
+    options = ("--depth", "stereo", "--objective", "mi", "--rotation-deg", "1", "--directions", "50")
+    outcome = coec("evaluate", SMALL, *options, "--halves", "2", "--output", tmp_path, "--json")
+    assert outcome.status == 130
+    assert outcome.document["interrupted"]
+    assert outcome.document["starts"] == 2
+    assert outcome.document["halves"] is None
+    assert json.loads((tmp_path / "report.json").read_text()) == outcome.document
+    with (tmp_path / "starts.csv").open() as table:
+        assert len(list(csv.reader(table))) == 1 + 2
+    assert "interrupted: the figures are of what was finished" in outcome.err
+
+
+def test_ctrl_c_before_the_first_result_leaves_none(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(experiments, "inferred", interrupted)
+    outcome = coec("evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "1", "--json")
+    assert outcome.status == 130
+    assert outcome.document["error"]["code"] == "interrupted"
+    assert "Traceback" not in outcome.err
 
 
 def test_needs_a_radius(coec: Coec) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from cli.conftest import Coec
+from coec import __version__
 from coec.cli import COMMANDS as COMMANDS_WITHOUT_COMMANDS
 from coec.cli import application
 
@@ -93,3 +95,50 @@ def test_without_a_command_says_how(coec: Coec) -> None:
     outcome = coec()
     assert outcome.status == 2
     assert "Usage" in outcome.out + outcome.err
+
+
+def test_the_version_comes_with_those_of_what_decides(coec: Coec) -> None:
+    document = coec("--version", "--json").document
+    assert document["coec"] == __version__
+    assert document["numpy"] == np.__version__
+    assert {"numba", "onnxruntime", "eclipse-zenoh", "python"} <= set(document)
+    shown = coec("--version")
+    assert shown.status == 0
+    assert shown.out.startswith(f"coec {__version__}\n")
+    assert f"numpy {np.__version__}" in shown.out
+    assert coec("--json", "models").status == 2
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("coec cal", {"calibrate"}),
+        ("coec calibrate x --object", {"--objective"}),
+        ("coec calibrate x --objective f", {"fused"}),
+        ("coec calibrate x --depth st", {"stereo", "street"}),
+        ("coec query command/r", {"command/rollback", "command/reset"}),
+        ("coec export x --format op", {"openlabel", "opencv"}),
+    ],
+)
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_completes_commands_options_and_values(
+    coec: Coec, monkeypatch: pytest.MonkeyPatch, typed: str, offered: set[str], shell: str
+) -> None:
+    monkeypatch.setenv("_COEC_COMPLETE", f"complete_{shell}")
+    monkeypatch.setenv("_TYPER_COMPLETE_ARGS", typed)
+    monkeypatch.setenv("_TYPER_COMPLETE_WORD_TO_COMPLETE", typed.split()[-1])
+    monkeypatch.setenv("_TYPER_COMPLETE_FISH_ACTION", "get-args")
+    monkeypatch.setenv("COMP_WORDS", typed)
+    monkeypatch.setenv("COMP_CWORD", str(len(typed.split()) - 1))
+    out = coec().out
+    assert all(value in out for value in offered)
+    if shell == "bash":
+        assert set(out.split()) == offered
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_script_of_a_shell_asks_this_program(coec: Coec, monkeypatch: pytest.MonkeyPatch, shell: str) -> None:
+    monkeypatch.setenv("_COEC_COMPLETE", f"source_{shell}")
+    shown = coec()
+    assert shown.status == 0
+    assert f"_COEC_COMPLETE=complete_{shell}" in shown.out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import getpass
 import hashlib
 import json
@@ -15,10 +16,14 @@ import pytest
 
 from cli.conftest import SMALL, Coec
 from coec.adapters.zenoh.bus import JSON, Answer, Bus, Lane, Request, Route, open_session
+from coec.cli.commands.query import KEYS as HELPED
+from coec.cli.commands.query import Options
+from coec.cli.query import PLAIN_KEYS, WITH_ARGUMENT
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError
 from coec.schemas.base import Message, to_json
-from coec.schemas.keys import Keys, parse_command_selector, parse_range_selector
+from coec.schemas.commands import NAMES, arguments_of
+from coec.schemas.keys import RIG, Keys, parse_command_selector, parse_range_selector
 from coec.schemas.replies import (
     Acknowledgement,
     PairStatus,
@@ -34,6 +39,7 @@ DEADLINE_S = 20.0
 KEYS = Keys("coec", "vehicle")
 WINDOW = bytes(range(256))
 CLAIMS: list[bytes | None] = []
+PAYLOADS: list[tuple[str, bytes]] = []
 
 
 @pytest.fixture
@@ -59,6 +65,7 @@ def vehicle() -> Iterator[str]:
     bus.serve(KEYS.window("front", "*"), window_routes)
     bus.serve(KEYS.evidence_of("front", "*"), no_event)
     bus.serve(KEYS.command("front", "*"), acknowledging)
+    bus.serve(KEYS.command(RIG, "*"), acknowledging)
     yield endpoint
     bus.undeclare_inputs()
     for thread in bus.threads:
@@ -91,6 +98,7 @@ def acknowledging(key: str) -> Sequence[Route]:
 
     def answer(request: Request) -> Answer:
         CLAIMS.append(request.attachment)
+        PAYLOADS.append((key, request.payload))
         done = Acknowledgement(
             vehicle="vehicle", pair="front", command="hold", accepted=True, code="held", text=request.parameters
         )
@@ -119,6 +127,13 @@ def no_event(_: str) -> Sequence[Route]:
         (("nonsense",), "known: extrinsic, health"),
         (("health", "--param", "limit"), "NAME=VALUE"),
         (("command/calibrate", "--payload", "{"), "not JSON"),
+        (("health", "--to", "x"), "health is no command"),
+        (("health", "--payload", "{}"), "health is no command"),
+        (("command/hold", "--to", "x"), "It takes --release: "),
+        (("command/apply", "--release"), "It takes none"),
+        (("command/rollback", "--to", "x", "--sensor", "roof"), "command/rollback of the rig does not take it"),
+        (("command/hold", "--release", "--payload", "{}"), "leave --release out, or --payload"),
+        (("command/explode", "--release"), "known: calibrate, apply"),
         (("overlay",), "--output FILE.jpg"),
         (("health", "--output", "h.jpg"), "--output belongs to"),
         (("health", "--timeout", "inf"), "--timeout inf"),
@@ -253,3 +268,60 @@ def test_a_recording_is_not_played_to_a_key_that_is_none(coec: Coec, endpoint: s
     outcome = coec("play", SMALL, "--pair", "a//b", "--connect", endpoint)
     assert outcome.status == 2
     assert "'sensors/a//b/camera' is no key" in outcome.err
+
+
+def test_several_pairs_answer_in_one_document_by_pair_and_a_table_each(coec: Coec, endpoint: str) -> None:
+    with open_session(ZenohConfig(embedded_router=True, listen=(endpoint,)), LimitsConfig()) as session:
+        bus = Bus(session)
+        for thread in bus.threads:
+            thread.start()
+        for pair in ("rear", "front"):
+            serve_document(bus, KEYS.windows(pair), WindowsReply(vehicle="vehicle", pair=pair, windows=(), snippets=()))
+        together = coec("query", "windows", "--connect", endpoint, "--json")
+        alone = coec("query", "windows", "--connect", endpoint, "--pair", "rear", "--json")
+        text = coec("query", "windows", "--connect", endpoint).out
+        bus.undeclare_inputs()
+        for thread in bus.threads:
+            thread.request_stop()
+            assert thread.join(DEADLINE_S)
+        bus.undeclare_queryables()
+    assert together.status == alone.status == 0
+    assert set(together.document["pairs"]) == {"front", "rear"}
+    assert together.document["pairs"]["rear"] == alone.document
+    assert alone.document["pair"] == "rear"
+    assert text.index("vehicle/front") < text.index("vehicle/rear")
+
+
+@pytest.mark.parametrize(
+    ("typed", "key", "payload"),
+    [
+        (("command/rollback", "--to", "ab12"), KEYS.command("front", "rollback"), {"to": "ab12"}),
+        (("command/hold", "--release"), KEYS.command("front", "hold"), {"release": True}),
+        (("command/hold", "--sensor", "roof"), KEYS.command(RIG, "hold"), {"sensor": "roof"}),
+        (("command/hold", "--payload", '{"release": true}'), KEYS.command("front", "hold"), {"release": True}),
+    ],
+)
+def test_options_stand_for_the_entries_of_a_payload(
+    coec: Coec, vehicle: str, typed: tuple[str, ...], key: str, payload: dict[str, Any]
+) -> None:
+    PAYLOADS.clear()
+    assert coec("query", *typed, "--connect", vehicle).status == 0
+    ((asked, sent),) = PAYLOADS
+    assert asked == key
+    assert json.loads(sent) == payload
+
+
+def test_every_entry_of_a_payload_has_its_option() -> None:
+    fields = {field.name for field in dataclasses.fields(Options)}
+    for command in NAMES:
+        for for_rig in (False, True):
+            assert {argument.name for argument in arguments_of(command, for_rig=for_rig)} <= fields
+
+
+def test_the_help_text_has_every_key_with_what_it_answers(coec: Coec) -> None:
+    shown = coec("query", "--help").out
+    asked = (*PLAIN_KEYS, *(f"{name}/{what}" for name, what in WITH_ARGUMENT.items()))
+    assert {each.key for each in HELPED} == set(asked)
+    for each in HELPED:
+        assert each.key in shown
+        assert each.answer in shown

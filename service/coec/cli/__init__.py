@@ -6,15 +6,20 @@ and nothing else.
 
 from __future__ import annotations
 
+import json
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
+from typing import Annotated, Any
 
 import typer
 
 from coec.cli.declaring import taking
 from coec.cli.exit_codes import BROKEN_PIPE, FAULT
+from coec.cli.stopping import no_interrupt_lost
 from coec.errors import CoecError, UsageError
+from coec.reports import plain_text
 
 GROUPS = ("models", "sim", "fleet")
 """Commands that have commands."""
@@ -51,11 +56,12 @@ COMMANDS = (
 def application(words: Sequence[str]) -> typer.Typer:
     """The commands that a command line can mean: the one that its first word names, and all where none is named, for
     the help text or the refusal. To declare one takes a millisecond, and most calls need no other."""
+    plain = plain_text.wants_plain(os.environ) or not plain_text.is_unicode(sys.stdout.encoding)
     app = typer.Typer(
         name="coec",
         no_args_is_help=True,
+        rich_markup_mode=None if plain else "rich",
         pretty_exceptions_enable=False,
-        add_completion=False,
         context_settings={"help_option_names": ["-h", "--help"]},
         help="Continuous online extrinsic calibration of a camera and a LiDAR.",
     )
@@ -70,25 +76,56 @@ def application(words: Sequence[str]) -> typer.Typer:
     return app
 
 
-def _coec() -> None:
+def _tell_version(asked: bool) -> None:
+    """Before anything else of the command line is looked at."""
+    if asked:
+        from coec.cli import version as work
+
+        print(json.dumps(work.document(), sort_keys=True) if "--json" in sys.argv[1:] else work.text())
+        raise typer.Exit(0)
+
+
+def _coec(
+    version: Annotated[  # noqa: ARG001  told by its callback
+        bool,
+        typer.Option(
+            "--version",
+            help="Print the version, and those of what decisions are computed with.",
+            callback=_tell_version,
+            is_eager=True,
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --version: one JSON document.")] = False,
+) -> None:
     # Without a callback, Typer takes an application of one command for that command.
-    pass
+    if as_json:
+        raise UsageError("--json before a command belongs to --version; of a command, write it behind its name")
 
 
 def main() -> int:
     """Entry point; returns the exit status."""
     as_json = "--json" in sys.argv[1:]
+    plain_text.never_fail()
     try:
-        application(sys.argv[1:])()
+        command = typer.main.get_command(application(sys.argv[1:]))
+        if not plain_text.is_unicode(sys.stdout.encoding):
+            _with_signs_of(sys.stdout.encoding, command)
+        with no_interrupt_lost():
+            command(prog_name="coec")
     except SystemExit as ended:
         status = ended.code if isinstance(ended.code, int) else 0
+        # A command that ends so by itself has said why.
+        if isinstance(getattr(ended.__context__, "__cause__", None), KeyboardInterrupt):
+            print("coec: interrupted", file=sys.stderr)
+            if as_json:
+                _print_error("interrupted", "ended by Ctrl-C before there was a result")
         if status == UsageError.exit_code and as_json:
             _print_error("bad_request", "the command line does not fit; standard error says how")
         return status
     except CoecError as error:
         print(f"coec: {error}", file=sys.stderr)
         if as_json:
-            _print_error(error.reply_code, str(error))
+            _print_error(error.reply_code, str(error), error.details)
         return error.exit_code
     except BrokenPipeError:
         # Whoever read our output has gone; nobody is left to be told, also not by the interpreter at its exit.
@@ -104,7 +141,15 @@ def main() -> int:
     return 0
 
 
-def _print_error(code: str, message: str) -> None:
-    import json
+def _with_signs_of(encoding: str, command: Any) -> None:
+    """Help texts of a command and of those below it in a locale that lacks signs: they would be sent as UTF-8 all the
+    same."""
+    for told in (command, *command.params):
+        if getattr(told, "help", None):
+            told.help = plain_text.encodable(told.help, encoding)
+    for below in getattr(command, "commands", {}).values():
+        _with_signs_of(encoding, below)
 
-    print(json.dumps({"error": {"code": code, "message": message}}, ensure_ascii=False))
+
+def _print_error(code: str, message: str, details: Mapping[str, Any] | None = None) -> None:
+    print(json.dumps({"error": {"code": code, "message": message}, **(details or {})}, ensure_ascii=False))

@@ -41,6 +41,8 @@ def run(options: Options) -> int:
     Raises:
         CoecError: no such network or source, or nothing to compare.
     """
+    if options.output is not None:
+        output.try_folder(options.output)
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)

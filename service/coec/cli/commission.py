@@ -11,6 +11,7 @@ import numpy as np
 
 from coec.adapters.depth.maps import CachedDepth, open_depth
 from coec.adapters.files.baseline_file import baseline_hash, baseline_to_json, load_baselines, save_baseline
+from coec.adapters.files.output import try_file
 from coec.adapters.images.codec import CachedGreys, GreyImages
 from coec.calibration.commissioning.baseline import Baseline
 from coec.calibration.commissioning.learning import MAX_PAIRS, commission
@@ -43,6 +44,7 @@ def run(options: Options) -> int:
         CoecError: there is none.
     """
     sensors = sensors_of(options.sensors or ())
+    try_file(options.output)
     with console.progress() as bars:
         times = StageTimes(bars)
         rigged = load(options.sources, options, times)

@@ -24,7 +24,7 @@ from coec.config import config_hash
 from coec.errors import UsageError
 from coec.evaluation.detection import try_detection
 from coec.geometry import se3
-from coec.reports import console, evaluation_tables, page, pictures, provenance
+from coec.reports import console, diagnosis, evaluation_tables, page, pictures, provenance
 from coec.reports.check_page import check_page, detection_page
 from coec.reports.evaluation_documents import detection_of
 from coec.reports.stage_times import StageTimes
@@ -85,17 +85,19 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
     seen = diagnose(window, rigged.depth, rigged.images, rigged.configuration, baseline)
     if options.output is not None:
         _write(options.output, seen, window, rigged)
-    wrong = seen.flagged or bool(seen.causes)
-    status = "failed" if wrong else "not_accepted" if seen.undecided else "accepted"
     metrics = {metric.name: metric_of(metric) for metric in seen.metrics}
+    offset, sigma = _in_degrees(seen.offset), _in_degrees(seen.sigma)
+    finding = diagnosis.finding_of(seen, offset, sigma)
     if options.as_json:
         document: dict[str, Any] = {
+            "finding": finding.state,
+            "text": finding.sentence,
             "flagged": seen.flagged,
             "undecided": seen.undecided,
             "flagged_by_paper": seen.flagged_by_paper,
             "causes": [{"code": cause.code, "text": cause.text} for cause in seen.causes],
-            "offset": _in_degrees(seen.offset),
-            "sigma": _in_degrees(seen.sigma),
+            "offset": offset,
+            "sigma": sigma,
             "drift": None if seen.drift is None else _in_degrees(seen.drift.value),
             "drift_sigma": None if seen.drift is None else _in_degrees(seen.drift.sigma),
             "first_derivative": seen.first_derivative.tolist(),
@@ -103,9 +105,8 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
             "metrics": {name: metric.model_dump(mode="json") for name, metric in metrics.items()},
         }
         console.print_json(document)
-        return int(status != "accepted")
+        return int(finding.state != "right")
     axes = console.table("axis", "offset", "± σ", "unit", "f'", "f''", right=(1, 2, 4, 5))
-    offset, sigma = _in_degrees(seen.offset), _in_degrees(seen.sigma)
     for axis, name in enumerate(console.AXIS_NAMES):
         axes.add_row(
             name,
@@ -115,12 +116,10 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
             console.figure(float(seen.first_derivative[axis]), sign=True),
             console.figure(float(seen.second_derivative[axis]), sign=True),
         )
+    diagnosis.show(finding)
     console.out.print(axes)
-    console.out.print("extrinsic ", console.styled(status), sep="")
-    for cause in seen.causes:
-        console.show(f"  {cause.code}: {cause.text}", "yellow")
-    console.show_metrics(metrics)
-    return int(status != "accepted")
+    console.show_metrics({name: metric for name, metric in metrics.items() if metric.value is not None})
+    return int(finding.state != "right")
 
 
 def _write(folder: Path, seen: Observation, window: Window, rigged: commission.Rigged) -> None:

@@ -8,6 +8,7 @@ from rich.progress import Progress
 
 from coec.adapters.files import output
 from coec.cli.commands.evaluate import Options
+from coec.cli.exit_codes import INTERRUPTED
 from coec.config import WindowConfig
 from coec.errors import CalibrationError
 from coec.evaluation.experiments import Stages
@@ -32,6 +33,8 @@ def run(options: Options) -> int:
     Raises:
         CoecError: there is nothing to evaluate.
     """
+    if options.output is not None:
+        output.try_folder(options.output)
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
@@ -45,16 +48,19 @@ def run(options: Options) -> int:
             document = _compare(options, subject, bars, stages)
         else:
             document, _ = _evaluate(options, subject, stages)
-    if options.output is not None:
-        output.write(options.output / "report.json", to_json(document))
-        evaluation_page.write(options.output, document, provenance.here())
     if options.as_json:
         console.print_json(document.model_dump(mode="json"))
     elif isinstance(document, ComparisonReport):
         evaluation_tables.show_comparison(document)
     else:
         evaluation_tables.show(document)
-    return 0
+    # Whoever reads the figures has them, should they not be written.
+    if options.output is not None:
+        output.write(options.output / "report.json", to_json(document))
+        evaluation_page.write(options.output, document, provenance.here())
+    if document.interrupted:
+        console.say("coec: interrupted: the figures are of what was finished")
+    return INTERRUPTED if document.interrupted else 0
 
 
 def plan_of(options: Options) -> Plan:
@@ -111,16 +117,23 @@ def _compare(options: Options, subject: Subject, bars: Progress, stages: Stages)
             output.write(folder / "report.json", to_json(reports[method]))
             evaluation_page.write(folder, reports[method], provenance.here())
         heard(1, "")
+        if reports[method].interrupted:
+            break
+    interrupted = any(report.interrupted for report in reports.values())
     if not reports:
         raise CalibrationError("; ".join(f"{method}: {reason}" for method, reason in not_evaluated.items()))
-    if options.output is not None:
+    if options.output is not None and not interrupted:
         # matplotlib takes a second to import.
         from coec.reports import evaluation_pictures
 
         of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
         evaluation_pictures.write_comparison(options.output, subject.window.window_id, of_starts, outcomes)
     return ComparisonReport(
-        source=options.source, methods=reports, not_evaluated=not_evaluated, elapsed_s=stages.elapsed_s()
+        source=options.source,
+        methods=reports,
+        not_evaluated=not_evaluated,
+        interrupted=interrupted,
+        elapsed_s=stages.elapsed_s(),
     )
 
 
@@ -133,7 +146,7 @@ def _evaluate(options: Options, subject: Subject, stages: Stages) -> tuple[Evalu
     plan = plan_of(options)
     bench = bench_of(subject, plan, choices_of(options))
     done = tried(subject, plan, bench, stages)
-    if options.output is not None:
+    if options.output is not None and not done.interrupted:
         # matplotlib takes a second to import.
         from coec.reports import evaluation_pictures
 
@@ -142,6 +155,7 @@ def _evaluate(options: Options, subject: Subject, stages: Stages) -> tuple[Evalu
         evaluation_pictures.write(options.output, bench, of_starts, done.outcomes, done.frames, done.slices, draw)
         if done.normalised:
             evaluation_pictures.write_normalised(options.output, bench.window.window_id, done.normalised)
+    if options.output is not None:
         table = evaluation_tables.csv_of(bench.reference, done.outcomes)
         output.write(options.output / "starts.csv", table.encode())
     return report_of(subject, plan, bench, done, stages.elapsed_s()), done.outcomes

@@ -10,6 +10,9 @@ SUCCESS = 0
 FAULT = 70
 """EX_SOFTWARE of sysexits.h."""
 
+INTERRUPTED = 130
+"""As a shell reports a process that SIGINT ended."""
+
 BROKEN_PIPE = 141
 """As a shell reports a process that SIGPIPE ended."""
 
@@ -21,6 +24,7 @@ EXIT_CODES: Mapping[int, str] = {
     UnavailableError.exit_code: "what a start needs is taken or away, and may be there later: a port, the state "
     "directory, the vehicle's place on the network. The unit of systemd tries again",
     ConfigError.exit_code: "the configuration cannot be used. The unit of systemd does not try again",
+    INTERRUPTED: "Ctrl-C; `evaluate` prints and writes what was finished by then",
     BROKEN_PIPE: "whoever read the output has gone",
 }
 """All that there are."""

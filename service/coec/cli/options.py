@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from coec.cli import completing
+
 SOURCE_HELP = (
     "a recorded window or ROS 2 bag (.mcap), kitti360:ROOT?camera=image_00, kitti-raw:ROOT?..., a folder or "
     "dataset.yaml, sim:seed=1&seconds=60"
@@ -36,15 +38,24 @@ Depth = Annotated[
         help="An ONNX file, a built-in name (`coec models`), or `stereo`: the maps of the source. Without it, what a "
         "recorded window names, else the network that comes with coec.",
         metavar="MODEL",
+        autocompletion=completing.depth_models,
     ),
 ]
 Objective = Annotated[
     str | None,
-    typer.Option(help="What is maximised: fused (edges and depth), mi (the paper), intensity.", metavar="NAME"),
+    typer.Option(
+        help="What is maximised: fused (edges and depth), mi (the paper), intensity.",
+        metavar="NAME",
+        autocompletion=completing.objectives,
+    ),
 ]
 CameraModel = Annotated[
     str | None,
-    typer.Option(help="Fit this model to the camera, and use it instead: double_sphere.", metavar="NAME"),
+    typer.Option(
+        help="Fit this model to the camera, and use it instead: double_sphere. Refused where it does not fit the lens.",
+        metavar="NAME",
+        autocompletion=completing.camera_models,
+    ),
 ]
 Frames = Annotated[
     int | None, typer.Option(help="Use at most so many camera frames, evenly chosen.", min=1, show_default="25")

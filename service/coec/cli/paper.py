@@ -42,6 +42,7 @@ def run(options: Options) -> int:
     Raises:
         CoecError: an experiment cannot be done.
     """
+    output.try_folder(options.output)
     with console.progress() as bars:
         stages = Stages(bars)
         load = stages.begin("load", None)
@@ -154,7 +155,7 @@ def _drive(bench: Bench, options: Options, stages: Stages) -> list[dict[str, Any
         }
         for radius_deg, outcomes in found.items()
     ]
-    title = f"{bench.window.window_id}: {options.objective}, {count} windows"
+    title = f"{bench.window.window_id}: {options.objective}, {count} window{'s' if count > 1 else ''}"
     named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in found.items()}
     output.write(options.output / "drive.png", paper_plots.drive(named, title))
     return rows
@@ -163,12 +164,16 @@ def _drive(bench: Bench, options: Options, stages: Stages) -> list[dict[str, Any
 def _window_count(bench: Bench, options: Options) -> int:
     if options.slice_s is None:
         return len(paper.slices(len(bench.window.pairs), DRIVE_PAIRS))
-    return max(int(_duration_s(options.source) // options.slice_s), 1)
+    return windows_of(open_source(options.source).camera_stamps_ns, options.slice_s)
 
 
-def _duration_s(source: str) -> float:
-    stamps_ns = open_source(source).camera_stamps_ns
-    return (stamps_ns[-1] - stamps_ns[0]) * 1e-9
+def windows_of(stamps_ns: Sequence[int], slice_s: float) -> int:
+    """How many windows of this length a recording with these frames has, at least one. Each frame stands for the time
+    to the next one: 1200 frames at 10 Hz are two minutes, though the last is taken 0.1 s before their end."""
+    lasted_s = (stamps_ns[-1] - stamps_ns[0]) * 1e-9
+    interval_s = lasted_s / max(len(stamps_ns) - 1, 1)
+    # Half an interval of grace: stamps jitter.
+    return max(int((lasted_s + 1.5 * interval_s) // slice_s), 1)
 
 
 def _drive_windows(bench: Bench, options: Options) -> Iterator[tuple[float, Bench, list[int]]]:

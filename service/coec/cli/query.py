@@ -35,7 +35,8 @@ from coec.config import Config, ZenohConfig, load_config
 from coec.errors import NotFoundError, OutputError, UsageError
 from coec.reports import console, replies
 from coec.schemas.base import from_json
-from coec.schemas.keys import VERSION_CHUNK, Keys
+from coec.schemas.commands import NAMES, RELEASE, SENSOR, TO, arguments_of
+from coec.schemas.keys import RIG, VERSION_CHUNK, Keys
 from coec.schemas.replies import StatusReply
 
 VEHICLE_KEYS = ("status", "rig", "config", "metrics")
@@ -110,19 +111,20 @@ def run(options: Options) -> int:
         return _download(options, asked.way, keys, argument)
     if options.output is not None:
         return _save_picture(options, asked.way, keys, head, argument)
+    payload = _payload(options)
     with connected_by(asked.way, options.timeout_s) as session:
         key, kind = _resolve(session, options, keys)
         if any(item.startswith("format=") for item in options.params or ()):
             kind = None
-        replies = _answers(session, key, options, asked)
+        replies = _answers(session, key, options, asked, payload)
         if not replies:
             raise nobody(key, service_is_there=is_alive(session, keys, options.timeout_s))
     return _show(replies, kind, options, key)
 
 
-def _answers(session: zenoh.Session, key: str, options: Options, asked: Asked) -> list[Reply]:
+def _answers(session: zenoh.Session, key: str, options: Options, asked: Asked, payload: bytes | None) -> list[Reply]:
     """To the query; a command is proven where the session has a certificate."""
-    selector, payload = _selector(key, _params(key, options)), _payload(options.payload)
+    selector = _selector(key, _params(key, options))
     credentials = asked.credentials
     if not _is_command(key):
         return ask(session, selector, options.timeout_s, payload)
@@ -178,7 +180,8 @@ def _resolve(session: zenoh.Session, options: Options, keys: Keys) -> tuple[str,
     if options.key in PAIR_KEYS:
         return f"{keys.root}/{options.pair or '*'}/{options.key}", options.key
     if head == "command" and argument:
-        return single_key(keys.command(options.pair or _only_pair(session, options, keys), argument)), "command"
+        of = options.pair or (RIG if options.sensor is not None else _only_pair(session, options, keys))
+        return single_key(keys.command(of, argument)), "command"
     if head == "evidence" and argument:
         return keys.evidence_of(_pair_of(session, options, keys, argument), argument), "event"
     raise UsageError("say where to with --output FILE.jpg")
@@ -209,13 +212,38 @@ def _selector(key: str, params: tuple[str, ...]) -> str:
     return f"{key}?{';'.join(given)}"
 
 
-def _payload(text: str | None) -> bytes | None:
-    if text is None:
+def _payload(options: Options) -> bytes | None:
+    """That of a command: as it was given, or of the options that stand for its entries.
+
+    Raises:
+        UsageError: what was given belongs to no such command; says what there is.
+    """
+    typed = {argument.name: getattr(options, argument.name) for argument in (TO, RELEASE, SENSOR)}
+    given = {name: value for name, value in typed.items() if value not in (None, False)}
+    chunks = options.key.split("/")
+    command = chunks[-1] if len(chunks) > 1 and chunks[-2] == "command" else None
+    if command is None:
+        unfit = [*(f"--{name}" for name in given), *([] if options.payload is None else ["--payload"])]
+        if unfit:
+            raise UsageError(f"{', '.join(unfit)}: {options.key} is no command, and takes none")
         return None
-    try:
-        return json.dumps(json.loads(text), separators=(",", ":")).encode()
-    except ValueError as error:
-        raise UsageError(f"--payload is not JSON: {error}") from error
+    if options.payload is not None:
+        if given:
+            raise UsageError(f"--payload says it all: leave --{', --'.join(given)} out, or --payload")
+        try:
+            return json.dumps(json.loads(options.payload), separators=(",", ":")).encode()
+        except ValueError as error:
+            raise UsageError(f"--payload is not JSON: {error}") from error
+    if command not in NAMES:
+        raise UsageError(f"there is no command {command}; known: {', '.join(NAMES)}")
+    of_rig = options.pair == RIG or (options.pair is None and options.sensor is not None)
+    known = {argument.name: argument.meaning for argument in arguments_of(command, for_rig=of_rig)}
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        takes = "; ".join(f"--{name}: {meaning}" for name, meaning in known.items()) or "none"
+        whose = "the rig" if of_rig else "a pair"
+        raise UsageError(f"--{', --'.join(unknown)}: command/{command} of {whose} does not take it. It takes {takes}")
+    return json.dumps(given, separators=(",", ":")).encode() if given else None
 
 
 def _show(replies: list[Reply], kind: str | None, options: Options, key: str) -> int:
@@ -224,12 +252,13 @@ def _show(replies: list[Reply], kind: str | None, options: Options, key: str) ->
         if "*" in key and f"/{VERSION_CHUNK}/" in options.key:
             console.print_json(values)
         elif len(values) > 1:
-            pairs = ", ".join(reply.key.split("/")[-2] for reply in replies)
-            raise UsageError(f"several pairs answered, name one with --pair: {pairs}")
+            console.print_json({"pairs": {value["key"].split("/")[-2]: value["value"] for value in values}})
         else:
             console.print_json(values[0]["value"])
     else:
-        for reply in replies:
+        for index, reply in enumerate(sorted(replies, key=lambda reply: reply.key)):
+            if index:
+                console.show("")
             _render(reply, kind)
     return 0 if all(_succeeded(reply, kind) for reply in replies) else 1
 

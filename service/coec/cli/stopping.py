@@ -1,8 +1,10 @@
-"""Commands that go on until they are told to stop."""
+"""How commands are told to stop."""
 
 from __future__ import annotations
 
+import _thread
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,3 +25,29 @@ def until_signal() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+LATER_S = 0.05
+"""Until a Ctrl-C that was lost comes again: the call of a library that lost it has returned by then, or loses it
+again."""
+
+
+@contextmanager
+def no_interrupt_lost() -> Iterator[None]:
+    """A Ctrl-C that falls into a call from C, of the compiler for instance, is dropped by Python with a traceback;
+    within, it comes again a moment later."""
+    before = sys.unraisablehook
+
+    def hear(what: sys.UnraisableHookArgs) -> None:
+        if issubclass(what.exc_type, KeyboardInterrupt):
+            again = threading.Timer(LATER_S, _thread.interrupt_main)
+            again.daemon = True
+            again.start()
+        else:
+            before(what)
+
+    sys.unraisablehook = hear
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before

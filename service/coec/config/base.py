@@ -60,5 +60,7 @@ def describe(error: ValidationError, names: Mapping[str, Sequence[str]] | None =
         place = list(item["loc"])
         if len(place) > 1 and isinstance(place[1], int) and place[1] < len(known.get(str(place[0]), ())):
             place[1] = known[str(place[0])][place[1]]
-        lines.append(f"{'.'.join(str(part) for part in place) or '(top)'}: {item['msg']}")
+        # Pydantic would name the class of ours.
+        what = "give names with their values (a mapping)" if item["type"] == "model_type" else item["msg"]
+        lines.append(f"{'.'.join(str(part) for part in place) or '(top)'}: {what}")
     return "; ".join(lines)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import pi, radians
 
@@ -127,15 +127,15 @@ def from_reference(bench: Bench, stages: Stages) -> Outcome:
     return outcome
 
 
-def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> list[Outcome]:
-    """One solve from each of the poses (4, 4)."""
+def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> Iterator[Outcome]:
+    """One solve from each of the poses (4, 4): each is there as soon as it is solved."""
     heard = stages.begin("starts", len(poses))
-    outcomes: list[Outcome] = []
-    for pose in poses:
-        outcomes.append(bench.solve(pose))
-        hits = sum(outcome.hit for outcome in outcomes)
-        heard(len(outcomes), f"{hits} hits, {100 * hits / len(outcomes):.1f} %")
-    return outcomes
+    hits = 0
+    for done, pose in enumerate(poses, start=1):
+        outcome = bench.solve(pose)
+        hits += outcome.hit
+        heard(done, f"{hits} hits, {100 * hits / done:.1f} %")
+        yield outcome
 
 
 def against_frames(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> tuple[FramesPoint, ...]:

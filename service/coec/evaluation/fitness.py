@@ -252,7 +252,9 @@ def _standing(seen: Fitness) -> Remark | None:
 def _rings(seen: Fitness) -> Remark | None:
     if seen.rings != 1:
         return None
-    return Remark("warn", "constant_ring", "The field `ring` holds one number: beams are told by their elevation.")
+    return Remark(
+        "warn", "constant_ring", "The field `ring` holds one number and is ignored: beams are told by their elevation."
+    )
 
 
 def _joined(seen: Fitness) -> Remark | None:

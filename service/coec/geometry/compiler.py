@@ -14,12 +14,15 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numba
 from numba import njit, prange
+from numba.core import event
 from numba.core.codegen import get_host_cpu_features
 
 import coec.geometry.cameras.compiled  # noqa: F401  makes the formulas known
+from coec.geometry import compile_news
 
 __all__ = ["njit", "on_one_thread", "prange"]
 
@@ -118,3 +121,16 @@ if numba.config.CPU_FEATURES is None:  # type: ignore[attr-defined]  # features 
 if not os.environ.get("NUMBA_CACHE_DIR"):  # a directory chosen by the user wins
     # numba's configuration is a module that fills itself at run time.
     numba.config.CACHE_DIR = str(kernel_cache_directory(Path(__file__).parent))  # type: ignore[attr-defined]
+
+
+class _Passes(event.Listener):
+    """A kernel from the cache goes through no pass of the compiler."""
+
+    def on_start(self, event: Any) -> None:
+        compile_news.tell(event.data["qualname"])
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:run_pass", _Passes())

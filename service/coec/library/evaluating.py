@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from math import degrees, radians
 from typing import Any, cast
 
@@ -92,18 +92,19 @@ class Subject:
     vehicle: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Experiments:
-    """What came of the experiments that were asked for."""
+    """What has come of the experiments that were asked for. `interrupted`: not of all of them."""
 
     from_reference: Outcome
-    outcomes: list[Outcome]
-    frames: tuple[FramesPoint, ...]
-    slices: tuple[SlicePoint, ...]
-    halves: Halves | None
-    normalised: dict[str, NormalisedErrors]
-    detection: DetectionReport | None
-    steps: tuple[StepRow, ...]
+    outcomes: list[Outcome] = field(default_factory=list)
+    frames: tuple[FramesPoint, ...] = ()
+    slices: tuple[SlicePoint, ...] = ()
+    halves: Halves | None = None
+    normalised: dict[str, NormalisedErrors] = field(default_factory=dict)
+    detection: DetectionReport | None = None
+    steps: tuple[StepRow, ...] = ()
+    interrupted: bool = False
 
 
 def configuration_of(plan: Plan, chosen: Choices, recorded: CalibrationConfig | None) -> CalibrationConfig:
@@ -168,43 +169,56 @@ def bench_of(subject: Subject, plan: Plan, chosen: Choices) -> Bench:
 
 
 def tried(subject: Subject, plan: Plan, bench: Bench, stages: Stages) -> Experiments:
-    """Every experiment that was asked for.
+    """Every experiment that was asked for; or after Ctrl-C those that were finished, if at least one start was.
 
     Raises:
         CalibrationError: there is no result even from the source's calibration.
     """
+    poses = experiments.poses_of(bench, plan.directions, plan.rotation_deg, plan.translation_m)
+    done = Experiments(experiments.from_reference(bench, stages))
+    try:
+        for outcome in experiments.from_starts(bench, poses, stages):
+            done.outcomes.append(outcome)
+        _try_further(done, subject, plan, bench, poses, stages)
+    except KeyboardInterrupt:
+        if not done.outcomes:
+            raise
+        done.interrupted = True
+    return done
 
+
+def _try_further(
+    done: Experiments, subject: Subject, plan: Plan, bench: Bench, poses: Sequence[Matrix4], stages: Stages
+) -> None:
     def cut(begin_s: float, end_s: float) -> Window:
         between_s = (begin_s, end_s)
         loaded = windows.load(subject.source, subject.frames, WindowConfig().pairs, lambda *_: None, between_s)
         # With the rig of the whole: it may have another camera model.
         return replace(loaded.window, rig=subject.window.rig)
 
-    poses = experiments.poses_of(bench, plan.directions, plan.rotation_deg, plan.translation_m)
-    from_reference = experiments.from_reference(bench, stages)
-    outcomes = experiments.from_starts(bench, poses, stages)
-    frames = experiments.against_frames(bench, poses, stages) if plan.against_frames else ()
-    slices = experiments.against_slice(bench, subject.model, cut, poses, stages) if plan.against_slice else ()
+    if plan.against_frames:
+        done.frames = experiments.against_frames(bench, poses, stages)
+    if plan.against_slice:
+        done.slices = experiments.against_slice(bench, subject.model, cut, poses, stages)
     radii = (radians(plan.rotation_deg), plan.translation_m)
     splits = plan.halves or plan.nees
     halved = experiments.in_halves(bench, splits, *radii, stages) if splits else []
-    halves = None
     if plan.halves:
-        halves = split_halves.compare(halved, len(bench.window.pairs) // 2, bench.configuration.search.dof)
-    normalised = {}
+        done.halves = split_halves.compare(halved, len(bench.window.pairs) // 2, bench.configuration.search.dof)
     if plan.nees:
         against, true_pose = _truth(subject.source, bench)
         starts = experiments.poses_of(bench, plan.nees, plan.rotation_deg, plan.translation_m)
         apart = experiments.in_windows(bench, subject.model, cut, starts, true_pose, stages)
-        normalised[against] = normalised_errors.normalise(normalised_errors.of_outcomes(apart), len(apart))
+        done.normalised[against] = normalised_errors.normalise(normalised_errors.of_outcomes(apart), len(apart))
         # Every split sees the same frames: they count as one.
-        normalised[OTHER_HALF] = normalised_errors.normalise(normalised_errors.of_differences(halved), independent=1)
-    detection = None
+        done.normalised[OTHER_HALF] = normalised_errors.normalise(
+            normalised_errors.of_differences(halved), independent=1
+        )
     if plan.detection:
         seen = experiments.detected(bench, plan.detection, experiments.CHECKS, stages)
-        detection = detection_of(seen, plan.detection, len(bench.window.pairs))
-    knocked = experiments.knocked(bench, plan.steps, stages) if plan.steps else []
-    return Experiments(from_reference, outcomes, frames, slices, halves, normalised, detection, steps_of(knocked))
+        done.detection = detection_of(seen, plan.detection, len(bench.window.pairs))
+    if plan.steps:
+        done.steps = steps_of(experiments.knocked(bench, plan.steps, stages))
 
 
 def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
@@ -244,6 +258,7 @@ def report_of(
         search_translation_m=search.translation_m if search.dof == 6 else 0.0,
         hit_rotation_deg=degrees(statistics.HIT_RAD),
         hit_translation_m=statistics.HIT_M if search.dof == 6 else None,
+        interrupted=done.interrupted,
         starts=summary.starts,
         hits=summary.hits,
         hit_rate=summary.hit_rate,

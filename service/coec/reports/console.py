@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
+from coec.reports import plain_text
+from coec.reports.progress import Bars
 from coec.schemas import replies
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -35,13 +37,24 @@ STATE_STYLES = {
 PIPE_WIDTH = 140
 """Columns where standard output is no terminal: nothing is folded into the lines of a log."""
 
-out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
-err = Console(stderr=True, highlight=False)
+
+def made(environment: Mapping[str, str], *, on_error: bool = False) -> Console:
+    """A console on standard output, or on standard error. One that is to be plain is no terminal to rich: no colours,
+    no bold, nothing that moves."""
+    width = PIPE_WIDTH if not on_error and not sys.stdout.isatty() else None
+    if plain_text.wants_plain(environment):
+        return Console(stderr=on_error, highlight=False, width=width, force_terminal=False, color_system=None)
+    return Console(stderr=on_error, highlight=False, width=width)
+
+
+out = made(os.environ)
+err = made(os.environ, on_error=True)
 
 
 def print_json(document: Any) -> None:
     """The one document of `--json`: a line with sorted keys, floats in the shortest form that reads back exactly."""
-    text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    escaped = not plain_text.is_unicode(sys.stdout.encoding)
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=escaped, allow_nan=False)
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
@@ -53,8 +66,10 @@ def raw(text: str) -> None:
 
 
 def plain(text: str) -> str:
-    """The text, without what a terminal would obey: some of what is shown came over a network."""
-    return "".join(character if character.isprintable() or character in "\n\t" else "\ufffd" for character in text)
+    """The text, without what a terminal would obey: some of what is shown came over a network. With the signs that the
+    terminal has, so that columns stay in line."""
+    obeyed = "".join(character if character.isprintable() or character in "\n\t" else "\ufffd" for character in text)
+    return obeyed if plain_text.is_unicode(out.encoding) else plain_text.encodable(obeyed, out.encoding)
 
 
 def say(text: str) -> None:
@@ -67,29 +82,19 @@ def show(text: str, style: str = "") -> None:
     out.print(Text(plain(text), style=style), soft_wrap=True)
 
 
-def progress(*, counted: bool = True) -> Progress:
-    """A progress display on standard error that disappears when it is done; nothing where that is not a terminal."""
-    count = (MofNCompleteColumn(),) if counted else ()
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        *count,
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[note]}"),
-        console=err,
-        transient=True,
-        disable=not err.is_terminal,
-    )
+def progress(*, counted: bool = True) -> Bars:
+    """A progress display on standard error that disappears when it is done; where that is not a terminal, a line now
+    and then."""
+    return Bars(err, say, counted=counted)
 
 
 def table(*columns: str, right: Iterable[int] = ()) -> Table:
     """A table; the columns whose index is in `right` hold numbers."""
-    made = _PlainTable(box=None, pad_edge=False, header_style="bold")
+    columned = _PlainTable(box=None, pad_edge=False, header_style="bold")
     numbers = set(right)
     for index, column in enumerate(columns):
-        made.add_column(column, justify="right" if index in numbers else "left", overflow="fold")
-    return made
+        columned.add_column(plain(column), justify="right" if index in numbers else "left", overflow="fold")
+    return columned
 
 
 class _PlainTable(Table):
@@ -137,4 +142,4 @@ def limit_of(metric: replies.MetricReply) -> tuple[str, Text]:
     if metric.limit is None:
         return "", Text()
     limit = f"{'≥' if metric.at_least else '≤'} {figure(metric.limit)}"
-    return limit, Text("✓", "green") if metric.passed else Text("✗", "red")
+    return limit, Text(plain("✓"), "green") if metric.passed else Text(plain("✗"), "red")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 from pydantic import Field
@@ -12,6 +14,33 @@ CommandName = Literal["calibrate", "apply", "rollback", "reset", "commission", "
 """Of CONTRACT."""
 
 NAMES: Final[tuple[CommandName, ...]] = get_args(CommandName)
+
+
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """One entry of a command's payload, a JSON object."""
+
+    name: str
+    kind: type
+    meaning: str
+
+
+RELEASE: Final = Argument("release", bool, "let go of what is held")
+TO: Final = Argument(
+    "to",
+    str,
+    "id of an accepted window, or the beginning of a sha256 of `history`: what was served then is served again",
+)
+SENSOR: Final = Argument("sensor", str, "of the rig: all pairs of this sensor, and no others")
+
+OF_PAIR: Final[Mapping[str, tuple[Argument, ...]]] = {"rollback": (TO,), "hold": (RELEASE,)}
+"""What a payload may hold, by command; the others take none."""
+
+
+def arguments_of(command: str, *, for_rig: bool) -> tuple[Argument, ...]:
+    """What the payload of a command may hold, for a pair or for the rig. A window is of one pair only."""
+    own = OF_PAIR.get(command, ())
+    return (*(argument for argument in own if argument is not TO), SENSOR) if for_rig else own
 
 
 class ProvenCommand(Message):

@@ -227,6 +227,9 @@ class EvaluationReport(Message):
     search_translation_m: float = Field(description="likewise; 0 with 3 dof")
     hit_rotation_deg: float = Field(description="a hit ends nearer to the source's calibration than this")
     hit_translation_m: float | None = Field(description="and, with 6 dof, than this; null with 3 dof")
+    interrupted: bool = Field(
+        default=False, description="ended before its time: figures are of the starts and experiments that were finished"
+    )
     starts: Count
     hits: Count
     hit_rate: float = Field(ge=0, le=1)
@@ -265,6 +268,7 @@ class ComparisonReport(Message):
     source: str
     methods: dict[str, EvaluationReport] = Field(description="by the name of the objective")
     not_evaluated: dict[str, str] = Field(description="objectives that this source does not allow, and why")
+    interrupted: bool = Field(default=False, description="ended before its time: the last method is not finished")
     elapsed_s: dict[str, float] = Field(description="by stage, s")
 
 

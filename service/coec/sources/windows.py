@@ -22,6 +22,10 @@ from coec.sources.spec import parse_spec
 WHOLE = (0.0, math.inf)
 """Seconds after the first camera frame that hold all of a recording."""
 
+HALF_TURN_DEG = 180.0
+FARTHEST_M = 50.0
+"""No sensor sits farther from another on a vehicle, of road or rail: a larger number was given in other units."""
+
 RECORDED_GAP_S = 1e9
 """Frames that were chosen from a recording may be any time apart; its order is already certain."""
 
@@ -112,7 +116,7 @@ def vector_of(option: str, text: str) -> NDArray[np.float64]:
     """ξ (6,) in radians and metres from `rx,ry,rz[,tx,ty,tz]` in degrees and metres, the value of an option.
 
     Raises:
-        UsageError: it is not three or six finite numbers; names the option.
+        UsageError: it is not three or six finite numbers, or they are beyond any mount; names the option.
     """
     try:
         values = [float(part) for part in text.split(",")]
@@ -125,12 +129,16 @@ def xi_of(what: str, values: Sequence[float]) -> NDArray[np.float64]:
     """ξ (6,) in radians and metres from `rx, ry, rz[, tx, ty, tz]` in degrees and metres.
 
     Raises:
-        UsageError: it is not three or six finite numbers; begins with `what`.
+        UsageError: it is not three or six finite numbers, or they are beyond any mount; begins with `what`.
     """
     if len(values) not in (3, 6) or not np.isfinite(values).all():
         raise UsageError(f"{what}: give three numbers (degrees), or six (degrees, then metres)")
     xi = np.zeros(6)
     xi[: len(values)] = values
+    if np.abs(xi[:3]).max() > HALF_TURN_DEG or np.abs(xi[3:]).max() > FARTHEST_M:
+        raise UsageError(
+            f"{what}: at most {HALF_TURN_DEG:g} degrees, then at most {FARTHEST_M:g} metres (not millimetres)"
+        )
     xi[:3] = np.radians(xi[:3])
     return xi
 

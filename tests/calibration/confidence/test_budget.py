@@ -121,3 +121,15 @@ def test_the_columns_of_a_sweep_are_measured(with_rings: bool, rng: np.random.Ge
     ring = beam[order].astype(np.uint16) if with_rings else None
     sweep = LidarFrame(0, "lidar", xyz_m[order].astype(np.float32), ring=ring)
     assert column_rad(sweep) == pytest.approx(np.radians(0.4), rel=1e-3)
+
+
+def test_a_ring_of_one_number_is_none() -> None:
+    """Two beams whose firings lie in between each other's: taken for one line they would be twice as fine."""
+    azimuth = np.concatenate([np.arange(0.0, 1.0, 4e-3), np.arange(2e-3, 1.0, 4e-3)])
+    elevation = np.repeat([0.0, 0.1], len(azimuth) // 2)
+    xyz_m = 10.0 * np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+    )
+    unnumbered = LidarFrame(0, "lidar", xyz_m.astype(np.float32))
+    constant = replace(unnumbered, ring=np.full(len(xyz_m), 3, np.uint16))
+    assert column_rad(constant) == column_rad(unnumbered) == pytest.approx(4e-3, rel=1e-3)

@@ -6,6 +6,7 @@ import json
 import logging
 import socket
 from collections.abc import Iterator
+from itertools import count
 
 import pytest
 from pydantic import ValidationError
@@ -109,7 +110,8 @@ def test_a_taken_port_is_a_trouble_and_no_end(door: HttpDoor) -> None:
 
 def test_a_router_that_is_away_is_told_once_each_time(caplog: pytest.LogCaptureFixture) -> None:
     there = iter([False, False, True, True, False, True])
-    watch = RouterWatch(("tcp/10.0.0.1:7447",), lambda: next(there))
+    clock = count(100, 10)
+    watch = RouterWatch(("tcp/10.0.0.1:7447",), lambda: next(there), lambda: float(next(clock)))
     codes = []
     with caplog.at_level(logging.INFO):
         for _ in range(6):
@@ -118,10 +120,25 @@ def test_a_router_that_is_away_is_told_once_each_time(caplog: pytest.LogCaptureF
     assert codes == ["no_router", "no_router", None, None, "no_router", None]
     assert caplog.messages == [
         "no router at tcp/10.0.0.1:7447, trying again",
-        "the router at tcp/10.0.0.1:7447 is there",
+        "the router at tcp/10.0.0.1:7447 is there again, after 20 s",
         "the router has gone: none at tcp/10.0.0.1:7447, trying again",
-        "the router at tcp/10.0.0.1:7447 is there",
+        "the router at tcp/10.0.0.1:7447 is there again, after 10 s",
     ]
+
+
+@pytest.mark.fault("a night without a router", "health has the reason; the log repeats it, each time later")
+def test_a_night_without_a_router_is_a_few_lines(caplog: pytest.LogCaptureFixture) -> None:
+    clock = count(0)
+    watch = RouterWatch(("tcp/10.0.0.1:7447",), lambda: False, lambda: float(next(clock)))
+    with caplog.at_level(logging.INFO):
+        for _ in range(8 * 3600):
+            watch.look()
+    said = [message for message in caplog.messages if "trying again" in message]
+    assert said == caplog.messages
+    assert said[1] == "no router at tcp/10.0.0.1:7447 for 60 s, trying again"
+    assert said[2] == "no router at tcp/10.0.0.1:7447 for 180 s, trying again"
+    assert 8 <= len(said) <= 20
+    assert watch.trouble is not None
 
 
 def test_who_is_the_router_itself_misses_none() -> None:

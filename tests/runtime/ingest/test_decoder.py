@@ -298,3 +298,14 @@ def test_a_call_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
     reader.join(20.0)
     assert len(got) == 1
     assert isinstance(got[0], Parcel)
+
+
+@pytest.mark.fault("a driver that fills `ring` with one number", "the field is ignored, and the log says so once")
+def test_a_ring_that_tells_no_beams_apart_is_said_once(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+    sweep = a_sweep()
+    for number, ring in enumerate((sweep.ring, np.full(len(sweep.xyz_m), 7, np.uint16)) * 3):
+        told = replace(sweep, stamp_ns=(1 + 3600 * number) * 10**9, ring=ring)
+        assert desk.take(LIDAR, msgpack_frames.encode_lidar(told), MSGPACK) is not None
+    said = [message for message in caplog.messages if "`ring`" in message]
+    assert len(said) == 1
+    assert "ignored" in said[0]

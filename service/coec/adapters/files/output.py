@@ -2,11 +2,41 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 from pathlib import Path
 
 from coec.adapters.files import durable
 from coec.errors import DecodeError, OutputError
 from coec.schemas.base import M, from_json
+
+
+def try_folder(folder: Path) -> None:
+    """Make the folder and write into it, before the work of which the result is to be there.
+
+    Raises:
+        OutputError: it cannot be made, or not be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # Permissions do not tell: of a full or read-only disk, or to root.
+        with tempfile.TemporaryFile(dir=folder) as trial:
+            trial.write(b"\0")
+    except OSError as error:
+        raise OutputError(f"cannot write to {folder}: {error.strerror}; name another folder with --output") from error
+
+
+def try_file(path: Path) -> None:
+    """Likewise of a file, which stays as it is, or absent.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    try_folder(path.parent)
+    if path.is_dir():
+        raise OutputError(f"cannot write {path}: it is a folder; name a file with --output")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise OutputError(f"cannot write {path}: Permission denied; name another file with --output")
 
 
 def write(path: Path, data: bytes) -> Path:

@@ -212,7 +212,7 @@ def read_attachment(path: Path, name: str) -> bytes | None:
 def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
     """The summary section, its CRC verified, and where it begins. Empty when there is none."""
     if size < len(MAGIC) + _TAIL_BYTES:
-        raise McapDamaged(f"byte {size}: the file is cut off")
+        raise McapDamaged(f"byte {size}: the file is cut off" if size else "it is empty, of 0 bytes")
     footer_at = size - _TAIL_BYTES
     stream.seek(footer_at)
     tail = _read(stream, _TAIL_BYTES, footer_at, size)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, sqrt
+from math import hypot
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.lens_limit import lens_error_px
 from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.geometry.cameras import pixel_rad
 from coec.geometry.edges.range_edges import NEIGHBOUR_RAD
-from coec.geometry.edges.scan_lines import BAND_RAD
+from coec.geometry.edges.scan_lines import BAND_RAD, telling
 
 LENS_PX = 0.05
 """What a target-based calibration of a lens leaves of its principal point, and of its scale at the rim: half of the 0.1
@@ -40,15 +41,11 @@ class Grain:
 
 
 def grain_of(window: Window, T_camera_lidar: Matrix4, held_m: float) -> Grain:
-    """Of a window, its camera at `T_camera_lidar` (4, 4); a centre that is held is known to `held_m`.
-
-    Of a fitted camera any miss up to its largest is as likely as another where the edges happen to lie: they gather on
-    the horizon and at the rim, and the fit was best for all of the image.
-    """
+    """Of a window, its camera at `T_camera_lidar` (4, 4); a centre that is held is known to `held_m`."""
     velocity_mps, turn_radps = _rates(window, T_camera_lidar)
     return Grain(
         pixel_rad=pixel_rad(window.rig.camera),
-        lens_px=hypot(LENS_PX, window.rig.camera_residual_px / sqrt(3.0)),
+        lens_px=hypot(LENS_PX, lens_error_px(window.rig.camera_residual_px)),
         column_rad=column_rad(window.pairs[0].lidar),
         velocity_mps=velocity_mps,
         turn_radps=turn_radps,
@@ -57,11 +54,12 @@ def grain_of(window: Window, T_camera_lidar: Matrix4, held_m: float) -> Grain:
 
 
 def column_rad(sweep: LidarFrame) -> float:
-    """Median turn between neighbours of a scan line, radians; where no ring is known, of rows of one elevation. 0 where
-    none has a neighbour."""
+    """Median turn between neighbours of a scan line, radians; where no ring tells beams apart, of rows alike high.
+    0 where none has a neighbour."""
     x, y, z = (sweep.xyz_m[:, axis].astype(np.float64) for axis in range(3))
     azimuth, across = np.arctan2(y, x), np.hypot(x, y)
-    row = np.floor(np.arctan2(z, across) / BAND_RAD) if sweep.ring is None else sweep.ring.astype(np.float64)
+    ring = telling(sweep.ring)
+    row = np.floor(np.arctan2(z, across) / BAND_RAD) if ring is None else ring.astype(np.float64)
     order = np.lexsort((azimuth, row))
     turn = np.diff(azimuth[order])
     neighbours = turn[(np.diff(row[order]) == 0.0) & (turn > 0.0) & (turn < NEIGHBOUR_RAD)]

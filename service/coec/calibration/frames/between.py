@@ -17,7 +17,7 @@ from coec.calibration.ports import ImageReducer
 from coec.calibration.types import FramePair, LidarFrame, Matrix4
 from coec.config import WindowConfig
 from coec.errors import DecodeError
-from coec.geometry.edges.scan_lines import BAND_RAD
+from coec.geometry.edges.scan_lines import BAND_RAD, telling
 
 NS_PER_S = 1_000_000_000
 MIB = 2**20
@@ -115,8 +115,9 @@ def _near_the_view(xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4, angle_ra
 
 def _rows(lidar: LidarFrame, of: NDArray[np.int64]) -> NDArray[np.int64]:
     """The row of each point: its ring, or without one the band of its elevation."""
-    if lidar.ring is not None and len(lidar.ring) and lidar.ring.min() < lidar.ring.max():
-        return lidar.ring[of].astype(np.int64)
+    ring = telling(lidar.ring)
+    if ring is not None:
+        return ring[of].astype(np.int64)
     x_m, y_m, z_m = lidar.xyz_m[of].T
     elevation = np.arctan2(z_m, np.hypot(x_m, y_m))
     return np.asarray(np.floor(elevation / np.float32(BAND_RAD)).astype(np.int64))

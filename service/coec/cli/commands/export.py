@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from coec.cli import completing
 from coec.cli.options import Json
 
 
@@ -29,6 +30,7 @@ class Options:
             "--format",
             help="tf, urdf, autoware, kalibr, kitti, kitti360, nuscenes, openlabel, colmap, opencv or json.",
             metavar="NAME",
+            autocompletion=completing.export_formats,
             show_default=False,
         ),
     ]

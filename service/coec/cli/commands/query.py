@@ -8,7 +8,35 @@ from typing import Annotated
 
 import typer
 
+from coec.cli import completing
 from coec.cli.options import Connect, Json, Prefix, ServiceConfig, Vehicle
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """What can be asked for. `parameters` are those of `--param`, beside `format`."""
+
+    key: str
+    answer: str
+    parameters: str = ""
+
+
+KEYS = (
+    Key("extrinsic", "where the camera is, with sigma", "format=tf, urdf, ... as `coec export`; parent, child"),
+    Key("health", "state, reasons, figures and their limits"),
+    Key("history", "past results, and who changed what", "since=NS, until=NS, limit=COUNT"),
+    Key("windows", "recorded windows and snippets"),
+    Key("windows/ID", "one of them, into --output FILE, its sha256 verified"),
+    Key("overlay", "picture of the latest window, into --output FILE.jpg", "at=nominal, window=ID"),
+    Key("evidence", "red events that are kept"),
+    Key("evidence/ID", "one of them; a picture of it with --output FILE.jpg", "overlay=before, overlay=after"),
+    Key("rig", "all sensors of the vehicle together"),
+    Key("status", "the service itself: streams, worker, budget, troubles"),
+    Key("config", "its effective configuration, without secrets"),
+    Key("metrics", "OpenMetrics text"),
+    Key("command/NAME", "calibrate, apply, rollback, reset, commission, hold", "timeout_ms=COUNT"),
+)
+"""In the order of the help text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +46,9 @@ class Options:
     key: Annotated[
         str,
         typer.Argument(
-            help="extrinsic, health, history, windows, windows/ID, status, config, metrics, command/NAME, or a whole "
-            "key expression with @v1 in it.",
+            help="One of the keys above, or a whole key expression with @v1 in it.",
+            metavar="KEY",
+            autocompletion=completing.query_keys,
             show_default=False,
         ),
     ]
@@ -44,7 +73,18 @@ class Options:
         list[str] | None,
         typer.Option("--param", help="Parameter of the query, for example limit=5; repeatable.", metavar="K=V"),
     ] = None
-    payload: Annotated[str | None, typer.Option(help="Payload of a command, JSON.")] = None
+    to: Annotated[
+        str | None,
+        typer.Option(help="Of command/rollback: window or sha256 of `query history` to serve again.", metavar="HASH"),
+    ] = None
+    release: Annotated[bool, typer.Option("--release", help="Of command/hold: let go of what is held.")] = False
+    sensor: Annotated[
+        str | None,
+        typer.Option(help="Of any command: for all pairs of this sensor of the rig.", metavar="NAME"),
+    ] = None
+    payload: Annotated[
+        str | None, typer.Option(help="Payload of a command, JSON, instead of such options.", metavar="JSON")
+    ] = None
     timeout_s: Annotated[
         float, typer.Option("--timeout", help="Seconds to wait, for the router and for the answer.", min=0.01)
     ] = 5.0
@@ -55,7 +95,25 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Ask a running service."""
     from coec.cli import query as work
 
     return work.run(options)
+
+
+def _help() -> str:
+    """Every key, what it answers and its parameters, kept in columns by the mark that help texts know."""
+    width = max(len(each.key) for each in KEYS)
+    rows = []
+    for each in KEYS:
+        rows.append(f"{each.key:{width}}  {each.answer}")
+        if each.parameters:
+            rows.append(f"{'':{width}}    --param {each.parameters}")
+    listed = "\n".join(rows)
+    several = (
+        "With --json and several pairs, one document: {pairs: {NAME: what the pair answered}}; with one pair, or with "
+        "--pair, its answer alone."
+    )
+    return f"Ask a running service.\n\n\b\n{listed}\n\n{several}"
+
+
+run.__doc__ = _help()

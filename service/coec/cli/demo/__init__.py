@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coec.adapters.files import output
+from coec.adapters.files import output as files
 from coec.adapters.files.rig import mask_to_png
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.window_fetch import fetch_window
@@ -28,6 +28,7 @@ from coec.cli.demo.screen import Screen
 from coec.cli.demo.vehicle import NS_PER_S, Vehicle
 from coec.cli.demo.watch import ASK_S, Seen, Watch
 from coec.config import Config
+from coec.geometry import compile_news
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys
@@ -50,6 +51,7 @@ def run(output: Path, *, as_json: bool) -> int:
         SourceError: what casts the rays is not installed.
         OutputError: a file cannot be written.
     """
+    files.try_folder(output)
     started_s = time.monotonic()
     config_of_drive = story.drive_config()
     from coec.simulation.drive import SimulatedDrive
@@ -61,7 +63,8 @@ def run(output: Path, *, as_json: bool) -> int:
         with running(folder / "coec.yaml", folder / "coec.log") as daemon, Screen() as screen:
             screen.wait("The service starts, the street is built …")
             # Compiles what the renderers then find compiled, while the service compiles its own.
-            next(drive.messages([0]))
+            with compile_news.heard_by(screen.hear):
+                next(drive.messages([0]))
             with connected(config.zenoh.connect, START_S) as session:
                 watch = Watch(
                     session,
@@ -91,9 +94,9 @@ def _configure(drive: SimulatedDrive, folder: Path) -> Config:
     """Writes the configuration of the service, and what it names, into the folder."""
     rig = drive.rig
     mask = np.ones((rig.camera.height, rig.camera.width), bool) if rig.mask is None else rig.mask
-    output.write(folder / "mask.png", mask_to_png(mask))
+    files.write(folder / "mask.png", mask_to_png(mask))
     config = story.service_config(rig, Path("mask.png"), free_endpoint())
-    output.write(folder / "coec.yaml", commented_yaml(config).encode())
+    files.write(folder / "coec.yaml", commented_yaml(config).encode())
     return config
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from types import TracebackType
 
@@ -15,6 +16,7 @@ from rich.text import Text
 from coec.cli.demo import story
 from coec.cli.demo.watch import Seen, Watch
 from coec.reports import console
+from coec.reports.progress import COMPILING, COMPILING_S, CompilingNews
 
 BARS = "▁▂▃▄▅▆▇█"
 BAR_WIDTH = 48
@@ -24,12 +26,18 @@ FIGURES = ("distance_rotation", "distance_pose", "edges_per_pair", "overlap", "m
 """Of the latest check of the monitor: what it decides by, and mutual information."""
 
 
+STARTING = "starting"
+"""State of a worker that compiles its kernels, or reads them from the cache, before its first job."""
+
+
 class Screen:
     """Shows what is seen, while it is open."""
 
     def __init__(self) -> None:
         self._live = Live(console=console.err, transient=True, auto_refresh=False)
         self._told = ""
+        self._news = CompilingNews(time.monotonic)
+        self._said_compiling = False
 
     def __enter__(self) -> Screen:
         self._live.start()
@@ -37,6 +45,19 @@ class Screen:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._live.stop()
+
+    def hear(self, kernel: str) -> None:
+        """A kernel is being compiled in this process, as `compile_news` tells it."""
+        self._news.hear(kernel)
+        if self._news.lasted_s >= COMPILING_S:
+            self._compiling(f"{COMPILING}: {self._news.kernels} so far, {self._news.lasted_s:.0f} s")
+
+    def _compiling(self, text: str) -> None:
+        if console.err.is_terminal:
+            self.wait(text)
+        elif not self._said_compiling:
+            self._said_compiling = True
+            console.say(f"demo: {COMPILING}; the drive begins then")
 
     def wait(self, what: str) -> None:
         """Nothing can be seen yet."""
@@ -49,6 +70,9 @@ class Screen:
             self._live.update(view(watch, seen), refresh=True)
             return
         moment = seen.moment
+        if seen.status.worker.state == STARTING and moment.t_s > COMPILING_S:
+            self._compiling("")
+            return
         told = f"{moment.health}, {moment.provenance}"
         if told != self._told:
             self._told = told
@@ -61,7 +85,7 @@ def view(watch: Watch, seen: Seen) -> RenderableType:
     rows = Table.grid(padding=(0, 2))
     rows.add_column(style="bold")
     rows.add_column()
-    rows.add_row("drive", _drive(moment.drive_s))
+    rows.add_row("drive", _drive(moment.drive_s) if seen.status.worker.state != STARTING else _before(moment.t_s))
     rows.add_row("health", Text.assemble(console.styled(moment.health), "  ", _reason(seen)))
     rows.add_row("error against the truth", _error(seen))
     rows.add_row("", curve(watch.series))
@@ -87,6 +111,11 @@ def curve(series: Sequence[tuple[float, float, str]], width: int = CURVE_WIDTH) 
         height = min(int(error_deg / (story.KNOCK_DEG * 1.1) * len(BARS)), len(BARS) - 1)
         text.append(BARS[height], console.STATE_STYLES.get(health, "dim"))
     return text
+
+
+def _before(t_s: float) -> Text:
+    """While the worker starts: the drive waits for it."""
+    return Text(f"waits: kernels are being compiled, once on this machine, {t_s:.0f} s")
 
 
 def _drive(second: float) -> Text:

@@ -189,8 +189,8 @@ def _type(body: dict[str, Any], shapes: Mapping[str, dict[str, Any]]) -> str:
 
 
 def _arguments(command: str) -> str:
-    given = {**payloads.ARGUMENTS.get(command, {}), **payloads.OF_RIG}
-    return ", ".join(f"`{name}`: {KINDS[kind]}" for name, kind in given.items())
+    given = dict.fromkeys((*commands.arguments_of(command, for_rig=False), commands.SENSOR))
+    return "; ".join(f"`{one.name}`: {KINDS[one.kind]}, {one.meaning}" for one in given)
 
 
 def _grammar(parser: Callable[..., Any]) -> str:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.bearings import Bearings, bearings
 from coec.geometry.compiler import njit, prange
-from coec.geometry.edges.scan_lines import BAND_RAD
+from coec.geometry.edges.scan_lines import BAND_RAD, telling
 
 BANDS = math.ceil(0.5 * math.pi / BAND_RAD)
 """Of a quarter of a turn, from the horizon up or down."""
@@ -85,7 +85,8 @@ def range_edges(
         seen: the bearings of the points, where the caller has them.
     """
     seen = bearings(xyz_m) if seen is None else seen
-    if ring is None or (len(ring) and ring.min() == ring.max()):  # one number for all beams tells none from another
+    ring = telling(ring)
+    if ring is None:
         # A point without an elevation lands in the highest band: it is near to none there.
         band = np.fmin(np.floor(seen.elevation / BAND_RAD), BANDS - 1)
         row, rows, same_line = (band + BANDS).astype(np.uint16), 2 * BANDS, SAME_LINE_RAD

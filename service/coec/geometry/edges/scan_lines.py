@@ -1,7 +1,20 @@
 """Rows of a sweep whose beams are not numbered. Without a kernel: whoever records sweeps thins them by rows, too."""
 
+from __future__ import annotations
+
 import math
+
+import numpy as np
+from numpy.typing import NDArray
 
 BAND_RAD = math.radians(0.42)
 """Height of a band of elevation where no ring is known: the beam spacing of a 64-beam sensor. Wider bands only cost
 time, narrower ones cut scan lines of a tilted sensor into pieces."""
+
+
+def telling(ring: NDArray[np.uint16] | None) -> NDArray[np.uint16] | None:
+    """The rings (N,) where they tell beams apart; None where there are none, or drivers fill the field with one number
+    for all beams."""
+    if ring is None or not len(ring) or ring.min() == ring.max():
+        return None
+    return ring

@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
 from typing import Any, Final
 
 import msgpack
 
 from coec.errors import UsageError
-from coec.schemas.commands import NAMES
-
-ARGUMENTS: Final[Mapping[str, Mapping[str, type]]] = {"rollback": {"to": str}, "hold": {"release": bool}}
-"""What a payload may hold, by command; the others take none."""
-
-OF_RIG: Final[Mapping[str, type]] = {"sensor": str}
-"""What that of a command for the rig may hold beside it."""
-
-OF_ONE_PAIR: Final = frozenset({"to"})
-"""What it may not: other pairs have other windows."""
+from coec.schemas.commands import NAMES, arguments_of
 
 MAX_SENDER: Final = 96
 """Characters of a sender in log and history."""
@@ -44,9 +34,7 @@ def parse(name: str, payload: bytes, *, for_rig: bool = False) -> dict[str, Any]
     """
     if name not in NAMES:
         raise UsageError(f"no such command; known: {', '.join(NAMES)}")
-    known = ARGUMENTS.get(name, {})
-    if for_rig:
-        known = {key: kind for key, kind in {**known, **OF_RIG}.items() if key not in OF_ONE_PAIR}
+    known = {argument.name: argument.kind for argument in arguments_of(name, for_rig=for_rig)}
     document = _document(payload)
     for key, value in document.items():
         if key not in known:

@@ -1,13 +1,19 @@
-"""Whether the router is there, in the log when it goes and comes, and as a reason of health while it is away."""
+"""Whether the router is there: in the log when it goes and comes, and now and then while it is away; as a reason of
+health all that time."""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 
 from coec.calibration.types import Reason
 
 _log = logging.getLogger(__name__)
+
+FIRST_REMINDER_S, LONGEST_REMINDER_S = 60.0, 3600.0
+"""After which the log says once more that there is none: a minute, then twice as long each time, up to an hour. Who
+reads the last screen of a log finds it, and a night without a router is twenty lines."""
 
 
 class RouterWatch:
@@ -17,11 +23,16 @@ class RouterWatch:
         trouble: None while somebody is there.
     """
 
-    def __init__(self, endpoints: Sequence[str], is_there: Callable[[], bool]) -> None:
+    def __init__(
+        self, endpoints: Sequence[str], is_there: Callable[[], bool], now_s: Callable[[], float] = time.monotonic
+    ) -> None:
         """`endpoints` as they may be shown; none where the service is the router itself."""
         self._endpoints = ", ".join(endpoints)
         self._is_there = is_there
+        self._now_s = now_s
         self._seen: bool | None = None
+        self._away_since_s = self._told_s = 0.0
+        self._reminder_s = FIRST_REMINDER_S
         self.trouble: Reason | None = None
 
     def look(self) -> None:
@@ -29,12 +40,19 @@ class RouterWatch:
         if not self._endpoints:
             return
         there = self._is_there()
+        now_s = self._now_s()
         if there == self._seen:
+            if not there and now_s - self._told_s >= self._reminder_s:
+                _log.warning(f"no router at {self._endpoints} for {now_s - self._away_since_s:.0f} s, trying again")
+                self._told_s, self._reminder_s = now_s, min(2.0 * self._reminder_s, LONGEST_REMINDER_S)
             return
         if there:
-            _log.info(f"the router at {self._endpoints} is there")
+            again = "" if self._seen is None else f" again, after {now_s - self._away_since_s:.0f} s"
+            _log.info(f"the router at {self._endpoints} is there{again}")
             self.trouble = None
         else:
+            self._away_since_s = self._told_s = now_s
+            self._reminder_s = FIRST_REMINDER_S
             away = "no router" if self._seen is None else "the router has gone: none"
             _log.warning(f"{away} at {self._endpoints}, trying again")
             text = (

@@ -206,7 +206,7 @@ TROUBLES: Mapping[str, Trouble] = {
     ),
     "held": Trouble(
         "A person holds the extrinsic as it is; nothing ails the service.",
-        "`coec query command/hold --payload '{\"release\": true}'` releases it.",
+        "`coec query command/hold --release` releases it.",
     ),
 }
 """By the code of the reason."""

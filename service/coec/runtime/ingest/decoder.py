@@ -29,6 +29,7 @@ from coec.config import (
     OpenLidarConfig,
 )
 from coec.errors import DecodeError
+from coec.geometry.edges.scan_lines import telling
 from coec.runtime.ingest.senders import Senders
 
 _log = logging.getLogger(__name__)
@@ -142,7 +143,7 @@ class Decoder:
         self._T_cloud_lidar = np.array(IDENTITY if lidar is None else lidar.T_cloud_lidar, dtype=np.float64)
         self._origin = OriginCheck()
         self._looked_in: int | None = None
-        self._contradicted = False
+        self._contradicted = self._ring_told = False
         self.timed_by = ""
 
     def counts(self) -> StreamCounts:
@@ -233,6 +234,13 @@ class Decoder:
         if period == self._looked_in and not self._contradicted:
             return None
         self._looked_in = period
+        if sweep.ring is not None and telling(sweep.ring) is None and not self._ring_told:
+            self._ring_told = True
+            _log.warning(
+                "the field `ring` of the clouds holds one number: it is ignored, beams are told by their elevation; "
+                "see to the driver of the LiDAR",
+                extra={"fields": {"sensor": self._stream.sensor}},
+            )
         found = self._origin.look(sweep)
         self._contradicted = found is not None
         return found

@@ -1,0 +1,50 @@
+"""Whether a camera model that was fitted to another may stand for it."""
+
+from __future__ import annotations
+
+from math import degrees, sqrt
+
+from coec.errors import LensError
+from coec.geometry.cameras import Camera, name_of, pixel_rad
+from coec.geometry.cameras.double_sphere_fit import DoubleSphereFit
+
+
+def lens_error_px(residual_max_px: float) -> float:
+    """Standard deviation of a fitted camera where the edges happen to lie, pixels.
+
+    Any miss up to its largest is as likely as another there: edges gather on the horizon and at the rim, and the fit
+    was best for all of the image.
+    """
+    return residual_max_px / sqrt(3.0)
+
+
+def require_fit(camera: Camera, fit: DoubleSphereFit, max_sigma_deg: float) -> None:
+    """Refuse a fit through which no result could be as sure as it must be to be accepted.
+
+    The error of a lens does not grow less with more frames, as all see it alike: what it is on the optical axis, as an
+    angle, is the least that σ of a rotation may claim. Where that alone is more than `max_sigma_deg`, at which results
+    are refused (`verdict.max_sigma_deg`), there is nothing to search for.
+
+    Raises:
+        LensError: so it is. Its details are those of the fit.
+    """
+    error_deg = degrees(lens_error_px(fit.residual_max_px) * pixel_rad(camera))
+    if error_deg <= max_sigma_deg:
+        return
+    name = name_of(camera)
+    raise LensError(
+        f"double_sphere does not fit this {name} lens: it is off by {fit.residual_max_px:.1f} px at most "
+        f"({fit.residual_rms_px:.2f} px rms), by which a rotation may be {error_deg:.2f}° wrong; a result is accepted "
+        f"up to {max_sigma_deg:g}°. Calibrate with the lens's own model: leave --camera-model out",
+        {
+            "camera_fit": {
+                "model": "double_sphere",
+                "of": name,
+                "residual_rms_px": fit.residual_rms_px,
+                "residual_max_px": fit.residual_max_px,
+                "coverage": fit.coverage,
+                "error_deg": error_deg,
+                "limit_deg": max_sigma_deg,
+            }
+        },
+    )

@@ -1,0 +1,116 @@
+"""Progress on standard error: bars in a terminal, and elsewhere a line now and then, so that no wait is silent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+
+from coec.geometry import compile_news
+
+LINE_S = 30.0
+"""Between two lines where there is no terminal: a log of an hour has a hundred."""
+
+COMPILING_S = 2.0
+"""A shorter wait for a compiler needs no word."""
+
+COMPILING = "compiling the kernels, once on this machine"
+
+
+class CompilingNews:
+    """What is known of a compilation that goes on. `kernels`: how many were begun; `lasted_s`: since the first."""
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._began_s: float | None = None
+        self._names: set[str] = set()
+
+    def hear(self, kernel: str) -> None:
+        """As `compile_news` tells it."""
+        if self._began_s is None:
+            self._began_s = self._now_s()
+        self._names.add(kernel)
+
+    @property
+    def kernels(self) -> int:
+        """Begun up to now."""
+        return len(self._names)
+
+    @property
+    def lasted_s(self) -> float:
+        """Since the first began; 0 before it."""
+        return 0.0 if self._began_s is None else self._now_s() - self._began_s
+
+
+class Bars(Progress):
+    """A bar for each task, gone when all is done; where the console is no terminal, lines of the task that goes on:
+    one every half minute, none of what is quicker."""
+
+    def __init__(
+        self,
+        console: Console,
+        say: Callable[[str], None],
+        *,
+        counted: bool,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`say` puts a line; `counted` shows how many parts of how many are done."""
+        self._say = say
+        self._now_s = now_s
+        self._told_s = now_s()
+        self._news = CompilingNews(now_s)
+        self._listening = compile_news.heard_by(self._hear)
+        self._compiling: TaskID | None = None
+        count = (MofNCompleteColumn(),) if counted else ()
+        super().__init__(
+            SpinnerColumn("dots" if console.encoding.startswith("utf") else "line"),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            *count,
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+
+    def __enter__(self) -> Bars:
+        self._listening.__enter__()
+        super().__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        super().__exit__(kind, error, at)
+        self._listening.__exit__(None, None, None)
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        """As rich has it."""
+        super().update(task_id, **changes)
+        if self.disable and self._is_time():
+            task = self._tasks[task_id]
+            note = task.fields.get("note", "")
+            done = f"{task.completed:g}" + ("" if task.total is None else f" of {task.total:g}")
+            self._say(f"coec: {task.description}: {f'{done}, {note}' if note else done}")
+
+    def _hear(self, kernel: str) -> None:
+        self._news.hear(kernel)
+        if self._news.lasted_s < COMPILING_S:
+            return
+        first = self._compiling is None
+        if first:
+            self._compiling = self.add_task(COMPILING, total=None, note="")
+        assert self._compiling is not None
+        super().update(self._compiling, completed=self._news.kernels, note=f"{self._news.kernels} so far")
+        if self.disable and (first or self._is_time()):
+            self._told_s = self._now_s()
+            self._say(f"coec: {COMPILING}: {self._news.kernels} so far")
+
+    def _is_time(self) -> bool:
+        if self._now_s() - self._told_s < LINE_S:
+            return False
+        self._told_s = self._now_s()
+        return True

@@ -1,0 +1,67 @@
+"""What a person reads of one check: the mount, the data, or that it cannot be told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coec.calibration.monitor.change_detector import Observation
+from coec.calibration.monitor.sensor_faults import Cause
+from coec.reports import diagnosis
+
+SIGMA = (0.12, 0.12, 0.13, 0.03, 0.03, 0.03)
+NOWHERE = (0.02, -0.01, 0.05, 0.0, 0.01, 0.0)
+RIGHT = Observation(
+    stamp_ns=5,
+    pair_stamps_ns=(1, 5),
+    metrics=(),
+    offset=np.zeros(6),
+    sigma=np.ones(6),
+    noise=np.ones(6),
+    place=np.zeros(6),
+    dispersion=1.0,
+    distance2=0.1,
+    flagged=False,
+    weak=False,
+    flagged_by_paper=None,
+    causes=(),
+)
+
+
+def test_a_mount_that_moved_is_named_by_its_axes_farthest_first() -> None:
+    off = (-1.0, 0.4, 0.1, 0.0, -0.2, 0.0)
+    found = diagnosis.finding_of(replace(RIGHT, flagged=True), off, SIGMA)
+    assert found.state == "moved"
+    assert found.sentence == "mount moved: pitch −1.0° ± 0.12°, down −0.20 m ± 0.03 m, yaw +0.4° ± 0.12°"
+    assert any("coec calibrate" in remark for remark in found.remarks)
+    assert any("camera or the LiDAR" in remark for remark in found.remarks)
+
+
+def test_where_no_axis_is_beyond_chance_the_farthest_is_named() -> None:
+    assert diagnosis.moved_text((0.1, 0.2, 0.0, 0.0, 0.0, 0.0), SIGMA) == "yaw +0.2° ± 0.12°"
+
+
+def test_wrong_data_accuse_no_mount() -> None:
+    cause = Cause("image_frozen", "every picture is the same.", "Look at the camera.")
+    found = diagnosis.finding_of(replace(RIGHT, flagged=True, causes=(cause,)), (9.0,) * 6, SIGMA)
+    assert found.state == "bad_data"
+    assert "mount moved" not in found.sentence
+    assert found.remarks[0] == "image_frozen: every picture is the same."
+
+
+def test_what_cannot_be_told_says_so() -> None:
+    found = diagnosis.finding_of(replace(RIGHT, undecided=True), (0.5, 0.0, 0.0, 0.0, 0.0, 0.0), SIGMA)
+    assert found.state == "unclear"
+    assert "cannot tell" in found.sentence
+    assert "pitch +0.5°" in found.sentence
+
+
+def test_a_right_one_says_what_would_not_be_seen(capsys: pytest.CaptureFixture[str]) -> None:
+    found = diagnosis.finding_of(replace(RIGHT, weak=True), NOWHERE, SIGMA)
+    assert found.state == "right"
+    diagnosis.show(found)
+    shown = capsys.readouterr().out
+    assert "less than 0.39°" in shown
+    assert "faint" in shown

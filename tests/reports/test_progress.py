@@ -1,0 +1,88 @@
+"""What a command says of its progress where nobody sees bars, by a clock of the test's."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from coec.geometry import compile_news
+from coec.reports.progress import COMPILING, COMPILING_S, LINE_S, Bars
+
+
+class Clock:
+    """Seconds that the test passes."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def bars(clock: Clock, said: list[str]) -> Bars:
+    return Bars(Console(file=io.StringIO()), said.append, counted=True, now_s=clock)
+
+
+def test_what_is_quick_says_nothing(bars: Bars, clock: Clock, said: list[str]) -> None:
+    with bars:
+        task = bars.add_task("starts", total=100, note="")
+        for done in range(100):
+            clock.now_s += 0.9 * LINE_S / 100
+            bars.update(task, completed=done, note="")
+    assert not said
+
+
+def test_what_is_long_says_a_line_now_and_then(bars: Bars, clock: Clock, said: list[str]) -> None:
+    with bars:
+        task = bars.add_task("starts", total=100, note="")
+        for done in range(1, 101):
+            clock.now_s += 5.0
+            bars.update(task, completed=done, note=f"{done - 1} hits")
+    assert len(said) == pytest.approx(500.0 / LINE_S, abs=1)
+    assert said[0] == "coec: starts: 6 of 100, 5 hits"
+
+
+def test_a_compiler_at_work_is_said_once_and_then_now_and_then(bars: Bars, clock: Clock, said: list[str]) -> None:
+    with bars:
+        compile_news.tell("first")
+        assert not said
+        clock.now_s += COMPILING_S
+        compile_news.tell("second")
+        compile_news.tell("second")
+        assert said == [f"coec: {COMPILING}: 2 so far"]
+        clock.now_s += LINE_S
+        compile_news.tell("third")
+        assert said[1:] == [f"coec: {COMPILING}: 3 so far"]
+    clock.now_s += LINE_S
+    compile_news.tell("fourth")
+    assert len(said) == 2, "who has ended hears no more"
+
+
+def test_kernels_from_the_cache_are_no_news() -> None:
+    from coec.geometry.compiler import njit
+
+    def twice(x: float) -> float:
+        return x * 2.0
+
+    heard: list[str] = []
+    kernel: Any = njit(twice)
+    with compile_news.heard_by(heard.append):
+        assert kernel(2.0) == 4.0
+        assert any("twice" in name for name in heard)
+        heard.clear()
+        assert kernel(3.0) == 6.0
+        assert not heard
