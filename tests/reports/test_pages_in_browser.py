@@ -38,7 +38,10 @@ LOOK = """() => ({
 })"""
 """What of a page is to be looked at."""
 
-ALIKE = {"dirty", "flagged", "hostile_calibration"}
+SETTLED = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+"""A page hears of its new size before the next frame is drawn."""
+
+ALIKE = {"detection", "dirty", "flagged", "hostile_calibration"}
 """Kinds that are laid out as others are."""
 
 LEAST_LETTER_PX = 11.0
@@ -77,6 +80,7 @@ def test_a_page_fits_every_screen_and_loads_nothing(browser: Browser, tmp_path: 
     tab, wrong = opened(browser, path)
     for width in WIDTHS_PX:
         tab.set_viewport_size({"width": width, "height": 900})
+        tab.evaluate(SETTLED)
         seen = tab.evaluate(LOOK)
         assert seen["wide"] <= seen["inner"] == width
         assert all(letter_px >= LEAST_LETTER_PX for letter_px in seen["small"]), width
