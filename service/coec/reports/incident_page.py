@@ -64,9 +64,7 @@ def page(story: Story, pictures: Sequence[str]) -> str:
     title = f"{event.vehicle}/{event.pair}: {', '.join(reason.code for reason in event.reasons) or 'red event'}"
     parts = [html.head(title), *(f"<p>{escape(each)}</p>" for each in sentences(story))]
     if pictures:
-        parts.append(
-            "<h2>What the camera saw: at the calibration that was served, and at the true one since</h2>"
-        )
+        parts.append("<h2>What the camera saw: at the calibration that was served, and at the true one since</h2>")
         parts += [
             f"<figure><img src='{escape(name, quote=True)}' alt='{escape(name)}'><figcaption>{escape(name)}"
             "</figcaption></figure>"
