@@ -165,8 +165,9 @@ def sentences(
         )
         lines.append("σ: how much stronger these are under the outlines than on average, 0 is chance. Axes: pixels.")
         before, after = telling.strength
+        images = "1 image" if telling.frames == 1 else f"{telling.frames} images"
         lines.append(
-            f"All outlines of {telling.frames} images, not only those shown: {caption.before} {before:+.2f} σ, "
+            f"All outlines of {images}, not only those shown: {caption.before} {before:+.2f} σ, "
             f"{caption.after} {after:+.2f} σ."
         )
     else:

@@ -67,6 +67,9 @@ class Story:
     snippets: tuple[str, ...] = ()
 
 
+SAW = "What the camera saw: at the calibration that was served, and at the true one since"
+
+
 def page(story: Story, pictures: Mapping[str, bytes], made: Made) -> Page:
     """The page; `pictures` are files beside it, by their names."""
     event = story.event
@@ -74,7 +77,7 @@ def page(story: Story, pictures: Mapping[str, bytes], made: Made) -> Page:
     results = () if story.history is None else story.history.results
     entries = () if story.history is None else story.history.entries
     sections = [
-        *((Section("What the camera saw", _pictures(pictures)),) if pictures else ()),
+        *((Section(SAW, _pictures(pictures)),) if pictures else ()),
         Section("Figures around the event", tuple(_timeline(event))),
         *((Section("What was decided, and why", (_results(results, event), *_refusals(results))),) if results else ()),
         *((Section("What happened, in the vehicle’s history", (_chain(story), _entries(entries))),) if entries else ()),
