@@ -213,13 +213,7 @@ def test_changes_begin_with_what_is_so_now_and_go_on(endpoint: str, bus: Bus) ->
     async def asked() -> None:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
             changes = vehicle.changes()
-            kinds: set[str] = set()
-
-            def all_told(change: Change) -> bool:
-                kinds.add(change.kind)
-                return kinds == {"alive", "extrinsic", "health"}
-
-            await until(changes, all_told)
+            await until(changes, _all_told())
             await changes.aclose()
             again = vehicle.changes(PAIR)
             await anext(again)
@@ -282,8 +276,8 @@ def test_a_slow_listener_loses_the_oldest_and_is_told(
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
             health = await vehicle.health()
             slow, prompt = vehicle.changes(), vehicle.changes()
-            await anext(slow)
-            await anext(prompt)
+            for changes in (slow, prompt):
+                await until(changes, _all_told())
             for since_ns in range(1, said + 1):
                 change = health.model_copy(update={"since_ns": since_ns})
                 bus.publish(KEYS.health(PAIR), Answer(to_msgpack(change), MSGPACK))
@@ -298,6 +292,17 @@ def test_a_slow_listener_loses_the_oldest_and_is_told(
     assert seen[0].lost >= said - waiting
     assert all(change.lost == 0 for change in seen[1:])
     record_property("figure", f"{WAITING} wait")
+
+
+def _all_told() -> Callable[[Change], bool]:
+    """Of one listener: whether it has heard all that is so now."""
+    kinds: set[str] = set()
+
+    def told(change: Change) -> bool:
+        kinds.add(change.kind)
+        return kinds == {"alive", "extrinsic", "health"}
+
+    return told
 
 
 def _says(since_ns: int) -> Callable[[Change], bool]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Literal
@@ -18,6 +18,10 @@ from coec.schemas.replies import ExtrinsicReply, HealthReply
 
 MAX_BYTES = 2**20
 """Of one document that is taken in; health with all its figures has some 10 kB."""
+
+
+MAX_KEYS = 4096
+"""Of a vehicle, three for each pair."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,38 +54,35 @@ def listening(
 ) -> Iterator[None]:
     """Until the end of the block `take` is called for what a pair (`*`: each) says now, and for every change; and
     `refuse` for what is no document of ours. Both are called on Zenoh's threads and must not wait. Nothing waits for
-    the answers of now, which come within `timeout_s` or not at all."""
-    changed: set[str] = set()
+    the answers of now, which come within `timeout_s` or not at all. A pair that comes is asked, too: what it said first
+    may have gone before anybody was known to listen."""
+    heard: set[str] = set()
     order = threading.Lock()
+    given_up = zenoh.CancellationToken()
 
     def give(sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
         try:
+            if key not in heard and len(heard) >= MAX_KEYS:
+                raise DecodeError("too_many_keys", f"a vehicle with more than {MAX_KEYS} keys")
             change = _change(sample)
         except DecodeError:
             refuse()
         else:
+            heard.add(key)
             take(change)
 
     def hear(sample: zenoh.Sample) -> None:
         with order:
-            changed.add(str(sample.key_expr))
             give(sample)
 
     def answered(reply: zenoh.Reply) -> None:
         with order:
-            # What has changed meanwhile is newer than this answer, or the same.
-            if reply.ok is not None and str(reply.ok.key_expr) not in changed:
+            # What was heard meanwhile is newer than this answer, or the same.
+            if reply.ok is not None and str(reply.ok.key_expr) not in heard:
                 give(reply.ok)
 
-    handler = zenoh.handlers.Callback(hear, indirect=False)
-    told = (keys.health(pair), keys.extrinsic(pair))
-    given_up = zenoh.CancellationToken()
-    with ExitStack() as stack:
-        for key in told:
-            stack.callback(session.declare_subscriber(key, handler).undeclare)
-        tokens = session.liveliness().declare_subscriber(keys.alive(pair), handler, history=True)
-        stack.callback(tokens.undeclare)
-        stack.callback(given_up.cancel)
+    def ask(told: Iterable[str]) -> None:
         for key in told:
             session.get(
                 key,
@@ -90,6 +91,27 @@ def listening(
                 timeout=timeout_s,
                 cancellation_token=given_up,
             )
+
+    def come_or_gone(sample: zenoh.Sample) -> None:
+        hear(sample)
+        of_pair = str(sample.key_expr).removesuffix("alive")
+        told = (f"{of_pair}health", f"{of_pair}extrinsic")
+        if sample.kind == zenoh.SampleKind.PUT:
+            ask(told)
+        else:
+            with order:
+                heard.difference_update(told)
+
+    now = (keys.health(pair), keys.extrinsic(pair))
+    handler = zenoh.handlers.Callback(hear, indirect=False)
+    with ExitStack() as stack:
+        for key in now:
+            stack.callback(session.declare_subscriber(key, handler).undeclare)
+        of_tokens = zenoh.handlers.Callback(come_or_gone, indirect=False)
+        tokens = session.liveliness().declare_subscriber(keys.alive(pair), of_tokens, history=True)
+        stack.callback(tokens.undeclare)
+        stack.callback(given_up.cancel)
+        ask(now)
         yield
 
 
