@@ -160,9 +160,9 @@ def test_the_frames_average_to_the_score(sharp_street: Window, fused: FusedObjec
 def test_its_cells_sum_to_the_objective_but_for_a_constant(sharp_street: Window, fused: FusedObjective) -> None:
     truth = sharp_street.T_camera_lidar_start
     cells = fused.cells(truth)
-    assert cells.at(truth).shape == (len(sharp_street.pairs), COLUMNS * ROWS + 1)
+    assert cells.at(truth[None])[0].shape == (len(sharp_street.pairs), COLUMNS * ROWS + 1)
     poses = [truth, *sample_reach(truth, SearchBox(np.radians(1.0), 0.0), 4)]
-    rest = [cells.at(pose).sum(axis=1).mean() - fused.evaluate(pose).score for pose in poses]
+    rest = [cells.at(pose[None])[0].sum(axis=1).mean() - fused.evaluate(pose).score for pose in poses]
     np.testing.assert_allclose(rest, rest[0], atol=1e-9)
     in_front = cells.sight.p_camera[:, 2] > 0.0
     assert in_front.mean() > 0.9
