@@ -103,9 +103,7 @@ def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> N
         step = np.minimum(blur_px * ways.steps, widest)
         begin = at
 
-        def scores(
-            points: NDArray[np.float64], level: Told = level, begin: NDArray[np.float64] = begin
-        ) -> list[float]:
+        def scores(points: NDArray[np.float64], level: Told = level, begin: NDArray[np.float64] = begin) -> list[float]:
             deviations = begin + np.sum(ways.directions * points[:, None, :], axis=2)
             # Half a deviation at the end of its reach: what the window does not tell stays as it was told.
             unlike = deviations[:, SHIFTS.stop :] / REACH[SHIFTS.stop :]
