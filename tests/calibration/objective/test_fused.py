@@ -346,8 +346,8 @@ def test_what_cannot_be_chance_to_one_witness_outranks_two_poor_showings(
     """In a garage with a network that has never seen one, a plain sum preferred 3.2 + 2.4 to 6.6 - 1.1."""
 
     def ranked(edges: float, depth: float) -> float:
-        monkeypatch.setattr(Fusion, "edge_contrast", lambda *_: edges)
-        monkeypatch.setattr(Fusion, "depth_contrast", lambda *_: depth)
+        monkeypatch.setattr(Fusion, "edge_contrasts", lambda *_: [edges])
+        monkeypatch.setattr(Fusion, "depth_contrasts", lambda *_: [depth])
         return fusion.rank(np.eye(4))
 
     assert ranked(6.6, -1.1) > ranked(3.2, 2.4)

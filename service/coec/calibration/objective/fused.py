@@ -183,9 +183,13 @@ class Fusion:
         """The same at one pose (4, 4)."""
         return self.edge_contrasts(T_camera_lidar[None])[0]
 
+    def depth_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
+        """How far the depth witness stands above other poses at each of K poses (K, 4, 4); standard deviations."""
+        return [self._of_depth.standard(at.score) for at in self._depth.evaluate_each(poses)]
+
     def depth_contrast(self, T_camera_lidar: Matrix4) -> float:
-        """How far the depth witness stands above other poses; standard deviations."""
-        return self._of_depth.standard(self._depth.evaluate(T_camera_lidar).score)
+        """The same at one pose (4, 4)."""
+        return self.depth_contrasts(T_camera_lidar[None])[0]
 
     def ranks(self, poses: Sequence[Matrix4]) -> list[float]:
         """How outstanding each of some poses (4, 4) is to both witnesses, standard deviations.
@@ -194,10 +198,9 @@ class Fusion:
         with the square). A plain sum would let two poor showings outdo one that cannot be chance.
         """
         stacked = np.array(poses).reshape(-1, 4, 4)
-        depths = (self._of_depth.standard(at.score) for at in self._depth.evaluate_each(stacked))
         return [
             hypot(max(edges, 0.0), max(depth, 0.0))
-            for edges, depth in zip(self.edge_contrasts(stacked), depths, strict=True)
+            for edges, depth in zip(self.edge_contrasts(stacked), self.depth_contrasts(stacked), strict=True)
         ]
 
     def rank(self, T_camera_lidar: Matrix4) -> float:
