@@ -19,7 +19,9 @@ NOWHERE = SightLines(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
 def landscape(score: Callable[[Array], Array], axes: int = 3, step_rad: float = 1e-3) -> Landscape:
     """Of cells (F, B) as a function of the perturbation (6,), about no perturbation."""
     return Landscape.about(
-        Cells(lambda pose: score(se3.perturbation_log(pose)), step_rad, NOWHERE), np.eye(4), tuple(range(axes))
+        Cells(lambda poses: np.array([score(se3.perturbation_log(pose)) for pose in poses]), step_rad, NOWHERE),
+        np.eye(4),
+        tuple(range(axes)),
     )
 
 

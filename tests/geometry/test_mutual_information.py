@@ -5,9 +5,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coec.geometry import mutual_information as kernels
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
-from coec.geometry.mutual_information import TASK, BinnedFrames, joint_histograms, mutual_information
+from coec.geometry.mutual_information import (
+    TASK,
+    BinnedFrames,
+    information_of_each,
+    joint_histograms,
+    mutual_information,
+)
 from coec.geometry.projection import project
 from oracles import entropy, mutual_information_of_frame
 
@@ -117,6 +124,18 @@ def test_points_that_are_not_numbers_are_not_counted() -> None:
     frames.xyz_m[:, ::3] = np.nan
     frames.xyz_m[:, 1::3] = np.inf
     assert mutual_information(frames, POSE).points[0] == by_oracle(frames, POSE)[0][1] < 1000
+
+
+def test_many_poses_at_once_are_each_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = frames_of(CAMERAS["pinhole"], (5000, 1, TASK + 7), 32, 32)
+    # The last one shifts by more than single precision tells near points with.
+    poses = [se3.perturb(POSE, np.array([0.02 * k, 0.0, 0.0, 0.0, 0.3 * k, 0.0])) for k in range(5)]
+    # Two of them at a time.
+    monkeypatch.setattr(kernels, "MOST_COUNTS", 2 * 4 * 33 * 32)
+    for at, pose in zip(information_of_each(frames, np.stack(poses)), poses, strict=True):
+        alone = mutual_information(frames, pose)
+        np.testing.assert_array_equal(at.mi, alone.mi)
+        np.testing.assert_array_equal(at.points, alone.points)
 
 
 def test_nothing_in_view_is_no_information() -> None:

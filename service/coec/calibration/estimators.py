@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.confidence.modes import Rivals
+from coec.calibration.frames.decoded_once import DecodedOnce
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
 from coec.calibration.objective.edges import EdgeWitness, build_edges
@@ -137,10 +138,12 @@ def sight_of(
 
 
 def _masked(sight: Sight) -> Sight:
-    # The images are decoded once more when an estimator asks: to keep them all would cost more than that is worth.
+    images = DecodedOnce(sight.images)
+    sight = replace(sight, images=images)
+    first_looks = sight._each("images", lambda index: images.first(sight.window.pairs[index].camera))
     moving = (
         grey
-        for grey, pair in zip(sight.greys(), sight.window.pairs, strict=True)
+        for grey, pair in zip(first_looks, sight.window.pairs, strict=True)
         if pair.motion is None or not pair.motion.stays_below(MIN_SPEED_MPS)
     )
     rig = sight.window.rig
@@ -202,7 +205,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     basins = find_basins(edges, start, reach)
     progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
-    ranked = sorted(((fusion.rank(b.T_camera_lidar), b.T_camera_lidar) for b in basins), key=lambda item: -item[0])
+    ranked = sorted(_with_ranks(fusion, [basin.T_camera_lidar for basin in basins]), key=lambda item: -item[0])
     to_rank = near(config.search, fusion.ranking[-1])
     of_start = basin_next_to(edges, start, SearchBox(NEIGHBOURHOOD_RAD, reach.translation_m))
     least = PLAUSIBLE * max((rank for rank, _ in ranked), default=0.0)
@@ -219,7 +222,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
             # The coarser bands led the first one of a basin: they would lead the others to the same end.
             bands = fusion.ranking[-1:] if there else fusion.ranking
             ends.append(polish_in_turn(bands, basin, to_rank, progress))
-    polished = [(fusion.rank(end.T_camera_lidar), end.T_camera_lidar) for end in ends]
+    polished = _with_ranks(fusion, [end.T_camera_lidar for end in ends])
 
     def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:
         rank, pose = end
@@ -259,6 +262,10 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     return Found(finest, found, metrics, summits, edges)
 
 
+def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[tuple[float, Matrix4]]:
+    return list(zip(fusion.ranks(poses), poses, strict=True))
+
+
 def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> list[float]:
     """The largest edge contrast among those of `others` (4, 4) that are summits beside `pose` (4, 4), in a list; an
     empty one where there is none.
@@ -266,7 +273,8 @@ def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> lis
     A climb may also end on the shoulder of the hill that `pose` is the top of, where turns and shifts make up for each
     other: from there the way to the top leads down nowhere.
     """
-    for contrast, other in sorted(((fusion.edge_contrast(o), o) for o in others), key=lambda item: -item[0]):
+    contrasts = fusion.edge_contrasts(np.array(others).reshape(-1, 4, 4))
+    for contrast, other in sorted(zip(contrasts, others, strict=True), key=lambda item: -item[0]):
         apart = se3.difference(other, pose)
         if any(fusion.edge_contrast(se3.perturb(pose, share * apart)) < contrast for share in BETWEEN):
             return [contrast]

@@ -26,6 +26,9 @@ BUNDLE = 512
 SECTORS = 64
 """Sectors of azimuth by which a sweep is ordered: of 5.6 degrees, some three bundles of a 64-beam sweep each."""
 
+NEVER_OUT = -math.inf
+"""Least cosine of a bundle that is left out nowhere."""
+
 MARGIN_RAD = 1e-6
 """Added to every angle, for rounding."""
 
@@ -79,13 +82,11 @@ class Bundles:
     least_cosine: NDArray[np.float64]
     shift_m: float
 
-    def at(self, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(B,) whether a bundle may be in view at a pose (4, 4)."""
+    def least_cosine_at(self, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(B,) `least_cosine` at a pose (4, 4): of none is it out of reach where the pose shifts by more."""
         if float(np.linalg.norm(T_camera_lidar[:3, 3])) > self.shift_m:
-            return np.ones(len(self.axis), np.bool_)
-        a, r = self.axis, T_camera_lidar[2]
-        seen: NDArray[np.bool_] = a[:, 0] * r[0] + a[:, 1] * r[1] + a[:, 2] * r[2] >= self.least_cosine
-        return seen
+            return np.full(len(self.axis), NEVER_OUT)
+        return self.least_cosine
 
 
 def azimuth_order(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:

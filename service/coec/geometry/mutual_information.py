@@ -19,13 +19,16 @@ from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera
 from coec.geometry.compiler import njit, prange
-from coec.geometry.culling import BUNDLE, Bundles
+from coec.geometry.culling import BUNDLE, NEVER_OUT, Bundles
 from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Certainty, certain_pixels, exact_pixel, filter_of
 from coec.geometry.prefetch import prefetch
 
 TASK = 32 * BUNDLE
 """Points per parallel task: small enough to balance two to sixteen threads over a handful of frames, large enough
 that zeroing and adding up a task's histograms (8 kB each at 32 bins) does not count."""
+
+MOST_COUNTS = 2_000_000
+"""Counts of the histograms of several poses at once: 8 MB."""
 
 NEIGHBOURS = 8
 """Points of a sweep of which one stands for all when lines of a depth map are fetched: they lie within five pixels of a
@@ -77,54 +80,78 @@ def mutual_information(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]
         frames: the window, binned.
         T_camera_lidar: (4, 4) float64, LiDAR to camera.
     """
-    mi, points = _information(*_histograms_of_tasks(frames, T_camera_lidar))
-    return FrameInformation(mi, points)
+    return information_of_each(frames, T_camera_lidar[None])[0]
+
+
+def information_of_each(frames: BinnedFrames, poses: NDArray[np.float64]) -> list[FrameInformation]:
+    """The same at each of many poses (K, 4, 4) in one go: several threads share what is too short for them one by
+    one."""
+    if len(poses) == 1:
+        counts, first_task = _histograms_of_tasks(frames, poses)
+        return [FrameInformation(*_information(counts[0], first_task))]
+    tasks = max(len(_tasks(frames.first_point)[1]), 1)
+    found, at_once = [], max(1, MOST_COUNTS // (tasks * (frames.depth_bins + 1) * frames.range_bins))
+    for begin in range(0, len(poses), at_once):
+        mi, points = _informations(*_histograms_of_tasks(frames, poses[begin : begin + at_once]))
+        found += [FrameInformation(*of_pose) for of_pose in zip(mi, points, strict=True)]
+    return found
 
 
 def joint_histograms(frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.int64]:
     """(F, depth_bins, range_bins) int64 counts of points by depth bin at their pixel and by range bin."""
-    counts, first_task = _histograms_of_tasks(frames, T_camera_lidar)
+    (counts,), first_task = _histograms_of_tasks(frames, T_camera_lidar[None])
     summed = [counts[a:b, :-1].sum(axis=0, dtype=np.int64) for a, b in pairwise(first_task)]
     return np.stack(summed)
 
 
 def _histograms_of_tasks(
-    frames: BinnedFrames, T_camera_lidar: NDArray[np.float64]
+    frames: BinnedFrames, poses: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """The joint histogram of each task, with one more row for points on no value, and the first task of each frame."""
-    T = np.ascontiguousarray(T_camera_lidar, np.float64)
-    in_view = _every_bundle(frames.first_point) if frames.bundles is None else frames.bundles.at(T)
+    """The joint histogram of each task at each of K poses, with one more row for points on no value, and the first task
+    of each frame."""
+    poses = np.ascontiguousarray(poses, np.float64)
+    bundles = _of_every_bundle(frames.first_point) if frames.bundles is None else frames.bundles
+    least_cosine = np.stack([bundles.least_cosine_at(T) for T in poses])
     single = filter_of(frames.camera)
+    limits = [single.at(T) for T in poses]
     return _count(
-        frames.camera, single.camera, single.at(T), T, frames.xyz_m, frames.range_bin, frames.first_point,
-        frames.depth_bin, in_view, frames.depth_bins, frames.range_bins,
+        frames.camera, single.camera, limits[0], np.array([limit.near_m for limit in limits]), poses, frames.xyz_m,
+        frames.range_bin, frames.first_point, frames.depth_bin, bundles.axis, least_cosine, frames.depth_bins,
+        frames.range_bins,
     )  # fmt: skip
 
 
-def _every_bundle(first_point: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """As `Bundles.at`, where nothing is left out."""
-    return np.ones(int((-(-np.diff(first_point) // BUNDLE)).sum()), np.bool_)
+def _of_every_bundle(first_point: NDArray[np.int64]) -> Bundles:
+    """Bundles of which none is left out."""
+    count = int((-(-np.diff(first_point) // BUNDLE)).sum())
+    return Bundles(np.zeros((count, 3)), np.full(count, NEVER_OUT), math.inf)
 
 
 @njit(cache=True, parallel=True)
 def _count(
-    camera: Camera, single: Camera, limits: Certainty, T: NDArray[np.float64], xyz: NDArray[np.float32],
-    range_bin: NDArray[np.unsignedinteger], first_point: NDArray[np.int64], depth_bin: NDArray[np.unsignedinteger],
-    in_view: NDArray[np.bool_], depth_bins: int, range_bins: int,
+    camera: Camera, single: Camera, limits: Certainty, near_m: NDArray[np.float32], poses: NDArray[np.float64],
+    xyz: NDArray[np.float32], range_bin: NDArray[np.unsignedinteger], first_point: NDArray[np.int64],
+    depth_bin: NDArray[np.unsignedinteger], axis: NDArray[np.float64], least_cosine: NDArray[np.float64],
+    depth_bins: int, range_bins: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:  # fmt: skip
-    """Joint histogram of each task, and the first task of each frame, with the number of tasks at the end. Integer
-    counts: the sum does not depend on the number of threads."""
+    """Joint histogram of each task at each of K poses (K, 4, 4), and the first task of each frame, with the number of
+    tasks at the end. Integer counts: the sum does not depend on the number of threads.
+
+    `near_m` (K,) takes the place of that of `limits`; `axis` (B, 3) and `least_cosine` (K, B) are those of `Bundles`.
+    """
     first_task, task_frame, task_start, task_stop, task_bundle = _tasks(first_point)
     tasks = task_frame.shape[0]
     # One row more than there are depth bins: points that fall on no value are counted there, without a branch.
-    counts = np.zeros((tasks, depth_bins + 1, range_bins), np.int32)
-    T_single = T.astype(np.float32)
-    for task in prange(tasks):
+    counts = np.zeros((poses.shape[0], tasks, depth_bins + 1, range_bins), np.int32)
+    for job in prange(poses.shape[0] * tasks):
+        k, task = job // tasks, job % tasks
         start, stop = task_start[task], task_stop[task]
+        bundles = slice(task_bundle[task], task_bundle[task + 1])
         _count_points(
-            camera, single, limits, T, T_single, xyz[0, start:stop], xyz[1, start:stop], xyz[2, start:stop],
-            range_bin[start:stop], in_view[task_bundle[task] : task_bundle[task + 1]], depth_bin[task_frame[task]],
-            counts[task],
+            camera, single, Certainty(limits.reach_px, limits.edge_cosine, near_m[k]), poses[k],
+            poses[k].astype(np.float32), xyz[0, start:stop], xyz[1, start:stop], xyz[2, start:stop],
+            range_bin[start:stop], axis[bundles], least_cosine[k][bundles], depth_bin[task_frame[task]],
+            counts[k, task],
         )  # fmt: skip
     return counts, first_task
 
@@ -155,16 +182,18 @@ def _tasks(
 def _count_points(
     camera: Camera, single: Camera, limits: Certainty, T: NDArray[np.float64], T_single: NDArray[np.float32],
     x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32], range_bin: NDArray[np.unsignedinteger],
-    in_view: NDArray[np.bool_], depth_bin: NDArray[np.unsignedinteger], counts: NDArray[np.int32],
+    axis: NDArray[np.float64], least_cosine: NDArray[np.float64], depth_bin: NDArray[np.unsignedinteger],
+    counts: NDArray[np.int32],
 ) -> None:  # fmt: skip
-    """Adds the points of one task to its joint histogram (depth_bins + 1, range_bins)."""
+    """Adds the points of one task, those of bundles in view, to its joint histogram (depth_bins + 1, range_bins)."""
     pixel = np.empty(BUNDLE, np.int32)
     columns, one = np.uint64(counts.shape[1]), np.int32(1)
     # Two histograms, used in turn: neighbouring points often share a cell, and an increment that follows another on the
     # same address has to wait for it.
     even, odd = counts.ravel(), np.zeros(counts.size, np.int32)
-    for index in range(in_view.shape[0]):
-        if not in_view[index]:
+    for index in range(axis.shape[0]):
+        cosine = axis[index, 0] * T[2, 0] + axis[index, 1] * T[2, 1] + axis[index, 2] * T[2, 2]
+        if not cosine >= least_cosine[index]:
             continue
         begin = index * BUNDLE
         end = min(begin + BUNDLE, x.shape[0])
@@ -254,4 +283,16 @@ def _information(
                 margins += _times_log(count)
             mi[f] = math.log(n) + (cells - margins) / n
             points[f] = n
+    return mi, points
+
+
+@njit(cache=True, parallel=True)
+def _informations(
+    counts: NDArray[np.int32], first_task: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """As `_information`, of the counts of K poses: (K, F) each."""
+    shape = (counts.shape[0], len(first_task) - 1)
+    mi, points = np.empty(shape), np.empty(shape, np.int64)
+    for k in prange(counts.shape[0]):
+        mi[k], points[k] = _information(counts[k], first_task)
     return mi, points

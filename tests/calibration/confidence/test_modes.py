@@ -31,12 +31,15 @@ class TwoSummits:
     def evaluate(self, T_camera_lidar: Array) -> Evaluation:
         raise NotImplementedError
 
+    def evaluate_each(self, poses: Array) -> list[Evaluation]:
+        raise NotImplementedError
+
     def cells(self, T_camera_lidar: Array) -> Cells:
         assert np.allclose(T_camera_lidar, np.eye(4))  # cut at the best one
         return Cells(self._at, self.step_rad, NOWHERE)
 
-    def _at(self, pose: Array) -> Array:
-        return np.zeros((10, 5)) if np.allclose(pose, np.eye(4)) else -self._difference
+    def _at(self, poses: Array) -> Array:
+        return np.array([np.zeros((10, 5)) if np.allclose(pose, np.eye(4)) else -self._difference for pose in poses])
 
 
 def sigma_yaw(drop: float, rng: np.random.Generator, away: Array = AWAY) -> float:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from coec.adapters.images.codec import GreyImages
 from coec.calibration.commissioning.baseline import Accuracy, MonitorLimits
@@ -46,6 +47,9 @@ class Hill:
         score = float(-0.5 * (PEAKEDNESS * off**2).sum())
         frames = np.array([score - 1.0, score + 1.0])
         return Evaluation(score, frames, mi=score, overlap=1.0, points_in_view=1)
+
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+        return [self.evaluate(pose) for pose in poses]
 
 
 def test_are_those_of_the_hill() -> None:

@@ -23,6 +23,9 @@ class Paraboloid:
         score = 1.0 - 0.5 * float(away @ self._curvature @ away)
         return Evaluation(score, np.array([score]), score, 1.0, 1000)
 
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+        return [self.evaluate(pose) for pose in poses]
+
 
 @pytest.mark.parametrize(("dof", "kept"), [(3, ()), (6, ()), (6, (4,))])
 def test_derivatives_are_those_of_the_axes_that_were_searched(

@@ -160,9 +160,9 @@ def test_the_frames_average_to_the_score(sharp_street: Window, fused: FusedObjec
 def test_its_cells_sum_to_the_objective_but_for_a_constant(sharp_street: Window, fused: FusedObjective) -> None:
     truth = sharp_street.T_camera_lidar_start
     cells = fused.cells(truth)
-    assert cells.at(truth).shape == (len(sharp_street.pairs), COLUMNS * ROWS + 1)
+    assert cells.at(truth[None])[0].shape == (len(sharp_street.pairs), COLUMNS * ROWS + 1)
     poses = [truth, *sample_reach(truth, SearchBox(np.radians(1.0), 0.0), 4)]
-    rest = [cells.at(pose).sum(axis=1).mean() - fused.evaluate(pose).score for pose in poses]
+    rest = [cells.at(pose[None])[0].sum(axis=1).mean() - fused.evaluate(pose).score for pose in poses]
     np.testing.assert_allclose(rest, rest[0], atol=1e-9)
     in_front = cells.sight.p_camera[:, 2] > 0.0
     assert in_front.mean() > 0.9
@@ -346,8 +346,8 @@ def test_what_cannot_be_chance_to_one_witness_outranks_two_poor_showings(
     """In a garage with a network that has never seen one, a plain sum preferred 3.2 + 2.4 to 6.6 - 1.1."""
 
     def ranked(edges: float, depth: float) -> float:
-        monkeypatch.setattr(Fusion, "edge_contrast", lambda *_: edges)
-        monkeypatch.setattr(Fusion, "depth_contrast", lambda *_: depth)
+        monkeypatch.setattr(Fusion, "edge_contrasts", lambda *_: [edges])
+        monkeypatch.setattr(Fusion, "depth_contrasts", lambda *_: [depth])
         return fusion.rank(np.eye(4))
 
     assert ranked(6.6, -1.1) > ranked(3.2, 2.4)

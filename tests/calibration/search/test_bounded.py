@@ -11,8 +11,8 @@ from coec.calibration.search.bounded import Box, maximum_in
 TOP = np.array([0.4, -1.2])
 
 
-def hill(x: NDArray[np.float64]) -> float:
-    return float(np.exp(-((x - TOP) ** 2).sum()))
+def hill(points: NDArray[np.float64]) -> list[float]:
+    return [float(np.exp(-((x - TOP) ** 2).sum())) for x in points]
 
 
 def box(half: float, tolerance: float = 1e-6) -> Box:
@@ -28,9 +28,9 @@ def test_the_top_is_found() -> None:
 def test_nothing_outside_of_the_box_is_tried() -> None:
     visited: list[NDArray[np.float64]] = []
 
-    def watched(x: NDArray[np.float64]) -> float:
-        visited.append(x.copy())
-        return hill(x)
+    def watched(points: NDArray[np.float64]) -> list[float]:
+        visited.extend(points.copy())
+        return hill(points)
 
     found, _ = maximum_in(box(1.0), watched, np.zeros(2), 200)
     assert np.abs(visited).max() <= 1.0
@@ -54,10 +54,33 @@ def test_a_coarser_tolerance_takes_fewer_evaluations(coarse: float, fine: float)
 def evaluations_to(tolerance: float) -> int:
     tried = 0
 
-    def counted(x: NDArray[np.float64]) -> float:
+    def counted(points: NDArray[np.float64]) -> list[float]:
         nonlocal tried
-        tried += 1
-        return hill(x)
+        tried += len(points)
+        return hill(points)
 
     maximum_in(box(3.0, tolerance), counted, np.zeros(2), 500)
     return tried
+
+
+def test_what_does_not_depend_on_scores_is_asked_for_at_once_and_never_again() -> None:
+    asked: list[NDArray[np.float64]] = []
+
+    def watched(points: NDArray[np.float64]) -> list[float]:
+        asked.append(points.copy())
+        return hill(points)
+
+    maximum_in(box(3.0), watched, np.zeros(2), 200)
+    assert [len(points) for points in asked] == [5] + [1] * (len(asked) - 1)
+    assert len(np.unique(np.concatenate(asked), axis=0)) == sum(map(len, asked))
+
+
+def test_no_more_is_asked_for_than_may_be() -> None:
+    asked: list[int] = []
+
+    def watched(points: NDArray[np.float64]) -> list[float]:
+        asked.append(len(points))
+        return hill(points)
+
+    assert maximum_in(box(3.0), watched, np.zeros(2), 3)[1]
+    assert sum(asked) == 3

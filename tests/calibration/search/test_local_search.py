@@ -35,6 +35,9 @@ class Hill:
         score = float(np.exp(-0.5 * (((xi - self.top) / self._widths) ** 2).sum()))
         return Evaluation(score, np.array([score]), score, 1.0, 1)
 
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+        return [self.evaluate(pose) for pose in poses]
+
 
 def apart_deg(found: SearchResult, hill: Hill) -> float:
     return float(np.degrees(np.abs(se3.difference(found.T_camera_lidar, START) - hill.top)[:3].max()))

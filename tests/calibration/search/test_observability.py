@@ -66,6 +66,9 @@ class Valley:
         score = float(np.exp(-0.5 * ((turn / 0.1) ** 2 + shift @ shift)))
         return Evaluation(score, np.array([score]), score, 1.0, 1)
 
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+        return [self.evaluate(pose) for pose in poses]
+
 
 @pytest.mark.parametrize("turned", [turned_about_camera, turned_about_lidar])
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (0.0, -20.0, 0.0), (11.0, 11.0, 12.0)])

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
 from coec.geometry.edges.alignment import (
+    LEAST_SQUARE,
     EdgeFrames,
     alignment_of_each,
     alignment_of_parts,
+    alignments,
+    alignments_of_late,
     frame_alignment,
-    significance_of_late,
     significances,
 )
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
@@ -73,14 +75,14 @@ def test_every_camera_model_agrees_with_the_plain_form_between_pixels(model: str
 def test_a_part_is_what_its_points_are_by_themselves() -> None:
     frames = frames_of(CAMERAS["double_sphere"], (2000, 0, 1, 1501))
     part = np.random.default_rng(1).integers(0, 4, len(frames.weight)).astype(np.uint8)
-    at = alignment_of_parts(frames, part, 5, POSE)
+    at = alignment_of_parts(frames, part, 5, POSE[None])
     for number in range(5):
         # Nothing but weight makes a point count.
         alone = frame_alignment(replace(frames, weight=np.where(part == number, frames.weight, np.float32(0.0))), POSE)
-        np.testing.assert_allclose(at.strength[:, number], alone.strength, rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(at.square[:, number], alone.square, rtol=1e-6)
-    assert (at.square[:, :4].sum(axis=0) > 50.0).all()
-    assert not at.square[:, 4].any()
+        np.testing.assert_allclose(at.strength[0, :, number], alone.strength, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(at.square[0, :, number], alone.square, rtol=1e-6)
+    assert (at.square[0, :, :4].sum(axis=0) > 50.0).all()
+    assert not at.square[0, :, 4].any()
 
 
 @pytest.mark.parametrize("model", CAMERAS)
@@ -109,6 +111,18 @@ def test_each_frame_may_have_a_pose_of_its_own() -> None:
         assert at.square[number] == alone.square[number]
 
 
+def test_many_poses_at_once_are_each_by_itself() -> None:
+    frames = frames_of(CAMERAS["double_sphere"], (2000, 0, 1501))
+    poses = np.stack([POSE, np.eye(4), se3.perturb(POSE, np.array([0.02, -0.01, 0.03, 0.1, 0.0, -0.1]))])
+    at = alignments(frames, poses)
+    for number, pose in enumerate(poses):
+        alone = frame_alignment(frames, pose)
+        np.testing.assert_array_equal(at.strength[number], alone.strength)
+        np.testing.assert_array_equal(at.square[number], alone.square)
+        of_alone = alone.strength / np.sqrt(np.maximum(alone.square, LEAST_SQUARE))
+        np.testing.assert_array_equal(at.of_single_frames[number], of_alone)
+
+
 def test_edges_that_were_seen_later_are_where_they_have_come_to() -> None:
     frames, rng = frames_of(CAMERAS["double_sphere"], (2000, 0, 1501)), np.random.default_rng(3)
     passing = rng.normal(scale=8.0, size=frames.xyz_m.shape).astype(np.float32)
@@ -116,7 +130,7 @@ def test_edges_that_were_seen_later_are_where_they_have_come_to() -> None:
     late_s = np.array([0.03, -0.02, 0.05], np.float32)
     come = frames.xyz_m + passing * (late_s[0] * share[0] + late_s[1] * share[1] + late_s[2] * share[2])
     expected = frame_alignment(replace(frames, xyz_m=come), POSE).significance
-    assert significance_of_late(frames, passing, share, late_s, POSE) == expected
+    assert alignments_of_late(frames, passing, share, late_s[None], POSE[None]).at(0).significance == expected
     assert expected != frame_alignment(frames, POSE).significance
 
 

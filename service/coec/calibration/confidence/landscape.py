@@ -33,18 +33,18 @@ class Landscape:
     @classmethod
     def about(cls, cells: Cells, pose: Matrix4, moved: tuple[int, ...]) -> Landscape:
         """At a pose (4, 4)."""
-        return cls(cells, pose, moved, cells.at(pose))
+        return cls(cells, pose, moved, cells.at(pose[None])[0])
 
     @property
     def frames(self) -> int:
         """Number of frames F."""
         return len(self.centre)
 
-    def at(self, offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(F, B) the cells at an offset (n,) along the axes moved."""
-        xi = np.zeros(6)
-        xi[list(self.moved)] = offset
-        return self.cells.at(se3.perturb(self.pose, xi))
+    def at(self, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(K, F, B) the cells at each of K offsets (K, n) along the axes moved."""
+        xi = np.zeros((len(offsets), 6))
+        xi[:, list(self.moved)] = offsets
+        return self.cells.at(np.array([se3.perturb(self.pose, one) for one in xi]))
 
     def certainty(self, cells: NDArray[np.float64]) -> float:
         """How surely the optimum stands above another pose, of which the cells (F, B) are given: what they are lower

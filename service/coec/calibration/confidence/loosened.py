@@ -138,6 +138,6 @@ def beside_a_turn(moved_px: float) -> float:
 def _cells(sharp: Told, deviation: NDArray[np.float64], sector: NDArray[np.uint8]) -> NDArray[np.float64]:
     """(F, B) what each frame adds to the significance in each sector; `sector` (E,) is where each range edge lies."""
     frames, pose = sharp.otherwise(deviation)
-    of_parts = alignment_of_parts(frames, sector, UNSEEN + 1, pose)
-    square = float(of_parts.square[:, :UNSEEN].sum())
-    return np.asarray(of_parts.strength[:, :UNSEEN] / sqrt(max(square, LEAST_SQUARE)))
+    of_parts = alignment_of_parts(frames, sector, UNSEEN + 1, pose[None])
+    square = float(of_parts.square[0, :, :UNSEEN].sum())
+    return np.asarray(of_parts.strength[0, :, :UNSEEN] / sqrt(max(square, LEAST_SQUARE)))

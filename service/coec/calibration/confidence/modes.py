@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp, fsum
 
+import numpy as np
+
 from coec.calibration.confidence.landscape import Landscape
 from coec.calibration.objective.mutual_information import Divisible
 from coec.calibration.types import Matrix4
@@ -39,9 +41,10 @@ def with_modes(rivals: Rivals, moved: Sequence[int], covariance: list[list[float
     if not aways_and_poses:
         return covariance
     landscape = Landscape.about(rivals.objective.cells(rivals.best), rivals.best, axes)
+    at_others = landscape.cells.at(np.array([other for _, other in aways_and_poses]))
     found = [
-        (exp(-2.0 * max(landscape.certainty(landscape.cells.at(other)), 0.0) ** 2), away)
-        for away, other in aways_and_poses
+        (exp(-2.0 * max(landscape.certainty(cells), 0.0) ** 2), away)
+        for (away, _), cells in zip(aways_and_poses, at_others, strict=True)
     ]
     whole = 1.0 + fsum(weight for weight, _ in found)
     n = range(len(axes))

@@ -68,15 +68,16 @@ def _derivatives(landscape: Landscape, step_rad: float) -> tuple[NDArray[np.floa
     shape, count = landscape.centre.shape, len(landscape.moved)
     steps = of_both(step_rad)[list(landscape.moved)]
 
-    def at(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        return landscape.at(offset).ravel()
+    def at(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+        return landscape.at(offsets).reshape(len(offsets), -1)
 
     gradients, second = along(at, steps, range(count))
     information = [[0.0] * count for _ in range(count)]
     for i in range(count):
         information[i][i] = -fsum(second[i].tolist())
-    for i, j in combinations(range(count), 2):
-        information[i][j] = information[j][i] = -fsum(across(at, steps, i, j).tolist())
+    pairs = list(combinations(range(count), 2))
+    for (i, j), mixed in zip(pairs, across(at, steps, pairs), strict=True):
+        information[i][j] = information[j][i] = -fsum(mixed.tolist())
     return gradients.reshape(count, *shape), information
 
 

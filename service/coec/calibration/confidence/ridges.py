@@ -40,9 +40,12 @@ def widened(landscape: Landscape, noise: Noise) -> list[list[float]]:
     n = range(len(scale))
     scaled = [[noise.covariance[i][j] / scale[i] / scale[j] for j in n] for i in n]
     wide = [row[:] for row in noise.covariance]
-    for variance, direction in eigen(scaled):
-        axis = [sqrt(max(variance, 0.0)) * part * of for part, of in zip(direction, scale, strict=True)]
-        ahead, behind = _reach(landscape, np.array(axis)), _reach(landscape, -np.array(axis))
+    axes = [
+        [sqrt(max(variance, 0.0)) * part * of for part, of in zip(direction, scale, strict=True)]
+        for variance, direction in eigen(scaled)
+    ]
+    both_ways = _reaches(landscape, np.array([[axis, np.negative(axis)] for axis in axes]).reshape(-1, len(scale)))
+    for axis, ahead, behind in zip(axes, both_ways[::2], both_ways[1::2], strict=True):
         more = max(0.5 * (ahead**2 + behind**2) / _expected(noise, axis) ** 2 - 1.0, 0.0)
         wide = [[wide[i][j] + more * axis[i] * axis[j] for j in n] for i in n]
     return wide
@@ -57,19 +60,25 @@ def _expected(noise: Noise, axis: list[float]) -> float:
     return 2.0 * CERTAIN * sqrt(scatter) / fsum(a * b for a, b in zip(pull, axis, strict=True))
 
 
-def _reach(landscape: Landscape, one_sigma: NDArray[np.float64]) -> float:
-    """Over how many standard deviations, an offset (n,) each, the drop is not certain: on a ridge with dents, all that
-    is not one. A drop that is a little surer makes it a little less."""
-    reach, before, certainty_before = 0.0, 0.0, 0.0
+def _reaches(landscape: Landscape, one_sigma: NDArray[np.float64]) -> list[float]:
+    """Along each of m ways, over how many standard deviations, an offset of `one_sigma` (m, n) each, the drop is not
+    certain: on a ridge with dents, all that is not one. A drop that is a little surer makes it a little less."""
+    reaches, walking = [0.0] * len(one_sigma), list(range(len(one_sigma)))
+    before, certainties_before = 0.0, [0.0] * len(one_sigma)
     distance = FIRST
     for _ in range(DOUBLINGS + 1):
-        certainty = landscape.certainty(landscape.at(distance * one_sigma))
-        reach += (distance - before) * _share_open(certainty_before, certainty)
-        if certainty >= BEYOND_DOUBT:
+        going_on = []
+        for way, cells in zip(walking, landscape.at(distance * one_sigma[walking]), strict=True):
+            certainty = landscape.certainty(cells)
+            reaches[way] += (distance - before) * _share_open(certainties_before[way], certainty)
+            certainties_before[way] = certainty
+            if certainty < BEYOND_DOUBT:
+                going_on.append(way)
+        if not going_on:
             break
-        before, certainty_before = distance, certainty
+        walking, before = going_on, distance
         distance *= 2.0
-    return reach
+    return reaches
 
 
 def _share_open(begin: float, end: float) -> float:

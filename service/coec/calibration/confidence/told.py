@@ -17,7 +17,7 @@ from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
 from coec.geometry.culling import half_field_of_view_rad
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significance_of_late
+from coec.geometry.edges.alignment import EdgeFrames, alignments, alignments_of_late
 from coec.geometry.edges.image_edges import VOID
 from coec.geometry.projection import project
 from coec.geometry.thinning import thinned
@@ -90,13 +90,19 @@ class Told:
             self, frames=self.frames.of_points(kept), passing=self.passing[:, kept], share=self.share[:, kept]
         )
 
-    def significance(self, deviation: NDArray[np.float64]) -> float:
-        """Of the alignment at a deviation (12,)."""
-        pose, late_s = se3.perturb(self.pose, deviation[: SHIFTS.stop]), deviation[CLOCKS].astype(np.float32)
-        frames = self._through_lens(deviation)
-        if late_s.any():
-            return significance_of_late(frames, self.passing, self.share, late_s, pose)
-        return frame_alignment(frames, pose).significance
+    def significances(self, deviations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(K,) of the alignment at each of K deviations (K, 12)."""
+        found = np.empty(len(deviations))
+        for through in _of_one_lens(deviations):
+            some = deviations[through]
+            poses = np.array([se3.perturb(self.pose, deviation[: SHIFTS.stop]) for deviation in some])
+            frames, late_s = self._through_lens(some[0]), some[:, CLOCKS].astype(np.float32)
+            if late_s.any():
+                at = alignments_of_late(frames, self.passing, self.share, late_s, poses)
+            else:
+                at = alignments(frames, poses)
+            found[through] = [at.at(k).significance for k in range(len(some))]
+        return found
 
     def pixels(self, deviation: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(E, 2) where the range edges lie at a deviation (12,), and (E,) whether they do."""
@@ -144,6 +150,14 @@ class Told:
             return np.broadcast_to(np.eye(3)[place - SHIFTS.start], turned_m.shape)
         passing_m = (self.passing * self.share[place - CLOCKS.start]).astype(np.float64)
         return np.asarray(np.einsum("ij,jn->ni", T[:3, :3], passing_m))
+
+
+def _of_one_lens(deviations: NDArray[np.float64]) -> list[list[int]]:
+    """Places of those of K deviations (K, 12) that are through the same lens, for each lens."""
+    places: dict[bytes, list[int]] = {}
+    for place, lens in enumerate(deviations[:, LENS]):
+        places.setdefault(lens.tobytes(), []).append(place)
+    return list(places.values())
 
 
 def levels_told(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> list[Told]:

@@ -103,13 +103,14 @@ def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> N
         step = np.minimum(blur_px * ways.steps, widest)
         begin = at
 
-        def score(along: NDArray[np.float64], level: Told = level, begin: NDArray[np.float64] = begin) -> float:
-            deviation = begin + np.sum(ways.directions * along, axis=1)
+        def scores(points: NDArray[np.float64], level: Told = level, begin: NDArray[np.float64] = begin) -> list[float]:
+            deviations = begin + np.sum(ways.directions * points[:, None, :], axis=2)
             # Half a deviation at the end of its reach: what the window does not tell stays as it was told.
-            unlike = deviation[SHIFTS.stop :] / REACH[SHIFTS.stop :]
-            return level.significance(deviation) - 0.5 * float(np.sum(unlike * unlike))
+            unlike = deviations[:, SHIFTS.stop :] / REACH[SHIFTS.stop :]
+            found: list[float] = (level.significances(deviations) - 0.5 * np.sum(unlike * unlike, axis=1)).tolist()
+            return found
 
         box = Box(-2.0 * widest, 2.0 * widest, step, (SETTLING if last else LEADING) * step)
-        found, _ = maximum_in(box, score, np.zeros(len(step)), MAX_EVALUATIONS)
+        found, _ = maximum_in(box, scores, np.zeros(len(step)), MAX_EVALUATIONS)
         at = begin + np.sum(ways.directions * found, axis=1)
     return at

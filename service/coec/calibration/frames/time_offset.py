@@ -111,7 +111,7 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
     edges = build_edges(moving, points, (images.grey(pair.camera) for pair in moving), rig)
     rotated, offset_s = _coarse(edges, twists, pose, limits)
     scores = _scores(edges.whole, twists, rotated)
-    found = _maximum(lambda x: float(scores(x).mean()), offset_s, limits)
+    found = _maximum(lambda x: float(scores(x[None])[0].mean()), offset_s, limits)
     sigma_s = _sigma(scores, found, limits)
     return _judged(float(found[OFFSET]), sigma_s, spread, limits)
 
@@ -174,14 +174,14 @@ def _coarse(edges: EdgeWitness, twists: list[Twist], pose: Matrix4, limits: Time
 
 
 def _scores(frames: EdgeFrames, twists: list[Twist], pose: Matrix4) -> FrameScores:
-    """Significance of each frame (F,), as a function of the perturbation of `pose` and the offset (7,)."""
+    """Significance of each frame (K, F), as a function of K perturbations of `pose` and offsets (K, 7)."""
     frame = np.repeat(np.arange(len(twists)), np.diff(frames.first_point))
 
-    def of(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def of_one(x: NDArray[np.float64]) -> NDArray[np.float64]:
         moved = replace(frames, xyz_m=_moved(frames.xyz_m, frame, twists, float(x[OFFSET])))
         return frame_alignment(moved, se3.perturb(pose, x[:OFFSET])).of_frames
 
-    return of
+    return lambda xs: np.array([of_one(x) for x in xs])
 
 
 def _maximum(
@@ -198,7 +198,7 @@ def _maximum(
     reach, steps = np.array([TURN_RAD] * 3 + [limits.reach_s]), STEPS[fitted]
     start = np.array([0.0, 0.0, 0.0, offset_s])
     box = Box(-reach, reach, steps, TOLERANCE * steps)
-    found, _ = maximum_in(box, lambda coordinates: score(full(coordinates)), start, MAX_EVALUATIONS)
+    found, _ = maximum_in(box, lambda points: [score(full(point)) for point in points], start, MAX_EVALUATIONS)
     return full(found)
 
 
@@ -230,14 +230,14 @@ def _derivatives(
     """Central differences of each frame's score: negative Hessians over the fitted axes (F, 4, 4), those of the fitted
     axes with the translation (F, 4, 3), gradients (F, 4)."""
 
-    def at(shift: NDArray[np.float64]) -> NDArray[np.float64]:
-        return scores(found + shift)
+    def at(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+        return scores(found + shifts)
 
     gradients, second = along(at, STEPS, FITTED)
     hessians = np.zeros((gradients.shape[1], len(FITTED), len(FITTED)))
     for a, i in enumerate(FITTED):
         hessians[:, a, a] = -second[a]
         for b, j in enumerate(FITTED[:a]):
-            hessians[:, a, b] = hessians[:, b, a] = -across(at, STEPS, i, j)
-    shifts = np.array([[-across(at, STEPS, i, j) for j in SHIFTS] for i in FITTED])
+            hessians[:, a, b] = hessians[:, b, a] = -across(at, STEPS, [(i, j)])[0]
+    shifts = np.array([-across(at, STEPS, [(i, j) for j in SHIFTS]) for i in FITTED])
     return hessians, np.moveaxis(shifts, 2, 0), gradients.T

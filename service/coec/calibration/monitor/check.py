@@ -156,6 +156,8 @@ def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) 
     cells = edges.cells(found.T_rotation)
     landscape = Landscape.about(cells, found.T_rotation, tuple(range(ROTATION_DOF)))
     noise = measure_noise(landscape)
+    poses = (se3.perturb(pose, expected.rotation), found.T_pose, se3.perturb(pose, expected.pose))
+    at_expected_turn, at_pose, at_expected_pose = cells.at(np.stack(poses))
     whole, sharp = edges.whole.frames, edges.sharp.frames
     return Check(
         pairs=len(evidence.pairs),
@@ -167,8 +169,8 @@ def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) 
         edges_at_best=frame_alignment(whole, found.T_rotation).significance,
         edges_in_view=_in_view(sharp, found.T_rotation),
         looks=1.0 if noise is None else noise.looks,
-        of_rotation=support(landscape.centre, cells.at(se3.perturb(pose, expected.rotation))),
-        of_pose=support(cells.at(found.T_pose), cells.at(se3.perturb(pose, expected.pose))),
+        of_rotation=support(landscape.centre, at_expected_turn),
+        of_pose=support(at_pose, at_expected_pose),
         contrast=found.contrast,
         overlap=_in_view(sharp, pose) / max(len(sharp.weight), 1),
     )

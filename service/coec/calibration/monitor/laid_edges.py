@@ -73,10 +73,11 @@ class LaidEdges:
         sector = np.zeros(len(p_camera), np.uint8)
         sector[seen] = sectors(uv_px[seen])
 
-        def at(pose: Matrix4) -> NDArray[np.float64]:
-            of_sectors = alignment_of_parts(frames, sector, COLUMNS * ROWS, pose)
-            scale = len(frames.maps) / np.sqrt(max(float(of_sectors.square.sum()), LEAST_SQUARE))
-            return np.asarray(of_sectors.strength * scale)
+        def at(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+            of_sectors = alignment_of_parts(frames, sector, COLUMNS * ROWS, poses)
+            squares = np.array([float(square.sum()) for square in of_sectors.square])
+            scales = len(frames.maps) / np.sqrt(np.maximum(squares, LEAST_SQUARE))
+            return np.asarray(of_sectors.strength * scales[:, None, None])
 
         sight = SightLines(p_camera[seen], frames.weight[seen].astype(np.float64), self.frame[seen])
         return Cells(at, CELL_STEP * self.bands[0].blur_rad, sight)

@@ -170,18 +170,20 @@ def _led(bands: tuple[LaidLevel, ...], pose: Matrix4) -> _End:
 
 def _climb(frames: EdgeFrames, start: Matrix4, step: NDArray[np.float64], tolerance: float) -> _End:
     """The maximum next to a pose, along as many axes as there are steps."""
-    dof, xi = len(step), np.zeros((2, 1, 3))
+    dof = len(step)
 
-    def at(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-        xi.reshape(-1)[:dof] = coordinates
-        return moved_by(start, xi[0], xi[1])
+    def at(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        xi = np.zeros((len(points), 6))
+        xi[:, :dof] = points
+        return moved_by(start, np.ascontiguousarray(xi[:, :3]), np.ascontiguousarray(xi[:, 3:]))
 
-    def score(coordinates: NDArray[np.float64]) -> float:
-        return float(smooth_significances(frames, at(coordinates))[0])
+    def scores(points: NDArray[np.float64]) -> list[float]:
+        found: list[float] = smooth_significances(frames, at(points)).tolist()
+        return found
 
     reach = CLIMB_STEPS * step
-    found, _ = maximum_in(Box(-reach, reach, step, tolerance * step), score, np.zeros(dof), MAX_EVALUATIONS)
-    end = at(found)
+    found, _ = maximum_in(Box(-reach, reach, step, tolerance * step), scores, np.zeros(dof), MAX_EVALUATIONS)
+    end = at(found[None])
     return _End(end[0], float(smooth_significances(frames, end)[0]))
 
 

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import Matrix4
-
 COLUMNS, ROWS = 8, 2
 """Sectors of the image, across and down. More than there are degrees of freedom, so that their scatter can be told from
 the pose; each several degrees wide, so that an object lies in one. 4 x 4, 4 x 2 and near from far apart, and 16 x 1
@@ -41,13 +39,13 @@ class Cells:
     """An objective near one pose, taken apart.
 
     Attributes:
-        at: (F, B) what each of F frames adds in each of B sectors at a pose (4, 4): the mean over the frames of the
-            sums over the sectors is the objective, but for a constant.
+        at: (K, F, B) what each of F frames adds in each of B sectors at each of K poses (K, 4, 4): the mean over the
+            frames of the sums over the sectors is the objective, but for a constant.
         step_rad: difference step at which its hill is still a hill: not wider than its top, not finer than its ripples.
         sight: what is in view at that pose.
     """
 
-    at: Callable[[Matrix4], NDArray[np.float64]]
+    at: Callable[[NDArray[np.float64]], NDArray[np.float64]]
     step_rad: float
     sight: SightLines
 

@@ -52,8 +52,9 @@ def axis_derivatives(objective: Objective, pose: Matrix4) -> tuple[NDArray[np.fl
 def _derivatives(
     objective: Objective, pose: Matrix4, axes: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    def at(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        return objective.evaluate(se3.perturb(pose, offset)).frame_scores
+    def at(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+        poses = np.array([se3.perturb(pose, offset) for offset in offsets])
+        return np.array([found.frame_scores for found in objective.evaluate_each(poses)])
 
     gradients, second = along(at, of_both(objective.step_rad), axes)
     return gradients.mean(axis=1), -second.mean(axis=1)

@@ -8,22 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 FrameScores = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""The scores of F frames (F,) at an offset (n,) from the place of the derivatives."""
+"""The scores of F frames (K, F) at each of K offsets (K, n) from the place of the derivatives."""
 
 
 def along(
     at: FrameScores, steps: NDArray[np.float64], axes: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gradients and second derivatives, (len(axes), F) each, along some of n axes; `steps` (n,) are the differences."""
-    shifts, centre = np.diag(steps), at(np.zeros(len(steps)))
-    plus = np.array([at(shifts[axis]) for axis in axes])
-    minus = np.array([at(-shifts[axis]) for axis in axes])
+    shifts = np.diag(steps)[list(axes)]
+    centre, *beside = at(np.concatenate([np.zeros((1, len(steps))), shifts, -shifts]))
+    plus, minus = np.array(beside[: len(axes)]), np.array(beside[len(axes) :])
     of_axes = steps[list(axes), None]
     return (plus - minus) / (2.0 * of_axes), (plus + minus - 2.0 * centre) / of_axes**2
 
 
-def across(at: FrameScores, steps: NDArray[np.float64], i: int, j: int) -> NDArray[np.float64]:
-    """(F,) the mixed second derivative of two of n axes."""
-    shifts = np.diag(steps)
-    both, against = shifts[i] + shifts[j], shifts[i] - shifts[j]
-    return np.asarray((at(both) + at(-both) - at(against) - at(-against)) / (4.0 * steps[i] * steps[j]))
+def across(at: FrameScores, steps: NDArray[np.float64], pairs: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    """(len(pairs), F) the mixed second derivatives of pairs of n axes."""
+    shifts, offsets = np.diag(steps), []
+    for i, j in pairs:
+        both, against = shifts[i] + shifts[j], shifts[i] - shifts[j]
+        offsets += [both, -both, against, -against]
+    found = at(np.array(offsets).reshape(-1, len(steps)))
+    of_pairs = np.array([4.0 * steps[i] * steps[j] for i, j in pairs])[:, None]
+    return np.asarray((found[::4] + found[1::4] - found[2::4] - found[3::4]) / of_pairs)

@@ -16,7 +16,7 @@ from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, pixel_rad, scaled
 from coec.geometry.culling import half_field_of_view_rad, within_cone
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
+from coec.geometry.edges.alignment import Alignment, EdgeFrames, alignments, frame_alignment
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
@@ -102,7 +102,15 @@ class EdgesAlone:
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
         """Significance at `T_camera_lidar` (4, 4), 0 where nothing is in view; depth and overlap are not looked at."""
-        at = frame_alignment(self._frames, T_camera_lidar)
+        return self._evaluation(frame_alignment(self._frames, T_camera_lidar))
+
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+        """The same at each of many poses (K, 4, 4)."""
+        at = alignments(self._frames, poses)
+        return [self._evaluation(at.at(k)) for k in range(len(poses))]
+
+    @staticmethod
+    def _evaluation(at: Alignment) -> Evaluation:
         return Evaluation(at.significance, at.of_frames, mi=math.nan, overlap=math.nan, points_in_view=0)
 
 

@@ -6,6 +6,7 @@ network that tells nothing adds noise of one unit, a scene without edges likewis
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import hypot, radians, sqrt
 
@@ -21,8 +22,10 @@ from coec.geometry.cameras import in_image
 from coec.geometry.culling import half_field_of_view_rad
 from coec.geometry.edges.alignment import (
     LEAST_SQUARE,
+    Alignment,
     EdgeFrames,
     alignment_of_parts,
+    alignments,
     frame_alignment,
     significances,
 )
@@ -86,9 +89,15 @@ class FusedObjective:
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
         """The objective at `T_camera_lidar` (4, 4), in standard deviations."""
-        depth = self._depth.evaluate(T_camera_lidar)
-        of_frames = frame_alignment(self._edges, T_camera_lidar).of_frames
-        frame_scores = (of_frames - self._of_edges.mean) / self._of_edges.deviation
+        return self._fused(frame_alignment(self._edges, T_camera_lidar), self._depth.evaluate(T_camera_lidar))
+
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+        """The same at each of many poses (K, 4, 4)."""
+        edges, depth = alignments(self._edges, poses), self._depth.evaluate_each(poses)
+        return [self._fused(edges.at(k), of_depth) for k, of_depth in enumerate(depth)]
+
+    def _fused(self, edges: Alignment, depth: Evaluation) -> Evaluation:
+        frame_scores = (edges.of_frames - self._of_edges.mean) / self._of_edges.deviation
         frame_scores = frame_scores + (depth.frame_scores - self._of_depth.mean) / self._of_depth.deviation
         return Evaluation(
             score=float(frame_scores.mean()),
@@ -113,12 +122,15 @@ class FusedObjective:
         sector = np.zeros(len(p_camera), np.uint8)
         sector[seen] = sectors(uv_px[seen])
 
-        def at(pose: Matrix4) -> NDArray[np.float64]:
-            of_sectors = alignment_of_parts(edges, sector, COLUMNS * ROWS, pose)
-            square = float(of_sectors.square.sum())
-            scale = len(edges.maps) / sqrt(max(square, LEAST_SQUARE)) / self._of_edges.deviation
-            of_depth = self._depth.evaluate(pose).frame_scores / self._of_depth.deviation
-            return np.column_stack([of_sectors.strength * scale, of_depth])
+        def at(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+            cells = np.empty((len(poses), len(edges.maps), COLUMNS * ROWS + 1))
+            of_sectors = alignment_of_parts(edges, sector, COLUMNS * ROWS, poses)
+            for k, of_depth in enumerate(self._depth.evaluate_each(poses)):
+                square = float(of_sectors.square[k].sum())
+                scale = len(edges.maps) / sqrt(max(square, LEAST_SQUARE)) / self._of_edges.deviation
+                cells[k, :, :-1] = of_sectors.strength[k] * scale
+                cells[k, :, -1] = of_depth.frame_scores / self._of_depth.deviation
+            return cells
 
         sight = SightLines(p_camera[seen], edges.weight[seen].astype(np.float64), frame[seen])
         return Cells(at, CELL_STEP * self._step_rad, sight)
@@ -140,7 +152,7 @@ class Fusion:
     def __init__(self, edges: EdgeWitness, depth: MutualInformation, start: Matrix4, reach: SearchBox) -> None:
         self._edges, self._depth = edges, depth
         poses = sample_reach(start, reach, OTHER_POSES)
-        self._of_depth = Scale.of(np.array([depth.evaluate(pose).score for pose in poses]))
+        self._of_depth = Scale.of(np.array([at.score for at in depth.evaluate_each(poses)]))
         of_edges = replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD))
         poses = sample_reach(start, of_edges, OTHER_POSES)
         seen = SearchBox(of_edges.rotation_rad + BEYOND.rotation_rad, of_edges.translation_m + BEYOND.translation_m)
@@ -161,20 +173,36 @@ class Fusion:
             FusedObjective(edges.sharp, edges.blur_rad, depth, of_sharp, self._of_depth),
         )
 
+    def edge_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
+        """How far the edge witness, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);
+        standard deviations."""
+        of_bands = np.stack([significances(band, poses) for band in self._edges.bands], axis=1)
+        return [self._of_bands.standard(float(np.mean(z))) for z in of_bands]
+
     def edge_contrast(self, T_camera_lidar: Matrix4) -> float:
-        """How far the edge witness, averaged over its bands, stands above other poses; standard deviations."""
-        z = [float(significances(band, T_camera_lidar[None])[0]) for band in self._edges.bands]
-        return self._of_bands.standard(float(np.mean(z)))
+        """The same at one pose (4, 4)."""
+        return self.edge_contrasts(T_camera_lidar[None])[0]
+
+    def depth_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
+        """How far the depth witness stands above other poses at each of K poses (K, 4, 4); standard deviations."""
+        return [self._of_depth.standard(at.score) for at in self._depth.evaluate_each(poses)]
 
     def depth_contrast(self, T_camera_lidar: Matrix4) -> float:
-        """How far the depth witness stands above other poses; standard deviations."""
-        return self._of_depth.standard(self._depth.evaluate(T_camera_lidar).score)
+        """The same at one pose (4, 4)."""
+        return self.depth_contrasts(T_camera_lidar[None])[0]
 
-    def rank(self, T_camera_lidar: Matrix4) -> float:
-        """How outstanding a pose is to both witnesses, standard deviations.
+    def ranks(self, poses: Sequence[Matrix4]) -> list[float]:
+        """How outstanding each of some poses (4, 4) is to both witnesses, standard deviations.
 
         The root of the sum of squares, as improbabilities combine (Fisher 1925: the logarithm of a normal tail falls
         with the square). A plain sum would let two poor showings outdo one that cannot be chance.
         """
-        edges, depth = self.edge_contrast(T_camera_lidar), self.depth_contrast(T_camera_lidar)
-        return hypot(max(edges, 0.0), max(depth, 0.0))
+        stacked = np.array(poses).reshape(-1, 4, 4)
+        return [
+            hypot(max(edges, 0.0), max(depth, 0.0))
+            for edges, depth in zip(self.edge_contrasts(stacked), self.depth_contrasts(stacked), strict=True)
+        ]
+
+    def rank(self, T_camera_lidar: Matrix4) -> float:
+        """The same of one pose (4, 4)."""
+        return self.ranks([T_camera_lidar])[0]

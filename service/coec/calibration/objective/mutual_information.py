@@ -24,7 +24,12 @@ from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, in_image, scaled
 from coec.geometry.culling import azimuth_order, bundle, half_field_of_view_rad, within_cone
-from coec.geometry.mutual_information import BinnedFrames, mutual_information
+from coec.geometry.mutual_information import (
+    BinnedFrames,
+    FrameInformation,
+    information_of_each,
+    mutual_information,
+)
 from coec.geometry.projection import project
 from coec.geometry.shares import share_of_pixels
 from coec.geometry.thinning import thinned
@@ -83,6 +88,10 @@ class Objective(Protocol):
         """The objective at `T_camera_lidar` (4, 4)."""
         ...
 
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+        """The same at each of many poses (K, 4, 4) that do not depend on each other's."""
+        ...
+
 
 class Divisible(Objective, Protocol):
     """An objective that can be taken apart."""
@@ -121,7 +130,13 @@ class MutualInformation:
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
         """The objective at `T_camera_lidar` (4, 4)."""
-        at = mutual_information(self._frames, T_camera_lidar)
+        return self._guarded(mutual_information(self._frames, T_camera_lidar))
+
+    def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
+        """The objective at each of many poses (K, 4, 4)."""
+        return [self._guarded(at) for at in information_of_each(self._frames, poses)]
+
+    def _guarded(self, at: FrameInformation) -> Evaluation:
         share = at.points / np.maximum(self._reference, 1)
         frame_scores = at.mi * np.minimum(1.0, share / GUARD_OVERLAP)
         return Evaluation(
@@ -169,7 +184,7 @@ class MutualInformation:
         seen = valid & in_image(frames.camera, uv_px)
         frame = np.searchsorted(frames.first_point, chosen, side="right") - 1
         return Cells(
-            lambda pose: self.evaluate(pose).frame_scores[:, None],
+            lambda poses: np.array([at.frame_scores[:, None] for at in self.evaluate_each(poses)]),
             self.step_rad,
             SightLines(p_camera[seen], np.ones(int(seen.sum())), frame[seen]),
         )
@@ -248,7 +263,7 @@ def build_mutual_information(
     depth_bin = np.stack([_pixel_bins(frame.of_pixels, lit, config.depth_bins) for frame in frames])
     reach = _Reach(half_field_of_view_rad(camera, lit), start, box)
     binned = _binned(frames, camera, depth_bin, reach, config)
-    reference = np.max([mutual_information(binned, pose).points for pose in _poses_of_box(start, box)], axis=0)
+    reference = np.max([at.points for at in information_of_each(binned, _poses_of_box(start, box))], axis=0)
     if not reference.any():
         raise CalibrationError(
             "no LiDAR point falls on the image anywhere in the search box: check the direction of T_camera_lidar "
@@ -288,11 +303,11 @@ def _binned(
     )
 
 
-def _poses_of_box(start: Matrix4, box: SearchBox) -> list[Matrix4]:
-    """The start, and the rotations at the centres of the faces and at the corners of the box."""
+def _poses_of_box(start: Matrix4, box: SearchBox) -> NDArray[np.float64]:
+    """(n, 4, 4) the start, and the rotations at the centres of the faces and at the corners of the box."""
     steps = [s for s in product((-1.0, 0.0, 1.0), repeat=3) if sum(map(abs, s)) != 2]
     rotations = [np.array([*step, 0.0, 0.0, 0.0]) * box.rotation_rad for step in steps]
-    return [se3.perturb(start, rotation) for rotation in rotations]
+    return np.array([se3.perturb(start, rotation) for rotation in rotations])
 
 
 class _Reach:

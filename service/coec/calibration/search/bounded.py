@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import nlopt
@@ -26,18 +26,39 @@ class Box:
     tolerance: NDArray[np.float64]
 
 
+Scores = Callable[[NDArray[np.float64]], Sequence[float]]
+"""What K points (K, n) score, each by itself."""
+
+
 def maximum_in(
-    box: Box, score: Callable[[NDArray[np.float64]], float], start: NDArray[np.float64], max_evaluations: int
+    box: Box, scores: Scores, start: NDArray[np.float64], max_evaluations: int
 ) -> tuple[NDArray[np.float64], bool]:
     """The best coordinates (n,) of the box that a search from `start` (n,) comes to, and whether its evaluations ran
-    out before it came to an end."""
+    out before it came to an end.
+
+    The first points do not depend on what they score: they are asked for together, the others one by one.
+    """
+    # The first quadratic model needs two steps of room between the bounds.
+    step = np.minimum(box.step, (box.upper - box.lower) / 2.0)
+    first = _first_points(start, step)[:max_evaluations]
+    known = dict(zip((point.tobytes() for point in first), scores(first), strict=True))
+
+    def score(point: NDArray[np.float64], _gradient: NDArray[np.float64]) -> float:
+        found = known.pop(point.tobytes(), None)
+        return scores(point[None])[0] if found is None else found
+
     optimiser = nlopt.opt(nlopt.LN_BOBYQA, len(start))
     optimiser.set_lower_bounds(box.lower)
     optimiser.set_upper_bounds(box.upper)
-    # The first quadratic model needs two steps of room between the bounds.
-    optimiser.set_initial_step(np.minimum(box.step, (box.upper - box.lower) / 2.0))
+    optimiser.set_initial_step(step)
     optimiser.set_xtol_abs(box.tolerance)
     optimiser.set_maxeval(max_evaluations)
-    optimiser.set_max_objective(lambda x, _gradient: score(x))
+    optimiser.set_max_objective(score)
     found = np.asarray(optimiser.optimize(start))
     return found, optimiser.last_optimize_result() == nlopt.MAXEVAL_REACHED
+
+
+def _first_points(start: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2·n + 1, n) those of BOBYQA's first model: the start, and a step either way along each axis where the box has
+    room for both. Elsewhere it begins aside of them."""
+    return np.concatenate([start[None], start + np.diag(step), start - np.diag(step)])

@@ -30,8 +30,9 @@ from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, frame_alignment, significances
+from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, alignments, significances
 from coec.geometry.edges.charts import EdgeCharts, charted_significances
+from coec.geometry.edges.climbs import Climb, Summit, climbed
 from coec.geometry.thinning import thinned
 
 REACH_RAD = radians(4.0)
@@ -81,9 +82,6 @@ the best split with at least so many on either side is settled, too."""
 
 STARTS = 6
 """Poses from which a side of so few is climbed: the one that fits the blurred band best may lie a degree beside."""
-
-MAX_SWEEPS = 8
-"""Of a climb over the axes: it begins within two steps of its end."""
 
 MIN_FRAMES = 4
 """With fewer there is no early and late."""
@@ -139,25 +137,43 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
     band = _asked(edges.bands[0], edges.half_view_rad, pose)
     sharp = _asked(edges.sharp, edges.half_view_rad, pose)
     chart = _asked(edges.charts[-1], edges.half_view_rad, pose)
-    blur_rad = edges.band_blur_rad[0]
+    blur_rad, frames = edges.band_blur_rad[0], len(band.first_point) - 1
     near = sample_reach(pose, SearchBox(NEAR_BLURS * blur_rad, 0.0), NEAR_POSES)
-    far = _put_forward(chart, pose, len(band.first_point) - 1)
+    far = _put_forward(chart, pose, frames)
     poses = np.concatenate([pose[None], near, *far, *_put_forward_by_ends(chart, band, pose)])
-    early = np.cumsum([scores(band, at) for at in poses], axis=1).T  # (F, K)
+    early = np.cumsum(alignments(band, poses).of_single_frames, axis=1).T  # (F, K)
     total = early[-1]
     late = total - early
     gains = early[:-1].max(axis=1) + late[:-1].max(axis=1) - total.max()
-    T_whole, _ = _climbed(band, poses[int(np.argmax(total))], blur_rad)
-    settled = []
-    for last_early in _promising(gains):
-        begun = []
-        for first, last, of_side in ((0, last_early + 1, early), (last_early + 1, len(early), late)):
-            starts = poses[np.argsort(-of_side[last_early], kind="stable")[: STARTS if last - first <= FEW else 1]]
-            climbed = (_climbed(_part(band, first, last), start, blur_rad)[0] for start in starts)
-            side = _part(sharp, first, last)
-            begun.append(max((_climbed(side, at, edges.blur_rad) for at in climbed), key=lambda end: end[1])[0])
-        settled.append(_settled(sharp, last_early + 1, (*begun, T_whole), edges.blur_rad))
+    begun = [Climb(poses[int(np.argmax(total))], 0, frames)]
+    sides: list[range] = []
+    promising = _promising(gains)
+    for last_early in promising:
+        for first, last, of_side in ((0, last_early + 1, early), (last_early + 1, frames, late)):
+            number = STARTS if last - first <= FEW else 1
+            best = np.argsort(-of_side[last_early], kind="stable")[:number].tolist()
+            sides.append(range(len(begun), len(begun) + number))
+            begun += [Climb(poses[k], first, last) for k in best]
+    on_band = [end.pose for end in _climbed(band, begun, blur_rad)]
+    again = [replace(climb, pose=pose) for climb, pose in zip(begun, on_band, strict=True)]
+    # What fits all frames is climbed on the sharpest edges later, beside the poses of the settled sides.
+    on_sharp = _climbed(sharp, again[1:], edges.blur_rad)
+    of_sides = [max((on_sharp[k - 1] for k in side), key=lambda end: end.score).pose for side in sides]
+    splits = [
+        _Split(last_early + 1, T_before, T_after)
+        for last_early, T_before, T_after in zip(promising, of_sides[::2], of_sides[1::2], strict=True)
+    ]
+    settled = _settled(sharp, splits, on_band[0], edges.blur_rad)
     return max(settled, key=lambda change: (change.of_camera, change.gain))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Split:
+    """Where a window is split, and the pose (4, 4) of either side."""
+
+    first_late: int
+    T_before: Matrix4
+    T_after: Matrix4
 
 
 def _promising(gains: NDArray[np.float64]) -> list[int]:
@@ -167,23 +183,47 @@ def _promising(gains: NDArray[np.float64]) -> list[int]:
     return [best] if len(inner) == 0 else list(dict.fromkeys((best, FEW - 1 + int(np.argmax(inner)))))
 
 
-def _settled(sharp: EdgeFrames, first_late: int, begun: Sequence[Matrix4], blur_rad: float) -> ChangePoint:
-    """The likeliest change next to a split, from poses that fit what is before and after it and the whole."""
-    T_before, T_after, T_whole = begun
-    frames, best, most = len(sharp.first_point) - 1, (first_late, T_before, T_after), -inf
+def _settled(sharp: EdgeFrames, begun: Sequence[_Split], T_whole: Matrix4, blur_rad: float) -> list[ChangePoint]:
+    """The likeliest change next to each split, from poses that fit what is before and after it and one (4, 4) that fits
+    the whole. They take their turns together: so several climbs are under way at once."""
+    frames, turning = len(sharp.first_point) - 1, dict(enumerate(begun))
+    best, most = dict(turning), dict.fromkeys(turning, -inf)
     for _ in range(TURNS):
-        T_before, before = _climbed(_part(sharp, 0, first_late), T_before, blur_rad)
-        T_after, after = _climbed(_part(sharp, first_late, frames), T_after, blur_rad)
-        if before + after > most:
-            best, most = (first_late, T_before, T_after), before + after
-        split = 1 + int(np.argmax(np.cumsum(scores(sharp, T_before) - scores(sharp, T_after))[:-1]))
-        if split == first_late:
+        ends = _climbed(sharp, [climb for split in turning.values() for climb in _sides(split, frames)], blur_rad)
+        at_ends = _scores(sharp, [end.pose for end in ends])
+        again = {}
+        for (number, split), place in zip(turning.items(), range(0, len(ends), 2), strict=True):
+            before, after = ends[place : place + 2]
+            now = replace(split, T_before=before.pose, T_after=after.pose)
+            if before.score + after.score > most[number]:
+                best[number], most[number] = now, before.score + after.score
+            first_late = 1 + int(np.argmax(np.cumsum(at_ends[place] - at_ends[place + 1])[:-1]))
+            if first_late != split.first_late:
+                again[number] = replace(now, first_late=first_late)
+        if not again:
             break
-        first_late = split
-    first_late, T_before, T_after = best
+        turning = again
     # One pose for all of them is no worse than that of either side.
-    together = max(_climbed(sharp, T, blur_rad)[1] for T in (T_whole, T_before, T_after))
-    at_before, at_after = scores(sharp, T_before), scores(sharp, T_after)
+    chosen = list(best.values())
+    whole = [T_whole, *(T for split in chosen for T in (split.T_before, split.T_after))]
+    of_whole, *of_sides = _climbed(sharp, [Climb(T, 0, frames) for T in whole], blur_rad)
+    at_sides = _scores(sharp, whole[1:])
+    changes = []
+    for place, split in zip(range(0, len(of_sides), 2), chosen, strict=True):
+        together = max(end.score for end in (of_whole, *of_sides[place : place + 2]))
+        changes.append(_change(split, at_sides[place], at_sides[place + 1], together))
+    return changes
+
+
+def _sides(split: _Split, frames: int) -> tuple[Climb, Climb]:
+    return Climb(split.T_before, 0, split.first_late), Climb(split.T_after, split.first_late, frames)
+
+
+def _change(
+    split: _Split, at_before: NDArray[np.float64], at_after: NDArray[np.float64], together: float
+) -> ChangePoint:
+    """Of a settled split, with the scores (F,) of its frames at both poses, and what they score at one for all."""
+    first_late = split.first_late
     before, after = float(at_before[:first_late].sum()), float(at_after[first_late:].sum())
     losses = (
         _loss(at_before[:first_late], at_after[:first_late]),
@@ -191,8 +231,8 @@ def _settled(sharp: EdgeFrames, first_late: int, begun: Sequence[Matrix4], blur_
     )
     return ChangePoint(
         first_late,
-        T_before,
-        T_after,
+        split.T_before,
+        split.T_after,
         gain=before + after - together,
         support=min(_support(at_before[:first_late]), _support(at_after[first_late:])),
         likeness=min(losses) / max(losses) if min(losses) > 0.0 else 0.0,
@@ -244,12 +284,12 @@ def _about(pose: Matrix4) -> NDArray[np.float64]:
 
 def scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
     """(F,) z of each frame by itself at a pose (4, 4)."""
-    at = frame_alignment(band, pose)
-    return np.asarray(at.strength / np.sqrt(np.maximum(at.square, LEAST_SQUARE)))
+    return np.asarray(_scores(band, [pose])[0])
 
 
-def _score(band: EdgeFrames, pose: Matrix4) -> float:
-    return float(scores(band, pose).sum())
+def _scores(band: EdgeFrames, poses: Sequence[Matrix4]) -> NDArray[np.float64]:
+    """(K, F) the same at each of K poses (4, 4)."""
+    return alignments(band, np.stack(poses)).of_single_frames
 
 
 def _support(of_frames: NDArray[np.float64]) -> float:
@@ -265,22 +305,12 @@ def _loss(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float((told * (own - other)).sum() / max(np.square(told).sum(), LEAST_SQUARE))
 
 
-def _climbed(band: EdgeFrames, start: Matrix4, blur_rad: float) -> tuple[Matrix4, float]:
-    """The pose (4, 4) next to `start` at which the frames score most, the axes in turn, and their score."""
-    pose, best, step_rad, halved = start, _score(band, start), CLIMB_BLURS * blur_rad, 0
-    for _ in range(MAX_SWEEPS):
-        improved = False
-        for turn in (*np.eye(6)[:3], *-np.eye(6)[:3]):
-            trial = se3.perturb(pose, step_rad * turn)
-            score = _score(band, trial)
-            if score > best:
-                pose, best, improved = trial, score, True
-        if not improved:
-            halved += 1
-            if halved > HALVINGS:
-                break
-            step_rad *= 0.5
-    return pose, best
+def _climbed(band: EdgeFrames, begun: Sequence[Climb], blur_rad: float) -> list[Summit]:
+    """The poses next to those where climbs begin at which their frames score most, the axes in turn."""
+    nowhere, turns = np.eye(4), (*np.eye(6)[:3], *-np.eye(6)[:3])
+    steps_rad = [CLIMB_BLURS * blur_rad * 0.5**halved for halved in range(HALVINGS + 1)]
+    moves = np.array([[se3.perturb(nowhere, step_rad * turn) for turn in turns] for step_rad in steps_rad])
+    return climbed(band, list(begun), moves)
 
 
 def _asked(edges: Edges, half_view_rad: float, pose: Matrix4) -> Edges:

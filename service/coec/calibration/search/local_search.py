@@ -60,18 +60,18 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     """
     evaluations = 0
 
-    def score(coordinates: NDArray[np.float64]) -> float:
+    def scores(points: NDArray[np.float64]) -> list[float]:
         nonlocal evaluations
-        evaluations += 1
+        evaluations += len(points)
         progress.step("search", evaluations, config.max_evaluations)
-        return objective.evaluate(_pose(start, coordinates)).score
+        return [at.score for at in objective.evaluate_each(np.array([_pose(start, point) for point in points]))]
 
     centre, most = np.zeros(config.dof), config.max_evaluations
     half_width = _per_axis(config.dof, radians(config.rotation_deg), config.translation_m)
     step = _per_axis(config.dof, radians(config.step_deg), config.step_m)
-    found, exhausted = maximum_in(_box(centre, half_width, half_width, step, config), score, centre, most)
+    found, exhausted = maximum_in(_box(centre, half_width, half_width, step, config), scores, centre, most)
     reach, step = (of_both(turn_rad)[: config.dof] for turn_rad in (REFINE_BOX_RAD, REFINE_STEP_RAD))
-    found, exhausted_again = maximum_in(_box(found, reach, half_width, step, config), score, found, most)
+    found, exhausted_again = maximum_in(_box(found, reach, half_width, step, config), scores, found, most)
     stop_reason = StopReason.TOLERANCE
     if exhausted or exhausted_again:
         stop_reason = StopReason.EVALUATIONS
@@ -111,15 +111,15 @@ def polish(
         perturbed = se3.perturb(basin, perturbation)
         return perturbed if kept is None else kept(perturbed)
 
-    def score(coordinates: NDArray[np.float64]) -> float:
+    def scores(points: NDArray[np.float64]) -> list[float]:
         nonlocal evaluations
-        evaluations += 1
+        evaluations += len(points)
         progress.step("search", evaluations, config.max_evaluations)
-        return objective.evaluate(pose(coordinates)).score
+        return [at.score for at in objective.evaluate_each(np.array([pose(point) for point in points]))]
 
     step = of_both(objective.step_rad, POLISH_METRES_PER_RADIAN)[moved]
     centre, reach = np.zeros(len(moved)), POLISH_STEPS * step
-    found, exhausted = maximum_in(_box(centre, reach, reach, step, config), score, centre, config.max_evaluations)
+    found, exhausted = maximum_in(_box(centre, reach, reach, step, config), scores, centre, config.max_evaluations)
     stop_reason = StopReason.EVALUATIONS if exhausted else StopReason.TOLERANCE
     return SearchResult(pose(found), evaluations, stop_reason)
 

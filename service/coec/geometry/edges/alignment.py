@@ -84,45 +84,68 @@ class Alignment:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PartedAlignment:
-    """As `Alignment`, per frame and part: `strength` (F, P) Σ w·e, `square` (F, P) Σ w²."""
+class PartedAlignments:
+    """As `Alignments`, per frame and part: `strength` (K, F, P) Σ w·e, `square` (K, F, P) Σ w²."""
 
     strength: NDArray[np.float64]
     square: NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignments:
+    """As `Alignment`, at each of K poses: `strength` (K, F) Σ w·e, `square` (K, F) Σ w²."""
+
+    strength: NDArray[np.float64]
+    square: NDArray[np.float64]
+
+    @property
+    def of_single_frames(self) -> NDArray[np.float64]:
+        """(K, F) z of each frame by itself; 0 where nothing is in view."""
+        return np.asarray(self.strength / np.sqrt(np.maximum(self.square, LEAST_SQUARE)))
+
+    def at(self, index: int) -> Alignment:
+        """At one of the poses."""
+        return Alignment(self.strength[index], self.square[index])
+
+
 def frame_alignment(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> Alignment:
     """The alignment at one pose (4, 4), with e interpolated between pixels: smooth in the pose."""
-    return alignment_of_each(frames, T_camera_lidar[None])
+    return alignments(frames, T_camera_lidar[None]).at(0)
+
+
+def alignments(frames: EdgeFrames, poses: NDArray[np.float64]) -> Alignments:
+    """The same at many poses (K, 4, 4) in one go: several threads share what is too short for them one by one."""
+    sums = _smooth_sums(*_arguments(frames), poses.astype(np.float32, order="C")[:, None])
+    return Alignments(sums[:, :, 0], sums[:, :, 1])
 
 
 def alignment_of_each(frames: EdgeFrames, poses: NDArray[np.float64]) -> Alignment:
     """The same with a pose for each frame (F, 4, 4); or one (1, 4, 4) for all."""
-    sums = _smooth_sums(*_arguments(frames), poses.astype(np.float32, order="C"))
-    return Alignment(sums[:, 0], sums[:, 1])
+    sums = _smooth_sums(*_arguments(frames), poses.astype(np.float32, order="C")[None])
+    return Alignment(sums[0, :, 0], sums[0, :, 1])
 
 
 def alignment_of_parts(
-    frames: EdgeFrames, part: NDArray[np.uint8], parts: int, T_camera_lidar: NDArray[np.float64]
-) -> PartedAlignment:
-    """The same at one pose (4, 4), of each of so many `parts` of the range edges by itself; `part` (E,) is where each
-    belongs."""
-    sums = _smooth_sums_of_parts(*_arguments(frames), T_camera_lidar.astype(np.float32), part, parts)
-    return PartedAlignment(sums[:, :, 0], sums[:, :, 1])
+    frames: EdgeFrames, part: NDArray[np.uint8], parts: int, poses: NDArray[np.float64]
+) -> PartedAlignments:
+    """The same at each of many poses (K, 4, 4), of each of so many `parts` of the range edges by itself; `part` (E,) is
+    where each belongs."""
+    sums = _smooth_sums_of_parts(*_arguments(frames), poses.astype(np.float32, order="C"), part, parts)
+    return PartedAlignments(sums[:, :, :, 0], sums[:, :, :, 1])
 
 
-def significance_of_late(
+def alignments_of_late(
     frames: EdgeFrames,
     passing: NDArray[np.float32],
     share: NDArray[np.float32],
     late_s: NDArray[np.float32],
-    T_camera_lidar: NDArray[np.float64],
-) -> float:
-    """z at one pose (4, 4), with e interpolated between pixels, of range edges that pass at (3, E) m/s and were seen
-    later than they were placed: by their shares (3, E) of three delays (3,), s. To the last bits that of
-    `frame_alignment` of edges moved by as much."""
-    sums = _late_sums(*_arguments(frames), T_camera_lidar.astype(np.float32), passing, share, late_s)
-    return Alignment(sums[:, 0], sums[:, 1]).significance
+    poses: NDArray[np.float64],
+) -> Alignments:
+    """The alignments at many poses (K, 4, 4), with e interpolated between pixels, of range edges that pass at (3, E)
+    m/s and were seen later than they were placed: by their shares (3, E) of three delays, s, those (K, 3) of each pose.
+    To the last bits that of `frame_alignment` of edges moved by as much."""
+    sums = _late_sums(*_arguments(frames), poses.astype(np.float32, order="C"), passing, share, late_s)
+    return Alignments(sums[:, :, 0], sums[:, :, 1])
 
 
 def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -133,7 +156,10 @@ def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.
 def smooth_significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4), with e interpolated between pixels: (K,). To the last bits that of
     `frame_alignment`."""
-    return np.asarray(_smooth_z(*_arguments(frames), poses.astype(np.float32)))
+    at = alignments(frames, poses)
+    # One frame after the other, whatever their number.
+    strength, square = np.cumsum(at.strength, axis=1)[:, -1], np.cumsum(at.square, axis=1)[:, -1]
+    return np.asarray(strength / np.sqrt(np.maximum(square, LEAST_SQUARE)))
 
 
 _Arguments = tuple[Camera, NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int8]]
@@ -145,30 +171,6 @@ def _arguments(frames: EdgeFrames) -> _Arguments:
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _smooth_z(
-    camera: Camera,
-    xyz: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    first_point: NDArray[np.int64],
-    maps: NDArray[np.int8],
-    poses: NDArray[np.float32],
-) -> NDArray[np.float64]:
-    frames = first_point.shape[0] - 1
-    sums = np.empty((poses.shape[0], frames, 2))
-    for task in prange(poses.shape[0] * frames):
-        k, f = task // frames, task % frames
-        sums[k, f] = _smooth_sums_of_frame(camera, poses[k], xyz, weight, first_point[f], first_point[f + 1], maps[f])
-    z = np.empty(poses.shape[0])
-    for k in range(poses.shape[0]):
-        strength, square = 0.0, 0.0
-        for f in range(frames):
-            strength += sums[k, f, 0]
-            square += sums[k, f, 1]
-        z[k] = strength / math.sqrt(max(square, LEAST_SQUARE))
-    return z
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
 def _smooth_sums(
     camera: Camera,
     xyz: NDArray[np.float32],
@@ -177,11 +179,13 @@ def _smooth_sums(
     maps: NDArray[np.int8],
     poses: NDArray[np.float32],
 ) -> NDArray[np.float64]:
+    """(K, F, 2) at poses (K, F, 4, 4), or (K, 1, 4, 4): one for all frames."""
     frames = first_point.shape[0] - 1
-    sums = np.zeros((frames, 2))
-    for f in prange(frames):
-        pose = poses[min(np.int64(f), poses.shape[0] - 1)]
-        sums[f] = _smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[f])
+    sums = np.empty((poses.shape[0], frames, 2))
+    for task in prange(poses.shape[0] * frames):
+        k, f = task // frames, task % frames
+        pose = poses[k, min(np.int64(f), poses.shape[1] - 1)]
+        sums[k, f] = smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[f])
     return sums
 
 
@@ -192,22 +196,23 @@ def _late_sums(
     weight: NDArray[np.float32],
     first_point: NDArray[np.int64],
     maps: NDArray[np.int8],
-    T: NDArray[np.float32],
+    poses: NDArray[np.float32],
     passing: NDArray[np.float32],
     share: NDArray[np.float32],
     late_s: NDArray[np.float32],
 ) -> NDArray[np.float64]:
     frames = first_point.shape[0] - 1
-    sums = np.zeros((frames, 2))
-    for f in prange(frames):
+    sums = np.empty((poses.shape[0], frames, 2))
+    for task in prange(poses.shape[0] * frames):
+        k, f = task // frames, task % frames
         told, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
         edges, block, moved_m = maps[f].ravel(), _block(), np.empty((3, BLOCK), np.float32)
         for begin in range(first_point[f], first_point[f + 1], BLOCK):
             end = min(begin + BLOCK, first_point[f + 1])
-            _pass_by(xyz[:, begin:end], passing[:, begin:end], share[:, begin:end], late_s, moved_m)
+            _pass_by(xyz[:, begin:end], passing[:, begin:end], share[:, begin:end], late_s[k], moved_m)
             x, y, z = moved_m[0, : end - begin], moved_m[1, : end - begin], moved_m[2, : end - begin]
-            _add(told, square, *_between(camera, T, x, y, z, weight[begin:end], edges, block))
-        sums[f, 0], sums[f, 1] = _total(told) / STRENGTH_STEPS, _total(square)
+            _add(told, square, *_between(camera, poses[k], x, y, z, weight[begin:end], edges, block))
+        sums[k, f, 0], sums[k, f, 1] = _total(told) / STRENGTH_STEPS, _total(square)
     return sums
 
 
@@ -227,7 +232,7 @@ def _pass_by(
 
 
 @njit(cache=True, error_model="numpy")
-def _smooth_sums_of_frame(
+def smooth_sums_of_frame(
     camera: Camera,
     T: NDArray[np.float32],
     xyz: NDArray[np.float32],
@@ -254,18 +259,19 @@ def _smooth_sums_of_parts(
     weight: NDArray[np.float32],
     first_point: NDArray[np.int64],
     maps: NDArray[np.int8],
-    T: NDArray[np.float32],
+    poses: NDArray[np.float32],
     part: NDArray[np.uint8],
     parts: int,
 ) -> NDArray[np.float64]:
     frames = first_point.shape[0] - 1
-    sums = np.zeros((frames, parts, 2))
-    for f in prange(frames):
-        edges, of_frame, block = maps[f].ravel(), sums[f], _block()
+    sums = np.zeros((poses.shape[0], frames, parts, 2))
+    for task in prange(poses.shape[0] * frames):
+        n, f = task // frames, task % frames
+        edges, of_frame, block = maps[f].ravel(), sums[n, f], _block()
         for begin in range(first_point[f], first_point[f + 1], BLOCK):
             end = min(begin + BLOCK, first_point[f + 1])
             x, y, z = xyz[0, begin:end], xyz[1, begin:end], xyz[2, begin:end]
-            told, square = _between(camera, T, x, y, z, weight[begin:end], edges, block)
+            told, square = _between(camera, poses[n], x, y, z, weight[begin:end], edges, block)
             for i in range(end - begin):
                 k = part[begin + i]
                 of_frame[k, 0] += told[i]

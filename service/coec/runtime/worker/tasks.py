@@ -107,7 +107,7 @@ class Solver:
             rig = _small(self._rigs[pair.name])
             # Two kernels are those of the uncertainty of a result, and an invented window need not lead to one.
             project(rig.camera, np.ones((1, 3)))
-            alignment_of_parts(_one_edge(rig), np.zeros(1, np.uint8), 1, np.eye(4))
+            alignment_of_parts(_one_edge(rig), np.zeros(1, np.uint8), 1, np.eye(4)[None])
             with contextlib.suppress(CalibrationError, DecodeError):
                 diagnose(_invented_window(rig), _Ramp(), self._images, configuration, None)
             with contextlib.suppress(CalibrationError, DecodeError):

@@ -1,0 +1,46 @@
+"""Images that are looked at twice, once for the mask and once for what they show, and decoded once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.ports import ImageReader
+from coec.calibration.types import CameraFrame
+
+MOST_KEPT_BYTES = 64_000_000
+"""Of decoded images in all: twenty-five of 2.5 megapixels. It is what the edge maps that they become take, and an image
+goes as its maps come; those beyond are decoded again."""
+
+
+class DecodedOnce:
+    """An image reader that remembers images from their first look to their second."""
+
+    def __init__(self, images: ImageReader) -> None:
+        self._images = images
+        self._kept: dict[int, NDArray[np.uint8]] = {}
+        self._bytes = 0
+
+    def first(self, frame: CameraFrame) -> NDArray[np.uint8]:
+        """(height, width) grey values of a frame that `grey` is asked for later.
+
+        Raises:
+            DecodeError: the image cannot be decoded within the limits.
+        """
+        grey = self._images.grey(frame)
+        if id(frame) not in self._kept and self._bytes + grey.nbytes <= MOST_KEPT_BYTES:
+            self._kept[id(frame)] = grey
+            self._bytes += grey.nbytes
+        return grey
+
+    def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
+        """(height, width) grey values; forgotten here.
+
+        Raises:
+            DecodeError: the image cannot be decoded within the limits.
+        """
+        kept = self._kept.pop(id(frame), None)
+        if kept is None:
+            return self._images.grey(frame)
+        self._bytes -= kept.nbytes
+        return kept

@@ -1,0 +1,117 @@
+"""Climbs of the alignment of range edges from many poses at once, each over frames of its own.
+
+A frame scores z = Σ w·e / √Σ w² by itself, and a pose the sum over the frames of its climb. A step of one climb takes a
+twentieth of a millisecond: several climbs at once, each on one thread, are the least work that is worth sharing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.geometry.cameras import Camera, in_single_precision
+from coec.geometry.compiler import njit, prange
+from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, smooth_sums_of_frame
+
+MAX_SWEEPS = 8
+"""Of a climb over its moves: it begins within two steps of its end."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Climb:
+    """One of many: a pose (4, 4) where it begins or ends, and the frames that it is about, those from `first` to before
+    `last`."""
+
+    pose: NDArray[np.float64]
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Summit:
+    """Where a climb ended: pose (4, 4), and what its frames score there."""
+
+    pose: NDArray[np.float64]
+    score: float
+
+
+def climbed(frames: EdgeFrames, climbs: list[Climb], moves: NDArray[np.float64]) -> list[Summit]:
+    """The end of each climb: every move in turn is tried on the left of the pose and kept if it helps; when none does,
+    the finer ones are, and after the finest it ends.
+
+    Args:
+        frames: with the frames of all climbs.
+        climbs: where they begin.
+        moves: (L, M, 4, 4) the moves of each of L finenesses.
+    """
+    spans = np.array([(climb.first, climb.last) for climb in climbs], np.int64)
+    poses = np.array([climb.pose for climb in climbs])
+    scores = _climb(
+        in_single_precision(frames.camera), frames.xyz_m, frames.weight, frames.first_point, frames.maps, spans, moves,
+        poses,
+    )  # fmt: skip
+    return [Summit(pose, score) for pose, score in zip(poses, scores.tolist(), strict=True)]
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _climb(
+    camera: Camera,
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.int8],
+    spans: NDArray[np.int64],
+    moves: NDArray[np.float64],
+    poses: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """(K,) the scores at the ends of climbs over the frames `spans` (K, 2), into `poses` (K, 4, 4) where they began."""
+    scores = np.empty(poses.shape[0])
+    for k in prange(poses.shape[0]):
+        first, last = spans[k, 0], spans[k, 1]
+        pose, fineness = poses[k].copy(), 0
+        best = _score(camera, xyz, weight, first_point, maps, first, last, pose)
+        for _ in range(MAX_SWEEPS):
+            improved = False
+            for move in range(moves.shape[1]):
+                trial = _on_the_left(moves[fineness, move], pose)
+                score = _score(camera, xyz, weight, first_point, maps, first, last, trial)
+                if score > best:
+                    pose, best, improved = trial, score, True
+            if not improved:
+                fineness += 1
+                if fineness == moves.shape[0]:
+                    break
+        poses[k], scores[k] = pose, best
+    return scores
+
+
+@njit(cache=True, error_model="numpy")
+def _score(
+    camera: Camera,
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.int8],
+    first: int,
+    last: int,
+    pose: NDArray[np.float64],
+) -> float:
+    T, total = pose.astype(np.float32), 0.0
+    for f in range(first, last):
+        strength, square = smooth_sums_of_frame(camera, T, xyz, weight, first_point[f], first_point[f + 1], maps[f])
+        total += strength / math.sqrt(max(square, LEAST_SQUARE))
+    return total
+
+
+@njit(cache=True)
+def _on_the_left(move: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """move · pose, as `se3.perturb` adds it up."""
+    out = pose.copy()
+    for i in range(3):
+        for j in range(4):
+            out[i, j] = move[i, 0] * pose[0, j] + move[i, 1] * pose[1, j] + move[i, 2] * pose[2, j]
+            out[i, j] += move[i, 3] * pose[3, j]
+    return out
