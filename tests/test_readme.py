@@ -197,6 +197,11 @@ def test_python_that_is_shown_is_python(block: Block) -> None:
     compile(block.text, str(block.page), "exec")
 
 
+def test_the_python_of_readme_is_the_example_that_a_test_runs() -> None:
+    (block,) = (block for block in BLOCKS if block.language == "python" and block.page.stem == "README")
+    assert block.text.strip() == (REPOSITORY / "docs" / "examples" / "calibrate.py").read_text().strip()
+
+
 def test_no_form_is_left_of_a_command_that_is_gone() -> None:
     typed = {step.command for block in CONSOLE for step in block.steps}
     assert set(FORMS) - typed == set()

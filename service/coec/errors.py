@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 
 class CoecError(Exception):
@@ -17,7 +16,7 @@ class CoecError(Exception):
 
     exit_code = 1
     reply_code = "internal"
-    details: Mapping[str, Any] = {}
+    details: Mapping[str, object] = {}
 
 
 class UsageError(CoecError):
@@ -71,7 +70,7 @@ class LensError(CalibrationError):
 
     reply_code = "lens_does_not_fit"
 
-    def __init__(self, message: str, details: Mapping[str, Any]) -> None:
+    def __init__(self, message: str, details: Mapping[str, object]) -> None:
         super().__init__(message)
         self.details = details
 

@@ -58,7 +58,8 @@ def test_text_is_what_one_copies(coec: Coec, tmp_path: Path) -> None:
     np.testing.assert_allclose(json.loads(matrix.group()), found["matrix"], atol=1e-9)
     np.testing.assert_allclose(json.loads(quaternion.group(1)), found["quaternion_xyzw"], atol=1e-9)
     assert "objective mi, 3 degrees of freedom (rotation only), depth from stereo" in text
-    assert f"written to {tmp_path / 'out'}: overlay_after.png, overlay_before.png, result.json" in text
+    names = "close_ups.png, overlay_after.png, overlay_before.png, report.html, residuals.png, result.json"
+    assert f"written to {tmp_path / 'out'}: {names}" in text
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(coec: Coec, tmp_path: Path) -> None:
@@ -112,7 +113,7 @@ def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path)
         assert (written / name).read_bytes().startswith(b"\x89PNG")
     page = (written / "report.html").read_text()
     assert json.dumps(outcome.document["camera_from_lidar"]["matrix"]).replace("[", "").split("]")[0] in page
-    assert page.count("data:image/") == 2
+    assert page.count("data:image/") == 4
 
 
 def test_fitted_double_sphere_reports_its_residual(coec: Coec, tmp_path: Path) -> None:

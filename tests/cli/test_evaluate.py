@@ -102,7 +102,7 @@ def test_output_folder_holds_table_report_and_pictures(coec: Coec, tmp_path: Pat
         assert (written / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert [point["frames"] for point in outcome.document["frames"]] == [1, 2]
     page = (written / "report.html").read_text()
-    assert page.count("data:image/") == 4
+    assert page.count("data:image/") == 6
     assert "How many frames it takes" in page
 
     rows = list(csv.DictReader((written / "starts.csv").read_text().splitlines()))

@@ -103,7 +103,12 @@ def evaluate(
         directions: number of starts, spread evenly (a Fibonacci sphere).
         halves: also split the frames so often at random into disjoint halves, and compare their results.
         detection: also say how well moved extrinsics are seen, over so many splits of the frames.
-        depth, objective, dof, motion_compensation, camera_model, progress: as `calibrate`.
+        depth: as `calibrate`.
+        objective: as `calibrate`.
+        dof: as `calibrate`.
+        motion_compensation: as `calibrate`.
+        camera_model: as `calibrate`.
+        progress: as `calibrate`.
 
     Returns:
         A pydantic model: `hit_rate`, `rotation_deg` and `translation_m` (median, p95, max), `bias`, `std`,
@@ -113,6 +118,7 @@ def evaluate(
         UsageError: a value that does not exist, or starts too far for any search box.
         CalibrationError: there is no result even from the recording's calibration.
         SourceError, WindowError, ModelError: as `calibrate`.
+        KeyboardInterrupt: on Ctrl-C.
     """
     for name, value, least in (
         ("rotation_deg", rotation_deg, 0.0),
@@ -132,4 +138,6 @@ def evaluate(
     subject = subject_of(cut.source, cut.frames, cut.loaded, plan, chosen, camera_model, stages)
     bench = bench_of(subject, plan, chosen)
     done = tried(subject, plan, bench, stages)
+    if done.interrupted:
+        raise KeyboardInterrupt
     return report_of(subject, plan, bench, done, stages.elapsed_s())

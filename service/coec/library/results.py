@@ -133,7 +133,8 @@ class Result:
             path: the file; its folder is made if need be.
             format: `tf`, `urdf`, `autoware`, `kalibr`, `kitti`, `kitti360`, `nuscenes`, `openlabel`, `colmap`,
                 `opencv` or `json`. Which direction each holds is written in the file.
-            parent, child: names of the frames; None: the LiDAR's and the camera's.
+            parent: name of the frame; None: the LiDAR's.
+            child: likewise; None: the camera's.
             T_parent_lidar: (4, 4) pose of the LiDAR in `parent`, metres; None: the LiDAR is the parent.
             force: also write what is not accepted; the file says so.
 

@@ -7,12 +7,14 @@ from collections.abc import Callable, Mapping
 from coec.cli.pages.commands import commands_page
 from coec.cli.pages.configuration import configuration_page
 from coec.cli.pages.contract import keys_page, schemas_page
+from coec.cli.pages.figures import figures_page
 from coec.cli.pages.python_api import python_page
 from coec.cli.pages.service import metrics_page, operations_page
 
 PAGES: Mapping[str, Callable[[], str]] = {
     "cli.md": commands_page,
     "configuration.md": configuration_page,
+    "figures.md": figures_page,
     "keys.md": keys_page,
     "metrics.md": metrics_page,
     "operations.md": operations_page,
