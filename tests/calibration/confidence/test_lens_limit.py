@@ -78,7 +78,9 @@ def test_the_limit_is_that_of_the_result() -> None:
     fit = fit_double_sphere(camera)
     with pytest.raises(LensError) as refused:
         require_fit(camera, fit, 0.0)
-    error_deg = refused.value.details["camera_fit"]["error_deg"]
+    told = refused.value.details["camera_fit"]
+    assert isinstance(told, dict)
+    error_deg = told["error_deg"]
     require_fit(camera, fit, 1.001 * error_deg)
     with pytest.raises(LensError, match="leave --camera-model out"):
         require_fit(camera, fit, 0.999 * error_deg)
