@@ -37,6 +37,7 @@ from coec.adapters.ros.moving_frames import MovingFrame, frames_in
 from coec.adapters.ros.static_transforms import StaticTransforms, decode_joints
 from coec.adapters.system.logs import LossCounter
 from coec.adapters.zenoh.settings import mode_of, settings_of
+from coec.calibration.lidar_to_lidar.types import RangeBias
 from coec.calibration.lifecycle import Rules, after_estimate, initial_state, restored
 from coec.calibration.types import CameraFrame, LidarFrame
 from coec.config import (
@@ -62,7 +63,7 @@ from coec.runtime.nominal.findings import Found
 from coec.runtime.nominal.kept import NOMINAL_FILE, KeptNominals
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.worker.answers import MalformedAnswerError, number_of, pack_answer, read_answer
-from coec.runtime.worker.jobs import Drawn, Kind, Solved
+from coec.runtime.worker.jobs import Drawn, Kind, Registered, Solved
 from coec.runtime.worker.link import Link, NoMessageError
 from coec.schemas import keys
 from coec.schemas.base import to_json
@@ -699,7 +700,7 @@ def _model_card_seeds() -> list[bytes]:
 
 # --- the worker -------------------------------------------------------------------------------------------------------
 
-KINDS: Final = (Kind.SOLVE, Kind.CHECK, Kind.OVERLAY, Kind.COMMISSION, None)
+KINDS: Final = (Kind.SOLVE, Kind.CHECK, Kind.OVERLAY, Kind.COMMISSION, None, Kind.REGISTER)
 """A picture is answered as an overlay is."""
 
 
@@ -733,12 +734,15 @@ def _worker_seeds() -> list[bytes]:
         "textured": 4, "stamp_ns": 7, "pair_stamps_ns": [5, 7],
         "flagged": True, "weak": False, "flagged_by_paper": None,
         "metrics": [{"name": "mi", "value": 0.3, "limit": 1.0, "at_least": True}],
-        "causes": [{"code": "dark", "text": "It is dark."}], "distance2": 0.1, "drift": None, "dirty": [3],
+        "causes": [{"code": "dark", "text": "It is dark.", "advice": "Wait."}],
+        "distance2": 0.1, "drift": None, "dirty": [3],
         "dispersion": 1.5,
         **{name: msgpack.ExtType(1, msgpack.packb([[6], bytes(48)])) for name in
            ("offset", "sigma", "noise", "place", "first_derivative", "second_derivative")},
     }  # fmt: skip
     checked = {"id": 2, "result": {"observation": observation, "baseline_not_used": None}}
+    registered = Registered(np.eye(4), np.eye(6), RangeBias(0.01, 0.002), 0.02, 900, 0.4, 2, ())
+    answers.append((5, pack_answer(6, registered)))
     messages = [*answers, (0, refused), (3, learned), (1, checked), (4, {"id": 1, "result": None})]
     return [bytes([kind]) + msgpack.packb(message) for kind, message in messages]
 
