@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from coec.adapters.files import output
 from coec.calibration.frames.time_offset import TimeOffset
+from coec.cli.chosen import choices_of
 from coec.cli.commands.calibrate import Options
 from coec.config import WindowConfig
 from coec.errors import OutputError
 from coec.geometry.cameras import Camera
 from coec.library.calibrating import Calibrated, calibrated
 from coec.library.camera_fit import CameraFit
-from coec.library.choices import Choices
 from coec.reports import calibration, console, page, pictures, provenance
 from coec.reports.calibration_page import calibration_page
 from coec.reports.close_ups import Caption
@@ -75,16 +75,6 @@ def run(options: Options) -> int:
         causes = ", ".join(f"{count} {cause}" for cause, count in sorted(loaded.unpaired.items()))
         console.say(f"coec: frames without a partner: {causes}")
     return 0 if done.result.verdict.decision == "accepted" and not_written is None else 1
-
-
-def choices_of(options: Options) -> Choices:
-    """What was given on the command line."""
-    return Choices(
-        depth=options.depth,
-        objective=options.objective,
-        dof=None if options.dof is None else int(options.dof),
-        motion_compensation=False if options.no_motion_compensation else None,
-    )
 
 
 def _document(

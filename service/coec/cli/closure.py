@@ -11,6 +11,7 @@ from coec.adapters.depth.maps import open_depth
 from coec.adapters.files import output
 from coec.calibration.types import Matrix4
 from coec.cli import evaluate
+from coec.cli.chosen import choices_of
 from coec.cli.commands.evaluate import Options
 from coec.config import LimitsConfig, WindowConfig
 from coec.evaluation import experiments
@@ -81,7 +82,7 @@ def relative_of(text: str) -> Matrix4:
 def _bench(options: Options, name: str, stages: Stages) -> Bench:
     load = stages.begin(f"load {name}", None)
     loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
-    configuration = configuration_of(evaluate.plan_of(options), evaluate.choices_of(options), loaded.configuration)
+    configuration = configuration_of(evaluate.plan_of(options), choices_of(options), loaded.configuration)
     model = open_depth(configuration.depth, LimitsConfig())
     depth = experiments.inferred(loaded.window, model, stages.begin(f"depth {name}", len(loaded.window.pairs)))
     return Bench(loaded.window, depth, experiments.greys_of(loaded.window), configuration)

@@ -7,13 +7,13 @@ from dataclasses import replace
 from rich.progress import Progress
 
 from coec.adapters.files import output
+from coec.cli.chosen import choices_of
 from coec.cli.commands.evaluate import Options
 from coec.cli.exit_codes import INTERRUPTED
 from coec.config import WindowConfig
 from coec.errors import CalibrationError
 from coec.evaluation.experiments import Stages
 from coec.evaluation.statistics import Outcome
-from coec.library.choices import Choices
 from coec.library.evaluating import Plan, Subject, bench_of, report_of, subject_of, tried
 from coec.reports import console, evaluation_page, evaluation_tables, provenance
 from coec.schemas.base import to_json
@@ -75,16 +75,6 @@ def plan_of(options: Options) -> Plan:
         nees=options.nees,
         detection=options.detection,
         steps=options.steps,
-    )
-
-
-def choices_of(options: Options) -> Choices:
-    """What was given on the command line."""
-    return Choices(
-        depth=options.depth,
-        objective=options.objective,
-        dof=None if options.dof is None else int(options.dof),
-        motion_compensation=False if options.no_motion_compensation else None,
     )
 
 
