@@ -119,6 +119,12 @@ def test_the_unit_has_as_much_memory_as_the_container() -> None:
     assert unit()["TasksMax"] == [str(compose()["coec"]["pids_limit"])]
 
 
+def test_the_unit_gives_a_user_without_a_home_places_for_kernels_and_networks() -> None:
+    (line,) = unit()["Environment"]
+    assert {"XDG_CACHE_HOME=%C", "XDG_DATA_HOME=%S"} <= set(line.split())
+    assert {"coec"} == {*unit()["CacheDirectory"], *unit()["StateDirectory"]}
+
+
 @pytest.mark.fault(
     "a setting of the unit that systemd does not know, or that opens the sandbox",
     "systemd takes every line, and rates its exposure below 2 of 10",

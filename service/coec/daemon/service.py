@@ -90,7 +90,8 @@ GIVE_BACK_S = 5.0
 cleared by the system first."""
 
 STALLED_S = 20.0
-"""A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed."""
+"""A thread without a beat for so long is stuck: the watchdog of the service manager is no longer fed, and a start is
+given no more time."""
 
 # Together with the worker, which is killed, these bound the end of the service below 15 s.
 INGEST_STOP_S, RECORDER_STOP_S, DECIDER_STOP_S, RIG_STOP_S, SCRIBE_STOP_S = 2.0, 4.0, 0.5, 0.5, 1.5
@@ -291,6 +292,8 @@ class Daemon:
             return CoecError.exit_code if self._presence.rival is None else UnavailableError.exit_code
         if all(thread.silence_s < STALLED_S for thread in self._prompt_threads()):
             self._notifier.watchdog()
+            if self._state == "starting":
+                self._notifier.starting(STALLED_S)
         return 0
 
     def _stop(self) -> bool:

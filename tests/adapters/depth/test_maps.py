@@ -1,5 +1,6 @@
 """Where depth comes from: maps of the frames, networks by file and by name, and the cache."""
 
+import pwd
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,19 @@ def test_network_is_opened_by_the_name_of_its_card(tmp_path: Path, monkeypatch: 
     (models_folder() / "midas_small.onnx").write_bytes(first_channel())
     model = open_depth(DepthConfig(model="midas_small"), LIMITS)
     assert model.infer(_frame(5)).values.shape == (256, 256)
+
+
+@pytest.mark.fault("a user without a home, as a service manager makes them up", "networks of the package are opened")
+def test_a_user_without_a_home_has_the_networks_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody(uid: int) -> None:
+        raise KeyError(f"getpwuid(): uid not found: {uid}")
+
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", nobody)
+    assert open_depth(DepthConfig(model="street"), LIMITS).identity
+    with pytest.raises(ModelError, match=r"there is no depth network ~/mine\.onnx"):
+        open_depth(DepthConfig(model="~/mine.onnx"), LIMITS)
 
 
 def test_known_network_is_found_by_name_under_its_customary_file_name(

@@ -16,10 +16,12 @@ def test_the_manager_is_told_by_datagrams(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(address)
         notifier = Notifier.from_environment({"NOTIFY_SOCKET": address})
+        notifier.starting(20.0)
         notifier.ready()
         notifier.watchdog()
         notifier.stopping()
-        assert [manager.recv(100) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1", b"STOPPING=1"]
+        told = [manager.recv(100) for _ in range(4)]
+        assert told == [b"EXTEND_TIMEOUT_USEC=20000000", b"READY=1", b"WATCHDOG=1", b"STOPPING=1"]
         notifier.reloading()
         begins, stamp = manager.recv(100).split(b"\n")
         assert begins == b"RELOADING=1"

@@ -8,6 +8,7 @@ from collections import OrderedDict
 from pathlib import Path
 
 from coec.adapters.depth.model_cards import CARDS, ModelCard, built_in_cards, find_card
+from coec.adapters.files.home import from_home
 from coec.adapters.frames.incoming import Refusal
 from coec.adapters.images.codec import decode_depth
 from coec.calibration.ports import DepthModel
@@ -99,7 +100,7 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
     if config.model == STEREO:
         return PrecomputedDepth(limits)
     named = built_in_cards().get(config.model)
-    path = _file_of(named) if named is not None else Path(config.model).expanduser()
+    path = _file_of(named) if named is not None else from_home(config.model)
     if not path.is_file():
         raise ModelError(
             f"there is no depth network {path}: give an ONNX file, `{STEREO}` for the maps that come with "
@@ -113,7 +114,7 @@ def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
 def models_folder() -> Path:
     """Where networks are looked for by name: `coec/models` in $XDG_DATA_HOME, by default ~/.local/share."""
     base = os.environ.get("XDG_DATA_HOME", "")
-    return (Path(base) if base else Path.home() / ".local" / "share") / "coec" / "models"
+    return (Path(base) if base else from_home("~/.local/share")) / "coec" / "models"
 
 
 def _file_of(card: ModelCard) -> Path:

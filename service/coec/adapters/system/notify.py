@@ -21,6 +21,10 @@ class Notifier:
         """The notifier of the manager that started this process."""
         return cls(environment.get("NOTIFY_SOCKET"))
 
+    def starting(self, within_s: float) -> None:
+        """The start gets on; more is heard within so many seconds."""
+        self._send(f"EXTEND_TIMEOUT_USEC={round(within_s * 1e6)}")
+
     def ready(self) -> None:
         """The service answers and can calibrate."""
         self._send("READY=1")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from coec.adapters.files.home import from_home
 from coec.adapters.files.rig import camera_of, load_mask, rigid_matrix
 from coec.adapters.ros.camera_info import Info, Lens, info_topic, is_rectified, lens_of
 from coec.adapters.ros.transforms import bare
@@ -49,7 +49,7 @@ def rig_of_bag(
             info = _info(index, intrinsics, camera_frame, image_topic)
             camera = camera_of(_lens(index, info, image_topic).intrinsics)
         else:
-            path = Path(intrinsics).expanduser()
+            path = from_home(intrinsics)
             document = RigFile.model_validate(load_yaml(path))
             camera = camera_of(document.camera)
             if document.T_camera_lidar is not None:
