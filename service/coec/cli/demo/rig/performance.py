@@ -11,7 +11,7 @@ from coec.cli.demo.rig.outcome import Outcome, is_over, outcome_of
 from coec.cli.demo.rig.service import serving
 from coec.cli.demo.rig.story import Act
 from coec.cli.demo.rig.told import Asker, Told
-from coec.cli.demo.rig.vehicle import RigVehicle
+from coec.cli.demo.rig.vehicle import RigVehicle, driving
 from coec.reports import console
 
 
@@ -24,14 +24,14 @@ def run(output: Path, *, as_json: bool) -> int:
     """
     started_s = time.monotonic()
     console.say("demo: the street is built; on the first run of a machine kernels are compiled, for a minute")
-    vehicle = RigVehicle()
     acts: list[report.Performance] = []
-    with console.progress() as bars:
+    with driving() as vehicle, console.progress() as bars:
         task = bars.add_task("instants of the drives", total=len(story.ACTS) * len(vehicle.plan), note="")
         for act in story.ACTS:
             acts.append(_play(vehicle, act, lambda note: bars.update(task, advance=1, note=note)))
             bars.update(task, completed=len(acts) * len(vehicle.plan))
-    files = report.write(output, vehicle.as_built, acts)
+        as_built = vehicle.as_built
+    files = report.write(output, as_built, acts)
     if as_json:
         console.print_json(report.document(acts, files, time.monotonic() - started_s))
     else:
@@ -43,9 +43,10 @@ def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[
     """With a service of its own, which knows nothing of other acts: until the story is told, or the drive is over.
     `heard` is told of every instant."""
     said: list[Told] = []
+    drawn = vehicle.frames(act)
     with serving(vehicle.as_built, story.LIDAR) as service:
         teller = Asker(service)
-        for frames in vehicle.frames(act):
+        for frames in drawn:
             heard(f"{act.name}: {frames.second:.0f} s of driving")
             _hear(act, said, teller.hear(frames))
             if said and is_over(outcome_of(act, said), said[-1]):
