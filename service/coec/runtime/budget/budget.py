@@ -77,6 +77,12 @@ class Budget:
         with self._lock:
             return self._turns.affords(pair, stamp_ns, suspected=suspected)
 
+    def window_turn_s(self, pair: str, stamp_ns: int) -> float:
+        """How much later than at once a window of a pair that the rig wants may end, now that its stream has come to
+        this stamp, s: those before it are paid then. It is taken to be on its way."""
+        with self._lock:
+            return self._turns.window_turn_s(pair, stamp_ns)
+
     def ended(self, pair: str) -> None:
         """A check that had begun has ended, however it did."""
         with self._lock:

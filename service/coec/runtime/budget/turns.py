@@ -10,12 +10,12 @@ A state machine: sensor time alone passes in it, and it knows no thread and no c
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from coec.runtime.budget.drive_clock import DriveClock
 from coec.runtime.budget.prices import Price
-from coec.runtime.budget.store import Debt, Store
+from coec.runtime.budget.store import LOOKS_SHARE, Debt, Store
 
 SEEN_PERIODS = 6
 """A pair that has asked for nothing for so many of its periods takes no part: its streams have stopped, or the vehicle
@@ -60,11 +60,6 @@ class _Pair:
     window: Price = field(default_factory=Price)
     prepared_s: float = 0.0
 
-    @property
-    def wanted(self) -> float:
-        """Of a core, for every check and every window."""
-        return self.look.cpu_s / self.period_s + self.window.cpu_s / self.debt.over_s
-
 
 class Turns:
     """Of all pairs of a service."""
@@ -74,6 +69,7 @@ class Turns:
         self._clock = DriveClock()
         self._store = Store(cores)
         self._pairs: dict[str, _Pair] = {}
+        self._windows_until_s = 0.0
 
     def use(self, cores: float) -> None:
         """Another budget from now on."""
@@ -92,17 +88,27 @@ class Turns:
         """Whether a check of a pair may begin, now that its stream has come to a stamp. It is then taken to begin."""
         pair = self._pairs[name]
         now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * pair.period_s)
-        self._store.earn(now_s, [each.debt for each in self._pairs.values()])
+        self._earn(now_s)
         pair.asked_s, pair.waits, pair.suspected = now_s, True, suspected
         claim = self._claim(name, now_s)
         others = [each for each in self._pairs if each != name and self._waits(each)]
-        ahead_s = sum(self._pairs[each].look.cpu_s for each in others if self._claim(each, now_s) > claim)
-        in_hand_s = sum(each.in_hand * each.look.cpu_s for each in self._pairs.values())
+        ahead_s = sum(self._look_s(self._pairs[each]) for each in others if self._claim(each, now_s) > claim)
+        in_hand_s = sum(each.in_hand * self._look_s(each) for each in self._pairs.values())
         if self._store.level_s - in_hand_s - ahead_s < (-self._store.depth_s if suspected else 0.0):
             return False
         pair.begun_s, pair.waits = now_s, False
         pair.in_hand += 1
         return True
+
+    def window_turn_s(self, name: str, stamp_ns: int) -> float:
+        """How much later than at once a window of a pair that is wanted soon may end, now that its stream has come to a
+        stamp, s. The windows of all pairs of a sensor follow each other as fast as the budget earns them beside the
+        looks; all at once they would be ready together, and keep the worker from every look for as long as they
+        take."""
+        now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * self._pairs[name].period_s)
+        begin_s = max(self._windows_until_s, now_s)
+        self._windows_until_s = begin_s + self._window_s(self._pairs[name]) / ((1.0 - LOOKS_SHARE) * self._cores)
+        return begin_s - now_s
 
     def ended(self, name: str) -> None:
         """A check that had begun has ended, whether it was done or not."""
@@ -135,7 +141,11 @@ class Turns:
     @property
     def wanted(self) -> float:
         """Of a core, for every check and every window of the pairs that ask for them."""
-        return sum(pair.wanted for pair in self._pairs.values() if self._active(pair))
+        return sum(
+            self._look_s(pair) / pair.period_s + self._window_s(pair) / pair.debt.over_s
+            for pair in self._pairs.values()
+            if self._active(pair)
+        )
 
     @property
     def stretch(self) -> float:
@@ -160,6 +170,19 @@ class Turns:
             for name, pair in self._pairs.items()
         }
 
+    def _earn(self, now_s: float) -> None:
+        for pair in self._pairs.values():
+            pair.debt.next_s = self._window_s(pair) if self._active(pair) else 0.0
+        self._store.earn(now_s, [pair.debt for pair in self._pairs.values()])
+
+    def _look_s(self, pair: _Pair) -> float:
+        """Price of a check, processor time."""
+        return _expected_s(pair.look, [each.look for each in self._pairs.values()])
+
+    def _window_s(self, pair: _Pair) -> float:
+        """Price of a window, processor time."""
+        return _expected_s(pair.window, [each.window for each in self._pairs.values()])
+
     def _claim(self, name: str, now_s: float) -> tuple[bool, float, str]:
         """The name decides between equals, so that it is the same one every time."""
         pair = self._pairs[name]
@@ -172,6 +195,15 @@ class Turns:
 
     def _active(self, pair: _Pair) -> bool:
         return self._clock.now_s - pair.asked_s <= SEEN_PERIODS * pair.period_s
+
+
+def _expected_s(price: Price, all_prices: Sequence[Price]) -> float:
+    """A price, s; before the first measurement the middle one of those of the other pairs, of two the lower, and 0
+    where nobody has one. With many pairs the first windows are most of the work of the first minutes."""
+    if price.known:
+        return price.cpu_s
+    known_s = sorted(each.cpu_s for each in all_prices if each.known)
+    return known_s[(len(known_s) - 1) // 2] if known_s else 0.0
 
 
 def _phase(index: int) -> float:
