@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -123,9 +124,9 @@ def test_frames_are_drawn_ahead_of_the_one_that_is_sent_and_not_to_the_end(monke
     monkeypatch.setattr(story, "LONGEST_S", 20.0)
     drawers = AtOnce()
     frames = vehicle_of(drawers).frames(LIDAR)
-    assert drawers.asked == 5 * AHEAD, "before the service is there"
+    assert drawers.asked == 5 * (AHEAD - 1), "all but the first, which compiles what the others then find compiled"
     next(frames)
-    assert drawers.asked == 5 * (AHEAD + 1)
+    assert drawers.asked == 5 * AHEAD
 
 
 def test_what_the_service_says_is_told_as_it_is() -> None:
@@ -164,7 +165,7 @@ def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeyp
             return [told(story.LONGEST_S)]
 
     monkeypatch.setattr(performance, "Asker", Silent)
-    monkeypatch.setattr(performance, "serving", lambda *_: nullcontext())
+    monkeypatch.setattr(performance, "serving", lambda *_: nullcontext(SimpleNamespace(until_ready=lambda: None)))
     monkeypatch.setattr(story, "CAMERA_PX", 64)
     monkeypatch.setattr(story, "LONGEST_S", 2.0)
     monkeypatch.setattr(performance, "driving", lambda: nullcontext(vehicle_of(AtOnce())))

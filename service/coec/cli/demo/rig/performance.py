@@ -43,8 +43,9 @@ def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[
     """With a service of its own, which knows nothing of other acts: until the story is told, or the drive is over.
     `heard` is told of every instant."""
     said: list[Told] = []
-    drawn = vehicle.frames(act)
     with serving(vehicle.as_built, story.LIDAR) as service:
+        drawn = vehicle.frames(act)
+        service.until_ready()
         teller = Asker(service)
         for frames in drawn:
             heard(f"{act.name}: {frames.second:.0f} s of driving")

@@ -74,6 +74,8 @@ class RigVehicle:
 
     def frames(self, act: Act) -> Iterator[Frames]:
         """All of them, in order. The first are being drawn when this returns."""
+        if not self._begun:
+            self._draw_first()
         begun = ((instant, self._begin(act, instant)) for instant in self.plan)
         waiting = deque(islice(begun, AHEAD))
         return self._in_order(waiting, begun)
@@ -88,6 +90,14 @@ class RigVehicle:
             waiting.extend(islice(begun, 1))
             motions = tuple(self.as_built.message(entry) for entry in instant.motions)
             yield Frames(sweep, dict(zip(instant.pictures, pictures, strict=True)), motions)
+
+    def _draw_first(self) -> None:
+        """Draw the first instant in this process: what is compiled for that, once on a machine, is told to who waits,
+        and every drawer finds it compiled."""
+        for entry in (self.plan[0].sweep, *self.plan[0].pictures.values()):
+            drawn: Future[Message] = Future()
+            drawn.set_result(self.as_built.message(entry))
+            self._begun[AS_BUILT, entry] = drawn
 
     def _begin(self, act: Act, instant: Instant) -> Sequence[Future[Message]]:
         """Have the sweep and the pictures of an instant drawn, unless an earlier act has."""
