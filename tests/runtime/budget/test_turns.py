@@ -330,6 +330,9 @@ def test_what_one_window_costs_is_expected_of_the_others() -> None:
     turns.looked("rear", 0.5)
     assert turns.wanted == pytest.approx(4 * (0.5 / PERIOD_S + 9.0 / SLICE_S))
     assert turns.shares()["front"].window_s is None, "but nobody says that it was measured"
+    turns.join_looks("roof to flank", 15.0)
+    assert turns.affords("roof to flank", S, suspected=False)
+    assert turns.wanted == pytest.approx(4 * (0.5 / PERIOD_S + 9.0 / SLICE_S)), "who has other looks, and no windows"
 
 
 @pytest.mark.fault(

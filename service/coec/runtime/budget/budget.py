@@ -70,7 +70,7 @@ class Budget:
     def join_looks(self, name: str, period_s: float) -> None:
         """Something joins that wants a look in each period, and no windows."""
         with self._lock:
-            self._turns.join(name, period_s, period_s)
+            self._turns.join_looks(name, period_s)
 
     def affords(self, pair: str, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether a check of a pair, whose stream has come to this stamp, may begin; `ended` has to follow then."""

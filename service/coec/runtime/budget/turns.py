@@ -46,12 +46,13 @@ class Share:
 
 @dataclass(slots=True)
 class _Pair:
-    """`asked_s`: when it asked last; `waits`: in vain. `begun_s`: when its last check began. `in_hand`: its checks that
-    have begun and not ended; `prepared_s`: what depth for the open window has cost."""
+    """`asked_s`: when it asked last; `waits`: in vain. `begun_s`: when its last check began. `has_windows`: or looks
+    alone. `in_hand`: its checks that have begun and not ended; `prepared_s`: what depth for the open window cost."""
 
     period_s: float
     debt: Debt
     begun_s: float
+    has_windows: bool = True
     asked_s: float = -math.inf
     waits: bool = False
     suspected: bool = False
@@ -83,6 +84,10 @@ class Turns:
         phase = _phase(len(self._pairs))
         self._pairs[name] = _Pair(period_s, Debt(slice_s), self._clock.now_s)
         return phase
+
+    def join_looks(self, name: str, period_s: float) -> None:
+        """Something joins that wants a look in each period, and no windows."""
+        self._pairs[name] = _Pair(period_s, Debt(period_s), self._clock.now_s, has_windows=False)
 
     def affords(self, name: str, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether a check of a pair may begin, now that its stream has come to a stamp. It is then taken to begin."""
@@ -177,11 +182,12 @@ class Turns:
 
     def _look_s(self, pair: _Pair) -> float:
         """Price of a check, processor time."""
-        return _expected_s(pair.look, [each.look for each in self._pairs.values()])
+        alike = [each.look for each in self._pairs.values() if each.has_windows is pair.has_windows]
+        return _expected_s(pair.look, alike)
 
     def _window_s(self, pair: _Pair) -> float:
         """Price of a window, processor time."""
-        return _expected_s(pair.window, [each.window for each in self._pairs.values()])
+        return _expected_s(pair.window, [each.window for each in self._pairs.values()]) if pair.has_windows else 0.0
 
     def _claim(self, name: str, now_s: float) -> tuple[bool, float, str]:
         """The name decides between equals, so that it is the same one every time."""
