@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from coec.runtime.budget.drive_clock import DriveClock
-from coec.runtime.budget.prices import Price
+from coec.runtime.budget.prices import Price, middle_s
 from coec.runtime.budget.store import LOOKS_SHARE, Debt, Store
 
 SEEN_PERIODS = 6
@@ -98,7 +98,7 @@ class Turns:
         claim = self._claim(name, now_s)
         others = [each for each in self._pairs if each != name and self._waits(each)]
         ahead_s = sum(self._look_s(self._pairs[each]) for each in others if self._claim(each, now_s) > claim)
-        in_hand_s = sum(each.in_hand * self._look_s(each) for each in self._pairs.values())
+        in_hand_s = sum(each.in_hand * self._look_s(each) for each in self._pairs.values() if each.in_hand)
         if self._store.level_s - in_hand_s - ahead_s < (-self._store.depth_s if suspected else 0.0):
             return False
         pair.begun_s, pair.waits = now_s, False
@@ -108,11 +108,12 @@ class Turns:
     def window_turn_s(self, name: str, stamp_ns: int) -> float:
         """How much later than at once a window of a pair that is wanted soon may end, now that its stream has come to a
         stamp, s. The windows of all pairs of a sensor follow each other as fast as the budget earns them beside the
-        looks; all at once they would be ready together, and keep the worker from every look for as long as they
-        take."""
+        looks; all at once they would be ready together, and keep the worker from every look for as long as they take.
+        In whole seconds: a price that moves by a little moves no slice."""
         now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * self._pairs[name].period_s)
         begin_s = max(self._windows_until_s, now_s)
-        self._windows_until_s = begin_s + self._window_s(self._pairs[name]) / ((1.0 - LOOKS_SHARE) * self._cores)
+        earned_in_s = self._window_s(self._pairs[name]) / ((1.0 - LOOKS_SHARE) * self._cores)
+        self._windows_until_s = begin_s + math.ceil(earned_in_s)
         return begin_s - now_s
 
     def ended(self, name: str) -> None:
@@ -182,12 +183,16 @@ class Turns:
 
     def _look_s(self, pair: _Pair) -> float:
         """Price of a check, processor time."""
+        if pair.look.known:
+            return pair.look.cpu_s
         alike = [each.look for each in self._pairs.values() if each.has_windows is pair.has_windows]
-        return _expected_s(pair.look, alike)
+        return _expected_s(alike)
 
     def _window_s(self, pair: _Pair) -> float:
         """Price of a window, processor time."""
-        return _expected_s(pair.window, [each.window for each in self._pairs.values()]) if pair.has_windows else 0.0
+        if pair.window.known or not pair.has_windows:
+            return pair.window.cpu_s
+        return _expected_s([each.window for each in self._pairs.values()])
 
     def _claim(self, name: str, now_s: float) -> tuple[bool, float, str]:
         """The name decides between equals, so that it is the same one every time."""
@@ -203,13 +208,10 @@ class Turns:
         return self._clock.now_s - pair.asked_s <= SEEN_PERIODS * pair.period_s
 
 
-def _expected_s(price: Price, all_prices: Sequence[Price]) -> float:
-    """A price, s; before the first measurement the middle one of those of the other pairs, of two the lower, and 0
-    where nobody has one. With many pairs the first windows are most of the work of the first minutes."""
-    if price.known:
-        return price.cpu_s
-    known_s = sorted(each.cpu_s for each in all_prices if each.known)
-    return known_s[(len(known_s) - 1) // 2] if known_s else 0.0
+def _expected_s(others: Sequence[Price]) -> float:
+    """What is expected of a pair that has no price yet, s: the middle one of those of the others. With many pairs the
+    first windows are most of the work of the first minutes."""
+    return middle_s([each.cpu_s for each in others if each.known])
 
 
 def _phase(index: int) -> float:
