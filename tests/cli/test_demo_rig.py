@@ -176,6 +176,29 @@ def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeyp
     assert all(Path(path).stat().st_size > 0 for path in outcome.document["files"])
 
 
+@pytest.mark.fault("a service that looks at nothing", "said in a sentence, and no page is written")
+def test_a_service_that_tells_nothing_is_an_error(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mute:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def hear(self, _: Frames) -> list[Told]:
+            return []
+
+        def rest(self) -> list[Told]:
+            return []
+
+    monkeypatch.setattr(performance, "Asker", Mute)
+    monkeypatch.setattr(performance, "serving", lambda *_: nullcontext(SimpleNamespace(until_ready=lambda: None)))
+    monkeypatch.setattr(story, "CAMERA_PX", 64)
+    monkeypatch.setattr(story, "LONGEST_S", 2.0)
+    monkeypatch.setattr(performance, "driving", lambda: nullcontext(vehicle_of(AtOnce())))
+    outcome = coec("demo", "--rig", "--output", tmp_path / "demo")
+    assert outcome.status != 0
+    assert "looked at none of its pairs" in outcome.err
+    assert not (tmp_path / "demo").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.fault("a LiDAR, and on another drive a camera, is knocked by 1°", "it alone is named, and within a minute")
 def test_a_knocked_lidar_and_a_knocked_camera_are_told_apart(

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from coec.cli.demo.daemon import DemoError
 from coec.cli.demo.rig import report, story
 from coec.cli.demo.rig.outcome import Outcome, is_over, outcome_of
 from coec.cli.demo.rig.service import serving
@@ -41,7 +42,11 @@ def run(output: Path, *, as_json: bool) -> int:
 
 def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[Outcome, list[Told]]:
     """With a service of its own, which knows nothing of other acts: until the story is told, or the drive is over.
-    `heard` is told of every instant."""
+    `heard` is told of every instant.
+
+    Raises:
+        DemoError: the service does not start, answer or end, or tells nothing.
+    """
     said: list[Told] = []
     with serving(vehicle.as_built, story.LIDAR) as service:
         drawn = vehicle.frames(act)
@@ -54,6 +59,8 @@ def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[
                 break
         else:
             _hear(act, said, teller.rest())
+    if not said:
+        raise DemoError("the service has looked at none of its pairs")
     return outcome_of(act, said), said
 
 
