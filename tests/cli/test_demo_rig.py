@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -16,8 +19,9 @@ from cli.conftest import Coec
 from coec.cli.demo.rig import performance, report, story
 from coec.cli.demo.rig.outcome import Outcome, is_over, outcome_of
 from coec.cli.demo.rig.told import NS_PER_S, SensorTold, Told, told_of
-from coec.cli.demo.rig.vehicle import Frames, RigVehicle
+from coec.cli.demo.rig.vehicle import AHEAD, Frames, RigVehicle
 from coec.reports.rig_plot import EdgeSeen
+from coec.simulation import drawing
 from coec.simulation.journey import START_NS
 from coec.simulation.rig_drive import RigConfig, RigDrive
 from rig_replies import knocked, untold
@@ -36,6 +40,24 @@ def told(second: float, *moved: str) -> Told:
 
     edges = {f"{name}-roof": EdgeSeen(name, "roof", 0.1, 0.1) for name in SENSORS[:-1]}
     return Told(second, "front-roof", {name: sensor(name) for name in SENSORS}, edges)
+
+
+class AtOnce(Executor):
+    """In this process, when it is asked."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.asked += 1
+        done: Future[Any] = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
+
+
+def vehicle_of(executor: Executor) -> RigVehicle:
+    drawing.begin(tuple(story.drive_config(act) for act in (None, *story.ACTS)))
+    return RigVehicle(drawing.Drawers(executor))
 
 
 QUIET, NAMED = told(KNOCK_S - 9.0), told(KNOCK_S + 14.0, "left")
@@ -85,7 +107,7 @@ def test_acts_share_the_frames_of_what_stands_still(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(story, "CAMERA_PX", 64)
     monkeypatch.setattr(story, "KNOCK_S", 1.0)
     monkeypatch.setattr(story, "LONGEST_S", 2.0)
-    vehicle = RigVehicle()
+    vehicle = vehicle_of(AtOnce())
     first, second = (list(vehicle.frames(act)) for act in story.ACTS)
     assert len(first) == len(second) == len(vehicle.plan)
     assert first[0].second < 1.0 < first[-1].second
@@ -95,6 +117,16 @@ def test_acts_share_the_frames_of_what_stands_still(monkeypatch: pytest.MonkeyPa
         for camera, picture in before.pictures.items():
             turned = camera == CAMERA.sensor and picture.stamp_ns - START_NS >= 1_000_000_000
             assert (picture is after.pictures[camera]) is not turned
+
+
+def test_frames_are_drawn_ahead_of_the_one_that_is_sent_and_not_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(story, "CAMERA_PX", 64)
+    monkeypatch.setattr(story, "LONGEST_S", 20.0)
+    drawers = AtOnce()
+    frames = vehicle_of(drawers).frames(LIDAR)
+    assert drawers.asked == 5 * (AHEAD - 1), "all but the first, which compiles what the others then find compiled"
+    next(frames)
+    assert drawers.asked == 5 * AHEAD
 
 
 def test_what_the_service_says_is_told_as_it_is() -> None:
@@ -133,14 +165,38 @@ def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeyp
             return [told(story.LONGEST_S)]
 
     monkeypatch.setattr(performance, "Asker", Silent)
-    monkeypatch.setattr(performance, "serving", lambda *_: nullcontext())
+    monkeypatch.setattr(performance, "serving", lambda *_: nullcontext(SimpleNamespace(until_ready=lambda: None)))
     monkeypatch.setattr(story, "CAMERA_PX", 64)
     monkeypatch.setattr(story, "LONGEST_S", 2.0)
+    monkeypatch.setattr(performance, "driving", lambda: nullcontext(vehicle_of(AtOnce())))
     outcome = coec("demo", "--rig", "--json", "--output", tmp_path)
     assert outcome.status == 1
     assert [act["knocked"] for act in outcome.document["acts"]] == ["roof", "left"]
     assert not outcome.document["passed"]
     assert all(Path(path).stat().st_size > 0 for path in outcome.document["files"])
+
+
+@pytest.mark.fault("a service that looks at nothing", "said in a sentence, and no page is written")
+def test_a_service_that_tells_nothing_is_an_error(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mute:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def hear(self, _: Frames) -> list[Told]:
+            return []
+
+        def rest(self) -> list[Told]:
+            return []
+
+    monkeypatch.setattr(performance, "Asker", Mute)
+    monkeypatch.setattr(performance, "serving", lambda *_: nullcontext(SimpleNamespace(until_ready=lambda: None)))
+    monkeypatch.setattr(story, "CAMERA_PX", 64)
+    monkeypatch.setattr(story, "LONGEST_S", 2.0)
+    monkeypatch.setattr(performance, "driving", lambda: nullcontext(vehicle_of(AtOnce())))
+    outcome = coec("demo", "--rig", "--output", tmp_path / "demo")
+    assert outcome.status != 0
+    assert "looked at none of its pairs" in outcome.err
+    assert not (tmp_path / "demo").exists()
 
 
 @pytest.mark.slow

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from coec.reports import replies
+from coec.reports import replies, service_status
 from coec.schemas.base import to_json
-from coec.schemas.replies import BudgetShare, BudgetStatus, ConfigurationStatus
+from coec.schemas.replies import BudgetShare, BudgetStatus, ConfigurationStatus, PairStatus, StreamStatus
 from coec.schemas.rig_state import RigReply
 from rig_replies import joint, knocked, untold
 from runtime.api.test_metrics import a_busy_status
@@ -23,9 +23,9 @@ def test_a_configuration_that_is_not_in_force_is_said(
     capsys: pytest.CaptureFixture[str], told: dict[str, object], line: str
 ) -> None:
     configuration = ConfigurationStatus.model_validate({"read_ns": 1, **told})
-    replies.status(to_json(a_busy_status()))
+    service_status.status(to_json(a_busy_status()))
     assert line not in capsys.readouterr().out
-    replies.status(to_json(a_busy_status().model_copy(update={"configuration": configuration})))
+    service_status.status(to_json(a_busy_status().model_copy(update={"configuration": configuration})))
     assert line in capsys.readouterr().out
 
 
@@ -35,13 +35,40 @@ def test_a_budget_that_does_not_suffice_is_said(capsys: pytest.CaptureFixture[st
     budget = BudgetStatus(
         cores=0.5, spent=0.5, wanted=0.8, stretched_by=1.6, in_store_s=0.0, spent_s={}, pairs={"front": share}
     )
-    replies.status(to_json(a_busy_status().model_copy(update={"budget": budget})))
+    service_status.status(to_json(a_busy_status().model_copy(update={"budget": budget})))
     said = " ".join(capsys.readouterr().out.split())
     assert "budget 0.5 of a core; 0.50 spent, 0.80 wanted" in said
     assert "1.6 times as far apart as configured; waiting: front" in said
     enough = budget.model_copy(update={"wanted": 0.3, "stretched_by": 1.0})
-    replies.status(to_json(a_busy_status().model_copy(update={"budget": enough})))
+    service_status.status(to_json(a_busy_status().model_copy(update={"budget": enough})))
     assert "suffice" not in capsys.readouterr().out
+
+
+@pytest.mark.fault(
+    "24 pairs of eight cameras and three LiDARs", "`coec query status` is a screen, and says where what is lost"
+)
+def test_the_status_of_many_pairs_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    cameras = [
+        StreamStatus(received=9, accepted=9 - (n == 3), losses={"overrun": 1} if n == 3 else {}) for n in range(8)
+    ]
+    pairs = tuple(
+        PairStatus(name=f"c{camera}-l{lidar}", camera=cameras[camera], checks=7, losses={"not_awaited": camera + 1})
+        for camera in range(8)
+        for lidar in range(3)
+    )
+    share = BudgetShare(look_s=1.0, window_s=None, unseen_s=7.0, suspected=False, waiting=True, active=True)
+    shares = {pair.name: share.model_copy(update={"suspected": pair.name == "c3-l0"}) for pair in pairs}
+    budget = BudgetStatus(cores=0.5, spent=0.5, wanted=0.8, stretched_by=1.6, in_store_s=0.0, spent_s={}, pairs=shares)
+    status = a_busy_status().model_copy(update={"pairs": pairs, "budget": budget})
+    service_status.status(to_json(status))
+    said = capsys.readouterr().out
+    lines = [" ".join(line.split()) for line in said.splitlines()]
+    assert "lost, camera: 1 overrun in c3-l0, c3-l1, c3-l2" in lines
+    assert "lost, windows: up to 8 not_awaited in c7-l0, c7-l1, c7-l2 and 21 more" in lines
+    assert "waiting: c0-l0, c0-l1, c0-l2 and 21 more" in " ".join(lines)
+    assert any(line.startswith("c3-l0 7 suspected") for line in lines)
+    assert any(line.startswith("c3-l1 7 waits") for line in lines)
+    assert len(lines) < 50, "a screen of a terminal"
 
 
 def said_of_rig(capsys: pytest.CaptureFixture[str], reply: RigReply) -> str:

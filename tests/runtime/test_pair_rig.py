@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,6 +28,7 @@ from coec.runtime.outside import Outside
 from coec.runtime.pair import Pair
 from coec.runtime.recording.window_store import WindowStore
 from coec.runtime.rig.keeper import RigKeeper
+from coec.runtime.worker.jobs import Checked, Job
 from coec.runtime.worker.supervisor import Worker
 from coec.schemas.base import to_json
 from coec.schemas.keys import Keys
@@ -46,12 +48,23 @@ def _configuration(folder: Path, apply: str) -> Config:
     return config.model_copy(update={"pairs": tuple(pairs)})
 
 
+class DimWorker(KnowingWorker):
+    """Sees in a window what no check shows it."""
+
+    def _check(self, job: Job) -> Checked:
+        checked = super()._check(job)
+        vague = np.full(6, 0.2)
+        said = replace(checked.observation, offset=np.zeros(6), sigma=vague, noise=vague, flagged=False)
+        return replace(checked, observation=said)
+
+
 class RigBench:
     """All pairs of a vehicle, driven in an order that a seed draws."""
 
-    def __init__(self, folder: Path, seed: int = 0, apply: str = "within_limits") -> None:
+    def __init__(self, folder: Path, seed: int = 0, config: Config | None = None, dim: str | None = None) -> None:
+        """`dim` is a pair whose checks tell nothing."""
         folder.mkdir(parents=True)
-        config = _configuration(folder, apply)
+        config = config or _configuration(folder, "within_limits")
         self.rng = random.Random(seed)
         self.intake = Intake(config.limits)
         self.keys = Keys("coec", config.vehicle)
@@ -78,7 +91,7 @@ class RigBench:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)
             for pair in config.pairs:
-                worker = KnowingWorker()
+                worker = DimWorker() if pair.name == dim else KnowingWorker()
                 object.__setattr__(outside, "worker", worker)
                 self.pairs[pair.name] = Pair(pair, config, outside)
                 cast("InstantRecorder", self.pairs[pair.name].recorder).worker = worker
@@ -172,8 +185,36 @@ def test_a_knocked_lidar_is_corrected_once_for_all_pairs_and_the_same_in_a_repla
     record_property("figure", f"{(reply.correction.stamp_ns / S) - STEP_S:.0f} s after the knock")
 
 
+SLICE_S = 120.0
+
+
+@pytest.mark.fault(
+    "a knocked LiDAR, and one of its pairs suspects nothing", "its window is hurried, and the correction does not wait"
+)
+def test_a_pair_that_suspects_nothing_has_its_window_as_soon_as_its_sensor_is_named(
+    tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    """Its ordinary slice, which begins again when all pairs serve what they found, would end a minute later."""
+    config = _configuration(tmp_path / "one", "within_limits")
+    window = config.pairs[0].window.model_copy(update={"slice_s": SLICE_S})
+    config = config.model_copy(
+        update={"pairs": tuple(pair.model_copy(update={"window": window}) for pair in config.pairs)}
+    )
+    bench = RigBench(tmp_path / "one", config=config, dim="rear")
+    bench.drive(STEP_S - 45, STEP_S + 100)
+    correction = bench.reply.correction
+    assert correction is not None
+    assert set(correction.pairs) == set(CAMERAS)
+    came_s = correction.stamp_ns / S - STEP_S
+    record_property("figure", f"{came_s:.0f} s after the knock")
+    assert came_s < 60.0
+    again = RigBench(tmp_path / "two", 1, config, dim="rear")
+    again.drive(STEP_S - 45, STEP_S + 100)
+    assert again.told() == bench.told()
+
+
 def test_where_people_decide_the_correction_waits_for_them(tmp_path: Path) -> None:
-    bench = RigBench(tmp_path / "state", apply="never")
+    bench = RigBench(tmp_path / "state", config=_configuration(tmp_path / "state", "never"))
     bench.drive(STEP_S - 45, STEP_S + 50)
     assert bench.reply.correction is None or set(bench.reply.correction.pairs) == set(CAMERAS)
     assert {sensor.name: sensor.state for sensor in bench.reply.sensors}["roof"] == "lidar_moved"

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from coec.reports import console
+from coec.reports.service_status import duration, losses, status
 from coec.schemas import replies, rig_state
 from coec.schemas.base import from_json
 
@@ -51,7 +52,7 @@ def extrinsic(payload: bytes) -> None:
 def health(payload: bytes) -> None:
     """The health of a pair."""
     reply = from_json(replies.HealthReply, payload)
-    age = "" if reply.age_s is None else f", evaluated {_duration(reply.age_s)} ago"
+    age = "" if reply.age_s is None else f", evaluated {duration(reply.age_s)} ago"
     console.out.print(
         f"{reply.vehicle}/{reply.pair}  ",
         console.styled(reply.state),
@@ -83,7 +84,7 @@ def health(payload: bytes) -> None:
         console.show(f"point times are {quality.point_times}")
     if quality.frozen_image:
         console.show("the camera repeats the same picture", "bold red")
-    _losses(quality.drops)
+    losses(quality.drops)
 
 
 def history(payload: bytes) -> None:
@@ -159,42 +160,6 @@ def event(payload: bytes) -> None:
     console.out.print(table)
 
 
-def status(payload: bytes) -> None:
-    """The daemon."""
-    reply = from_json(replies.StatusReply, payload)
-    worker, storage = reply.worker, reply.storage
-    console.show(
-        f"coec {reply.version} for {reply.vehicle}: {reply.state}, up {_duration(reply.uptime_s)}, "
-        f"configuration {reply.config_hash}"
-    )
-    for reason in reply.reasons:
-        console.show(f"  {reason.code}: {reason.text}", "yellow")
-    if reply.configuration is not None and reply.configuration.refused is not None:
-        console.show(f"  the configuration on the disk was refused: {reply.configuration.refused}", "yellow")
-    elif reply.configuration is not None and reply.configuration.waiting:
-        console.show(f"  waits for a restart: {', '.join(reply.configuration.waiting)}", "yellow")
-    console.show(
-        f"worker {worker.state}, process {worker.pid or '-'}, {worker.restarts} restarts, {worker.queued} waiting; "
-        f"windows {storage.bytes_used / 1e6:.0f} MB, free {storage.bytes_free / 1e9:.1f} GB"
-    )
-    if reply.budget is not None:
-        _budget(reply.budget)
-    table = console.table("pair", "camera", "lidar", "ego", "pairs", "chosen", "windows", "solved", right=range(1, 8))
-    for pair in reply.pairs:
-        streams = [f"{s.accepted}/{s.received}" if s else "-" for s in (pair.camera, pair.lidar, pair.ego)]
-        counts = [str(count) for count in (pair.pairs, pair.selected, pair.windows, pair.solved)]
-        table.add_row(pair.name, *streams, *counts)
-    console.out.print(table)
-    for pair in reply.pairs:
-        streams_of = {
-            "camera": pair.camera.losses,
-            "lidar": pair.lidar.losses,
-            "ego": pair.ego.losses if pair.ego else {},
-        }
-        _losses({**streams_of, "pairs not chosen": pair.rejections, "windows": pair.losses})
-    _losses({"worker": worker.losses, "storage": storage.losses})
-
-
 def rig(payload: bytes) -> None:
     """All sensors of a vehicle."""
     reply = from_json(rig_state.RigReply, payload)
@@ -227,7 +192,7 @@ def rig(payload: bytes) -> None:
     if reply.correction is not None:
         named, pairs = " and ".join(reply.correction.sensors), ", ".join(reply.correction.pairs)
         console.show(f"last put right: {named}, in {pairs}, since {_instant(reply.correction.from_ns)}")
-    _losses({"rig": reply.losses})
+    losses({"rig": reply.losses})
 
 
 def _lidars(reply: rig_state.RigReply) -> None:
@@ -249,7 +214,7 @@ def _lidars(reply: rig_state.RigReply) -> None:
     for lidars in reply.lidars:
         for reason in lidars.reasons:
             console.show(f"  {lidars.name}: {reason.text}", "yellow")
-        _losses({lidars.name: lidars.losses})
+        losses({lidars.name: lidars.losses})
 
 
 def _joint(joint: rig_state.JointReply) -> None:
@@ -302,30 +267,5 @@ def _axes(axes: replies.Axes) -> None:
     console.out.print(table)
 
 
-def _budget(budget: replies.BudgetStatus) -> None:
-    console.show(f"budget {budget.cores:g} of a core; {budget.spent:.2f} spent, {budget.wanted:.2f} wanted")
-    if budget.stretched_by > 1.0:
-        waiting = ", ".join(name for name, share in budget.pairs.items() if share.waiting) or "none"
-        console.show(
-            f"  it does not suffice: checks and windows are {budget.stretched_by:g} times as far apart as configured; "
-            f"waiting: {waiting}",
-            "yellow",
-        )
-
-
-def _losses(losses: Mapping[str, Mapping[str, int]]) -> None:
-    for place, causes in losses.items():
-        if causes:
-            console.show(
-                f"  lost, {place}: " + ", ".join(f"{count} {cause}" for cause, count in sorted(causes.items()))
-            )
-
-
 def _instant(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC).isoformat(sep=" ").removesuffix("+00:00") + "Z"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

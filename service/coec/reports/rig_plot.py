@@ -109,7 +109,7 @@ def rig_from_above(sensors: Sequence[SensorSeen], edges: Sequence[EdgeSeen], tit
     _draw_labels(axes, sensors, list(places.values()))
     figure.colorbar(scale, ax=axes, shrink=0.55, label="a pair's offset from its nominal, in its standard deviations")
     seen = [state for state in STATE_COLOURS if any(_state(sensor) == state for sensor in sensors)]
-    handles = [_dot("o", STATE_COLOURS[state], state.replace("_", " ")) for state in seen]
+    handles = [_dot("o", STATE_COLOURS[state], state_words(state)) for state in seen]
     handles += [_dot("^", "white", "camera"), _dot("o", "white", "LiDAR")]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return png(figure)
@@ -122,13 +122,18 @@ def words_of(sensor: SensorSeen) -> str:
         by = "" if sensor.moved_deg is None else f" by {sensor.moved_deg:.2g}°"
         lines.append(f"moved{by}")
     elif sensor.state != "calibrated":
-        lines.append(sensor.state.replace("_", " "))
+        lines.append(state_words(sensor.state))
     if sensor.probability is not None and (sensor.state != "calibrated" or sensor.probability >= 0.005):
-        lines.append(_percent(sensor.probability))
+        lines.append(percent(sensor.probability))
     return "\n".join(lines)
 
 
-def _percent(probability: float) -> str:
+def state_words(state: str) -> str:
+    """The state of a sensor as people write it."""
+    return state.replace("_", " ").replace("lidar", "LiDAR")
+
+
+def percent(probability: float) -> str:
     """Never 100 % or 0 % of what is not certain."""
     if probability > 0.99:
         return "> 99 %"

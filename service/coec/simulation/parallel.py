@@ -5,9 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from typing import Protocol
+from contextlib import contextmanager
+from typing import Any, Protocol
 
 from coec.sources.recording import Message
 
@@ -53,21 +54,29 @@ def messages_by(config: Driven, processes: int) -> Iterator[Message]:
     if processes == 1 or count <= PART:
         yield from whole.messages()
         return
+    with spawned(processes, _open, config) as pool:
+        waiting: deque[Future[list[Message]]] = deque()
+        for begin in range(0, count, PART):
+            waiting.append(pool.submit(_part, begin))
+            if len(waiting) > 2 * processes:
+                yield from waiting.popleft().result()
+        while waiting:
+            yield from waiting.popleft().result()
+
+
+@contextmanager
+def spawned(processes: int, begin: Callable[..., None], *given: Any) -> Iterator[ProcessPoolExecutor]:
+    """Processes that each begin with a call of `begin`. What waits for them at the end is given up: whoever wanted it
+    has gone."""
     # A compiled loop of one process must not take the cores of the other; read when numba is imported there.
     before = os.environ.get("NUMBA_NUM_THREADS")
     os.environ["NUMBA_NUM_THREADS"] = "1"
     try:
         spawn = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(processes, mp_context=spawn, initializer=_open, initargs=(config,))
+        pool = ProcessPoolExecutor(processes, mp_context=spawn, initializer=begin, initargs=given)
         try:
-            waiting: deque[Future[list[Message]]] = deque()
-            for begin in range(0, count, PART):
-                waiting.append(pool.submit(_part, begin))
-                if len(waiting) > 2 * processes:
-                    yield from waiting.popleft().result()
-            while waiting:
-                yield from waiting.popleft().result()
-        finally:  # also where the reader has gone before the end
+            yield pool
+        finally:
             pool.shutdown(cancel_futures=True)
     finally:
         if before is None:

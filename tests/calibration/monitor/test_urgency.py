@@ -114,3 +114,39 @@ def test_the_alarms_of_one_suspicion_are_counted(street: Window) -> None:
     drive.urgency.calm()
     drive.urgency.alarm(since_ns=round(second * S))
     assert drive.until(second, second + 50)[-1][0] - second == 20.0
+
+
+def test_what_the_rig_waits_for_outlasts_the_calm_of_the_pair(street: Window) -> None:
+    drive = Drive(street)
+    drive.until(1000, 1070)
+    drive.urgency.wanted(since_ns=1055 * S, longer_s=15.0)
+    drive.urgency.calm()
+    assert drive.urgency.is_waiting
+    ends = drive.until(1070, 1220)
+    assert [(second, end.complete) for second, end in ends] == [(1070.0, True), (1105.0, True), (1205.0, True)]
+    assert not drive.urgency.is_waiting, "one window, and then ordinary ones"
+
+
+def test_a_suspicion_does_not_wait_for_the_turn_that_the_rig_gave(street: Window) -> None:
+    drive = Drive(street)
+    drive.until(1000, 1070)
+    drive.urgency.wanted(since_ns=1055 * S, longer_s=60.0)
+    assert [second for second, _ in drive.until(1070, 1075)] == [1070.0]
+    drive.urgency.alarm(since_ns=1072 * S)
+    assert [(second, end.complete) for second, end in drive.until(1075, 1100)] == [(1075.0, False), (1095.0, True)]
+
+
+def test_what_the_rig_wants_is_no_second_window_while_one_is_on_its_way(street: Window) -> None:
+    drive = Drive(street)
+    drive.until(1000, 1070)
+    drive.urgency.alarm(since_ns=1055 * S)
+    drive.urgency.wanted(since_ns=1055 * S, longer_s=60.0)
+    assert [second for second, _ in drive.until(1070, 1200)] == [1070.0, 1090.0, 1190.0]
+
+
+def test_nothing_is_wanted_of_a_time_that_is_no_more(street: Window) -> None:
+    drive = Drive(street)
+    drive.until(1000, 1070)
+    drive.urgency.wanted(since_ns=1055 * S, longer_s=0.0)
+    drive.urgency.forget()
+    assert [second for second, _ in drive.until(1070, 1110)] == [1100.0]

@@ -54,7 +54,7 @@ def test_what_everything_would_take_is_told_with_what_it_stretches(budget: Budge
     clock.now_s = 103.0
     told = budget_status_of(budget.report())
     assert told.cores == 0.5
-    assert told.wanted == pytest.approx(2 * 2.0 / 5.0 + 9.0 / 180.0)
+    assert told.wanted == pytest.approx(2 * (2.0 / 5.0 + 9.0 / 180.0)), "what one window costs is expected of the other"
     assert told.stretched_by == pytest.approx(told.wanted / 0.5, abs=0.05)
     assert told.spent == pytest.approx(16.5 / 103.0)
     assert told.in_store_s == pytest.approx(5.0 - 4.0)

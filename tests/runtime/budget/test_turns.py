@@ -11,7 +11,7 @@ from statistics import mean
 import pytest
 
 from coec.config import BudgetConfig
-from coec.runtime.budget.store import DEPTH_S, Debt, Store
+from coec.runtime.budget.store import DEPTH_S, LOOKS_SHARE, Debt, Store
 from coec.runtime.budget.turns import Turns
 
 S = 1_000_000_000
@@ -303,3 +303,52 @@ def test_first_windows_of_many_pairs_lie_apart() -> None:
     phases = [turns.join(str(index), PERIOD_S, SLICE_S) for index in range(8)]
     assert phases[:4] == [0.0, 0.5, 0.25, 0.75]
     assert sorted(phases) == [index / 8 for index in range(8)]
+
+
+@pytest.mark.fault(
+    "24 pairs begin at once, and nobody knows yet what they cost", "the budget holds from the first minutes on"
+)
+def test_windows_of_the_first_minutes_come_out_of_the_budget(record_property: Callable[[str, object], None]) -> None:
+    """At the prices that were measured for eight cameras of 700×700 and three LiDARs."""
+    names = [str(number) for number in range(24)]
+    drive = Drive(Turns(0.5), dict.fromkeys(names, 0.1), 2.0, frame_s=0.1).run(SLICE_S)
+    assert len(drive.windows) >= 20, "nearly each pair has had its first"
+    lay_in_store = DEPTH_S * 0.5
+    record_property("figure", f"{drive.spent_s / SLICE_S:.2f} cores")
+    assert drive.spent_s <= 0.5 * SLICE_S + 2.0 * lay_in_store
+    assert all(drive.longest_unseen_s(name) <= LONGEST_UNSEEN_S for name in names)
+
+
+def test_what_one_window_costs_is_expected_of_the_others() -> None:
+    turns = Turns(0.5)
+    for name in NAMES:
+        turns.join(name, PERIOD_S, SLICE_S)
+        assert turns.affords(name, S, suspected=False)
+        turns.ended(name)
+    assert turns.wanted == 0.0
+    turns.solved("left", 9.0)
+    turns.looked("rear", 0.5)
+    assert turns.wanted == pytest.approx(4 * (0.5 / PERIOD_S + 9.0 / SLICE_S))
+    assert turns.shares()["front"].window_s is None, "but nobody says that it was measured"
+    turns.join_looks("roof to flank", 15.0)
+    assert turns.affords("roof to flank", S, suspected=False)
+    assert turns.wanted == pytest.approx(4 * (0.5 / PERIOD_S + 9.0 / SLICE_S)), "who has other looks, and no windows"
+
+
+@pytest.mark.fault(
+    "a LiDAR of eight pairs is named", "their windows end one after the other, as fast as the budget pays"
+)
+def test_windows_that_the_rig_wants_follow_each_other_as_the_budget_earns_them() -> None:
+    names = [str(number) for number in range(8)]
+    turns = Turns(0.5)
+    for name in names:
+        turns.join(name, PERIOD_S, SLICE_S)
+        turns.solved(name, 3.0)
+    later_s = [turns.window_turn_s(name, 100 * S) for name in names]
+    apart_s = 3.0 / (0.5 * (1.0 - LOOKS_SHARE))
+    assert later_s == pytest.approx([apart_s * place for place in range(8)])
+    turns.affords(names[0], 130 * S, suspected=False)
+    assert turns.window_turn_s(names[0], 130 * S) == pytest.approx(8 * apart_s - 30.0)
+    turns.affords(names[0], 160 * S, suspected=False)
+    turns.affords(names[0], 180 * S, suspected=False)
+    assert turns.window_turn_s(names[0], 200 * S) == 0.0, "what was long ago keeps nobody waiting"

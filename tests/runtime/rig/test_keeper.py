@@ -78,6 +78,28 @@ def test_a_correction_comes_to_all_pairs_at_one_sensor_time(
     record_property("figure", f"{LAG_NS / NS:.0f} s")
 
 
+def test_windows_of_a_named_sensor_are_wanted_of_all_its_pairs_from_one_sensor_time_on(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    drive(said, KNOCKED_S + 25.0)
+    move = reply(said).move
+    assert move is not None
+    from_ns = move.since_ns + 5 * NS + LAG_NS  # a look counts five seconds later
+    for camera in CAMERAS:
+        assert said.pairs[camera].window_wanted(from_ns - 1) is None
+        since_ns = said.pairs[camera].window_wanted(from_ns)
+        assert since_ns is not None
+        assert KNOCKED_S * NS <= since_ns <= move.since_ns, "of no frames from before the knock"
+        assert said.pairs[camera].window_wanted(from_ns) is None, "once"
+
+
+def test_what_was_wanted_of_another_time_is_forgotten(tmp_path: Path) -> None:
+    said = SaidRig(tmp_path)
+    drive(said, KNOCKED_S + 25.0)
+    said.pairs["left"].time_stepped_back(round(1.0 * NS))
+    said.settle()
+    assert all(said.pairs[camera].window_wanted(2**62) is None for camera in CAMERAS)
+
+
 @pytest.mark.fault("pairs of a rig are known in another order in a replay", "the same reply, to the byte")
 def test_a_replay_says_the_same_to_the_byte(tmp_path: Path) -> None:
     told = set()

@@ -5,6 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
+from coec.calibration.types import Window
+from coec.config import Config, LidarConfig
+from coec.errors import CalibrationError
+from coec.runtime.worker import tasks
+from coec.runtime.worker.tasks import Solver
+from warm import LENSES, pairs
+
 SCRIPT = """
 import gc
 from numba.core.dispatcher import Dispatcher
@@ -46,3 +55,19 @@ def test_no_calibration_waits_for_a_kernel_after_the_warm_up() -> None:
     warm, left = done.stdout.split(maxsplit=1)
     assert int(warm) > 15
     assert left.strip() == "[]"
+
+
+def test_pairs_that_differ_in_numbers_alone_are_warmed_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    warmed: list[type] = []
+
+    def calibrated(window: Window, *_: object) -> None:
+        warmed.append(type(window.rig.camera))
+        raise CalibrationError("an invented window need not lead to a result")
+
+    monkeypatch.setattr(tasks, "calibrate", calibrated)
+    monkeypatch.setattr(tasks, "diagnose", calibrated)
+    one, other = (next(iter(pairs([lens]))) for lens in LENSES[:2])
+    another = one.model_copy(update={"name": "another", "lidar": LidarConfig(key="another/lidar")})
+    Solver(Config(pairs=(one, another, other)), 1).warm_up()
+    assert len(set(warmed)) == 2
+    assert len(warmed) == 4, "a check and a window of each"

@@ -1,4 +1,5 @@
-"""When a window is wanted soon: the monitor suspects, and only a window can tell.
+"""When a window is wanted soon: the monitor suspects, and only a window can tell; or the rig names a sensor, and waits
+for a window of each of its pairs.
 
 An open slice that began before the mount moved mixes two extrinsics and is ended, whatever it holds. One that began
 later is ended as soon as it is enough for a window, or given up for a short dense one if that is sooner.
@@ -26,16 +27,40 @@ class Urgency:
         self._since_ns: int | None = None
         self._tries = 0
         self._hurried = False
+        self._for_rig = False
+        self._longer_s = 0.0
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a window is wanted and has not come."""
+        return self._since_ns is not None
 
     def alarm(self, since_ns: int) -> None:
-        """A window is wanted of pairs since `since_ns`."""
-        if self._since_ns is None and self._tries < TRIES:
-            self._since_ns, self._hurried = since_ns, False
+        """A window is wanted of pairs since `since_ns`. The pair's own suspicion does not wait its turn."""
+        if (self._since_ns is None or self._for_rig) and self._tries < TRIES:
+            self._want(since_ns, for_rig=False, longer_s=0.0)
             self._tries += 1
 
+    def wanted(self, since_ns: int, longer_s: float) -> None:
+        """The rig waits for a window of pairs since `since_ns`, whatever the pair itself suspects. The slice is so much
+        longer than an urgent one: the pairs of a sensor are solved one after the other."""
+        if self._since_ns is None:
+            self._want(since_ns, for_rig=True, longer_s=longer_s)
+
     def calm(self) -> None:
-        """The suspicion is over."""
-        self._since_ns, self._tries = None, 0
+        """The suspicion is over. What the rig waits for is still to come."""
+        self._tries = 0
+        if not self._for_rig:
+            self._since_ns = None
+
+    def forget(self) -> None:
+        """Nothing is wanted any more: sensor time has stepped back."""
+        self.calm()
+        self._since_ns = None
+
+    def _want(self, since_ns: int, *, for_rig: bool, longer_s: float) -> None:
+        self._since_ns, self._hurried = since_ns, False
+        self._for_rig, self._longer_s = for_rig, longer_s
 
     def heed(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
         """Before a pair is offered to the cutter: ends its slice if that is called for.
@@ -77,4 +102,4 @@ class Urgency:
     def _length_s(self, window: WindowConfig, rate_hz: float | None) -> float:
         """Of an urgent slice: as configured, or longer where pairs come slowly, but no longer than any other."""
         needed_s = MARGIN * window.pairs / rate_hz if rate_hz else 0.0
-        return min(max(self._monitor.urgent_slice_s, needed_s), window.slice_s)
+        return min(max(self._monitor.urgent_slice_s, needed_s) + self._longer_s, window.slice_s)

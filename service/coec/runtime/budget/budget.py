@@ -70,12 +70,18 @@ class Budget:
     def join_looks(self, name: str, period_s: float) -> None:
         """Something joins that wants a look in each period, and no windows."""
         with self._lock:
-            self._turns.join(name, period_s, period_s)
+            self._turns.join_looks(name, period_s)
 
     def affords(self, pair: str, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether a check of a pair, whose stream has come to this stamp, may begin; `ended` has to follow then."""
         with self._lock:
             return self._turns.affords(pair, stamp_ns, suspected=suspected)
+
+    def window_turn_s(self, pair: str, stamp_ns: int) -> float:
+        """How much later than at once a window of a pair that the rig wants may end, now that its stream has come to
+        this stamp, s: those before it are paid then. It is taken to be on its way."""
+        with self._lock:
+            return self._turns.window_turn_s(pair, stamp_ns)
 
     def ended(self, pair: str) -> None:
         """A check that had begun has ended, however it did."""

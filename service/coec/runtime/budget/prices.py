@@ -13,21 +13,27 @@ MOST_S = 600.0
 
 
 class Price:
-    """Processor time of one kind of work, s."""
+    """Processor time of one kind of work, s.
+
+    Attributes:
+        cpu_s: the middle one of the last measurements, of two the lower; 0 before the first.
+    """
 
     def __init__(self) -> None:
         self._seen: deque[float] = deque(maxlen=KEPT)
+        self.cpu_s = 0.0
 
     def add(self, cpu_s: float) -> None:
         """It took so much."""
         self._seen.append(min(max(cpu_s, 0.0), MOST_S))
+        self.cpu_s = middle_s(list(self._seen))
 
     @property
     def known(self) -> bool:
         """Whether it was measured at all."""
         return bool(self._seen)
 
-    @property
-    def cpu_s(self) -> float:
-        """The middle one of the last measurements, of two the lower; 0 before the first."""
-        return sorted(self._seen)[(len(self._seen) - 1) // 2] if self._seen else 0.0
+
+def middle_s(measured_s: list[float]) -> float:
+    """The middle one, of two the lower; 0 where there is none."""
+    return sorted(measured_s)[(len(measured_s) - 1) // 2] if measured_s else 0.0

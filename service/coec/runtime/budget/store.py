@@ -1,6 +1,6 @@
 """Processor time that is in store, and what is owed for windows: a token bucket, s.
 
-It is filled as time passes, by the budget less the instalments of what windows have cost: a solve takes seconds, and if
+It is filled as time passes, by the budget less the instalments of what windows cost: a solve takes seconds, and if
 it were paid at once no pair would be looked at for as long as that is earned. Looks are paid when they are done. What
 is in store goes down to a debt of the same depth for whoever may borrow, and is earned again before anybody else's
 turn.
@@ -21,10 +21,17 @@ LOOKS_SHARE = 0.25
 
 @dataclass(slots=True)
 class Debt:
-    """What is owed for the windows of a pair, s, and over how long it is paid, s."""
+    """What is owed for the windows of a pair, s, and over how long it is paid, s.
+
+    Attributes:
+        owed_s: negative: saved for the next one.
+        next_s: what the next one is expected to cost. It is saved for, or many windows at the beginning, of which
+            nothing is paid yet, would come on top of what looks spend.
+    """
 
     over_s: float
     owed_s: float = 0.0
+    next_s: float = 0.0
 
 
 class Store:
@@ -50,7 +57,7 @@ class Store:
         """It is `now_s`: what has been earned since the last time pays the instalments that are due, and is stored."""
         passed_s, self._now_s = max(now_s - self._now_s, 0.0), max(now_s, self._now_s)
         earned_s = self._cores * passed_s
-        due_s = [debt.owed_s * -math.expm1(-passed_s / debt.over_s) for debt in debts]
+        due_s = [max(debt.owed_s + debt.next_s, 0.0) * -math.expm1(-passed_s / debt.over_s) for debt in debts]
         paid_s = min(sum(due_s), (1.0 - LOOKS_SHARE) * earned_s)
         for debt, part_s in zip(debts, due_s, strict=True):
             debt.owed_s -= part_s * paid_s / sum(due_s) if paid_s else 0.0

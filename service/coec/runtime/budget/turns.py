@@ -10,12 +10,12 @@ A state machine: sensor time alone passes in it, and it knows no thread and no c
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from coec.runtime.budget.drive_clock import DriveClock
-from coec.runtime.budget.prices import Price
-from coec.runtime.budget.store import Debt, Store
+from coec.runtime.budget.prices import Price, middle_s
+from coec.runtime.budget.store import LOOKS_SHARE, Debt, Store
 
 SEEN_PERIODS = 6
 """A pair that has asked for nothing for so many of its periods takes no part: its streams have stopped, or the vehicle
@@ -46,12 +46,13 @@ class Share:
 
 @dataclass(slots=True)
 class _Pair:
-    """`asked_s`: when it asked last; `waits`: in vain. `begun_s`: when its last check began. `in_hand`: its checks that
-    have begun and not ended; `prepared_s`: what depth for the open window has cost."""
+    """`asked_s`: when it asked last; `waits`: in vain. `begun_s`: when its last check began. `has_windows`: or looks
+    alone. `in_hand`: its checks that have begun and not ended; `prepared_s`: what depth for the open window cost."""
 
     period_s: float
     debt: Debt
     begun_s: float
+    has_windows: bool = True
     asked_s: float = -math.inf
     waits: bool = False
     suspected: bool = False
@@ -59,11 +60,6 @@ class _Pair:
     look: Price = field(default_factory=Price)
     window: Price = field(default_factory=Price)
     prepared_s: float = 0.0
-
-    @property
-    def wanted(self) -> float:
-        """Of a core, for every check and every window."""
-        return self.look.cpu_s / self.period_s + self.window.cpu_s / self.debt.over_s
 
 
 class Turns:
@@ -74,6 +70,7 @@ class Turns:
         self._clock = DriveClock()
         self._store = Store(cores)
         self._pairs: dict[str, _Pair] = {}
+        self._windows_until_s = 0.0
 
     def use(self, cores: float) -> None:
         """Another budget from now on."""
@@ -88,21 +85,36 @@ class Turns:
         self._pairs[name] = _Pair(period_s, Debt(slice_s), self._clock.now_s)
         return phase
 
+    def join_looks(self, name: str, period_s: float) -> None:
+        """Something joins that wants a look in each period, and no windows."""
+        self._pairs[name] = _Pair(period_s, Debt(period_s), self._clock.now_s, has_windows=False)
+
     def affords(self, name: str, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether a check of a pair may begin, now that its stream has come to a stamp. It is then taken to begin."""
         pair = self._pairs[name]
         now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * pair.period_s)
-        self._store.earn(now_s, [each.debt for each in self._pairs.values()])
+        self._earn(now_s)
         pair.asked_s, pair.waits, pair.suspected = now_s, True, suspected
         claim = self._claim(name, now_s)
         others = [each for each in self._pairs if each != name and self._waits(each)]
-        ahead_s = sum(self._pairs[each].look.cpu_s for each in others if self._claim(each, now_s) > claim)
-        in_hand_s = sum(each.in_hand * each.look.cpu_s for each in self._pairs.values())
+        ahead_s = sum(self._look_s(self._pairs[each]) for each in others if self._claim(each, now_s) > claim)
+        in_hand_s = sum(each.in_hand * self._look_s(each) for each in self._pairs.values() if each.in_hand)
         if self._store.level_s - in_hand_s - ahead_s < (-self._store.depth_s if suspected else 0.0):
             return False
         pair.begun_s, pair.waits = now_s, False
         pair.in_hand += 1
         return True
+
+    def window_turn_s(self, name: str, stamp_ns: int) -> float:
+        """How much later than at once a window of a pair that is wanted soon may end, now that its stream has come to a
+        stamp, s. The windows of all pairs of a sensor follow each other as fast as the budget earns them beside the
+        looks; all at once they would be ready together, and keep the worker from every look for as long as they take.
+        In whole seconds: a price that moves by a little moves no slice."""
+        now_s = self._clock.observe(name, stamp_ns, SEEN_PERIODS * self._pairs[name].period_s)
+        begin_s = max(self._windows_until_s, now_s)
+        earned_in_s = self._window_s(self._pairs[name]) / ((1.0 - LOOKS_SHARE) * self._cores)
+        self._windows_until_s = begin_s + math.ceil(earned_in_s)
+        return begin_s - now_s
 
     def ended(self, name: str) -> None:
         """A check that had begun has ended, whether it was done or not."""
@@ -135,7 +147,11 @@ class Turns:
     @property
     def wanted(self) -> float:
         """Of a core, for every check and every window of the pairs that ask for them."""
-        return sum(pair.wanted for pair in self._pairs.values() if self._active(pair))
+        return sum(
+            self._look_s(pair) / pair.period_s + self._window_s(pair) / pair.debt.over_s
+            for pair in self._pairs.values()
+            if self._active(pair)
+        )
 
     @property
     def stretch(self) -> float:
@@ -160,6 +176,24 @@ class Turns:
             for name, pair in self._pairs.items()
         }
 
+    def _earn(self, now_s: float) -> None:
+        for pair in self._pairs.values():
+            pair.debt.next_s = self._window_s(pair) if self._active(pair) else 0.0
+        self._store.earn(now_s, [pair.debt for pair in self._pairs.values()])
+
+    def _look_s(self, pair: _Pair) -> float:
+        """Price of a check, processor time."""
+        if pair.look.known:
+            return pair.look.cpu_s
+        alike = [each.look for each in self._pairs.values() if each.has_windows is pair.has_windows]
+        return _expected_s(alike)
+
+    def _window_s(self, pair: _Pair) -> float:
+        """Price of a window, processor time."""
+        if pair.window.known or not pair.has_windows:
+            return pair.window.cpu_s
+        return _expected_s([each.window for each in self._pairs.values()])
+
     def _claim(self, name: str, now_s: float) -> tuple[bool, float, str]:
         """The name decides between equals, so that it is the same one every time."""
         pair = self._pairs[name]
@@ -172,6 +206,12 @@ class Turns:
 
     def _active(self, pair: _Pair) -> bool:
         return self._clock.now_s - pair.asked_s <= SEEN_PERIODS * pair.period_s
+
+
+def _expected_s(others: Sequence[Price]) -> float:
+    """What is expected of a pair that has no price yet, s: the middle one of those of the others. With many pairs the
+    first windows are most of the work of the first minutes."""
+    return middle_s([each.cpu_s for each in others if each.known])
 
 
 def _phase(index: int) -> float:

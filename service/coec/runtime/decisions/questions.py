@@ -17,7 +17,7 @@ from coec.runtime.decisions.mailbox import Mailbox
 from coec.runtime.decisions.queue import DecisionQueue, Question
 from coec.runtime.ingest.chooser import Served
 from coec.runtime.ingest.sensor_clock import NS_PER_S
-from coec.runtime.recording.window_store import WindowStore
+from coec.runtime.recording.window_store import WindowStore, start_ns_of
 from coec.runtime.rig.pair_side import Correction, PairOfRig
 from coec.runtime.worker import jobs
 from coec.runtime.worker.jobs import JobOutcome
@@ -77,6 +77,7 @@ class Questions:
         self._budget = budget
         self._mailbox = mailbox
         self._period_ns = round(pair.monitor.period_s * NS_PER_S)
+        self._latest_window_ns = 0
         self._decides: Decides
 
     def answer_to(self, decides: Decides) -> None:
@@ -100,6 +101,17 @@ class Questions:
         """By how much slices are to be longer than configured, at least 1."""
         return self._budget.stretch
 
+    def window_wanted(self, stamp_ns: int) -> int | None:
+        """Since which sensor time the rig wants pairs for a window, before a pair of this stamp; told once. None: it
+        wants none, or one of since then is on its way, or known."""
+        since_ns = self._rig.window_wanted(stamp_ns)
+        return None if since_ns is None or since_ns <= self._latest_window_ns else since_ns
+
+    def window_turn_s(self, stamp_ns: int) -> float:
+        """How much later than at once a window that the rig wants may end, s, so that the budget pays for those before
+        it. It is then taken to be on its way."""
+        return self._budget.window_turn_s(self._pair.name, stamp_ns)
+
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
         """Is `served` right, by these pairs? Asked at a sensor time, once it is known to be afforded."""
         standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
@@ -117,6 +129,7 @@ class Questions:
     def window(self, window_id: str, stamp_ns: int) -> int:
         """What does a window say that ends at a sensor time? It is on its way to the disk. From when on its answer
         counts, sensor time."""
+        self._latest_window_ns = start_ns_of(window_id)
         return self._queue.ask(self._due_ns(stamp_ns), self._expires_s(jobs.Kind.SOLVE), window_id).due_ns
 
     def prefetch(self, frame: bytes) -> None:
@@ -149,6 +162,7 @@ class Questions:
 
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
+        self._latest_window_ns = 0
         self._rig.time_stepped_back(stamp_ns)
         self._mailbox.post(partial(self._decides.time_stepped_back, stamp_ns))
 

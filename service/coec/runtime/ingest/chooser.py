@@ -48,6 +48,14 @@ class Asks(Protocol):
         """Whether a check may be asked for at a sensor time; it has to be asked for then. What is `suspected` comes
         before what is not."""
 
+    def window_wanted(self, stamp_ns: int) -> int | None:
+        """Since which sensor time the rig wants pairs for a window, before a pair of this stamp; told once. None: it
+        wants none."""
+
+    def window_turn_s(self, stamp_ns: int) -> float:
+        """How much later than at once a window that the rig wants may end, s, so that the budget pays for those before
+        it. It is then taken to be on its way."""
+
     def check(self, pairs: tuple[FramePair, ...], served: Served, stamp_ns: int) -> None:
         """Is `served` right, by these pairs? Asked at a sensor time, once it is known to be afforded."""
 
@@ -200,6 +208,7 @@ class Chooser:
         # The steady clock plays no part: this one only tells at which rate pairs come.
         self._pace.observe(pair.stamp_ns, 0.0)
         self._follow_stretch()
+        self._follow_rig(pair.stamp_ns)
         for ended in self._urgency.heed(self._cutter, self._pace.rate_hz):
             self._end(ended, pair.stamp_ns)
         frozen_before = self._cutter.rejections["frozen"]
@@ -276,6 +285,7 @@ class Chooser:
         self._steps_back += 1
         self._losses.add("monitor", "time_stepped_back", detail="the clock of the sensors stepped back")
         self.calm()
+        self._urgency.forget()
         self._window_due_ns = stamp_ns
         self._asks.time_stepped_back(stamp_ns)
 
@@ -305,6 +315,12 @@ class Chooser:
             self._stretch = stretch
             slice_s = min(stretch * self._window.slice_s, MAX_SLICE_S)
             self._cutter.use(self._window.model_copy(update={"slice_s": slice_s}))
+
+    def _follow_rig(self, stamp_ns: int) -> None:
+        """A sensor of the pair was named: what puts it right waits for a window of each of its pairs."""
+        since_ns = self._asks.window_wanted(stamp_ns)
+        if since_ns is not None and not self._urgency.is_waiting:
+            self._urgency.wanted(since_ns, self._asks.window_turn_s(stamp_ns))
 
     def _await_turn(self, check: tuple[FramePair, ...]) -> None:
         """There are pairs for a check. Those of a period before that still wait for their turn are too old then."""

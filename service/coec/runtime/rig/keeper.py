@@ -32,6 +32,7 @@ from coec.runtime.rig.graph import graph_of
 from coec.runtime.rig.lidar_side import LidarsKnown, LidarsSaid
 from coec.runtime.rig.pair_side import Correction, PairOfRig, Said, served_by
 from coec.runtime.rig.rig_file import RigFile
+from coec.runtime.rig.wishes import Wish, wishes
 
 _log = logging.getLogger(__name__)
 
@@ -91,8 +92,8 @@ class _Joined:
 
 
 class RigKeeper:
-    """Of one vehicle. `put`, `at`, `step_back`, `corrections`, `join` and `join_lidars` are for any thread; everything
-    else belongs to `thread`."""
+    """Of one vehicle. `put`, `at`, `step_back`, `corrections`, `window_wanted`, `join` and `join_lidars` are for any
+    thread; everything else belongs to `thread`."""
 
     def __init__(self, folder: Path, links: Sequence[LinkConfig], scribe: Scribe) -> None:
         """`listen` is to be called before anything is told."""
@@ -103,6 +104,7 @@ class RigKeeper:
         self._condition = threading.Condition()
         self._order: order.Order[Said | LidarsSaid | LidarsKnown | _Joined | _SteppedBack] = order.Order()
         self._corrections: dict[str, deque[Correction]] = {}
+        self._wishes: dict[str, Wish] = {}
         self._pairs: dict[str, _Joined] = {}
         self._lidars: dict[str, LidarsKnown] = {}
         self._have_all_answers: list[Callable[[], bool]] = []
@@ -180,6 +182,7 @@ class RigKeeper:
             self._order.step_back(stamp_ns, _SteppedBack())
             for waiting in self._corrections.values():
                 waiting.clear()
+            self._wishes.clear()
             self._condition.notify_all()
 
     def corrections(self, pair: str, stamp_ns: int) -> list[Correction]:
@@ -190,6 +193,15 @@ class RigKeeper:
             while waiting and waiting[0].from_ns <= stamp_ns:
                 found.append(waiting.popleft())
             return found
+
+    def window_wanted(self, pair: str, stamp_ns: int) -> int | None:
+        """See `pair_side.Keeps`."""
+        with self._condition:
+            wish = self._wishes.get(pair)
+            if wish is None or wish.from_ns > stamp_ns:
+                return None
+            del self._wishes[pair]
+            return wish.since_ns
 
     def request_stop(self) -> None:
         """Take what was said, and end the thread."""
@@ -295,8 +307,10 @@ class RigKeeper:
         self._rig = fresh if self._rig is None else vehicle.grown(self._rig, fresh)
 
     def _tell_pairs(self, before: VehicleRig | None, stamp_ns: int) -> None:
-        """Hand a new correction to the pairs that it is for. With the lock."""
+        """Hand a new correction to the pairs that it is for, and say of which a window is awaited now. With the
+        lock."""
         rig = self._rig
+        self._wishes |= wishes(before, rig, stamp_ns + LAG_NS)
         if rig is None or rig.correction is None or (before is not None and before.correction is rig.correction):
             return
         correction, self._from_ns = rig.correction, stamp_ns + LAG_NS

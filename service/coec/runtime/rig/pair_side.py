@@ -52,6 +52,9 @@ class Keeps(Protocol):
     def corrections(self, pair: str, stamp_ns: int) -> list[Correction]:
         """Those that count from this sensor time on, or from an earlier one, each told once."""
 
+    def window_wanted(self, pair: str, stamp_ns: int) -> int | None:
+        """Since which sensor time the rig wants pairs of frames for a window, as it counts at this one; told once."""
+
 
 class PairOfRig:
     """Of one pair. What it says is for the thread that decides about the pair, what it is told for that of its
@@ -89,6 +92,11 @@ class PairOfRig:
     def corrections(self, stamp_ns: int) -> list[Correction]:
         """Those that count before a pair of frames of this stamp is looked at, each told once."""
         return self._rig.corrections(self._name, stamp_ns)
+
+    def window_wanted(self, stamp_ns: int) -> int | None:
+        """Since which sensor time the rig wants pairs of frames for a window, before one of this stamp is looked at;
+        told once. None: it wants none."""
+        return self._rig.window_wanted(self._name, stamp_ns)
 
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""

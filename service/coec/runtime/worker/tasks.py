@@ -99,8 +99,14 @@ class Solver:
             self._network(pair.calibration.depth)
 
     def warm_up(self) -> None:
-        """Run every kernel once on a few invented points, so that no window waits for a compiler."""
-        for pair in self._config.pairs:
+        """Run every kernel once on a few invented points, so that no window waits for a compiler. Kernels are compiled
+        for types: of pairs that differ in numbers alone, as most of a vehicle do, one is enough."""
+        alike = {
+            (type(rig.camera), rig.sweep is None, pair.calibration): pair
+            for pair in self._config.pairs
+            for rig in (self._rigs[pair.name],)
+        }
+        for pair in alike.values():
             short = {"max_evaluations": WARM_UP_EVALUATIONS, "reach_deg": WARM_UP_REACH_DEG}
             search = pair.calibration.search.model_copy(update=short)
             configuration = pair.calibration.model_copy(update={"search": search})

@@ -6,12 +6,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from coec.cli.demo.daemon import DemoError
 from coec.cli.demo.rig import report, story
 from coec.cli.demo.rig.outcome import Outcome, is_over, outcome_of
 from coec.cli.demo.rig.service import serving
 from coec.cli.demo.rig.story import Act
 from coec.cli.demo.rig.told import Asker, Told
-from coec.cli.demo.rig.vehicle import RigVehicle
+from coec.cli.demo.rig.vehicle import RigVehicle, driving
 from coec.reports import console
 
 
@@ -24,14 +25,14 @@ def run(output: Path, *, as_json: bool) -> int:
     """
     started_s = time.monotonic()
     console.say("demo: the street is built; on the first run of a machine kernels are compiled, for a minute")
-    vehicle = RigVehicle()
     acts: list[report.Performance] = []
-    with console.progress() as bars:
+    with driving() as vehicle, console.progress() as bars:
         task = bars.add_task("instants of the drives", total=len(story.ACTS) * len(vehicle.plan), note="")
         for act in story.ACTS:
             acts.append(_play(vehicle, act, lambda note: bars.update(task, advance=1, note=note)))
             bars.update(task, completed=len(acts) * len(vehicle.plan))
-    files = report.write(output, vehicle.as_built, acts)
+        as_built = vehicle.as_built
+    files = report.write(output, as_built, acts)
     if as_json:
         console.print_json(report.document(acts, files, time.monotonic() - started_s))
     else:
@@ -41,17 +42,25 @@ def run(output: Path, *, as_json: bool) -> int:
 
 def _play(vehicle: RigVehicle, act: Act, heard: Callable[[str], None]) -> tuple[Outcome, list[Told]]:
     """With a service of its own, which knows nothing of other acts: until the story is told, or the drive is over.
-    `heard` is told of every instant."""
+    `heard` is told of every instant.
+
+    Raises:
+        DemoError: the service does not start, answer or end, or tells nothing.
+    """
     said: list[Told] = []
     with serving(vehicle.as_built, story.LIDAR) as service:
+        drawn = vehicle.frames(act)
+        service.until_ready()
         teller = Asker(service)
-        for frames in vehicle.frames(act):
+        for frames in drawn:
             heard(f"{act.name}: {frames.second:.0f} s of driving")
             _hear(act, said, teller.hear(frames))
             if said and is_over(outcome_of(act, said), said[-1]):
                 break
         else:
             _hear(act, said, teller.rest())
+    if not said:
+        raise DemoError("the service has looked at none of its pairs")
     return outcome_of(act, said), said
 
 

@@ -17,7 +17,7 @@ from coec.reports.page import Cell, Page, Picture, Pictures, Section, Table, Tex
 from coec.reports.page import write as write_page
 from coec.reports.page_parts import TONES, read
 from coec.reports.provenance import Made
-from coec.reports.rig_plot import SensorSeen, rig_from_above
+from coec.reports.rig_plot import SensorSeen, percent, rig_from_above, state_words
 from coec.simulation.rig_drive import RigDrive
 
 TITLE = "Who moved? A knocked LiDAR and a knocked camera"
@@ -32,6 +32,11 @@ ABOUT = (
 )
 
 PICTURED = "From above. The redder a line, the surer its pair that something has moved."
+
+BELIEVED = (
+    "A share is how probable it is that the sensor has moved. It is named when that was the answer twice in a row, and "
+    "two of its pairs say so if it has several; until then it is undecided."
+)
 
 Performance = tuple[Outcome, Sequence[Told]]
 """An act: what became of it, and all that was told."""
@@ -65,7 +70,7 @@ def picture(drive: RigDrive, act: Act, told: Told) -> bytes:
         for sensor in told.sensors.values()
     ]  # fmt: skip
     ago_s = told.second - story.KNOCK_S
-    title = f"{act.sensor} was turned by {act.knock_deg:.2g}°; {ago_s:.0f} s of driving later"
+    title = f"{_the(act)} was turned by {act.knock_deg:.2g}°; {ago_s:.0f} s of driving later"
     return rig_from_above(seen, list(told.edges.values()), title)
 
 
@@ -81,7 +86,7 @@ def turns(heard: Sequence[Told]) -> list[Told]:
 def summary(outcome: Outcome) -> str:
     """An act in a sentence."""
     act = outcome.act
-    begun = f"{act.sensor} was turned by {act.knock_deg:.2g}° at {story.KNOCK_S:.0f} s of driving"
+    begun = f"{_the(act)} was turned by {act.knock_deg:.2g}° at {story.KNOCK_S:.0f} s of driving"
     if not outcome.passed:
         return f"{begun}. " + " ".join(outcome.objections())
     assert outcome.named_s is not None  # else it is an objection
@@ -91,9 +96,10 @@ def summary(outcome: Outcome) -> str:
 def show(acts: Sequence[Performance], files: Sequence[Path]) -> None:
     """The summary in the terminal."""
     for outcome, heard in acts:
-        rows = console.table("drive", "looked at", *heard[0].sensors, right=(0,))
+        order = _order(outcome.act, heard[0])
+        rows = console.table("drive", *order, "looked at", right=(0,))
         for told in turns(heard):
-            rows.add_row(f"{told.second:.1f} s", told.looked_at, *_cells(told))
+            rows.add_row(f"{told.second:.1f} s", *_cells(told, order), told.looked_at)
         console.out.print(rows)
         console.show(summary(outcome), "bold green" if outcome.passed else "bold red")
         console.out.print()
@@ -142,7 +148,8 @@ def page(pictures: Sequence[Path], acts: Sequence[Performance], made: Made) -> P
             (
                 Text((summary(outcome),)),
                 Pictures((Picture(read(path), _alt(outcome, heard[-1]), PICTURED),)),
-                _turns_told(heard),
+                _turns_told(outcome.act, heard),
+                Text((BELIEVED,)),
                 Text((heard[-1].sensors[outcome.act.sensor].reason,)),
             ),
         )
@@ -158,31 +165,42 @@ def page(pictures: Sequence[Path], acts: Sequence[Performance], made: Made) -> P
 
 
 def _alt(outcome: Outcome, told: Told) -> str:
-    states = ", ".join(f"{name} {sensor.state.replace('_', ' ')}" for name, sensor in told.sensors.items())
+    states = ", ".join(f"{name} {state_words(sensor.state)}" for name, sensor in told.sensors.items())
     return f"The vehicle from above after {outcome.act.sensor} was turned: {states}"
 
 
 def _heading(act: Act) -> str:
-    return "The LiDAR is knocked" if act.sensor == story.LIDAR else f"The camera {act.sensor} is knocked"
+    return f"{_the(act)} is knocked"
 
 
-def _turns_told(heard: Sequence[Told]) -> Table:
+def _the(act: Act) -> str:
+    return f"The {'LiDAR' if act.sensor == story.LIDAR else 'camera'} {act.sensor}"
+
+
+def _order(act: Act, told: Told) -> tuple[str, ...]:
+    """Sensors, the knocked one first: on a narrow screen it is the one that is seen."""
+    return (act.sensor, *(name for name in told.sensors if name != act.sensor))
+
+
+def _turns_told(act: Act, heard: Sequence[Told]) -> Table:
+    order = _order(act, heard[0])
     rows: list[Sequence[str | Cell]] = [
-        (f"{told.second:.1f} s", told.looked_at, *_toned(told)) for told in turns(heard)
+        (f"{told.second:.1f} s", *_toned(told, order), told.looked_at) for told in turns(heard)
     ]
-    heads = ("Drive", "Looked at", *heard[0].sensors)
+    heads = ("Drive", *order, "Looked at")
     return Table("What was believed of every sensor, whenever that changed", heads, rows, frozenset({0}))
 
 
-def _toned(told: Told) -> list[Cell]:
-    states = _states(told)
-    return [Cell(text, tone=TONES.get(state, "none")) for text, state in zip(_cells(told), states, strict=True)]
+def _toned(told: Told, order: Sequence[str]) -> list[Cell]:
+    states = [told.sensors[name].state for name in order]
+    return [Cell(text, tone=TONES.get(state, "none")) for text, state in zip(_cells(told, order), states, strict=True)]
 
 
-def _cells(told: Told) -> list[str]:
+def _cells(told: Told, order: Sequence[str]) -> list[str]:
+    seen = [told.sensors[name] for name in order]
     return [
-        sensor.state.replace("_", " ") + ("" if sensor.probability < 0.005 else f" {100.0 * sensor.probability:.0f} %")
-        for sensor in told.sensors.values()
+        state_words(sensor.state) + ("" if sensor.probability < 0.005 else f", {percent(sensor.probability)}")
+        for sensor in seen
     ]
 
 

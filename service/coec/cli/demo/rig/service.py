@@ -27,8 +27,9 @@ from coec.schemas.rig_state import RigReply
 if TYPE_CHECKING:
     from coec.simulation.rig_drive import RigDrive
 
-START_S = 240.0
-"""To come up. The first run on a machine compiles the kernels."""
+START_S = 600.0
+"""To come up. The first run on a machine compiles the kernels, for one minute of quiet cores and many of busy ones; a
+service that ends meanwhile is noticed at once."""
 
 ASK_S = 10.0
 """For one answer, on a machine that also draws the street."""
@@ -115,7 +116,7 @@ class Service:
 
 @contextmanager
 def serving(drive: RigDrive, lidar: str) -> Iterator[Service]:
-    """One that knows nothing but where the rig was built, ready for the first frame.
+    """One that knows nothing but where the rig was built, as it starts.
 
     Raises:
         DemoError: it does not start or answer, or ends before its time.
@@ -136,6 +137,5 @@ def serving(drive: RigDrive, lidar: str) -> Iterator[Service]:
         config = load_config(path)
         with running(path, folder / "coec.log") as daemon, connected(config.zenoh.connect, START_S) as session:
             service = Service(session, config, daemon, SensorKeys(("ego", lidar, *drive.cameras)))
-            service.until_ready()
             yield service
             daemon.end()

@@ -1,17 +1,25 @@
 """The vehicle of the demonstration of a rig: what its sensors see at the instants that are looked at, act by act.
 
-A frame of a sensor that stands where it was built is the same in every act, and drawn once.
+A frame of a sensor that stands where it was built is the same in every act, and drawn once. Frames are drawn in other
+processes, some instants ahead: while the service starts, and while it looks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
+from typing import Protocol
 
 from coec.cli.demo.rig import story
 from coec.cli.demo.rig.story import Act
+from coec.cli.demo.vehicle import RENDERERS
 from coec.evaluation.rig_looks import TURN_S
+from coec.simulation.drawing import drawing
 from coec.simulation.journey import START_NS
 from coec.simulation.rig_drive import RigDrive
 from coec.simulation.rig_instants import Instant, instants
@@ -19,6 +27,21 @@ from coec.simulation.schedule import Arrival
 from coec.sources.recording import Message
 
 NS_PER_S = 1_000_000_000
+
+AHEAD = 6
+"""Instants that are drawn, or wait for that, before the one that is sent: four seconds of a core each that nobody looks
+at when an act is over, and enough for the drawers while the service starts."""
+
+AS_BUILT = 0
+"""Number of the drive in which nobody is knocked; those of the acts follow it in their order."""
+
+
+class Draws(Protocol):
+    """Draws frames, see `simulation.drawing`."""
+
+    def draw(self, drive: int, entry: Arrival) -> Future[Message]:
+        """An entry of the plan of a drive, by its number."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,10 +61,11 @@ class Frames:
 class RigVehicle:
     """Drives the same street in every act."""
 
-    def __init__(self) -> None:
+    def __init__(self, drawers: Draws) -> None:
         """Raises SourceError: what casts the rays is not installed."""
         self.as_built = RigDrive(story.drive_config(None))
-        self._drawn: dict[Arrival, Message] = {}
+        self._drawers = drawers
+        self._begun: dict[tuple[int, Arrival], Future[Message]] = {}
 
     @cached_property
     def plan(self) -> list[Instant]:
@@ -49,17 +73,55 @@ class RigVehicle:
         return instants(self.as_built, story.LIDAR, TURN_S)
 
     def frames(self, act: Act) -> Iterator[Frames]:
-        """All of them, in order."""
-        knocked = RigDrive(story.drive_config(act))
+        """All of them, in order. The first are being drawn when this returns."""
+        if not self._begun:
+            self._draw_first()
+        begun = ((instant, self._begin(act, instant)) for instant in self.plan)
+        waiting = deque(islice(begun, AHEAD))
+        return self._in_order(waiting, begun)
+
+    def _in_order(
+        self, waiting: deque[tuple[Instant, Sequence[Future[Message]]]],
+        begun: Iterator[tuple[Instant, Sequence[Future[Message]]]],
+    ) -> Iterator[Frames]:  # fmt: skip
+        while waiting:
+            instant, frames = waiting.popleft()
+            sweep, *pictures = (frame.result() for frame in frames)
+            waiting.extend(islice(begun, 1))
+            motions = tuple(self.as_built.message(entry) for entry in instant.motions)
+            yield Frames(sweep, dict(zip(instant.pictures, pictures, strict=True)), motions)
+
+    def _draw_first(self) -> None:
+        """Draw the first instant in this process: what is compiled for that, once on a machine, is told to who waits,
+        and every drawer finds it compiled."""
+        for entry in (self.plan[0].sweep, *self.plan[0].pictures.values()):
+            drawn: Future[Message] = Future()
+            drawn.set_result(self.as_built.message(entry))
+            self._begun[AS_BUILT, entry] = drawn
+
+    def _begin(self, act: Act, instant: Instant) -> Sequence[Future[Message]]:
+        """Have the sweep and the pictures of an instant drawn, unless an earlier act has."""
+        entries = (instant.sweep, *instant.pictures.values())
+        numbered = [(self._drive_of(act, entry), entry) for entry in entries]
+        for drive, entry in numbered:
+            if (drive, entry) not in self._begun:
+                self._begun[drive, entry] = self._drawers.draw(drive, entry)
+        return [self._begun[one] for one in numbered]
+
+    def _drive_of(self, act: Act, entry: Arrival) -> int:
+        """Of an act where its sensor sees after the knock; what else there is to see is as it was built."""
         moved = self.as_built.stream(act.sensor)
+        knocked = entry.stream == moved and entry.stamp_ns - START_NS >= story.KNOCK_S * NS_PER_S
+        return 1 + story.ACTS.index(act) if knocked else AS_BUILT
 
-        def drawn(entry: Arrival) -> Message:
-            if entry.stream == moved and entry.stamp_ns - START_NS >= story.KNOCK_S * NS_PER_S:
-                return knocked.message(entry)
-            if entry not in self._drawn:
-                self._drawn[entry] = self.as_built.message(entry)
-            return self._drawn[entry]
 
-        for instant in self.plan:
-            pictures = {camera: drawn(entry) for camera, entry in instant.pictures.items()}
-            yield Frames(drawn(instant.sweep), pictures, tuple(drawn(entry) for entry in instant.motions))
+@contextmanager
+def driving() -> Iterator[RigVehicle]:
+    """The vehicle, with processes that draw what it sees.
+
+    Raises:
+        SourceError: what casts the rays is not installed.
+    """
+    configs = [story.drive_config(act) for act in (None, *story.ACTS)]
+    with drawing(configs, RENDERERS) as drawers:
+        yield RigVehicle(drawers)
