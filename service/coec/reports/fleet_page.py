@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from datetime import datetime
 
 from coec.reports.console import figure
+from coec.reports.instants import day
 from coec.reports.page import Block, Cell, Page, Section, Table, Text, Trend, Verdict
-from coec.reports.page.words import count, day
+from coec.reports.page.words import count
 from coec.reports.provenance import Made
 from coec.schemas.fleet import AXES, DayOfPair, FalseAlarms, FleetChanges, FleetReport, PairOfFleet
 
