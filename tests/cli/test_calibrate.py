@@ -103,6 +103,13 @@ def test_a_lens_that_the_fitted_model_does_not_hold_is_refused(coec: Coec, tmp_p
     fit = outcome.document["camera_fit"]
     assert fit["error_deg"] > fit["limit_deg"] == VerdictConfig().max_sigma_deg
     assert "--camera-model" in outcome.err
+    assert "--output" in outcome.err
+    # Where there is a folder, a picture in it shows where the model is off.
+    drawn = tmp_path / "out" / "lens_residual.png"
+    told = coec("calibrate", tmp_path, "--camera-model", "double_sphere", "--output", tmp_path / "out", "--json")
+    assert told.document["picture"] == str(drawn)
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    assert str(drawn) in told.err
 
 
 def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path) -> None:

@@ -285,7 +285,7 @@ def test_the_live_view_says_why_the_drive_does_not_begin() -> None:
     shown = Console(width=140, file=io.StringIO())
     with shown.capture() as before:
         shown.print(view(watch, seen_with("starting", 23.0)))
-    assert "waits: kernels are being compiled, once on this machine, 23 s" in before.get()
+    assert "waits: compiling the kernels, once on this machine, for about a minute; 23 s so far" in before.get()
     with shown.capture() as after:
         shown.print(view(watch, seen_with("idle", 36.0)))
     assert "compiled" not in after.get()

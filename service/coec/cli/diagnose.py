@@ -123,8 +123,9 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
 
 
 def _write(folder: Path, seen: Observation, window: Window, rigged: commission.Rigged) -> None:
-    poses = {"overlay": (window.T_camera_lidar_start, f"{window.rig.pair}  the extrinsic that was checked")}
-    drawn = pictures.write_overlays(folder, window, poses, rigged.configuration.motion_compensation)
+    (seen_at,) = pictures.overlays(window, (window.T_camera_lidar_start,), rigged.configuration.motion_compensation)
+    title = f"{window.rig.pair}  the extrinsic that was checked"
+    drawn = [pictures.write_overlay(folder, "overlay", seen_at, title)]
     of_check = check_page(
         seen, window, rigged.depth.identity, config_hash(rigged.configuration), drawn, provenance.here()
     )

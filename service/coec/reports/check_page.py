@@ -13,9 +13,10 @@ from coec.calibration.types import Reason as Found
 from coec.calibration.types import Window
 from coec.reports.evaluation_documents import in_degrees
 from coec.reports.evaluation_page import detection_table
-from coec.reports.page import Page, Section, Text, Verdict
-from coec.reports.page.words import count, instant, number
-from coec.reports.page_parts import advice_of, axes_table, figures_block, pictures_of, turn_and_shift
+from coec.reports.instants import second
+from coec.reports.page import Page, Pictures, Section, Text, Verdict
+from coec.reports.page.words import count, number
+from coec.reports.page_parts import advice_of, axes_table, figures_block, file_picture, turn_and_shift
 from coec.reports.provenance import Made, content_hash, depth_items
 from coec.schemas.evaluation import DetectionReport
 from coec.schemas.replies import Reason
@@ -49,9 +50,9 @@ def check_page(
         sigma,
         more=slopes,
     )
-    shown = pictures_of(pictures)
+    shown = tuple(file_picture(path) for path in pictures)
     sections = (
-        *((Section("Pictures", shown),) if shown else ()),
+        *((Section("Pictures", (Pictures(shown),)),) if shown else ()),
         Section("Where the check puts the camera", (table,)),
         Section(
             "What it rests on",
@@ -67,7 +68,7 @@ def check_page(
         made.section(
             (
                 ("Window", window.window_id),
-                ("Sensor time", f"{instant(seen.pair_stamps_ns[0])} to {instant(seen.stamp_ns)}"),
+                ("Sensor time", f"{second(seen.pair_stamps_ns[0])} to {second(seen.stamp_ns)}"),
                 ("Window, sha256 of images, points and stamps", content_hash(window)),
                 *depth_items(depth_identity),
                 ("Configuration, hash", config_hash),

@@ -23,7 +23,7 @@ def run(output: Path, *, as_json: bool) -> int:
         OutputError: a file cannot be written.
     """
     started_s = time.monotonic()
-    console.say("demo: the street is built; on the first run of a machine kernels are compiled, for a minute")
+    console.say("demo: the street is built; on the first run of a machine kernels are compiled, for about a minute")
     vehicle = RigVehicle()
     acts: list[report.Performance] = []
     with console.progress() as bars:

@@ -27,8 +27,9 @@ from coec.schemas.rig_state import RigReply
 if TYPE_CHECKING:
     from coec.simulation.rig_drive import RigDrive
 
-START_S = 240.0
-"""To come up. The first run on a machine compiles the kernels."""
+START_S = 600.0
+"""To come up. The first run on a machine compiles the kernels: about a minute on two quiet cores, several where others
+want them, too."""
 
 ASK_S = 10.0
 """For one answer, on a machine that also draws the street."""
