@@ -263,7 +263,7 @@ def observation(**changes: Any) -> Observation:
 
 def check(folder: Path, **changes: Any) -> Page:
     """Of `coec diagnose`."""
-    return check_page(observation(**changes), window(), HASH, "ab" * 8, files(folder, "overlay"), MADE)
+    return check_page(observation(**changes), None, window(), HASH, "ab" * 8, files(folder, "overlay"), MADE)
 
 
 def flagged(folder: Path) -> Page:

@@ -153,9 +153,7 @@ def _together(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
     for low, high in zip(BANDS, (inf, *BANDS), strict=False):
         of_band = [pair for pair in pairs if low <= pair.urgency < high]
         if of_band:
-            windows, accepted = (
-                sum(values) for values in zip(*((p.windows, p.accepted) for p in of_band), strict=True)
-            )
+            windows, accepted = sum(pair.windows for pair in of_band), sum(pair.accepted for pair in of_band)
             name = f"{low:g} and more" if high == inf else f"{low:g} to {high:g}"
             rows.append((name, str(len(of_band)), str(windows), percent(accepted / max(windows, 1))))
     heads = ("Urgency", "Pairs", "Windows", "Accepted")
