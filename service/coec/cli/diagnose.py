@@ -82,6 +82,8 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
         window = replace(window, T_camera_lidar_start=moved)
     baseline = None
     if options.rig is not None:
+        if not options.rig.is_file():
+            raise UsageError(f"--rig {options.rig}: there is no such file; `coec commission` writes one")
         baseline = load_baseline(options.rig, window.rig.pair)
         if baseline is None:
             raise UsageError(f"{options.rig} holds no baseline of the pair {window.rig.pair}: run `coec commission`")

@@ -35,6 +35,8 @@ def load_yaml(path: Path) -> Any:
             data = stream.read(MAX_YAML_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    if not data.strip():
+        raise ConfigError(f"{path} is empty")
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError as error:

@@ -21,8 +21,8 @@ from coec.geometry.projection import unproject
 DPI = 100
 """A point of type is 1.4 px: type of 9 points, the smallest, is legible without enlarging."""
 
-LETTER_PX = 7.7
-"""Width of a letter of bold type of 10 points, on average."""
+LETTER_PX = 8.4
+"""Width of a letter of bold type of 10 points, on average of lines with many figures."""
 
 BAR_SHARE = 0.3
 """A bar of scale is at most so much of the width."""

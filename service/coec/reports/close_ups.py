@@ -129,8 +129,9 @@ def close_ups(
             left = GAP_PX + AXIS_PX + column * (PANEL_PX[0] + GAP_PX + AXIS_PX)
             axes = box(figure, left, below, *_fitted(place.part.width, place.part.height, PANEL_PX))
             _panel(axes, image, window.rig, telling.outlines, T, place.part, COLOURS[column])
-            told = f"edges under the outlines {place.strength[column]:+.1f} σ"
-            axes.set_title(f"{NAMES[row]}  {name}: {told}", loc="left", size=10, pad=5, color="black")
+            axes.set_title(
+                f"{NAMES[row]}  {name}: {place.strength[column]:+.1f} σ", loc="left", size=10, pad=5, color="black"
+            )
     return bgr_of(figure)
 
 

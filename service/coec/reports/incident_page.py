@@ -250,7 +250,8 @@ def _refusals(results: Sequence[CalibrationResult]) -> Iterable[Text]:
             if metric.limit is not None and not metric.passed
         ]
         because = f" Beyond their limits: {', '.join(failed)}." if failed else ""
-        yield Text((f"{result.window_id} was refused: {_said(result.verdict.reasons)}{because}",))
+        why = _said(result.verdict.reasons).removesuffix(".")
+        yield Text((f"{result.window_id} was refused: {why}.{because}",))
 
 
 def _chain(story: Story) -> Block:

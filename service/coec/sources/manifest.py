@@ -94,7 +94,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     except ValidationError as error:
         raise SourceError(f"{path}: {describe(error)}") from error
     except ConfigError as error:
-        raise SourceError(f"{path}: {error}") from error
+        raise SourceError(str(error)) from error
     rig = Rig(
         pair=document.pair,
         camera=camera,
