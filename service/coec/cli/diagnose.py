@@ -136,11 +136,14 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
 
 def _measured(rigged: commission.Rigged, window: Window, seen: Observation) -> diagnosis.Measured | None:
     """How far a mount that a check accuses is off, by a solve of all pairs within reach of where it was; None where
-    there is no result. It searches translations where the check says that there is one."""
+    there is no result. It searches translations where the check says that there is one; where it does not, the camera's
+    centre is known no better than the check knows it: what turned a mount may have shifted it."""
     shifted = np.abs(seen.offset[3:]) >= diagnosis.TELLING * seen.sigma[3:]
     chosen = {"dof": 6 if shifted.any() else 3, "reach_deg": REACH_DEG}
     search = rigged.configuration.search.model_copy(update=chosen)
-    configuration = rigged.configuration.model_copy(update={"search": search})
+    known_m = max(rigged.configuration.verdict.held_translation_sigma_m, float(np.max(seen.sigma[3:])))
+    verdict = rigged.configuration.verdict.model_copy(update={"held_translation_sigma_m": known_m})
+    configuration = rigged.configuration.model_copy(update={"search": search, "verdict": verdict})
     try:
         estimate = calibrate(window, rigged.depth, rigged.images, configuration, Silence())
     except CalibrationError:

@@ -115,11 +115,15 @@ def _how_far(offset: Sequence[float], sigma: Sequence[float], measured: Measured
         )
     solved = [axis for axis, spread in enumerate(measured.sigma) if spread is not None]
     spread = [value or 0.0 for value in measured.sigma]
-    held = "" if len(solved) == len(spread) else " for turns, the camera's centre being where it was"
-    return f"mount moved: {moved_text(measured.offset, spread)}", (
-        f"Measured by a solve of all {measured.pairs} pairs{held}; it is accepted. `coec calibrate` writes it down.",
-        "It is counted from the extrinsic that was asked about: what that was off before the mount moved is in it.",
+    how = [f"Measured by a solve of all {measured.pairs} pairs, which is accepted; `coec calibrate` writes it down."]
+    if len(solved) < len(spread):
+        how.append(
+            "Only turns were searched: ± holds what a shift of the camera, too small for a check to see, would add."
+        )
+    how.append(
+        "It is counted from the extrinsic that was asked about: what that was off before the mount moved is in it."
     )
+    return f"mount moved: {moved_text(measured.offset, spread)}", tuple(how)
 
 
 NEAREST = (
