@@ -53,7 +53,9 @@ def run(options: Options) -> int:
                 time_offset=options.time_offset,
             )
     document = _document(done.result, times.elapsed_s(), done.fit, done.offset)
-    written, left_out, not_written = [], (), None
+    written: list[Path] = []
+    left_out: tuple[str, ...] = ()
+    not_written = None
     if options.output is not None:
         try:
             written, left_out = _write(options.output, loaded.window.rig.camera, done, document)

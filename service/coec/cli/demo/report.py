@@ -15,9 +15,9 @@ from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Matrix4, Window
 from coec.cli.demo import story
-from coec.cli.demo.outcome import ALARM, Ending, is_repaired
+from coec.cli.demo.outcome import Ending, is_repaired
 from coec.cli.demo.page import demo_page
-from coec.cli.demo.watch import Moment, Seen, Watch
+from coec.cli.demo.watch import ALARM, Moment, Seen, Watch
 from coec.config import LimitsConfig
 from coec.geometry import cameras
 from coec.reports import console, page, pictures, provenance
