@@ -37,6 +37,11 @@ REACH_DEG = 8.0
 calibrate` finds it."""
 
 
+MAX_SIGMA_DEG = 1.0
+"""Standard deviation of a rotation from which on nothing is told of it: a knock is told with its own, however sure one
+must be of what is served."""
+
+
 def run(options: Options) -> int:
     """One check at the recording's extrinsic, 1 if it is flagged or cannot tell; with `detection`, the table instead.
 
@@ -142,7 +147,9 @@ def _measured(rigged: commission.Rigged, window: Window, seen: Observation) -> d
     chosen = {"dof": 6 if shifted.any() else 3, "reach_deg": REACH_DEG}
     search = rigged.configuration.search.model_copy(update=chosen)
     known_m = max(rigged.configuration.verdict.held_translation_sigma_m, float(np.max(seen.sigma[3:])))
-    verdict = rigged.configuration.verdict.model_copy(update={"held_translation_sigma_m": known_m})
+    verdict = rigged.configuration.verdict.model_copy(
+        update={"held_translation_sigma_m": known_m, "max_sigma_deg": MAX_SIGMA_DEG}
+    )
     configuration = rigged.configuration.model_copy(update={"search": search, "verdict": verdict})
     try:
         estimate = calibrate(window, rigged.depth, rigged.images, configuration, Silence())

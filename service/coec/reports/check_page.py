@@ -131,7 +131,7 @@ def _where(seen: Observation, measured: Measured | None) -> str:
     if not measured.accepted:
         return f"{near}; a solve of all {measured.pairs} pairs is refused, so how far it is off is not sure."
     solved = [0.0 if s is None else value for value, s in zip(measured.offset, measured.sigma, strict=True)]
-    return f"A solve of all {measured.pairs} pairs, which is accepted, puts it {turn_and_shift(solved)} from there."
+    return f"A solve of all {measured.pairs} pairs puts it {turn_and_shift(solved)} from there."
 
 
 def _reason(found: Found) -> Reason:

@@ -27,7 +27,7 @@ class Measured:
 
     Attributes:
         offset, sigma: (6,) degrees and metres; σ is None on axes that were not solved.
-        accepted: whether its own figures of diagnosis let it pass.
+        accepted: whether its own figures of diagnosis let it pass, however large its σ.
         reasons: why not, a sentence each.
         pairs: that it saw.
     """
@@ -115,7 +115,7 @@ def _how_far(offset: Sequence[float], sigma: Sequence[float], measured: Measured
         )
     solved = [axis for axis, spread in enumerate(measured.sigma) if spread is not None]
     spread = [value or 0.0 for value in measured.sigma]
-    how = [f"Measured by a solve of all {measured.pairs} pairs, which is accepted; `coec calibrate` writes it down."]
+    how = [f"Measured by a solve of all {measured.pairs} pairs; `coec calibrate` says whether it may be served."]
     if len(solved) < len(spread):
         how.append(
             "Only turns were searched: ± holds what a shift of the camera, too small for a check to see, would add."
