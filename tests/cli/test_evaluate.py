@@ -195,7 +195,7 @@ def test_text_separates_bias_from_noise_and_counts_verdicts(coec: Coec) -> None:
     outcome = coec(
         "evaluate", SMALL, "--depth", "stereo", "--objective", "mi", "--rotation-deg", "3", "--directions", "3"
     )
-    assert "3 starts 3 deg away" in outcome.out
+    assert "3 starts 3° away" in outcome.out
     assert "3 hits within 0.5 deg: 100.0 %" in outcome.out
     assert "std of hits" in outcome.out
     assert "classified correctly: 100.0 %" in outcome.out
