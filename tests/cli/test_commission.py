@@ -24,6 +24,12 @@ def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec, tmp_path: Pat
     assert wrong.status == 1
     assert wrong.document["flagged"]
     assert wrong.document["metrics"]["distance_rotation"]["value"] > 1.0
+    # Eight small frames tell that it moved, and not surely how far.
+    assert wrong.document["measured"]["pairs"] == 8
+    assert not wrong.document["measured"]["accepted"]
+    assert wrong.document["measured"]["reasons"]
+    assert "±" not in wrong.document["text"]
+    assert right.document["measured"] is None
     page = (tmp_path / "report.html").read_text()
     assert "the camera is not where this extrinsic has it" in page
     assert page.count("data:image/") == 1
