@@ -43,7 +43,7 @@ class Vehicle:
     @property
     def is_held(self) -> bool:
         """Whether the last `hold` was one that held."""
-        return self.bench.store.state.frozen
+        return self.bench.store.state.hold is not None
 
     @property
     def commands(self) -> dict[str, int]:

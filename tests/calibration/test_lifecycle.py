@@ -10,6 +10,7 @@ import pytest
 from coec.calibration.lifecycle import (
     CommandRefusedError,
     HealthState,
+    Hold,
     PairState,
     Provenance,
     Rules,
@@ -446,7 +447,7 @@ def test_the_steps_of_a_day_add_up() -> None:
 
 
 def test_hold_freezes_everything_but_the_estimates() -> None:
-    frozen = held(HEALTHY)
+    frozen = held(HEALTHY, Hold())
     state = solved(frozen, estimate(0.55, 300))
     np.testing.assert_array_equal(state.T_camera_lidar, HEALTHY.T_camera_lidar)
     assert state.health is HealthState.HEALTHY, "it agrees with what is served"

@@ -103,17 +103,27 @@ def test_a_lens_that_the_fitted_model_does_not_hold_is_refused(coec: Coec, tmp_p
     fit = outcome.document["camera_fit"]
     assert fit["error_deg"] > fit["limit_deg"] == VerdictConfig().max_sigma_deg
     assert "--camera-model" in outcome.err
+    assert "--output" in outcome.err
+    # Where there is a folder, a picture in it shows where the model is off.
+    drawn = tmp_path / "out" / "lens_residual.png"
+    told = coec("calibrate", tmp_path, "--camera-model", "double_sphere", "--output", tmp_path / "out", "--json")
+    assert told.document["picture"] == str(drawn)
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    assert str(drawn) in told.err
 
 
 def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path) -> None:
     outcome = coec("calibrate", SMALL, "--depth", "stereo", "--output", tmp_path / "out", "--json")
     written = tmp_path / "out"
     assert json.loads((written / "result.json").read_text())["correction"] == outcome.document["correction"]
-    for name in ("overlay_before.png", "overlay_after.png", "close_ups.png", "residuals.png"):
+    for name in ("overlay_before.png", "overlay_after.png", "close_ups.png"):
         assert (written / name).read_bytes().startswith(b"\x89PNG")
     page = (written / "report.html").read_text()
     assert json.dumps(outcome.document["camera_from_lidar"]["matrix"]).replace("[", "").split("]")[0] in page
-    assert page.count("data:image/") == 4
+    assert page.count("data:image/") == 3
+    # Six frames of 160 px that are worth two: see tests/reports/test_pictures.py.
+    assert "No map of residuals" in page
+    assert not (written / "residuals.png").exists()
 
 
 def test_fitted_double_sphere_reports_its_residual(coec: Coec, tmp_path: Path) -> None:

@@ -24,6 +24,12 @@ def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec, tmp_path: Pat
     assert wrong.status == 1
     assert wrong.document["flagged"]
     assert wrong.document["metrics"]["distance_rotation"]["value"] > 1.0
+    # Eight small frames tell that it moved, and not surely how far.
+    assert wrong.document["measured"]["pairs"] == 8
+    assert not wrong.document["measured"]["accepted"]
+    assert wrong.document["measured"]["reasons"]
+    assert "±" not in wrong.document["text"]
+    assert right.document["measured"] is None
     page = (tmp_path / "report.html").read_text()
     assert "the camera is not where this extrinsic has it" in page
     assert page.count("data:image/") == 1
@@ -32,7 +38,7 @@ def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec, tmp_path: Pat
 def test_a_baseline_that_is_not_there(coec: Coec, tmp_path: Path) -> None:
     outcome = coec("diagnose", RIG, "--depth", "stereo", "--rig", tmp_path / "rig.json")
     assert outcome.status == 2
-    assert "run `coec commission`" in outcome.err
+    assert "`coec commission` writes one" in outcome.err
 
 
 def test_serials_have_a_form(coec: Coec) -> None:
@@ -55,7 +61,11 @@ def test_the_published_experiments(coec: Coec, tmp_path: Path) -> None:
     assert outcome.document["published"]["run_times_ms"]["25"] == [21.5, 4222.0]
     for name in ("metrics.png", "bullseye.png", "drive.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "report.html").read_text().count("data:image/") == 3
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/") == 0, "plots are drawn in the page"
+    assert page.count('class="disc"') == 2
+    assert page.count('class="plot small"') == 3
+    assert page.count('class="plot wide"') == 3
 
 
 def test_the_published_experiments_on_every_window_of_a_drive(coec: Coec, tmp_path: Path) -> None:

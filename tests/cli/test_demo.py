@@ -22,7 +22,7 @@ from coec.cli.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
 from coec.cli.demo.page import demo_page
 from coec.cli.demo.screen import BARS, Screen, curve, view
 from coec.cli.demo.vehicle import NS_PER_S, paced
-from coec.cli.demo.watch import Moment, Seen
+from coec.cli.demo.watch import Moment, Seen, with_alarm
 from coec.config import WindowConfig
 from coec.reports.page import render
 from coec.schemas import replies
@@ -56,6 +56,18 @@ def test_a_story_that_came_true() -> None:
     assert (told.error_before_deg, told.error_after_deg) == (3.01, 0.06)
 
 
+def test_an_alarm_at_the_calibration_of_the_workshop_is_no_false_one() -> None:
+    told = outcome(START, replace(START, drive_s=11.0, health="miscalibrated"), HEALTHY, KNOCKED, ALARM, REPAIRED)
+    assert told.passed
+
+
+def test_an_alarm_that_came_and_went_between_two_looks_is_in_the_story() -> None:
+    seen = [START, HEALTHY, KNOCKED, SUSPECT, REPAIRED]
+    told = outcome(*with_alarm(seen, 50.0))
+    assert told.passed
+    assert (told.alarm_s, told.repaired_s, told.error_before_deg) == (50.0, 61.0, 3.01)
+
+
 @pytest.mark.parametrize(
     ("moments", "complaint"),
     [
@@ -66,7 +78,7 @@ def test_a_story_that_came_true() -> None:
         ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, error_deg=0.31)), "did not repair"),
         ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, provenance="nominal")), "did not repair"),
         ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, health="degraded")), "degraded at the end"),
-        ((START, replace(ALARM, drive_s=20.0), HEALTHY, KNOCKED, ALARM, REPAIRED), "before the knock"),
+        ((START, HEALTHY, replace(ALARM, drive_s=30.0, error_deg=0.04), KNOCKED, ALARM, REPAIRED), "before the knock"),
     ],
 )
 def test_a_story_that_did_not(moments: tuple[Moment, ...], complaint: str) -> None:
@@ -171,7 +183,7 @@ def told(moments: Sequence[Moment]) -> str:
     series = [(moment.drive_s, moment.error_deg, moment.health) for moment in moments]
     happened = [(moment, "") for moment in moments]
     summary = [("error of the thing", "1°")]
-    return render(demo_page("A mount", series, happened, summary, outcome(*moments), None, [], MADE))
+    return render(demo_page("A mount", series, happened, summary, outcome(*moments), None, None, None, MADE))
 
 
 def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,7 +297,7 @@ def test_the_live_view_says_why_the_drive_does_not_begin() -> None:
     shown = Console(width=140, file=io.StringIO())
     with shown.capture() as before:
         shown.print(view(watch, seen_with("starting", 23.0)))
-    assert "waits: kernels are being compiled, once on this machine, 23 s" in before.get()
+    assert "waits: kernels compile, once, for about a minute; 23 s so far" in before.get()
     with shown.capture() as after:
         shown.print(view(watch, seen_with("idle", 36.0)))
     assert "compiled" not in after.get()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -14,6 +15,7 @@ from coec.cli import COMMANDS as COMMANDS_WITHOUT_COMMANDS
 from coec.cli import application
 
 COMMANDS = ("calibrate", "run", "check-config", "play", "query", "replay", "convert", "models", "demo")
+HELP = "import sys; sys.argv = ['coec', '--help']; from coec.cli import main; sys.exit(main())"
 HEAVY = ("cv2", "mcap", "numba", "numpy", "onnxruntime", "pydantic", "rosbags", "zenoh")
 
 
@@ -142,3 +144,23 @@ def test_the_script_of_a_shell_asks_this_program(coec: Coec, monkeypatch: pytest
     shown = coec()
     assert shown.status == 0
     assert f"_COEC_COMPLETE=complete_{shell}" in shown.out
+
+
+@pytest.mark.fault("a full disk under standard output", "one line says so; it is no fault of ours")
+def test_a_full_disk_under_the_output_is_a_line_and_1() -> None:
+    with open("/dev/full", "wb") as full:  # noqa: PTH123  a device, and no file
+        done = subprocess.run(
+            [sys.executable, "-c", HELP],
+            stdout=full, stderr=subprocess.PIPE, text=True, env={"PYTHONPATH": ":".join(sys.path)},
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == ["coec: cannot write: No space left on device; make room where the output goes"]
+
+
+def test_who_reads_no_further_leaves_141() -> None:
+    done = subprocess.run(
+        ["bash", "-c", f'{sys.executable} -c "{HELP}" | true; echo ${{PIPESTATUS[0]}}'],
+        capture_output=True, text=True, env={"PYTHONPATH": ":".join(sys.path), "PATH": os.defpath},
+    )  # fmt: skip
+    assert done.stdout.strip() == "141"
+    assert "Traceback" not in done.stderr

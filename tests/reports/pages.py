@@ -13,6 +13,7 @@ import numpy as np
 
 from baselines import a_baseline
 from coec.adapters.files.conversions import result_of
+from coec.calibration.commissioning.equation_2 import PaperLimits
 from coec.calibration.figures import FIGURES
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.sensor_faults import LENS_DIRTY
@@ -35,13 +36,20 @@ from coec.cli.demo.rig.outcome import outcome_of as rig_outcome_of
 from coec.cli.demo.rig.told import SensorTold, Told
 from coec.cli.demo.watch import Moment
 from coec.evaluation import paper_published
-from coec.reports import evaluation_page, fleet_page, incident_page
+from coec.evaluation.paper import MOVES_DEG, Figures
+from coec.evaluation.profiles import Scan, Views
+from coec.evaluation.starts import directions
+from coec.evaluation.statistics import HIT_RAD, Outcome, Trial
+from coec.reports import evaluation_charts, evaluation_page, fleet_page, incident_page, paper_charts
 from coec.reports.baseline_page import baselines_page
+from coec.reports.bullseye import bullseye
 from coec.reports.calibration_page import calibration_page
 from coec.reports.check_page import check_page, detection_page
 from coec.reports.incident_page import Story
-from coec.reports.page import Page
-from coec.reports.paper_page import paper_page
+from coec.reports.page import Compare, Page, Pictures
+from coec.reports.page_parts import file_picture
+from coec.reports.paper_page import Plots, paper_page
+from coec.reports.pictures import slid_pictures
 from coec.reports.provenance import Made
 from coec.schemas.evaluation import (
     ComparisonReport,
@@ -126,9 +134,15 @@ def calibration_report(*, accepted: bool = True, vehicle: str = "truck") -> Cali
 
 def calibration(folder: Path, *, accepted: bool = True, vehicle: str = "truck") -> Page:
     """Of `coec calibrate`, with pictures."""
-    paths = files(folder, "overlay_before", "overlay_after", "close_ups")
+    blocks = (compared(), Pictures(tuple(map(file_picture, files(folder, "close_ups", "lens_residual")))))
     report = calibration_report(accepted=accepted, vehicle=vehicle)
-    return calibration_page(report, window(), (1.0, 0.0, -2.0, 0.0, 0.0, 0.0), paths, ["a remark"], MADE)
+    return calibration_page(report, window(), (1.0, 0.0, -2.0, 0.0, 0.0, 0.0), blocks, ["a remark"], MADE)
+
+
+def compared() -> Compare:
+    """Two pictures in one place."""
+    noise = np.random.default_rng(3).integers(0, 255, (2, 180, 320, 3), dtype=np.uint8)
+    return slid_pictures((noise[0], noise[1]), ("Before: start.", "After: result."))
 
 
 SPREAD = Spread(median=0.04, p95=0.21, max=3.7)
@@ -140,8 +154,8 @@ HALVES = HalvesReport(
 NORMALISED = NormalisedErrorsReport(
     against="the simulated truth", judged=40, refused=2, independent=8, rms=AXES, largest=AXES, sigma=AXES,
     sigma_over_rms=AXES, within_1_sigma=(0.7,) * 6, within_2_sigma=(0.96,) * 6, within_3_sigma=(1.0,) * 6,
-    bin_edges=(-1.0, 1.0), histogram=((1, 2, 3),) * 6, confidences=(0.5,), reliability=((0.5,),) * 6, nees=1.1,
-    nees_low=0.6, nees_high=1.5,
+    bin_edges=(-2.0, -1.0, 1.0, 2.0), histogram=((1, 2, 3),) * 6, confidences=(0.5, 0.9),
+    reliability=((0.5, None),) * 6, nees=1.1, nees_low=0.6, nees_high=1.5,
 )  # fmt: skip
 DETECTION = DetectionReport(
     splits=3,
@@ -154,6 +168,18 @@ DETECTION = DetectionReport(
         for name, share in (("right", 0.01), ("0.5 deg", 0.62), ("1 deg", 0.99))
     ),
 )  # fmt: skip
+
+
+OUTCOMES = [
+    Outcome(Trial(np.eye(4), None, 1.0), np.eye(4), np.array([*error, 0.0, 0.0, 0.0]), float(np.linalg.norm(error)),
+            0.0, float(np.linalg.norm(error)) / HIT_RAD, bool(accepted))
+    for error, accepted in zip(
+        np.radians(np.random.default_rng(2).normal(0.0, 0.4, (12, 3))), (True, False) * 6, strict=True
+    )
+]  # fmt: skip
+ENDS = bullseye({"": OUTCOMES}, {"rotation vectors of the starts": directions(12)})
+SCANS = tuple(Scan(axis, np.linspace(-0.1, 0.1, 21), np.cos(np.linspace(-2.0, 2.0, 21))) for axis in range(6))
+VIEWS = Views(SCANS, SCANS)
 
 
 def evaluation_report(objective: str = "fused", accepted_misses: int = 0) -> EvaluationReport:
@@ -181,8 +207,10 @@ def evaluation_report(objective: str = "fused", accepted_misses: int = 0) -> Eva
 
 def evaluation(folder: Path, accepted_misses: int = 0) -> Page:
     """Of `coec evaluate`."""
-    pictures = files(folder, "bullseye", "overlay_before", "overlay_after", "profiles")
-    return evaluation_page.evaluation_page(evaluation_report(accepted_misses=accepted_misses), pictures, MADE)
+    del folder
+    ends = (ENDS, evaluation_charts.landscape({"fused": VIEWS, "mi": VIEWS}))
+    report = evaluation_report(accepted_misses=accepted_misses)
+    return evaluation_page.evaluation_page(report, ends, (compared(),), MADE)
 
 
 def comparison(folder: Path) -> Page:
@@ -191,7 +219,8 @@ def comparison(folder: Path) -> Page:
     report = ComparisonReport(
         source="sim:seed=1", methods=methods, not_evaluated={"intensity": "no cloud has intensity"}, elapsed_s={}
     )
-    return evaluation_page.comparison_page(report, files(folder, "bullseye"), MADE)
+    del folder
+    return evaluation_page.comparison_page(report, (ENDS,), MADE)
 
 
 def paper(folder: Path) -> Page:
@@ -210,7 +239,15 @@ def paper(folder: Path) -> Page:
         "drive": [{"start_deg": radius, **figures} for radius in paper_published.ERRORS_DEG],
         "run_times": [{"frames": frames, "mi_ms": 1.23, "solve_ms": 200.0} for frames in (5, 8)],
     }
-    return paper_page(document, files(folder, "metrics", "bullseye", "drive"), MADE)
+    del folder
+    rng = np.random.default_rng(4)
+    figures_at = [Figures(moved, *rng.normal(5.0 - moved, 1.0, 3)) for moved in MOVES_DEG for _ in range(20)]
+    plots = Plots(
+        paper_charts.failure_figures(figures_at, PaperLimits(3.0, 4.0, 5.0)),
+        ENDS,
+        paper_charts.drive({"from 5°": [(float(second), outcome) for second, outcome in enumerate(OUTCOMES)]}),
+    )
+    return paper_page(document, plots, MADE)
 
 
 def observation(**changes: Any) -> Observation:
@@ -226,7 +263,7 @@ def observation(**changes: Any) -> Observation:
 
 def check(folder: Path, **changes: Any) -> Page:
     """Of `coec diagnose`."""
-    return check_page(observation(**changes), window(), HASH, "ab" * 8, files(folder, "overlay"), MADE)
+    return check_page(observation(**changes), None, window(), HASH, "ab" * 8, files(folder, "overlay"), MADE)
 
 
 def flagged(folder: Path) -> Page:
@@ -327,9 +364,18 @@ def demo(folder: Path) -> Page:
     """Of `coec demo`."""
     series = [(moment.drive_s, moment.error_deg, moment.health) for moment in MOMENTS] + [(75.0, 0.06, "healthy")]
     happened = [(moment, "alarm" if moment.health == "miscalibrated" else "") for moment in MOMENTS]
-    paths = [*files(folder, "closeup_before", "closeup_after", "timeline"), folder / "sim-1.mcap"]
     outcome = outcome_of(MOMENTS, 36.0, 0.25)
-    return demo_page("A knocked mount", series, happened, [("knock", "3°")], outcome, result(), paths, MADE)
+    return demo_page(
+        "A knocked mount",
+        series,
+        happened,
+        [("knock", "3°")],
+        outcome,
+        result(),
+        compared(),
+        folder / "sim-1.mcap",
+        MADE,
+    )
 
 
 def rig_demo(folder: Path) -> Page:

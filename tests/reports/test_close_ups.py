@@ -37,7 +37,7 @@ def test_the_words_tell_time_difference_spread_and_network() -> None:
     truth = window.T_camera_lidar_start
     moved = se3.perturb(truth, TURN)
     lines = _said(window, moved, truth, Caption("start", "accepted", SIGMA, "tiny.onnx"))
-    assert lines[0].startswith("front, 2020-09-13T12:26:40.123Z: start and accepted are 0.50° and 0.0 cm apart")
+    assert lines[0].startswith("front, 2020-09-13 12:26:40.123Z: start and accepted are 0.50° and 0.0 cm apart")
     assert lines[1] == "accepted − start: pitch +0.00 ± 0.02°, yaw -0.50 ± 0.03°, roll +0.00 ± 0.04°"
     assert lines[2] == "depth network: tiny.onnx"
 

@@ -65,3 +65,29 @@ def test_a_right_one_says_what_would_not_be_seen(capsys: pytest.CaptureFixture[s
     shown = capsys.readouterr().out
     assert "less than 0.39°" in shown
     assert "faint" in shown
+
+
+MEASURED = diagnosis.Measured(
+    (-1.02, 0.01, 0.02, 0.0, 0.0, 0.0), (0.05, 0.04, 0.06, None, None, None), accepted=True, reasons=(), pairs=25
+)
+OFF = (-0.7, 0.0, 0.1, 0.0, 0.0, 0.0)
+
+
+def test_what_a_solve_has_measured_comes_before_the_nearest_place_that_a_check_finds() -> None:
+    found = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, MEASURED)
+    assert found.sentence == "mount moved: pitch −1.02° ± 0.05°"
+    assert any("all 25 pairs" in remark for remark in found.remarks)
+    assert any("Only turns were searched" in remark for remark in found.remarks)
+    shifted = replace(MEASURED, sigma=(0.05, 0.04, 0.06, 0.01, 0.01, 0.01))
+    found = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, shifted)
+    assert not any("Only turns" in remark for remark in found.remarks)
+    assert not any("nearest place" in remark for remark in found.remarks)
+
+
+def test_of_a_mount_whose_solve_is_refused_no_sigma_is_claimed() -> None:
+    refused = replace(MEASURED, accepted=False, reasons=("The runner-up is as good",))
+    found = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, refused)
+    assert found.state == "moved"
+    assert found.sentence.endswith("the nearest place at which the edges fit is pitch −0.7°")
+    assert "±" not in found.sentence
+    assert any("The runner-up is as good" in remark for remark in found.remarks)

@@ -7,22 +7,21 @@ import pytest
 
 from coec.adapters.images.range_colours import WHOLE, RangeScale
 from coec.geometry.cameras import build
-from coec.reports.overlay import LINE_SHARE, draw
+from coec.reports.overlay import LINE_SHARE, draw, titled
 
 WIDTH, HEIGHT = 960, 540
 CAMERA = build("pinhole", width=WIDTH, height=HEIGHT, fx=400.0, fy=400.0, cx=480.0, cy=270.0)
 T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-TITLE_ROWS = round(WIDTH * LINE_SHARE) + round(WIDTH * LINE_SHARE) // 4
 
 
 def _drawn(
     *points: tuple[float, float, float], mask: np.ndarray | None = None, scale: RangeScale | None = WHOLE
 ) -> np.ndarray:
-    """The picture without title and bar, on black."""
+    """The picture without its bar, on black."""
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    picture = draw(image, CAMERA, T_CAMERA_LIDAR, np.array(points, np.float32), mask, "title", scale)
+    picture = draw(image, CAMERA, T_CAMERA_LIDAR, np.array(points, np.float32), mask, scale)
     assert not image.any()
-    return picture[TITLE_ROWS : TITLE_ROWS + HEIGHT]
+    return picture[:HEIGHT]
 
 
 def test_a_point_lands_where_the_camera_sees_it() -> None:
@@ -58,8 +57,9 @@ def test_colours_follow_the_ranges_in_view_and_not_those_outside() -> None:
 
 
 def test_a_title_of_two_lines_is_higher_and_a_long_one_no_wider() -> None:
-    image, nothing = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.zeros((0, 3), np.float32)
-    one, two = (draw(image, CAMERA, T_CAMERA_LIDAR, nothing, None, text) for text in ("a", "a\n" + 400 * "b"))
+    picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    one, two = (titled(picture, text) for text in ("a", "a\n" + 400 * "b"))
+    np.testing.assert_array_equal(one[-HEIGHT:], picture)
     assert two.shape[0] - one.shape[0] == round(WIDTH * LINE_SHARE)
     assert one.shape[1] == two.shape[1] == WIDTH
 
@@ -81,6 +81,6 @@ def test_a_point_on_the_edge_is_cut_off() -> None:
 
 def test_small_images_are_enlarged() -> None:
     small = build("pinhole", width=200, height=100, fx=100.0, fy=100.0, cx=99.5, cy=49.5)
-    picture = draw(np.zeros((100, 200, 3), np.uint8), small, T_CAMERA_LIDAR, np.zeros((0, 3)), None, "")
+    picture = draw(np.zeros((100, 200, 3), np.uint8), small, T_CAMERA_LIDAR, np.zeros((0, 3)), None)
     assert picture.shape[1] == 1000
     assert picture.shape[0] > 500

@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 
 from coec.calibration.figures import FIGURES
 from coec.errors import DecodeError
-from coec.reports.evaluation_page import PICTURES
+from coec.reports import fleet_page
 from coec.reports.page import Chart, Ground, Mark, Page, Section, Series, Text, charts, render, ticks
 from coec.reports.page.embedding import embedded
 from coec.reports.page.words import NONE, number, percent, significant
 from coec.reports.page_parts import CAPTIONS, figures_block
+from coec.schemas.fleet import DayOfPair, FleetReport, PairOfFleet
 from coec.schemas.replies import MetricReply
 from reports import pages
 from reports.pages import EVIL, png
@@ -204,5 +205,33 @@ def test_figures_that_fail_come_first_with_what_to_do() -> None:
 
 
 def test_every_picture_has_words() -> None:
-    assert set(PICTURES) <= set(CAPTIONS)
     assert all(alt and caption.endswith(".") for alt, caption in CAPTIONS.values())
+
+
+def test_the_page_of_a_large_fleet_is_small_and_says_what_it_leaves_out() -> None:
+    days = tuple(
+        DayOfPair(date=f"2026-{number // 28 + 1:02}-{number % 28 + 1:02}", windows=3, low=(-0.1,) * 6,
+                  middle=(number / 100,) * 6, high=(0.1,) * 6)
+        for number in range(300)
+    )  # fmt: skip
+    one = PairOfFleet(
+        vehicle="shuttle", pair="front_left_wide", windows=900, accepted=800, errors=0, last_ns=10**18,
+        latest=(0.1,) * 6, drift=(0.1234,) * 6, slope=(0.3,) * 6, worst="rx_deg", urgency=1.0, days=days,
+    )  # fmt: skip
+    pairs = tuple(
+        one.model_copy(update={"vehicle": f"shuttle-of-the-north-{number:05}", "urgency": 3.0 * (1 - number / 10_000)})
+        for number in range(10_000)
+    )
+    report = FleetReport(
+        vehicles=10_000, pairs=pairs, windows=9_000_000, accepted=8_000_000,
+        refusals={f"reason_{number}": number + 1 for number in range(1000)}, errors={}, first_ns=1, last_ns=10**18,
+        figures=(), changes=None, false_alarms=None,
+    )  # fmt: skip
+    text = render(fleet_page.page(report, "Fleet", pages.MADE))
+    assert len(text) < 3_000_000
+    assert text.count('class="trend"') == fleet_page.DRAWN
+    assert text.count("shuttle-of-the-north-") >= fleet_page.DRAWN + fleet_page.LISTED
+    assert "8900 pairs more are not listed one by one" in text
+    assert "coec fleet report RESULTS --sql" in text
+    counted = [int(row) for row in re.findall(r'(?:and more|to [\d.]+)</td><td class="n">(\d+)</td>', text)]
+    assert sum(counted) == 8900

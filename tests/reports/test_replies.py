@@ -82,7 +82,7 @@ def test_of_a_rig_it_is_said_who_moved_and_in_which_pairs_it_was_put_right(capsy
     assert "lidar_moved" in said
     assert "99.8" in said
     assert "last put right: roof, in front, left, since" in said
-    assert "last moved: roof by 1.00°, named at 1970-01-01 00:00:08Z, over since 1970-01-01 00:00:09Z" in said
+    assert "last moved: roof by 1.00°, named at 8.000 s, over since 9.000 s" in said
     assert "left (by the others)" in said, "which pair has no window of its own"
     assert "+1.250 ± 0.050" in said
     assert "the pairs do not fit each other: χ² 55.0 at 6 degrees of freedom, p 1e-06" in said

@@ -25,7 +25,7 @@ def test_the_words_tell_what_all_parts_have_in_common() -> None:
     moved = se3.perturb(window.T_camera_lidar_start, np.array([0, radians(0.5), 0, 0, 0, 0]))
     shifts = local_shifts(window, GreyImages(LimitsConfig()), moved, compensated=True)
     lines = sentences(window, shifts, "start")
-    when = "2020-09-13T12:26:40.123Z"
+    when = "2020-09-13 12:26:40.123Z"
     assert lines[0] == f"front, {when} to {when}: range edges on edges of the image at start"
     assert "from 4 pairs" in lines[1]
     assert "a pixel is 0.143° on the axis" in lines[1]

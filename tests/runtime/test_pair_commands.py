@@ -112,7 +112,27 @@ def test_each_command_in_each_state(tmp_path: Path, situation: str, order: int) 
     if code in ("reset", "rolled_back"):
         assert bench.health == "unknown", "nobody has looked at it since"
     if name == "hold":
-        assert bench.store.state.frozen is (code == "held")
+        assert (bench.store.state.hold is not None) is (code == "held")
+
+
+def test_who_holds_it_and_why_is_told_wherever_one_asks_also_after_a_restart(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "state")
+    assert bench.do("hold", reason="the mirror is being changed") == "held"
+    for _ in range(2):
+        extrinsic, health = bench.answers.extrinsic_reply, bench.answers.health_reply
+        assert extrinsic.hold is not None
+        assert (extrinsic.held, extrinsic.hold.sender) == (True, "the test")
+        assert extrinsic.hold.reason == "the mirror is being changed"
+        (said,) = (reason.text for reason in health.reasons if reason.code == "held")
+        assert "the test" in said
+        assert said.endswith("the mirror is being changed.")
+        assert bench.entries("command")[-1].reason == "the mirror is being changed"
+        bench.restart()
+    assert bench.do("calibrate", reason="to see") == "too_few_pairs"
+    assert bench.entries("command")[-1].reason == "to see"
+    assert bench.do("hold", release=True) == "released"
+    assert bench.answers.extrinsic_reply.hold is None
+    assert bench.entries("command")[-1].reason is None
 
 
 @pytest.mark.fault("a `calibrate` that is refused as busy", "it changes nothing")
@@ -183,7 +203,7 @@ def test_commands_that_come_too_fast_are_answered_and_do_nothing(
     before = bench.store.history.entries()
     told = [bench.pair.commands.carry_out("hold", {"release": True}, "the test") for _ in range(5)]
     assert {(one.accepted, one.code) for one in told} == {(False, "too_many")}
-    assert bench.store.state.frozen
+    assert bench.store.state.hold is not None
     assert bench.store.history.entries() == before
     assert bench.answers.status().commands == {"hold_accepted": rate_limit.BURST, "hold_refused": 5}
 
@@ -223,7 +243,7 @@ def test_what_its_sender_has_given_up_on_is_not_done(tmp_path: Path, name: str) 
         answer = route.answer(Request(route.key, f"format=json;{parameters}", b"", received_s))
         assert (json.loads(answer.payload)["accepted"], json.loads(answer.payload)["code"]) == (False, "expired")
     bench.settle()
-    assert not bench.store.state.frozen
+    assert bench.store.state.hold is None
     assert (bench.pair.stream.report.chosen.selected, bench.recorder.recorded) == (selected, 0)
     assert len(bench.entries("command")) == entries
     assert bench.answers.status().commands == {f"{name}_refused": 3}

@@ -40,6 +40,12 @@ SAME_SCENE = 0.5
 they are worth three quarters of their number and more, of a standing vehicle a quarter to half."""
 
 
+def saw_one_scene(looks: float, frames: int) -> bool:
+    """Whether frames that are worth so many independent `looks` show the same again and again, as those of a vehicle
+    that stands do."""
+    return looks < SAME_SCENE * frames
+
+
 def counted_once(metrics: tuple[Metric, ...], looks: float, frames: int) -> tuple[Metric, ...]:
     """The metrics of an objective, with what frames have in common counted once, not in each of them. Where the number
     of independent `looks` is not known the frames are counted."""
@@ -121,7 +127,7 @@ def judge(
     ]
     if stop is not StopReason.TOLERANCE:
         reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
-    if looks < SAME_SCENE * frames and any(reason.code in UNCERTAIN for reason in reasons):
+    if saw_one_scene(looks, frames) and any(reason.code in UNCERTAIN for reason in reasons):
         told = f"{frames} frames are worth {looks:.1f} independent ones: a window taken in motion tells more"
         reasons.append(Reason("motion", told))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

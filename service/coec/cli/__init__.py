@@ -6,6 +6,7 @@ and nothing else.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
@@ -51,6 +52,10 @@ COMMANDS = (
     "demo",
 )
 """In the order of the help text."""
+
+
+NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Of a write to standard output, or to a temporary file: no fault of ours."""
 
 
 def application(words: Sequence[str]) -> typer.Typer:
@@ -113,6 +118,8 @@ def main() -> int:
         with no_interrupt_lost():
             command(prog_name="coec")
     except SystemExit as ended:
+        if isinstance(ended.__context__, BrokenPipeError):
+            return _unread()
         status = ended.code if isinstance(ended.code, int) else 0
         # A command that ends so by itself has said why.
         if isinstance(getattr(ended.__context__, "__cause__", None), KeyboardInterrupt):
@@ -128,10 +135,12 @@ def main() -> int:
             _print_error(error.reply_code, str(error), error.details)
         return error.exit_code
     except BrokenPipeError:
-        # Whoever read our output has gone; nobody is left to be told, also not by the interpreter at its exit.
-        sys.stdout = None
-        return BROKEN_PIPE
+        return _unread()
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in NO_ROOM:
+            sys.stdout = None
+            print(f"coec: cannot write: {error.strerror}; make room where the output goes", file=sys.stderr)
+            return CoecError.exit_code
         import traceback
 
         traceback.print_exc()
@@ -139,6 +148,12 @@ def main() -> int:
             _print_error("internal", f"{type(error).__name__}: {error}")
         return FAULT
     return 0
+
+
+def _unread() -> int:
+    """Whoever read our output has gone; nobody is left to be told, also not by the interpreter at its exit."""
+    sys.stdout = None
+    return BROKEN_PIPE
 
 
 def _with_signs_of(encoding: str, command: Any) -> None:

@@ -12,6 +12,7 @@ from coec.adapters.files import output
 from coec.calibration.frames.time_offset import TimeOffset
 from coec.cli.chosen import choices_of
 from coec.cli.commands.calibrate import Options
+from coec.cli.lens_refusal import drawn_if_refused
 from coec.config import WindowConfig
 from coec.errors import OutputError
 from coec.geometry.cameras import Camera
@@ -20,6 +21,8 @@ from coec.library.camera_fit import CameraFit
 from coec.reports import calibration, console, page, pictures, provenance
 from coec.reports.calibration_page import calibration_page
 from coec.reports.close_ups import Caption
+from coec.reports.page import Pictures
+from coec.reports.page_parts import file_picture
 from coec.reports.stage_times import StageTimes
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationReport, CalibrationResult
@@ -40,19 +43,22 @@ def run(options: Options) -> int:
         loaded = windows.load(
             options.source, options.frames, WindowConfig().pairs, lambda done, total: times.step("load", done, total)
         )
-        done = calibrated(
-            loaded,
-            choices_of(options),
-            times,
-            perturbation=xi,
-            camera_model=options.camera_model,
-            time_offset=options.time_offset,
-        )
+        with drawn_if_refused(options.output, loaded.window.rig.camera):
+            done = calibrated(
+                loaded,
+                choices_of(options),
+                times,
+                perturbation=xi,
+                camera_model=options.camera_model,
+                time_offset=options.time_offset,
+            )
     document = _document(done.result, times.elapsed_s(), done.fit, done.offset)
-    written, not_written = [], None
+    written: list[Path] = []
+    left_out: tuple[str, ...] = ()
+    not_written = None
     if options.output is not None:
         try:
-            written = _write(options.output, loaded.window.rig.camera, done, document)
+            written, left_out = _write(options.output, loaded.window.rig.camera, done, document)
         except OutputError as error:
             not_written = error
             document["not_written"] = str(error)
@@ -70,7 +76,7 @@ def run(options: Options) -> int:
     if not_written is not None:
         console.say(f"coec: {not_written}")
     elif options.output is not None and not options.as_json:
-        calibration.show_written(options.output, written)
+        calibration.show_written(options.output, written, left_out)
     if loaded.unpaired:
         causes = ", ".join(f"{count} {cause}" for cause, count in sorted(loaded.unpaired.items()))
         console.say(f"coec: frames without a partner: {causes}")
@@ -106,8 +112,10 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _write(folder: Path, camera: Camera, done: Calibrated, document: dict[str, Any]) -> list[Path]:
-    """`camera`: of the recording, which another one may have been fitted to."""
+def _write(
+    folder: Path, camera: Camera, done: Calibrated, document: dict[str, Any]
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Files, and what was left out. `camera`: of the recording, which another one may have been fitted to."""
     window, result, compensated = done.window, done.result, done.configuration.motion_compensation
     caption = Caption(
         before="start",
@@ -116,14 +124,18 @@ def _write(folder: Path, camera: Camera, done: Calibrated, document: dict[str, A
         network=pictures.network_text(done.configuration.depth.model, result.depth_identity),
     )
     T_found = np.array(result.camera_from_lidar.matrix)
-    drawn = pictures.write_comparison(folder, window, window.T_camera_lidar_start, T_found, caption, compensated)
+    drawn = pictures.write_comparison(
+        folder, window, window.T_camera_lidar_start, T_found, caption, compensated, result.independent_looks
+    )
+    files, blocks = list(drawn.files), drawn.blocks
     if done.fit is not None:
-        drawn.append(pictures.write_lens(folder, camera, window.rig.camera))
+        files.append(pictures.write_lens(folder, camera, window.rig.camera))
+        blocks = (*blocks, Pictures((file_picture(files[-1]),)))
     report = CalibrationReport.model_validate(document)
     written = output.write(folder / "result.json", to_json(report))
     said = calibration.remarks(document.get("camera_fit"), document.get("time_offset"))
-    of_result = calibration_page(report, window, calibration.start_of(window), drawn, said, provenance.here())
-    return [*drawn, written, page.write(folder / "report.html", of_result)]
+    of_result = calibration_page(report, window, calibration.start_of(window), blocks, said, provenance.here())
+    return [*files, written, page.write(folder / "report.html", of_result)], drawn.left_out
 
 
 def _sigma_of(result: CalibrationResult) -> NDArray[np.float64]:

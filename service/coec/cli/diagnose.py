@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +10,20 @@ import numpy as np
 
 from coec.adapters.files.baseline_file import load_baseline
 from coec.adapters.files.conversions import metric_of
+from coec.calibration.calibrator import calibrate
 from coec.calibration.commissioning.baseline import learned_hash, mismatch
 from coec.calibration.commissioning.learning import FAR_RAD
 from coec.calibration.estimators import sight_of
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import gather
 from coec.calibration.monitor.check_verdict import diagnose
-from coec.calibration.types import Window
+from coec.calibration.ports import Silence
+from coec.calibration.types import Decision, Window
 from coec.cli import commission
 from coec.cli.commands import commission as commission_options
 from coec.cli.commands.diagnose import Options
 from coec.config import config_hash
-from coec.errors import UsageError
+from coec.errors import CalibrationError, UsageError
 from coec.evaluation.detection import try_detection
 from coec.geometry import se3
 from coec.reports import console, diagnosis, evaluation_tables, page, pictures, provenance
@@ -29,6 +31,15 @@ from coec.reports.check_page import check_page, detection_page
 from coec.reports.evaluation_documents import detection_of
 from coec.reports.stage_times import StageTimes
 from coec.sources import windows
+
+REACH_DEG = 8.0
+"""How far from the pose that is asked about a mount is looked for: a knock, not a search of any pose. Beyond, `coec
+calibrate` finds it."""
+
+
+MAX_SIGMA_DEG = 1.0
+"""Standard deviation of a rotation from which on nothing is told of it: a knock is told with its own, however sure one
+must be of what is served."""
 
 
 def run(options: Options) -> int:
@@ -76,6 +87,8 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
         window = replace(window, T_camera_lidar_start=moved)
     baseline = None
     if options.rig is not None:
+        if not options.rig.is_file():
+            raise UsageError(f"--rig {options.rig}: there is no such file; `coec commission` writes one")
         baseline = load_baseline(options.rig, window.rig.pair)
         if baseline is None:
             raise UsageError(f"{options.rig} holds no baseline of the pair {window.rig.pair}: run `coec commission`")
@@ -83,11 +96,14 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
         if against is not None:
             raise UsageError(f"{options.rig} does not hold for this recording: {against}")
     seen = diagnose(window, rigged.depth, rigged.images, rigged.configuration, baseline)
+    # What a commissioned rig is off by is known of its checks alone.
+    asks = seen.flagged and not seen.causes and baseline is None
+    measured = _measured(rigged, window, seen) if asks else None
     if options.output is not None:
-        _write(options.output, seen, window, rigged)
+        _write(options.output, seen, window, rigged, measured)
     metrics = {metric.name: metric_of(metric) for metric in seen.metrics}
     offset, sigma = _in_degrees(seen.offset), _in_degrees(seen.sigma)
-    finding = diagnosis.finding_of(seen, offset, sigma)
+    finding = diagnosis.finding_of(seen, offset, sigma, measured)
     if options.as_json:
         document: dict[str, Any] = {
             "finding": finding.state,
@@ -98,6 +114,7 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
             "causes": [{"code": cause.code, "text": cause.text} for cause in seen.causes],
             "offset": offset,
             "sigma": sigma,
+            "measured": None if measured is None else asdict(measured),
             "drift": None if seen.drift is None else _in_degrees(seen.drift.value),
             "drift_sigma": None if seen.drift is None else _in_degrees(seen.drift.sigma),
             "first_derivative": seen.first_derivative.tolist(),
@@ -122,11 +139,41 @@ def _check(rigged: commission.Rigged, options: Options) -> int:
     return int(finding.state != "right")
 
 
-def _write(folder: Path, seen: Observation, window: Window, rigged: commission.Rigged) -> None:
-    poses = {"overlay": (window.T_camera_lidar_start, f"{window.rig.pair}  the extrinsic that was checked")}
-    drawn = pictures.write_overlays(folder, window, poses, rigged.configuration.motion_compensation)
+def _measured(rigged: commission.Rigged, window: Window, seen: Observation) -> diagnosis.Measured | None:
+    """How far a mount that a check accuses is off, by a solve of all pairs within reach of where it was; None where
+    there is no result. It searches translations where the check says that there is one; where it does not, the camera's
+    centre is known no better than the check knows it: what turned a mount may have shifted it."""
+    shifted = np.abs(seen.offset[3:]) >= diagnosis.TELLING * seen.sigma[3:]
+    chosen = {"dof": 6 if shifted.any() else 3, "reach_deg": REACH_DEG}
+    search = rigged.configuration.search.model_copy(update=chosen)
+    known_m = max(rigged.configuration.verdict.held_translation_sigma_m, float(np.max(seen.sigma[3:])))
+    verdict = rigged.configuration.verdict.model_copy(
+        update={"held_translation_sigma_m": known_m, "max_sigma_deg": MAX_SIGMA_DEG}
+    )
+    configuration = rigged.configuration.model_copy(update={"search": search, "verdict": verdict})
+    try:
+        estimate = calibrate(window, rigged.depth, rigged.images, configuration, Silence())
+    except CalibrationError:
+        return None
+    apart = se3.difference(estimate.optimum.T_camera_lidar, window.T_camera_lidar_start)
+    sigma = _in_degrees(estimate.uncertainty.sigma)
+    return diagnosis.Measured(
+        offset=tuple(_in_degrees(apart)),
+        sigma=tuple(value if solved else None for value, solved in zip(sigma, estimate.solved, strict=True)),
+        accepted=estimate.verdict.decision is Decision.ACCEPTED,
+        reasons=tuple(reason.text for reason in estimate.verdict.reasons),
+        pairs=estimate.pairs,
+    )
+
+
+def _write(
+    folder: Path, seen: Observation, window: Window, rigged: commission.Rigged, measured: diagnosis.Measured | None
+) -> None:
+    (seen_at,) = pictures.overlays(window, (window.T_camera_lidar_start,), rigged.configuration.motion_compensation)
+    title = f"{window.rig.pair}  the extrinsic that was checked"
+    drawn = [pictures.write_overlay(folder, "overlay", seen_at, title)]
     of_check = check_page(
-        seen, window, rigged.depth.identity, config_hash(rigged.configuration), drawn, provenance.here()
+        seen, measured, window, rigged.depth.identity, config_hash(rigged.configuration), drawn, provenance.here()
     )
     page.write(folder / "report.html", of_check)
 

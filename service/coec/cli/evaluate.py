@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from rich.progress import Progress
 
@@ -10,12 +11,15 @@ from coec.adapters.files import output
 from coec.cli.chosen import choices_of
 from coec.cli.commands.evaluate import Options
 from coec.cli.exit_codes import INTERRUPTED
+from coec.cli.lens_refusal import drawn_if_refused
 from coec.config import WindowConfig
 from coec.errors import CalibrationError
 from coec.evaluation.experiments import Stages
 from coec.evaluation.statistics import Outcome
 from coec.library.evaluating import Plan, Subject, bench_of, report_of, subject_of, tried
-from coec.reports import console, evaluation_page, evaluation_tables, provenance
+from coec.reports import console, evaluation_tables, page, provenance
+from coec.reports.evaluation_page import comparison_page, evaluation_page
+from coec.reports.page import Block, Page
 from coec.schemas.base import to_json
 from coec.schemas.evaluation import ComparisonReport, EvaluationReport
 from coec.sources import windows
@@ -40,14 +44,16 @@ def run(options: Options) -> int:
         load = stages.begin("load", None)
         loaded = windows.load(options.source, options.frames, WindowConfig().pairs, lambda done, _: load(done, ""))
         chosen = choices_of(_first_of(options))
-        subject = subject_of(
-            options.source, options.frames, loaded, plan_of(options), chosen, options.camera_model, stages
-        )
+        with drawn_if_refused(options.output, loaded.window.rig.camera):
+            subject = subject_of(
+                options.source, options.frames, loaded, plan_of(options), chosen, options.camera_model, stages
+            )
         document: EvaluationReport | ComparisonReport
         if options.objective == ALL:
-            document = _compare(options, subject, bars, stages)
+            document, told = _compare(options, subject, bars, stages)
         else:
-            document, _ = _evaluate(options, subject, stages)
+            of_method = _evaluate(options, subject, stages)
+            document, told = of_method.report, of_method.page
     if options.as_json:
         console.print_json(document.model_dump(mode="json"))
     elif isinstance(document, ComparisonReport):
@@ -57,7 +63,7 @@ def run(options: Options) -> int:
     # Whoever reads the figures has them, should they not be written.
     if options.output is not None:
         output.write(options.output / "report.json", to_json(document))
-        evaluation_page.write(options.output, document, provenance.here())
+        page.write(options.output / "report.html", told())
     if document.interrupted:
         console.say("coec: interrupted: the figures are of what was finished")
     return INTERRUPTED if document.interrupted else 0
@@ -83,14 +89,24 @@ def _first_of(options: Options) -> Options:
     return replace(options, objective=METHODS[0]) if options.objective == ALL else options
 
 
-def _compare(options: Options, subject: Subject, bars: Progress, stages: Stages) -> ComparisonReport:
-    """Every method, as far as the source allows.
+@dataclass(frozen=True, slots=True)
+class Evaluated:
+    """One method; `page()` makes the page of it."""
+
+    report: EvaluationReport
+    outcomes: list[Outcome]
+    page: Callable[[], Page]
+
+
+def _compare(
+    options: Options, subject: Subject, bars: Progress, stages: Stages
+) -> tuple[ComparisonReport, Callable[[], Page]]:
+    """Every method, as far as the source allows, and what makes the page of all.
 
     Raises:
         CalibrationError: it allows none.
     """
-    reports: dict[str, EvaluationReport] = {}
-    outcomes: dict[str, list[Outcome]] = {}
+    found: dict[str, Evaluated] = {}
     not_evaluated: dict[str, str] = {}
     for method in METHODS:
         folder = None if options.output is None else options.output / method
@@ -99,35 +115,38 @@ def _compare(options: Options, subject: Subject, bars: Progress, stages: Stages)
         of_method = replace(options, objective=method, output=folder, detection=splits)
         heard = stages.begin(method, 1)
         try:
-            reports[method], outcomes[method] = _evaluate(of_method, subject, Stages(bars, f"{method}: "))
+            found[method] = _evaluate(of_method, subject, Stages(bars, f"{method}: "))
         except CalibrationError as error:
             not_evaluated[method] = str(error)
             continue
         if folder is not None:
-            output.write(folder / "report.json", to_json(reports[method]))
-            evaluation_page.write(folder, reports[method], provenance.here())
+            output.write(folder / "report.json", to_json(found[method].report))
+            page.write(folder / "report.html", found[method].page())
         heard(1, "")
-        if reports[method].interrupted:
+        if found[method].report.interrupted:
             break
-    interrupted = any(report.interrupted for report in reports.values())
-    if not reports:
+    interrupted = any(each.report.interrupted for each in found.values())
+    if not found:
         raise CalibrationError("; ".join(f"{method}: {reason}" for method, reason in not_evaluated.items()))
+    ends: tuple[Block, ...] = ()
     if options.output is not None and not interrupted:
         # matplotlib takes a second to import.
         from coec.reports import evaluation_pictures
 
         of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
-        evaluation_pictures.write_comparison(options.output, subject.window.window_id, of_starts, outcomes)
-    return ComparisonReport(
+        outcomes = {method: each.outcomes for method, each in found.items()}
+        ends = evaluation_pictures.write_comparison(options.output, subject.window.window_id, of_starts, outcomes)
+    report = ComparisonReport(
         source=options.source,
-        methods=reports,
+        methods={method: each.report for method, each in found.items()},
         not_evaluated=not_evaluated,
         interrupted=interrupted,
         elapsed_s=stages.elapsed_s(),
     )
+    return report, lambda: comparison_page(report, ends, provenance.here())
 
 
-def _evaluate(options: Options, subject: Subject, stages: Stages) -> tuple[EvaluationReport, list[Outcome]]:
+def _evaluate(options: Options, subject: Subject, stages: Stages) -> Evaluated:
     """One method: its experiments, their report, and what belongs into the output folder but for the report.
 
     Raises:
@@ -136,16 +155,22 @@ def _evaluate(options: Options, subject: Subject, stages: Stages) -> tuple[Evalu
     plan = plan_of(options)
     bench = bench_of(subject, plan, choices_of(options))
     done = tried(subject, plan, bench, stages)
+    ends: tuple[Block, ...] = ()
+    worst: tuple[Block, ...] = ()
     if options.output is not None and not done.interrupted:
         # matplotlib takes a second to import.
         from coec.reports import evaluation_pictures
 
         of_starts = evaluation_pictures.Starts(options.rotation_deg, options.translation_m, options.directions)
         draw = stages.begin("draw", None)
-        evaluation_pictures.write(options.output, bench, of_starts, done.outcomes, done.frames, done.slices, draw)
+        drawn = evaluation_pictures.write(
+            options.output, bench, of_starts, done.outcomes, done.frames, done.slices, draw
+        )
+        ends, worst = drawn.ends, drawn.worst
         if done.normalised:
             evaluation_pictures.write_normalised(options.output, bench.window.window_id, done.normalised)
     if options.output is not None:
         table = evaluation_tables.csv_of(bench.reference, done.outcomes)
         output.write(options.output / "starts.csv", table.encode())
-    return report_of(subject, plan, bench, done, stages.elapsed_s()), done.outcomes
+    report = report_of(subject, plan, bench, done, stages.elapsed_s())
+    return Evaluated(report, done.outcomes, lambda: evaluation_page(report, ends, worst, provenance.here()))

@@ -22,8 +22,10 @@ from coec.evaluation.experiments import Bench, Stages, greys_of, inferred
 from coec.evaluation.paper_speed import run_times
 from coec.evaluation.statistics import Outcome
 from coec.library.choices import Choices, configuration_of
-from coec.reports import console, page, paper_plots, plots, provenance
-from coec.reports.paper_page import paper_page
+from coec.reports import console, page, paper_charts, paper_plots, plots, provenance
+from coec.reports.bullseye import bullseye
+from coec.reports.page import Block
+from coec.reports.paper_page import Plots, paper_page
 from coec.sources import open_source, windows
 
 FAR_DEG, DRIVE_DEG = 25.0, (5.0, 10.0)
@@ -54,19 +56,21 @@ def run(options: Options) -> int:
             window, open_depth(configuration.depth, LimitsConfig()), stages.begin("depth", len(window.pairs))
         )
         bench = Bench(window, depth, greys_of(window), configuration)
+        failure, metrics = _failure_metrics(bench, options, stages)
+        far, ends = _bullseye(bench, options, stages)
+        along, drive = _drive(bench, options, stages)
         document = {
             "source": options.source,
             "objective": options.objective,
             "pairs": len(window.pairs),
-            "failure_metrics": _failure_metrics(bench, options, stages),
-            "bullseye": _bullseye(bench, options, stages),
-            "drive": _drive(bench, options, stages),
+            "failure_metrics": failure,
+            "bullseye": far,
+            "drive": along,
             "run_times": [asdict(row) for row in run_times(options.source, configuration, stages)],
             "published": paper_published.document(),
         }
     written = output.write(options.output / "report.json", json.dumps(document, sort_keys=True, indent=1).encode())
-    drawn = [options.output / f"{name}.png" for name in ("metrics", "bullseye", "drive")]
-    page.write(options.output / "report.html", paper_page(document, drawn, provenance.here()))
+    page.write(options.output / "report.html", paper_page(document, Plots(metrics, ends, drive), provenance.here()))
     if options.as_json:
         console.print_json(document)
     else:
@@ -75,8 +79,8 @@ def run(options: Options) -> int:
     return 0
 
 
-def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
-    """Limits learned on every second pair, tried on the others."""
+def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> tuple[dict[str, Any], Block]:
+    """Limits learned on every second pair, tried on the others; and a plot."""
     sight = sight_of(bench.window, bench.depth, bench.images, bench.configuration, Silence())
     frames = depth_features(sight, bench.reference)
     heard = stages.begin("metrics", 2 * options.samples)
@@ -102,10 +106,10 @@ def _failure_metrics(bench: Bench, options: Options, stages: Stages) -> dict[str
         f"{bench.window.window_id}: equation (2), limits learned on the other half of the pairs; flagged at {shares}"
     )
     output.write(options.output / "metrics.png", paper_plots.failure_metrics(tried, limits, title))
-    return {"limits": asdict(limits), "moves": rows}
+    return {"limits": asdict(limits), "moves": rows}, paper_charts.failure_figures(tried, limits)
 
 
-def _bullseye(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
+def _bullseye(bench: Bench, options: Options, stages: Stages) -> tuple[dict[str, Any], Block]:
     heard = stages.begin(f"{FAR_DEG:g} deg", options.runs)
     far = Bench(bench.window, bench.depth, bench.images, _reaching(bench.configuration, FAR_DEG))
     outcomes = []
@@ -117,12 +121,12 @@ def _bullseye(bench: Bench, options: Options, stages: Stages) -> dict[str, Any]:
         f"{bench.window.window_id}: {options.objective}, {options.runs} runs from {FAR_DEG:g}°: {of.hits} hits, "
         f"{100 * of.classified_correctly:.0f} % classified correctly"
     )
-    spheres = {"rotation vectors of the starts": starts.directions(options.runs)}
+    spheres = {"Rotation vectors of the starts": starts.directions(options.runs)}
     output.write(options.output / "bullseye.png", plots.bullseye(outcomes, spheres, title))
-    return {"start_deg": FAR_DEG, **_figures(outcomes)}
+    return {"start_deg": FAR_DEG, **_figures(outcomes)}, bullseye({"": outcomes}, spheres)
 
 
-def _drive(bench: Bench, options: Options, stages: Stages) -> list[dict[str, Any]]:
+def _drive(bench: Bench, options: Options, stages: Stages) -> tuple[list[dict[str, Any]], Block]:
     """Every window of the drive from starts all around, so that together they are about `runs` for each radius."""
     count = _window_count(bench, options)
     per_window = max(options.runs // count, 1)
@@ -158,7 +162,7 @@ def _drive(bench: Bench, options: Options, stages: Stages) -> list[dict[str, Any
     title = f"{bench.window.window_id}: {options.objective}, {count} window{'s' if count > 1 else ''}"
     named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in found.items()}
     output.write(options.output / "drive.png", paper_plots.drive(named, title))
-    return rows
+    return rows, paper_charts.drive(named)
 
 
 def _window_count(bench: Bench, options: Options) -> int:

@@ -46,6 +46,15 @@ Matrix4x4 = tuple[
 IDENTITY: Matrix4x4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
+OUR_WORDS = {
+    # Pydantic would name the class of ours.
+    "model_type": "give names with their values (a mapping)",
+    "missing": "is missing",
+    "extra_forbidden": "there is no such key",
+}
+"""What a file says wrongly, by pydantic's name of it, where its own words are those of a programmer."""
+
+
 class Stage(BaseModel):
     """Base of every configuration model: frozen, no unknown keys, no NaN."""
 
@@ -60,7 +69,6 @@ def describe(error: ValidationError, names: Mapping[str, Sequence[str]] | None =
         place = list(item["loc"])
         if len(place) > 1 and isinstance(place[1], int) and place[1] < len(known.get(str(place[0]), ())):
             place[1] = known[str(place[0])][place[1]]
-        # Pydantic would name the class of ours.
-        what = "give names with their values (a mapping)" if item["type"] == "model_type" else item["msg"]
+        what = OUR_WORDS.get(item["type"], item["msg"])
         lines.append(f"{'.'.join(str(part) for part in place) or '(top)'}: {what}")
     return "; ".join(lines)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer
-from ruamel.yaml.error import YAMLError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from coec.errors import ConfigError
 
@@ -35,9 +35,16 @@ def load_yaml(path: Path) -> Any:
             data = stream.read(MAX_YAML_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    if not data.strip():
+        raise ConfigError(f"{path} is empty")
     try:
-        return parse_yaml(data.decode("utf-8"))
-    except (ConfigError, UnicodeDecodeError) as error:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        told = f"byte {error.start} is no text in UTF-8"
+        raise ConfigError(f"{path} is not valid YAML: {told}; is it the right file?") from error
+    try:
+        return parse_yaml(text)
+    except ConfigError as error:
         raise ConfigError(f"{path} is not valid YAML: {error}") from error
 
 
@@ -56,12 +63,21 @@ def parse_yaml(text: str) -> Any:
         document = reader.load(text)
     except ConfigError:
         raise
+    except MarkedYAMLError as error:
+        raise ConfigError(_told(error)) from error
     except YAMLError as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(" ".join(str(error).split())) from error
     except Exception as error:  # constructors of numbers, dates and the like raise whatever Python's own do
         raise ConfigError(f"a value in it is none: {type(error).__name__}") from error
     _check_extent(document)
     return document
+
+
+def _told(error: MarkedYAMLError) -> str:
+    """What is wrong and where, in one line."""
+    mark = error.problem_mark
+    where = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
+    return " ".join(f"{where}{error.problem or error.context or 'no YAML'}".split())
 
 
 class _Bounded(Composer):

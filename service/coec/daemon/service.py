@@ -210,7 +210,7 @@ class Daemon:
         ):
             thread.start()
         self._ros_outputs.start(self._told)
-        _log.info("the worker starts: where it has not run before it compiles its kernels, once, for half a minute")
+        _log.info("the worker starts: where it has not run before it compiles its kernels, once, for about a minute")
         self._worker.start()
         self._answers.declare(self._bus)
         self._door.use(self._config.metrics)

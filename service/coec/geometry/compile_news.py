@@ -1,4 +1,4 @@
-"""Who hears that kernels are being compiled: once on a machine, for half a minute. Imports no compiler itself."""
+"""Who hears that kernels are being compiled: once on a machine, for about a minute. Imports no compiler itself."""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ from coec.library.calibrating import Calibrated
 from coec.library.camera_fit import CameraFit
 from coec.library.exporting import accepted, text_of
 from coec.reports import pictures
+from coec.reports.overlay import titled
 from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Verdict
 
@@ -181,5 +182,5 @@ class Result:
             raise UsageError(f"at={at!r}: known are {', '.join(poses)}")
         title = f"{self.document.window_id}: {self.verdict.decision if at == 'result' else at}"
         compensated = self.configuration.motion_compensation
-        (drawn,) = pictures.overlays(window, [(poses[at], title)], compensated)
-        return np.ascontiguousarray(drawn[:, :, ::-1])
+        (drawn,) = pictures.overlays(window, [poses[at]], compensated)
+        return np.ascontiguousarray(titled(drawn, title)[:, :, ::-1])

@@ -97,9 +97,11 @@ def show_pose(camera_from_lidar: Transform, lidar_frame: str, camera_frame: str)
     console.show(f"quaternion x y z w: {_numbers(camera_from_lidar.quaternion_xyzw)}")
 
 
-def show_written(folder: Path, written: Sequence[Path]) -> None:
-    """Which files a command left where."""
+def show_written(folder: Path, written: Sequence[Path], left_out: Sequence[str] = ()) -> None:
+    """Which files a command left where, and what it left out, a sentence each."""
     console.show(f"written to {folder}: {', '.join(sorted(str(path.relative_to(folder)) for path in written))}")
+    for sentence in left_out:
+        console.show(sentence)
 
 
 def settings_text(configuration: CalibrationConfig, depth_identity: str) -> str:

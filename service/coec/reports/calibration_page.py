@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from coec.calibration.types import Window
-from coec.reports.page import AxesTable, Facts, Page, Section, Text, Verdict
-from coec.reports.page.words import count, instant, number, percent, significant, size
+from coec.reports.instants import second
+from coec.reports.page import AxesTable, Block, Facts, Page, Section, Text, Verdict
+from coec.reports.page.words import count, number, percent, significant, size
 from coec.reports.page_parts import (
     advice_of,
     axes_table,
     axis_value,
     copies_of,
     figures_block,
-    pictures_of,
     turn_and_shift,
 )
 from coec.reports.provenance import Made, content_hash, depth_items
@@ -31,7 +30,7 @@ def calibration_page(
     report: CalibrationReport,
     window: Window,
     start: Vector6,
-    pictures: Sequence[Path],
+    pictures: Sequence[Block],
     remarks: Sequence[str],
     made: Made,
 ) -> Page:
@@ -39,17 +38,13 @@ def calibration_page(
 
     Args:
         start: where the search began, from the recording's own calibration: rx ry rz (deg), tx ty tz (m).
-        pictures: files that were drawn of it, in the order in which they are shown.
+        pictures: what was drawn of it.
         remarks: what else was found out, a sentence each.
-
-    Raises:
-        OutputError: a picture cannot be read any more.
     """
-    shown = pictures_of(pictures)
     sections = (
         Section("Result", (_axes(report, start), *(Text((each,)) for each in remarks))),
         Section("To copy", (copies_of(report.camera_from_lidar, report.camera_frame, report.lidar_frame),)),
-        *((Section("Pictures", shown),) if shown else ()),
+        *((Section("Pictures", tuple(pictures)),) if pictures else ()),
         Section(
             "Why it was " + ("accepted" if _accepted(report) else "refused"),
             (
@@ -139,7 +134,7 @@ def _origin(report: CalibrationReport, window: Window) -> tuple[tuple[str, str],
     first, last = window.pairs[0].stamp_ns, window.pairs[-1].stamp_ns
     return (
         ("Window", report.window_id),
-        ("Sensor time", f"{instant(first)} to {instant(last)}"),
+        ("Sensor time", f"{second(first)} to {second(last)}"),
         ("Window, sha256 of images, points and stamps", content_hash(window)),
         *depth_items(report.depth_identity),
         ("Configuration, hash", report.config_hash),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Sequence
 from math import degrees
 
 import cv2
@@ -18,6 +20,9 @@ from coec.geometry.projection import unproject
 
 DPI = 100
 """A point of type is 1.4 px: type of 9 points, the smallest, is legible without enlarging."""
+
+LETTER_PX = 8.4
+"""Width of a letter of bold type of 10 points, on average of lines with many figures."""
 
 BAR_SHARE = 0.3
 """A bar of scale is at most so much of the width."""
@@ -43,6 +48,11 @@ def scale_bar(axes: Axes, camera: Camera, part: Rectangle) -> None:
         x, y - 0.02 * part.height, f"{length} px{angle}", size=9, va="bottom", zorder=4,
         bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.85},
     )  # fmt: skip
+
+
+def folded(lines: Sequence[str], width_px: int) -> list[str]:
+    """Lines of type of 10 points, none longer than so many pixels."""
+    return [part for line in lines for part in textwrap.wrap(line, int(width_px / LETTER_PX))]
 
 
 def bgr_of(figure: Figure) -> NDArray[np.uint8]:

@@ -11,11 +11,13 @@ from coec.adapters.files.conversions import metric_of
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.types import Reason as Found
 from coec.calibration.types import Window
+from coec.reports.diagnosis import Measured
 from coec.reports.evaluation_documents import in_degrees
 from coec.reports.evaluation_page import detection_table
-from coec.reports.page import Page, Section, Text, Verdict
-from coec.reports.page.words import count, instant, number
-from coec.reports.page_parts import advice_of, axes_table, figures_block, pictures_of, turn_and_shift
+from coec.reports.instants import second
+from coec.reports.page import Page, Pictures, Section, Text, Verdict
+from coec.reports.page.words import NONE, count, number
+from coec.reports.page_parts import advice_of, axes_table, axis_value, figures_block, file_picture, turn_and_shift
 from coec.reports.provenance import Made, content_hash, depth_items
 from coec.schemas.evaluation import DetectionReport
 from coec.schemas.replies import Reason
@@ -25,11 +27,18 @@ OF_PAPER = frozenset({"mi", "f1", "f2"})
 
 
 def check_page(
-    seen: Observation, window: Window, depth_identity: str, config_hash: str, pictures: Sequence[Path], made: Made
+    seen: Observation,
+    measured: Measured | None,
+    window: Window,
+    depth_identity: str,
+    config_hash: str,
+    pictures: Sequence[Path],
+    made: Made,
 ) -> Page:
     """One check.
 
     Args:
+        measured: by a solve of all pairs; None: there was none.
         window: whose `T_camera_lidar_start` was checked.
         pictures: files that were drawn of it.
 
@@ -47,11 +56,11 @@ def check_page(
         "Offset",
         offset,
         sigma,
-        more=slopes,
+        more=slopes if measured is None else {"By a solve of all pairs": _by_axis(measured), **slopes},
     )
-    shown = pictures_of(pictures)
+    shown = tuple(file_picture(path) for path in pictures)
     sections = (
-        *((Section("Pictures", shown),) if shown else ()),
+        *((Section("Pictures", (Pictures(shown),)),) if shown else ()),
         Section("Where the check puts the camera", (table,)),
         Section(
             "What it rests on",
@@ -67,14 +76,14 @@ def check_page(
         made.section(
             (
                 ("Window", window.window_id),
-                ("Sensor time", f"{instant(seen.pair_stamps_ns[0])} to {instant(seen.stamp_ns)}"),
+                ("Sensor time", f"{second(seen.pair_stamps_ns[0])} to {second(seen.stamp_ns)}"),
                 ("Window, sha256 of images, points and stamps", content_hash(window)),
                 *depth_items(depth_identity),
                 ("Configuration, hash", config_hash),
             )
         ),
     )  # fmt: skip
-    return Page("coec diagnose", f"Check of {window.rig.pair}", (_verdict(seen),), sections)
+    return Page("coec diagnose", f"Check of {window.rig.pair}", (_verdict(seen, measured),), sections)
 
 
 def detection_page(detection: DetectionReport, source: str, made: Made) -> Page:
@@ -88,24 +97,41 @@ def detection_page(detection: DetectionReport, source: str, made: Made) -> Page:
     return Page("coec diagnose", "How well a wrong extrinsic is seen", (Verdict("none", "Tried.", sentence),), sections)
 
 
-def _verdict(seen: Observation) -> Verdict:
+def _by_axis(measured: Measured) -> list[str]:
+    return [
+        NONE if sigma is None else f"{axis_value(value, axis)} ± {axis_value(sigma, axis, sign=False)}"
+        for axis, (value, sigma) in enumerate(zip(measured.offset, measured.sigma, strict=True))
+    ]
+
+
+def _verdict(seen: Observation, measured: Measured | None) -> Verdict:
     if seen.causes:
         reasons = [_reason(cause.as_reason()) for cause in seen.causes]
         sentence = " ".join(cause.text for cause in seen.causes) + " Such a check says nothing of the extrinsic."
         return Verdict("poor", "Cannot tell:", sentence, advice_of(reasons))
-    where = turn_and_shift(in_degrees(np.nan_to_num(seen.offset)))
     if seen.flagged:
         todo = (
             "See that the mount is tight.",
             "Calibrate: `coec calibrate` on a window of this mount tells where the camera is.",
         )
         return Verdict(
-            "bad", "Wrong:", f"the camera is not where this extrinsic has it. The check puts it {where}.", todo
+            "bad", "Wrong:", f"the camera is not where this extrinsic has it. {_where(seen, measured)}", todo
         )
     if seen.undecided:
         again = ("Take another window, in motion, past objects at different distances.",)
         return Verdict("unsure", "Undecided:", "this window neither accuses the extrinsic nor acquits it.", again)
     return Verdict("good", "Right.", "The edges fit this extrinsic as well as a right one.")
+
+
+def _where(seen: Observation, measured: Measured | None) -> str:
+    """How far off, by what can tell it."""
+    near = f"The nearest place at which the edges fit is {turn_and_shift(in_degrees(np.nan_to_num(seen.offset)))}"
+    if measured is None:
+        return f"{near}."
+    if not measured.accepted:
+        return f"{near}; a solve of all {measured.pairs} pairs is refused, so how far it is off is not sure."
+    solved = [0.0 if s is None else value for value, s in zip(measured.offset, measured.sigma, strict=True)]
+    return f"A solve of all {measured.pairs} pairs puts it {turn_and_shift(solved)} from there."
 
 
 def _reason(found: Found) -> Reason:

@@ -26,7 +26,7 @@ from coec.evaluation.outlines import Outlines, drawn_at
 from coec.evaluation.places import Place, Places, Shift, places, shift_px
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import Rectangle
-from coec.reports.canvas import DPI, bgr_of, box, scale_bar
+from coec.reports.canvas import DPI, bgr_of, box, folded, scale_bar
 from coec.reports.instants import instant
 
 COLOURS = ("#E69F00", "#56B4E9")
@@ -112,9 +112,8 @@ def close_ups(
     telling = places(window, images, T_before, T_after, size, PLACES, compensated=compensated)
     pair = window.pairs[telling.index]
     image = decode_bgr(pair.camera.image, bounds)
-    lines = sentences(window, telling, shift, T_before, T_after, caption)
-
     width = 2 * (AXIS_PX + PANEL_PX[0]) + 3 * GAP_PX
+    lines = folded(sentences(window, telling, shift, T_before, T_after, caption), width - 2 * GAP_PX)
     overview = _fitted(camera.width, camera.height, (width - 2 * GAP_PX, OVERVIEW_PX))
     row_px = TITLE_PX + PANEL_PX[1] + AXIS_PX
     height = GAP_PX + LINE_PX * len(lines) + GAP_PX + overview[1] + GAP_PX + row_px * len(telling.found)
@@ -130,8 +129,9 @@ def close_ups(
             left = GAP_PX + AXIS_PX + column * (PANEL_PX[0] + GAP_PX + AXIS_PX)
             axes = box(figure, left, below, *_fitted(place.part.width, place.part.height, PANEL_PX))
             _panel(axes, image, window.rig, telling.outlines, T, place.part, COLOURS[column])
-            told = f"edges under the outlines {place.strength[column]:+.1f} σ"
-            axes.set_title(f"{NAMES[row]}  {name}: {told}", loc="left", size=10, pad=5, color="black")
+            axes.set_title(
+                f"{NAMES[row]}  {name}: {place.strength[column]:+.1f} σ", loc="left", size=10, pad=5, color="black"
+            )
     return bgr_of(figure)
 
 

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from coec.evaluation.profiles import Scan, Views
 from coec.evaluation.statistics import HIT_M, FramesPoint, SlicePoint, Spread
-from coec.reports.plots import HIT_DEG, TICKS, png
+from coec.reports.bullseye import HIT_DEG
+from coec.reports.plots import TICKS, png
 
 AXIS_TITLES = ("rx pitch", "ry yaw", "rz roll", "tx right", "ty down", "tz forward")
 

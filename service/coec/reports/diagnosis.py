@@ -14,8 +14,29 @@ TELLING = 2.0
 SEEN = 3.0
 """Standard deviations of a check below which it would not notice that a mount has moved."""
 
+EXACT_DEG = 0.1
+"""A rotation whose standard deviation is smaller is told to a hundredth of a degree."""
+
 NAMES = ("pitch", "yaw", "roll", "right", "down", "forward")
 """Of turns about, and shifts along, the axes of the camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What a solve of all pairs comes to, from the pose that was asked about.
+
+    Attributes:
+        offset, sigma: (6,) degrees and metres; σ is None on axes that were not solved.
+        accepted: whether its own figures of diagnosis let it pass, however large its σ.
+        reasons: why not, a sentence each.
+        pairs: that it saw.
+    """
+
+    offset: tuple[float, ...]
+    sigma: tuple[float | None, ...]
+    accepted: bool
+    reasons: tuple[str, ...]
+    pairs: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +52,12 @@ class Finding:
 STYLES = {"right": "bold green", "moved": "bold red", "unclear": "bold yellow", "bad_data": "bold red"}
 
 
-def finding_of(seen: Observation, offset: Sequence[float], sigma: Sequence[float]) -> Finding:
+def finding_of(
+    seen: Observation, offset: Sequence[float], sigma: Sequence[float], measured: Measured | None = None
+) -> Finding:
     """Of one check; `offset` (6,) from the pose that was asked about to where the edges fit, and its standard
-    deviations, degrees and metres."""
+    deviations, degrees and metres. A check is sure of how far a pose is off where that is little: what a solve has
+    `measured` beside a pose that it accuses comes first."""
     if seen.causes:
         texts = tuple(f"{cause.code}: {cause.text}" for cause in seen.causes)
         advice = tuple(dict.fromkeys(cause.advice for cause in seen.causes))
@@ -42,13 +66,13 @@ def finding_of(seen: Observation, offset: Sequence[float], sigma: Sequence[float
     least = max(SEEN * value for value in sigma[:3])
     faint = ("The edges are faint: in the service this check would count for little.",) if seen.weak else ()
     if seen.flagged:
+        sentence, how = _how_far(offset, sigma, measured)
         return Finding(
             "moved",
-            f"mount moved: {moved_text(offset, sigma)}",
+            sentence,
             (
                 *faint,
-                "That is the nearest place at which the edges fit: `coec calibrate` measures it, from far away too, "
-                "and says how sure it is.",
+                *how,
                 "Of one pair it cannot be told whether the camera or the LiDAR moved: look at both mounts, then "
                 "calibrate, and serve what is accepted.",
             ),
@@ -66,15 +90,46 @@ def finding_of(seen: Observation, offset: Sequence[float], sigma: Sequence[float
     )
 
 
-def moved_text(offset: Sequence[float], sigma: Sequence[float]) -> str:
-    """The axes that are off by more than chance would have it, farthest first; if none is, the farthest."""
+def moved_text(offset: Sequence[float], sigma: Sequence[float], *, with_sigma: bool = True) -> str:
+    """The axes that are off by more than chance would have it, farthest first; if none is, the farthest. Axes without a
+    σ are not told."""
     told = [
         (abs(value) / spread, axis)
         for axis, (value, spread) in enumerate(zip(offset, sigma, strict=True))
         if spread > 0.0
     ]
     far = sorted((distance, axis) for distance, axis in told if distance >= TELLING) or [max(told)]
-    return ", ".join(_axis_text(axis, offset[axis], sigma[axis]) for _, axis in reversed(far))
+    return ", ".join(_axis_text(axis, offset[axis], sigma[axis], with_sigma) for _, axis in reversed(far))
+
+
+def _how_far(offset: Sequence[float], sigma: Sequence[float], measured: Measured | None) -> tuple[str, tuple[str, ...]]:
+    """Of a mount that moved: the sentence, and what the figures in it rest on."""
+    if measured is None:
+        return f"mount moved: {moved_text(offset, sigma)}", (NEAREST,)
+    if not measured.accepted:
+        why = measured.reasons[0] if measured.reasons else "no reason was given"
+        near = moved_text(offset, sigma, with_sigma=False)
+        return f"mount moved, by how much is not sure: the nearest place at which the edges fit is {near}", (
+            f"A solve of all {measured.pairs} pairs is refused: {why}.",
+            "Take a longer recording, in motion, and run `coec calibrate`.",
+        )
+    solved = [axis for axis, spread in enumerate(measured.sigma) if spread is not None]
+    spread = [value or 0.0 for value in measured.sigma]
+    how = [f"Measured by a solve of all {measured.pairs} pairs; `coec calibrate` says whether it may be served."]
+    if len(solved) < len(spread):
+        how.append(
+            "Only turns were searched: ± holds what a shift of the camera, too small for a check to see, would add."
+        )
+    how.append(
+        "It is counted from the extrinsic that was asked about: what that was off before the mount moved is in it."
+    )
+    return f"mount moved: {moved_text(measured.offset, spread)}", tuple(how)
+
+
+NEAREST = (
+    "That is the nearest place at which the edges fit: `coec calibrate` measures it, from far away too, and says how "
+    "sure it is."
+)
 
 
 def show(finding: Finding) -> None:
@@ -84,10 +139,10 @@ def show(finding: Finding) -> None:
         console.show(f"  {remark}")
 
 
-def _axis_text(axis: int, value: float, spread: float) -> str:
-    if axis < 3:
-        return f"{NAMES[axis]} {_signed(value, 1 if spread >= 0.05 else 2)}° ± {spread:.2f}°"
-    return f"{NAMES[axis]} {_signed(value, 2)} m ± {spread:.2f} m"
+def _axis_text(axis: int, value: float, spread: float, with_sigma: bool) -> str:
+    digits, unit = (1 if spread >= EXACT_DEG else 2, "°") if axis < 3 else (2, " m")
+    told = f"{NAMES[axis]} {_signed(value, digits)}{unit}"
+    return f"{told} ± {spread:.2f}{unit}" if with_sigma else told
 
 
 def _signed(value: float, digits: int) -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
-from coec.reports import page
+from coec.reports import evaluation_charts
 from coec.reports.console import AXIS_NAMES, UNITS
 from coec.reports.evaluation_tables import setting
 from coec.reports.page import (
@@ -24,7 +23,7 @@ from coec.reports.page import (
     Verdict,
 )
 from coec.reports.page.words import count, number, percent
-from coec.reports.page_parts import DIGITS, SHOWN_UNITS, SLID, pictures_of
+from coec.reports.page_parts import DIGITS, SHOWN_UNITS
 from coec.reports.provenance import Made, depth_items
 from coec.schemas.evaluation import (
     ComparisonReport,
@@ -44,41 +43,18 @@ ERROR_MEANING = (
 )
 
 
-PICTURES = ("bullseye", "overlay_before", "overlay_after", "close_ups", "residuals", "profiles", "normalised")
-"""Stems of the pictures that are drawn of an evaluation, in the order in which they are shown."""
-
-OF_WORST = frozenset({*SLID, "close_ups", "residuals"})
-"""Those of them that show the start which ended farthest from the reference."""
-
-
-def write(folder: Path, report: EvaluationReport | ComparisonReport, made: Made) -> Path:
-    """report.html in the folder in which the pictures of the evaluation lie.
-
-    Raises:
-        OutputError: a file cannot be read or written.
-    """
-    pictures = [path for stem in PICTURES if (path := folder / f"{stem}.png").is_file()]
-    if isinstance(report, ComparisonReport):
-        return page.write(folder / "report.html", comparison_page(report, pictures, made))
-    return page.write(folder / "report.html", evaluation_page(report, pictures, made))
-
-
-def evaluation_page(report: EvaluationReport, pictures: Sequence[Path], made: Made) -> Page:
+def evaluation_page(report: EvaluationReport, ends: Sequence[Block], worst: Sequence[Block], made: Made) -> Page:
     """One method.
 
     Args:
-        pictures: files that were drawn of it, in the order in which they are shown.
-
-    Raises:
-        OutputError: a picture cannot be read any more.
+        ends: what was drawn of where searches ended.
+        worst: likewise of the start that ended farthest from the reference.
     """
-    worst = pictures_of([path for path in pictures if path.stem in OF_WORST])
-    shown = pictures_of([path for path in pictures if path.stem not in OF_WORST])
     sections = [
         Section("Errors", (_spreads(report), _axes(report), Text((ERROR_MEANING,), quiet=True))),
         Section("Did it know?", (_verdicts(report),)),
-        *((Section("Where the searches ended", shown),) if shown else ()),
-        *((Section(f"The worst start, number {report.worst_start}", worst),) if worst else ()),
+        *((Section("Where the searches ended", tuple(ends)),) if ends else ()),
+        *((Section(f"The worst start, number {report.worst_start}", tuple(worst)),) if worst else ()),
         *_experiments(report),
         Section("How it was evaluated", (_setting(report),)),
         made.section(_origin(report)),
@@ -87,13 +63,9 @@ def evaluation_page(report: EvaluationReport, pictures: Sequence[Path], made: Ma
     return Page("coec evaluate", title, (_verdict(report),), tuple(sections))
 
 
-def comparison_page(report: ComparisonReport, pictures: Sequence[Path], made: Made) -> Page:
-    """Methods side by side; each has a page of its own in the folder of its name.
-
-    Raises:
-        OutputError: a picture cannot be read any more.
-    """
-    shown = pictures_of(pictures)
+def comparison_page(report: ComparisonReport, ends: Sequence[Block], made: Made) -> Page:
+    """Methods side by side, with what was drawn of where their searches ended; each has a page of its own in the folder
+    of its name."""
     rows: list[Sequence[str | Cell]] = [
         (
             Cell(name, href=f"{name}/report.html"),
@@ -119,7 +91,7 @@ def comparison_page(report: ComparisonReport, pictures: Sequence[Path], made: Ma
     not_allowed = Table("This source does not allow them", ("Method", "Why"), missing, prose=frozenset({1}))
     sections = (
         Section("Side by side", (table,)),
-        *((Section("Pictures", shown),) if shown else ()),
+        *((Section("Where the searches ended", tuple(ends)),) if ends else ()),
         *((Section("Not evaluated", (not_allowed,)),) if missing else ()),
         made.section((("Source", report.source),)),
     )  # fmt: skip
@@ -163,8 +135,10 @@ def _verdict(report: EvaluationReport) -> Verdict:
         served = count(misses, "miss", "misses")
         told = f"{served} would have been served: look at the worst start below, and at its figures."
         return Verdict("bad", "Wrong and accepted.", sentence, (told,))
-    tone: Tone = "good" if report.hits == report.starts else "unsure"
-    return Verdict(tone, "No miss was accepted.", sentence)
+    refused = report.verdicts.failed_hits
+    tone: Tone = "good" if report.hits == report.starts and not refused else "unsure"
+    lost = f" {count(refused, 'right result was', 'right results were')} refused." if refused else ""
+    return Verdict(tone, "No miss was accepted.", f"{sentence}{lost}")
 
 
 def _spreads(report: EvaluationReport) -> Table:
@@ -302,12 +276,12 @@ def _normalised(found: NormalisedErrorsReport) -> tuple[Block, ...]:
     caption = f"{found.judged} accepted, {found.refused} refused. True claims hold 68.3, 95.4 and 99.7 %."
     table = Table(caption, heads, rows, frozenset(range(1, 8)))
     if found.nees is None:
-        return (table,)
+        return (table, evaluation_charts.normalised(found))
     told = (
         f"NEES per axis {number(found.nees, 2)}; of true claims {number(found.nees_low, 2)} to "
         f"{number(found.nees_high, 2)} in 95 % of evaluations with {found.independent} results that share no frame."
     )
-    return table, Text((told,), quiet=True)
+    return table, Text((told,), quiet=True), evaluation_charts.normalised(found)
 
 
 def _steps(steps: Sequence[StepRow]) -> Table:

@@ -14,10 +14,17 @@ from coec.evaluation import profiles, starts, statistics
 from coec.evaluation.experiments import SUBSETS, Bench
 from coec.evaluation.normalised_errors import NormalisedErrors
 from coec.evaluation.statistics import FramesPoint, Outcome, SlicePoint
-from coec.reports import curves, normalised_plots, pictures, plots
+from coec.reports import curves, evaluation_charts, normalised_plots, pictures, plots
+from coec.reports.bullseye import bullseye
 from coec.reports.close_ups import Caption
 from coec.reports.evaluation_tables import setting, verdict
+from coec.reports.page import Block, Text
 from coec.sources import windows
+
+LANDSCAPE = (
+    "The objective and its witnesses along each axis about the reference, from their lowest to their highest value: a "
+    "good one has one peak, at zero."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +39,15 @@ class Starts:
         return setting(self.rotation_deg, self.translation_m)
 
 
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What a page shows of an evaluation: where searches ended, and the start that ended farthest from the
+    reference."""
+
+    ends: tuple[Block, ...]
+    worst: tuple[Block, ...]
+
+
 def write(
     folder: Path,
     bench: Bench,
@@ -40,7 +56,7 @@ def write(
     frames: Sequence[FramesPoint],
     slices: Sequence[SlicePoint],
     heard: Callable[[int, str], None],
-) -> None:
+) -> Drawn:
     """Bullseye, landscapes, errors against the amount of data where they were asked for, and the worst start beside
     where it ended.
 
@@ -54,9 +70,9 @@ def write(
     )
     hits = sum(outcome.hit for outcome in outcomes)
     unit = starts.directions(of_starts.directions)
-    spheres = {"rotation vectors of the starts": unit}
+    spheres = {"Rotation vectors of the starts": unit}
     if of_starts.translation_m > 0:
-        spheres["translations of the starts"] = unit[starts.partners(of_starts.directions)]
+        spheres["Translations of the starts"] = unit[starts.partners(of_starts.directions)]
     rate = f"{hits} of {len(outcomes)} starts hit, from {of_starts}"
     output.write(folder / "bullseye.png", plots.bullseye(outcomes, spheres, f"{title}\n{rate}"))
     if frames:
@@ -65,21 +81,23 @@ def write(
     if slices:
         about = f"{title} in all\n{SUBSETS} solves of each length, from {of_starts}"
         output.write(folder / "slices.png", curves.error_against_slice(slices, dof == 6, about))
-    write_landscape(folder, bench, title, heard)
-    _write_overlays(folder, bench, outcomes)
+    seen = write_landscape(folder, bench, title, heard)
+    ends = (bullseye({"": outcomes}, spheres), Text((LANDSCAPE,), quiet=True), evaluation_charts.landscape(seen))
+    return Drawn(ends, _write_worst(folder, bench, outcomes))
 
 
 def write_comparison(
     folder: Path, window_id: str, of_starts: Starts, outcomes: Mapping[str, Sequence[Outcome]]
-) -> None:
+) -> tuple[Block, ...]:
     """The bullseyes of all methods side by side.
 
     Raises:
         OutputError: the folder or the file cannot be written.
     """
     title = f"{window_id}: {of_starts.directions} starts, {of_starts}"
-    picture = plots.compared(outcomes, starts.directions(of_starts.directions), title)
-    output.write(folder / "bullseye.png", picture)
+    unit = starts.directions(of_starts.directions)
+    output.write(folder / "bullseye.png", plots.compared(outcomes, unit, title))
+    return (bullseye(outcomes, {"starts": unit}),)
 
 
 def write_normalised(folder: Path, name: str, found: Mapping[str, NormalisedErrors]) -> None:
@@ -91,30 +109,36 @@ def write_normalised(folder: Path, name: str, found: Mapping[str, NormalisedErro
     output.write(folder / "normalised.png", normalised_plots.normalised(found, name))
 
 
-def write_landscape(folder: Path, bench: Bench, title: str, heard: Callable[[int, str], None]) -> None:
-    """The fused objective and its witnesses about the reference, each by itself."""
+def write_landscape(
+    folder: Path, bench: Bench, title: str, heard: Callable[[int, str], None]
+) -> Mapping[str, profiles.Views]:
+    """The fused objective and its witnesses about the reference, each by itself: profiles.png, and what is in it."""
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
     sight = sight_of(window, bench.depth, bench.images, bench.configuration, Silence())
     named = profiles.landscapes(sight, bench.configuration)
     seen = profiles.views(named, bench.reference, bench.configuration.search.dof, heard)
     output.write(folder / "profiles.png", curves.landscape(seen, f"{title}\nabout the source's calibration"))
+    return seen
 
 
-def _write_overlays(folder: Path, bench: Bench, outcomes: Sequence[Outcome]) -> None:
+def _write_worst(folder: Path, bench: Bench, outcomes: Sequence[Outcome]) -> tuple[Block, ...]:
     index = statistics.worst(outcomes)
     outcome = outcomes[index]
     start_deg = windows.rotation_error_deg(outcome.trial.start, bench.reference)
     end_deg = degrees(outcome.rotation_rad)
     caption = Caption(
-        before=f"worst start, number {index}, {start_deg:.2f} deg off",
-        after=f"its end, {verdict(outcome)}, {end_deg:.2f} deg off",
+        before=f"worst start, number {index}, {start_deg:.2f}° off",
+        after=f"its end, {verdict(outcome)}, {end_deg:.2f}° off",
         network=pictures.network_text(bench.configuration.depth.model, bench.depth.identity),
     )
-    pictures.write_comparison(
+    estimate = outcome.trial.estimate
+    drawn = pictures.write_comparison(
         folder,
         bench.window,
         outcome.trial.start,
         outcome.T_camera_lidar,
         caption,
         bench.configuration.motion_compensation,
+        None if estimate is None else estimate.uncertainty.looks,
     )
+    return drawn.blocks

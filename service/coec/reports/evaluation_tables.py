@@ -37,7 +37,7 @@ CSV_FIGURES = (
 
 def setting(rotation_deg: float, translation_m: float) -> str:
     """How far away the starts are, in words."""
-    return f"{rotation_deg:g} deg" + (f" and {translation_m:g} m away" if translation_m > 0 else " away")
+    return f"{rotation_deg:g}°" + (f" and {translation_m:g} m away" if translation_m > 0 else " away")
 
 
 def verdict(outcome: Outcome) -> str:

@@ -4,19 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime
+from math import inf
 
 from coec.reports.console import figure
+from coec.reports.instants import day
 from coec.reports.page import Block, Cell, Page, Section, Table, Text, Trend, Verdict
-from coec.reports.page.words import count, day
+from coec.reports.page.words import NONE, count, percent
 from coec.reports.provenance import Made
-from coec.schemas.fleet import AXES, DayOfPair, FalseAlarms, FleetChanges, FleetReport, PairOfFleet
+from coec.schemas.fleet import AXES, FalseAlarms, FleetChanges, FleetReport, PairOfFleet
 
 NAMES = dict(zip(AXES, ("pitch", "yaw", "roll", "right", "down", "forward"), strict=True))
 LEAST = {"deg": 0.1, "m": 0.02}
 """Half of the least height of a plot: what is smaller is no drift, and shall not look like one."""
 
+WHERE_ALL_IS = (
+    "`report.json` beside this page has them all; `coec fleet report RESULTS --sql` prints queries that ask for more."
+)
+
 DRIFTED = 1.0
 """Urgency from which on a drift is one that a monitor has to see."""
+
+
+DRAWN, LISTED = 100, 1000
+"""Pairs with a plot, and pairs after them with a row: the page stays below 3 MB whatever the fleet. Others are told
+together."""
+
+ROWS = 200
+"""Of the other tables, at most, for the same reason."""
+
+PLOTTED_DAYS = 120
+"""Points of a plot that is 180 px wide, at most."""
+
+BANDS = (1.0, 0.5, 0.25, 0.1, 0.0)
+"""Urgencies from which on pairs that are not listed are counted together."""
 
 
 def page(report: FleetReport, title: str, made: Made) -> Page:
@@ -30,8 +50,8 @@ def page(report: FleetReport, title: str, made: Made) -> Page:
     if report.refusals or report.errors:
         counts = [*report.refusals.items(), *((f"{code} (no result)", n) for code, n in report.errors.items())]
         counts.sort(key=lambda item: (-item[1], item[0]))
-        rows = [(Cell(code, code=True), str(n)) for code, n in counts]
-        told = "Windows by code of a reason; one window may have several."
+        rows = [(Cell(code, code=True), str(n)) for code, n in counts[:ROWS]]
+        told = f"Windows by code of a reason; one window may have several.{_left_out(len(counts))}"
         table = Table(told, ("Code", "Windows"), rows, frozenset({1}))
         sections.append(Section("Why windows were refused, or have no result", (table,)))
     if report.figures:
@@ -74,10 +94,12 @@ def sentence_of_alarms(alarms: FalseAlarms) -> str:
 
 def _alarms(alarms: FalseAlarms) -> tuple[Block, ...]:
     told = Text((sentence_of_alarms(alarms),))
-    rows = [(name, str(number)) for name, number in alarms.by_pair.items()]
-    if not rows:
+    accused = sorted(alarms.by_pair.items(), key=lambda item: (-item[1], item[0]))
+    if not accused:
         return (told,)
-    return told, Table("Pairs that were accused without cause", ("Vehicle/pair", "False alarms"), rows, frozenset({1}))
+    rows = [(name, str(number)) for name, number in accused[:ROWS]]
+    caption = f"Pairs that were accused without cause.{_left_out(len(accused))}"
+    return told, Table(caption, ("Vehicle/pair", "False alarms"), rows, frozenset({1}))
 
 
 def _changes(changes: FleetChanges) -> tuple[Block, ...]:
@@ -100,36 +122,76 @@ def _changes(changes: FleetChanges) -> tuple[Block, ...]:
 
 
 def _vehicles(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
-    drift = ("Urgency", "Worst axis", "Drift", "Per 30 days", "Day by day")
-    heads = ("Vehicle", "Pair", *drift, "Windows", "Accepted", "Last window")
+    """The worst with a plot, more without one, and all others together."""
+    drift, counted = ("Urgency", "Worst axis", "Drift", "Per 30 days"), ("Windows", "Accepted", "Last window")
+    drawn, listed, others = pairs[:DRAWN], pairs[DRAWN : DRAWN + LISTED], pairs[DRAWN + LISTED :]
     told = (
         "Drift: where the last accepted windows are from where the first were. The plot shows that axis, day by day:"
         " median, and the band that holds two thirds of the windows. Urgency 1 is a step that a monitor has to see,"
         " 0.5° or 10 cm."
     )
-    rows = [_pair(pair) for pair in pairs]
-    return Text((told,), quiet=True), Table(count(len(pairs), "pair"), heads, rows, frozenset({2, 4, 5, 7, 8}))
+    rows = [(*_drift(pair), _plot(pair), *_counts(pair)) for pair in drawn]
+    of_all = count(len(pairs), "pair") if not listed else f"The first {DRAWN} of {len(pairs)} pairs"
+    heads = ("Vehicle", "Pair", *drift, "Day by day", *counted)
+    blocks: list[Block] = [Text((told,), quiet=True), Table(of_all, heads, rows, frozenset({2, 4, 5, 7, 8}))]
+    if listed:
+        rows = [(*_drift(pair), *_counts(pair)) for pair in listed]
+        caption = f"The next {len(listed)}, without plots"
+        blocks.append(Table(caption, ("Vehicle", "Pair", *drift, *counted), rows, frozenset({2, 4, 5, 6, 7})))
+    if others:
+        blocks += _together(others)
+    return tuple(blocks)
 
 
-def _pair(pair: PairOfFleet) -> Sequence[str | Cell]:
-    worst = drift = slope = "–"
-    plot: str | Cell = "–"
+def _together(pairs: Sequence[PairOfFleet]) -> tuple[Block, ...]:
+    """Pairs that are not listed one by one, by how urgent they are."""
+    told = (
+        f"{len(pairs)} pairs more are not listed one by one, as none of them is more urgent than those above. "
+        f"{WHERE_ALL_IS}"
+    )
+    rows = []
+    for low, high in zip(BANDS, (inf, *BANDS), strict=False):
+        of_band = [pair for pair in pairs if low <= pair.urgency < high]
+        if of_band:
+            windows, accepted = sum(pair.windows for pair in of_band), sum(pair.accepted for pair in of_band)
+            name = f"{low:g} and more" if high == inf else f"{low:g} to {high:g}"
+            rows.append((name, str(len(of_band)), str(windows), percent(accepted / max(windows, 1))))
+    heads = ("Urgency", "Pairs", "Windows", "Accepted")
+    return Text((told,)), Table("All other pairs, by urgency", heads, rows, frozenset({1, 2, 3}))
+
+
+def _left_out(total: int) -> str:
+    """What a table says of rows that it has no room for; begins with a space, or is empty."""
+    return "" if total <= ROWS else f" {ROWS} of {total} rows. {WHERE_ALL_IS}"
+
+
+def _drift(pair: PairOfFleet) -> Sequence[str | Cell]:
+    """Vehicle, pair, and how far it has drifted."""
+    worst = drift = slope = NONE
     if pair.worst is not None:
         axis, unit = AXES.index(pair.worst), pair.worst.rpartition("_")[2]
         shown = "°" if unit == "deg" else " m"
         per_month = pair.slope[axis]
         worst = NAMES[pair.worst]
         drift = f"{figure(pair.drift[axis], sign=True)}{shown}"
-        slope = "–" if per_month is None else f"{figure(per_month, sign=True)}{shown}"
-        plot = _plot(pair.days, axis, LEAST[unit], f"{pair.vehicle} {pair.pair}, {worst} day by day")
-    last = "–" if pair.last_ns is None else day(pair.last_ns)
+        slope = NONE if per_month is None else f"{figure(per_month, sign=True)}{shown}"
     urgency = Cell(f"{pair.urgency:.1f}", tone="bad" if pair.urgency >= DRIFTED else None)
-    counts = (str(pair.windows), str(pair.accepted))
-    return (pair.vehicle, pair.pair, urgency, worst, drift, slope, plot, *counts, last)
+    return (pair.vehicle, pair.pair, urgency, worst, drift, slope)
 
 
-def _plot(days: Sequence[DayOfPair], axis: int, least: float, title: str) -> str | Cell:
-    """Median and band of one axis over the days, about the first of them."""
+def _counts(pair: PairOfFleet) -> tuple[str, str, str]:
+    """Windows, those accepted, and the day of the last one."""
+    return str(pair.windows), str(pair.accepted), NONE if pair.last_ns is None else day(pair.last_ns)
+
+
+def _plot(pair: PairOfFleet) -> str | Cell:
+    """Median and band of the worst axis over the days, about the first of them; of many days every second, third, ...
+    and the last."""
+    if pair.worst is None:
+        return NONE
+    axis, unit = AXES.index(pair.worst), pair.worst.rpartition("_")[2]
+    step = -(-len(pair.days) // PLOTTED_DAYS) or 1
+    days = pair.days[::-1][::step][::-1]
     told = tuple(
         (datetime.fromisoformat(of_day.date).timestamp(), low, middle, high)
         for of_day in days
@@ -137,7 +199,8 @@ def _plot(days: Sequence[DayOfPair], axis: int, least: float, title: str) -> str
         and (middle := of_day.middle[axis]) is not None
         and (high := of_day.high[axis]) is not None
     )
-    return Cell("", trend=Trend(title, told, told[0][2], least)) if told else "–"
+    title = f"{pair.vehicle} {pair.pair}, {NAMES[pair.worst]} day by day"
+    return Cell("", trend=Trend(title, told, told[0][2], LEAST[unit])) if told else NONE
 
 
 def _figures(report: FleetReport) -> tuple[Block, ...]:
@@ -149,10 +212,12 @@ def _figures(report: FleetReport) -> tuple[Block, ...]:
             str(each.windows),
             *(figure(value) for value in (each.low, each.middle, each.high)),
         )
-        for each in report.figures
+        for each in report.figures[:ROWS]
     ]
     heads = ("Figure", "Pair", "Vehicles", "Windows", "0.5 %", "Median", "99.5 %")
     told = (
         "99 of 100 windows lie between the outer two. A vehicle without a baseline of its own can be held against them."
     )
-    return Text((told,), quiet=True), Table("Figures by pair", heads, rows, frozenset({2, 3, 4, 5, 6}))
+    return Text((told,), quiet=True), Table(
+        f"Figures by pair.{_left_out(len(report.figures))}", heads, rows, frozenset({2, 3, 4, 5, 6})
+    )

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from coec.reports.console import AXIS_NAMES, UNITS, figure
+from coec.reports.instants import NS_PER_S, second
 from coec.reports.page import (
     Block,
     Cell,
     Chart,
     Charts,
-    Compare,
     Ground,
     Mark,
     Page,
@@ -26,9 +26,9 @@ from coec.reports.page import (
     Tone,
     Verdict,
 )
-from coec.reports.page.words import NS_PER_S, instant
 from coec.reports.page_parts import TONES, advice_of, axis_value, title_of
 from coec.reports.provenance import Made
+from coec.reports.replies import entry_text
 from coec.schemas.incident import Absent, FetchedWindow, IncidentReport
 from coec.schemas.replies import (
     CalibrationResult,
@@ -46,8 +46,16 @@ MAX_PLOTS = 16
 """Figures that are drawn; a vehicle says how many it has."""
 
 PICTURED = {
-    "before.jpg": ("Before", "What the camera saw when the pair turned red, with the points at what was served then."),
-    "after.jpg": ("After", "The first picture of the window after it."),
+    "before.jpg": (
+        "Before",
+        "The window before the event: LiDAR points, or outlines, at what was served when the pair turned red, and, "
+        "once a window after it told where the camera is, at that beside it.",
+    ),
+    "after.jpg": (
+        "After",
+        "The window after the event, at the same two extrinsics: the one that fits here and not above is the mount "
+        "that moved.",
+    ),
 }
 """Name and caption of a picture by its file."""
 
@@ -99,8 +107,8 @@ def page(story: Story, pictures: Mapping[str, bytes], made: Made) -> Page:
 def sentences(story: Story) -> Iterable[str]:
     """The story in a few sentences, each of which a document in the folder bears out."""
     event = story.event
-    began = f"At {instant(event.stamp_ns)} of sensor time the pair {event.pair} of {event.vehicle} turned red"
-    yield f"{began} (by the vehicle's clock {instant(event.wall_ns)}). {_said(event.reasons)}"
+    began = f"At {second(event.stamp_ns)} of sensor time the pair {event.pair} of {event.vehicle} turned red"
+    yield f"{began} (by the vehicle's clock {second(event.wall_ns)}). {_said(event.reasons)}"
     decided = {result.window_id: result for result in (story.history.results if story.history else ())}
     for window_id, when in ((event.window_before, "before"), (event.window_after, "after")):
         if window_id is None:
@@ -150,8 +158,6 @@ def _pictures(pictures: Mapping[str, bytes]) -> tuple[Block, ...]:
         Picture(data, f"Camera image with LiDAR points, {PICTURED[name][0].lower()} the event", PICTURED[name][1], name)
         for name, data in pictures.items()
     ]
-    if len(shown) == len(PICTURED):
-        return (Compare(shown[0], shown[1], "Before and after the event"),)
     return (Pictures(tuple(shown)),)
 
 
@@ -167,7 +173,7 @@ def _timeline(event: EvidenceEvent) -> Iterable[Block]:
     first, last = points[0].stamp_ns, points[-1].stamp_ns
     states = " ".join(dict.fromkeys(point.state for point in points))
     yield Text(
-        (f"{len(points)} checks, {instant(first)} to {instant(last)}; states: {states}. The dashed line is the event, "
+        (f"{len(points)} checks, {second(first)} to {second(last)}; states: {states}. The dashed line is the event, "
          "the ground the state of health.",),
         quiet=True,
     )  # fmt: skip
@@ -222,7 +228,7 @@ def _results(results: Sequence[CalibrationResult], event: EvidenceEvent) -> Tabl
             for axis, (value, sigma) in enumerate(zip(result.correction, result.sigma, strict=True))
         ]
         verdict = Cell(result.verdict.decision, tone=TONES.get(result.verdict.decision, "none"))
-        return (instant(result.data_stamp_ns), when, result.window_id, str(result.pairs), verdict, *moved)
+        return (second(result.data_stamp_ns), when, result.window_id, str(result.pairs), verdict, *moved)
 
     heads = [f"{name}, {unit}" for name, unit in zip(AXIS_NAMES, UNITS, strict=True)]
     return Table(
@@ -244,7 +250,8 @@ def _refusals(results: Sequence[CalibrationResult]) -> Iterable[Text]:
             if metric.limit is not None and not metric.passed
         ]
         because = f" Beyond their limits: {', '.join(failed)}." if failed else ""
-        yield Text((f"{result.window_id} was refused: {_said(result.verdict.reasons)}{because}",))
+        why = _said(result.verdict.reasons).removesuffix(".")
+        yield Text((f"{result.window_id} was refused: {why}.{because}",))
 
 
 def _chain(story: Story) -> Block:
@@ -261,11 +268,11 @@ def _entries(entries: Sequence[ChainedEntry]) -> Table:
     rows = [
         (
             str(item.entry.sequence),
-            instant(item.entry.wall_ns),
-            "–" if item.entry.stamp_ns is None else instant(item.entry.stamp_ns),
+            second(item.entry.wall_ns),
+            "–" if item.entry.stamp_ns is None else second(item.entry.stamp_ns),
             item.entry.kind,
             item.entry.code,
-            item.entry.text,
+            entry_text(item.entry),
             item.entry.sender or "",
             Cell(item.sha256[:12], code=True),
         )
@@ -314,5 +321,5 @@ def _now(story: Story, health: HealthReply) -> Text:
     served = "" if story.extrinsic is None else f" Served: {story.extrinsic.provenance}."
     why = f" {_said(health.reasons)}" if health.reasons else ""
     version = "" if story.status is None else f" The service is coec {story.status.version}."
-    text = f"When this was fetched the pair was {health.state}, since {instant(health.since_ns)}.{why}{served}{version}"
+    text = f"When this was fetched the pair was {health.state}, since {second(health.since_ns)}.{why}{served}{version}"
     return Text((text,))

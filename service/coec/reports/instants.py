@@ -1,4 +1,4 @@
-"""Stamps of sensors as people read them."""
+"""Stamps as people read them: UTC, and seconds where the stamp is no date."""
 
 from __future__ import annotations
 
@@ -14,8 +14,30 @@ END_NS = 253_402_300_800 * NS_PER_S
 
 
 def instant(stamp_ns: int) -> str:
-    """UTC to the millisecond, ISO 8601; seconds where the stamp is no date."""
-    if not FIRST_DATE_NS <= stamp_ns < END_NS:
-        return f"{stamp_ns / NS_PER_S:.3f} s"
-    second, beyond = divmod(stamp_ns // NS_PER_MS, 1000)
-    return f"{datetime.fromtimestamp(second, UTC):%Y-%m-%dT%H:%M:%S}.{beyond:03d}Z"
+    """To the millisecond: of a frame."""
+    if not _is_date(stamp_ns):
+        return _bare(stamp_ns)
+    beyond_ms = stamp_ns // NS_PER_MS % 1000
+    return f"{_date(stamp_ns):%Y-%m-%d %H:%M:%S}.{beyond_ms:03d}Z"
+
+
+def second(stamp_ns: int) -> str:
+    """To the second: of what happened."""
+    return f"{_date(stamp_ns):%Y-%m-%d %H:%M:%S}Z" if _is_date(stamp_ns) else _bare(stamp_ns)
+
+
+def day(stamp_ns: int) -> str:
+    """To the day."""
+    return f"{_date(stamp_ns):%Y-%m-%d}" if _is_date(stamp_ns) else _bare(stamp_ns)
+
+
+def _is_date(stamp_ns: int) -> bool:
+    return FIRST_DATE_NS <= stamp_ns < END_NS
+
+
+def _date(stamp_ns: int) -> datetime:
+    return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC)
+
+
+def _bare(stamp_ns: int) -> str:
+    return f"{stamp_ns / NS_PER_S:.3f} s"

@@ -34,7 +34,6 @@ def draw(
     T_camera_lidar: Matrix4,
     xyz_m: NDArray[np.floating],
     mask: NDArray[np.bool_] | None,
-    title: str,
     scale: RangeScale | None = None,
 ) -> Pixels:
     """The image with the points of a sweep on it, coloured by range, near ones on top of far ones.
@@ -44,11 +43,10 @@ def draw(
         T_camera_lidar: (4, 4).
         xyz_m: (N, 3) LiDAR frame, compensated to the instant of the image.
         mask: (height, width) or None; points on pixels that are False are left out.
-        title: a line of ASCII above the image, or two; cut off where they are too long.
         scale: of the colours; None: that of the points in view.
 
     Returns:
-        (height', width', 3) uint8: title, picture, bar of ranges. Small images are enlarged by a whole factor.
+        (height', width', 3) uint8: picture, bar of ranges. Small images are enlarged by a whole factor.
     """
     factor = max(1, -(-MIN_WIDTH_PX // image_bgr.shape[1]))
     picture = np.asarray(np.repeat(np.repeat(image_bgr, factor, axis=0), factor, axis=1), dtype=np.uint8)
@@ -57,7 +55,13 @@ def draw(
     centres = np.rint((uv_px + 0.5) * factor - 0.5).astype(np.int64)
     shown = scale_of(range_m) if scale is None else scale
     _stamp(picture, centres, range_m, shown, radius_px=picture.shape[1] * POINT_SHARE)
-    return np.vstack([_title(picture.shape[1], title), picture, _bar(picture.shape[1], shown)])
+    return np.vstack([picture, _bar(picture.shape[1], shown)])
+
+
+def titled(picture: Pixels, title: str) -> Pixels:
+    """The picture with a line above it, or two; cut off where they are too long. For one that goes out alone: on a page
+    its caption says the same."""
+    return np.vstack([_title(picture.shape[1], title), picture])
 
 
 def _stamp(
@@ -87,7 +91,8 @@ def _stamp(
 
 def _title(width: int, title: str) -> Pixels:
     height = round(width * LINE_SHARE)
-    lines = title.split("\n")[:LINES]
+    # The letters are those of ASCII.
+    lines = title.replace("\u00b0", " deg").split("\n")[:LINES]
     strip = np.full((height * len(lines) + height // 4, width, 3), PAPER, dtype=np.uint8)
     for number, line in enumerate(lines):
         _write(strip[number * height :], line, 0.01 * width, height)

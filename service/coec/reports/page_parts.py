@@ -18,14 +18,11 @@ from coec.reports.console import AXIS_NAMES, UNITS
 from coec.reports.page import (
     AxesTable,
     AxisLine,
-    Block,
-    Compare,
     Copies,
     Copy,
     FigureLine,
     Figures,
     Picture,
-    Pictures,
     Tone,
 )
 from coec.reports.page.words import number, significant, size
@@ -55,25 +52,9 @@ PLENTY = 4.0
 """Times its limit a figure is kept by, to stand at the end of its margin; a quarter of it, to stand at the other."""
 
 CAPTIONS: Mapping[str, tuple[str, str]] = {
-    "overlay_before": (
-        "LiDAR points drawn on the camera image at the start",
-        "Before: points at the extrinsic that the search began with, coloured by range.",
-    ),
-    "overlay_after": (
-        "The same LiDAR points on the same image at the result",
-        "After: the same points at the result.",
-    ),
     "overlay": (
         "LiDAR points drawn on the camera image at the extrinsic that was checked",
         "Points at the extrinsic that was checked, coloured by range. Where it is right they end where things end.",
-    ),
-    "closeup_before": (
-        "Part of the camera image with LiDAR points where the service put them before the repair",
-        "Before the repair: LiDAR points where the service put them, coloured by range.",
-    ),
-    "closeup_after": (
-        "The same part of the same image with the points after the repair",
-        "After it, on the same picture.",
     ),
     "close_ups": (
         "Enlarged parts of the image with the range edges of the LiDAR, at the start and at the result",
@@ -83,35 +64,12 @@ CAPTIONS: Mapping[str, tuple[str, str]] = {
         "Map over the image of how well range edges and image edges agree at the result",
         "Where in the image range edges and image edges agree at the result, and where they do not.",
     ),
-    "camera_fit": (
+    "lens_residual": (
         "Map over the image of how far the fitted camera model is from the one it stands for",
         "What the fitted camera model misses, in pixels over the image.",
     ),
-    "bullseye": (
-        "Start directions coloured by final error, and final errors as seen from the reference",
-        "Left, where the searches started; right, where they ended. Inside the green ring is a hit.",
-    ),
-    "profiles": (
-        "Curves of the objective along each axis about the reference",
-        "The objective and its witnesses along each axis, from afar and from near: a good one has one peak, at zero.",
-    ),
-    "normalised": (
-        "Errors over claimed standard deviations, as histograms and reliability curves",
-        "Errors over what was claimed for them.",
-    ),
-    "metrics": (
-        "The paper's three figures at right and wrong extrinsics, with learned limits",
-        "The three figures of equation (2) at right and at wrong extrinsics.",
-    ),
-    "drive": (
-        "Errors of pitch, yaw and roll along the drive",
-        "Errors of every window along the drive.",
-    ),
 }
 """Alternative text and caption of a picture by the stem of its file."""
-
-SLID = ("overlay_before", "overlay_after")
-"""Two of one size that are shown in one place."""
 
 
 def file_picture(path: Path) -> Picture:
@@ -120,7 +78,7 @@ def file_picture(path: Path) -> Picture:
     Raises:
         OutputError: it cannot be read any more.
     """
-    alt, caption = CAPTIONS.get(path.stem) or (path.stem.replace("_", " "), path.stem.replace("_", " ").capitalize())
+    alt, caption = CAPTIONS[path.stem]
     return Picture(read(path), alt, caption)
 
 
@@ -134,22 +92,6 @@ def read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise OutputError(f"cannot read {path}, which was just written: {error.strerror}") from error
-
-
-def pictures_of(paths: Sequence[Path]) -> tuple[Block, ...]:
-    """The pictures among some files, the two overlays in one place.
-
-    Raises:
-        OutputError: one cannot be read.
-    """
-    shown = {path.stem: file_picture(path) for path in paths if path.suffix == ".png"}
-    blocks: list[Block] = []
-    if all(name in shown for name in SLID):
-        before, after = (shown.pop(name) for name in SLID)
-        blocks.append(Compare(before, after, "Start and result"))
-    if shown:
-        blocks.append(Pictures(tuple(shown.values())))
-    return tuple(blocks)
 
 
 def axis_value(value: float | None, axis: int, sign: bool = True) -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 from coec.evaluation import paper_published
 from coec.reports.page import Block, Page, Section, Table, Text, Verdict
 from coec.reports.page.words import NONE, number, percent
-from coec.reports.page_parts import pictures_of
 from coec.reports.provenance import Made
 
 PUBLISHED = (
@@ -19,20 +18,17 @@ PUBLISHED = (
 )
 
 
-def paper_page(document: Mapping[str, Any], pictures: Sequence[Path], made: Made) -> Page:
-    """The page of what `coec paper --json` prints.
+@dataclass(frozen=True, slots=True)
+class Plots:
+    """Of the failure metrics, of the far starts, and of the drive."""
 
-    Args:
-        pictures: files that were drawn of it.
+    metrics: Block
+    bullseye: Block
+    drive: Block
 
-    Raises:
-        OutputError: a picture cannot be read any more.
-    """
-    by_name = {path.stem: path for path in pictures}
 
-    def picture(name: str) -> tuple[Block, ...]:
-        return pictures_of([by_name[name]]) if name in by_name else ()
-
+def paper_page(document: Mapping[str, Any], plots: Plots, made: Made) -> Page:
+    """The page of what `coec paper --json` prints."""
     far = document["bullseye"]
     sentence = (
         f"From {far['start_deg']:g}° away {far['hits']} of {far['runs']} runs come home (published: "
@@ -42,9 +38,9 @@ def paper_page(document: Mapping[str, Any], pictures: Sequence[Path], made: Made
     sections = (
         Section(
             "Wrong extrinsics flagged by equation (2)",
-            (_moves(document["failure_metrics"]["moves"]), *picture("metrics")),
+            (_moves(document["failure_metrics"]["moves"]), plots.metrics),
         ),
-        Section("Solves", (_solves(document), *picture("bullseye"), *picture("drive"))),
+        Section("Solves", (_solves(document), plots.bullseye, plots.drive)),
         Section("Run times", (_times(document["run_times"]),)),
         made.section(
             (("Source", document["source"]), ("Objective", document["objective"]), ("Pairs", str(document["pairs"])))

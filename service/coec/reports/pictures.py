@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.adapters.files.output import write
-from coec.adapters.images.codec import decode_bgr, encode_png
+from coec.adapters.images.codec import decode_bgr, encode_jpeg, encode_png
 from coec.adapters.images.range_colours import NEAREST_M, scale_of
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import FramePair, Matrix4, Window
+from coec.calibration.verdict import saw_one_scene
 from coec.config import LimitsConfig
 from coec.geometry.cameras import Camera
 from coec.geometry.in_view import points_in_view
 from coec.reports.close_ups import Caption, close_ups, difference_text
 from coec.reports.instants import instant
 from coec.reports.lens_residual import lens_residual
-from coec.reports.overlay import draw
+from coec.reports.overlay import draw, titled
+from coec.reports.page import Block, Compare, Picture, Pictures, Text
+from coec.reports.page_parts import file_picture
 from coec.reports.residual_map import residual_map
+
+PAGE_JPEG_QUALITY = 95
+"""Of pictures that a page takes: it makes large ones smaller once more."""
+
+SLID_ALTS = ("LiDAR points on the camera image, before", "The same LiDAR points on the same image, after")
+"""What is seen on two pictures in one place, for who does not see it."""
 
 
 def middle(window: Window) -> FramePair:
@@ -28,23 +38,18 @@ def middle(window: Window) -> FramePair:
     return window.pairs[len(window.pairs) // 2]
 
 
-def write_overlays(
-    folder: Path, window: Window, poses: Mapping[str, tuple[Matrix4, str]], compensated: bool
-) -> list[Path]:
-    """`<name>.png` for each name: points at the pose (4, 4) on the image of the middle pair, with its title; all in the
-    same colours.
+def write_overlay(folder: Path, name: str, picture: NDArray[np.uint8], title: str) -> Path:
+    """`<name>.png`: a picture of `overlays` with its title.
 
     Raises:
-        OutputError: the folder or a file cannot be written.
-        DecodeError: the image cannot be decoded.
+        OutputError: the folder or the file cannot be written.
     """
-    drawn = overlays(window, tuple(poses.values()), compensated)
-    return [write(folder / f"{name}.png", encode_png(picture)) for name, picture in zip(poses, drawn, strict=True)]
+    return write(folder / f"{name}.png", encode_png(titled(picture, title)))
 
 
-def overlays(window: Window, poses: Sequence[tuple[Matrix4, str]], compensated: bool) -> list[NDArray[np.uint8]]:
-    """(height, width, 3) BGR for each pose (4, 4): points on the image of the middle pair, with a title; all in the
-    colours of what is seen at the first.
+def overlays(window: Window, poses: Sequence[Matrix4], compensated: bool) -> list[NDArray[np.uint8]]:
+    """(height, width, 3) BGR for each pose (4, 4): points on the image of the middle pair; all in the colours of what
+    is seen at the first.
 
     Raises:
         DecodeError: the image cannot be decoded.
@@ -52,15 +57,32 @@ def overlays(window: Window, poses: Sequence[tuple[Matrix4, str]], compensated: 
     pair, rig = middle(window), window.rig
     image = decode_bgr(pair.camera.image, LimitsConfig())
     cloud = compensate(pair, rig, enabled=compensated)
-    scale = scale_of(points_in_view(rig.camera, poses[0][0], cloud, rig.mask, NEAREST_M).range_m)
-    return [draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, title, scale) for T_camera_lidar, title in poses]
+    scale = scale_of(points_in_view(rig.camera, poses[0], cloud, rig.mask, NEAREST_M).range_m)
+    return [draw(image, rig.camera, T_camera_lidar, cloud, rig.mask, scale) for T_camera_lidar in poses]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What was drawn of two extrinsics: the files, the blocks of a page that show it, and what was left out, a sentence
+    each."""
+
+    files: tuple[Path, ...]
+    blocks: tuple[Block, ...]
+    left_out: tuple[str, ...]
 
 
 def write_comparison(
-    folder: Path, window: Window, T_before: Matrix4, T_after: Matrix4, caption: Caption, compensated: bool
-) -> list[Path]:
+    folder: Path,
+    window: Window,
+    T_before: Matrix4,
+    T_after: Matrix4,
+    caption: Caption,
+    compensated: bool,
+    looks: float | None,
+) -> Comparison:
     """Two extrinsics (4, 4) of a window: overlay_before.png, overlay_after.png, close_ups.png, and residuals.png at the
-    second one.
+    second one, unless it cannot be trusted: the pairs are worth so many independent `looks`, None where that is not
+    known.
 
     Raises:
         OutputError: the folder or a file cannot be written.
@@ -68,19 +90,40 @@ def write_comparison(
         CalibrationError: an image is not of the camera's size.
     """
     where = f"{window.rig.pair}  {instant(middle(window).stamp_ns)}"
-    # Overlays are lettered in ASCII.
-    apart = difference_text(T_before, T_after).replace("\u00b0", " deg")
-    poses = {
-        "overlay_before": (T_before, f"{where}  {caption.before}\n{apart} from {caption.after}"),
-        "overlay_after": (T_after, f"{where}  {caption.after}\n{apart} from {caption.before}"),
-    }
+    apart = difference_text(T_before, T_after)
+    before, after = overlays(window, (T_before, T_after), compensated)
     near = close_ups(window, T_before, T_after, compensated=compensated, caption=caption)
-    left = residual_map(window, T_after, compensated=compensated, name=caption.after)
-    return [
-        *write_overlays(folder, window, poses, compensated),
+    files = [
+        write_overlay(folder, "overlay_before", before, f"{where}  {caption.before}\n{apart} from {caption.after}"),
+        write_overlay(folder, "overlay_after", after, f"{where}  {caption.after}\n{apart} from {caption.before}"),
         write(folder / "close_ups.png", encode_png(near)),
-        write(folder / "residuals.png", encode_png(left)),
     ]
+    told = (
+        f"Before: {caption.before}, {apart} from the other. LiDAR points, coloured by range.",
+        f"After: {caption.after}.",
+    )
+    slid = slid_pictures((before, after), told)
+    one_scene = looks is not None and saw_one_scene(looks, len(window.pairs))
+    if one_scene:
+        why = (
+            f"No map of residuals: {len(window.pairs)} pairs that are worth {looks:.1f} independent looks show the "
+            "same edges again and again, as those of a vehicle that stands do, and a part of the image would look "
+            "right or wrong by chance."
+        )
+        return Comparison(tuple(files), (slid, Pictures((file_picture(files[-1]),)), Text((why,), quiet=True)), (why,))
+    left = residual_map(window, T_after, compensated=compensated, name=caption.after)
+    files.append(write(folder / "residuals.png", encode_png(left)))
+    return Comparison(tuple(files), (slid, Pictures(tuple(map(file_picture, files[2:])))), ())
+
+
+def slid_pictures(pictures: tuple[NDArray[np.uint8], NDArray[np.uint8]], captions: tuple[str, str]) -> Compare:
+    """Two pictures (height, width, 3) BGR of one size in one place, the words beside them: what a slider moves over has
+    none in it."""
+    before, after = (
+        Picture(encode_jpeg(picture, PAGE_JPEG_QUALITY), alt, caption)
+        for picture, alt, caption in zip(pictures, SLID_ALTS, captions, strict=True)
+    )
+    return Compare(before, after, "Before and after")
 
 
 def write_lens(folder: Path, camera: Camera, fitted: Camera) -> Path:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from math import degrees, pi
+from math import pi
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -17,7 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 
-from coec.evaluation.statistics import HIT_RAD, Outcome
+from coec.evaluation.statistics import Outcome
+from coec.reports.bullseye import HIT_DEG, LATITUDES_DEG, Places, end_places, latitude_radius, rim_of, start_places
 
 DPI = 110
 
@@ -27,12 +28,6 @@ ERROR_RANGE_DEG = (0.02, 20.0)
 TICKS = tuple(step * 10.0**decade for decade in range(-4, 3) for step in (1.0, 2.0, 3.0, 5.0, 7.0))
 """Of logarithmic axes."""
 
-TARGET_RIMS_DEG = (1.0, 2.0, 5.0, 10.0, 20.0, 45.0, 90.0, 180.0)
-"""Radii of the target: the smallest that holds 95 % of the ends is taken, the others are drawn on its rim. One degree
-is twice the limit of a hit."""
-
-HIT_DEG = degrees(HIT_RAD)
-
 COLOURS = "plasma"
 
 
@@ -40,8 +35,7 @@ def bullseye(outcomes: Sequence[Outcome], directions: Mapping[str, NDArray[np.fl
     """Left, for each of `directions` (title, (n, 3) unit vectors in camera axes): the start directions, coloured by
     where their solves ended. Right: where they ended, as seen from the reference.
 
-    The sphere of directions is flattened with equal areas (Lambert): the centre looks along +z (roll), the rim along
-    -z, the middle ring lies across.
+    How the sphere of directions is flattened is told by `bullseye.start_places`.
     """
     figure = Figure(figsize=(6.2 * (len(directions) + 1), 7.0), layout="constrained")
     figure.suptitle(title)
@@ -49,7 +43,7 @@ def bullseye(outcomes: Sequence[Outcome], directions: Mapping[str, NDArray[np.fl
     for column, (name, unit) in enumerate(directions.items()):
         _draw_starts(_polar(figure, 1, len(directions) + 1, column), name, unit, outcomes, colours)
     axes = _polar(figure, 1, len(directions) + 1, len(directions))
-    _draw_target(axes, outcomes, colours, _rim_deg(outcomes))
+    _draw_target(axes, outcomes, colours, rim_of(outcomes))
     _scale(figure, [axes], colours)
     figure.legend(handles=_legend(outcomes), loc="outside lower center", ncols=4, frameon=False)
     return png(figure)
@@ -61,7 +55,7 @@ def compared(methods: Mapping[str, Sequence[Outcome]], directions: NDArray[np.fl
     figure = Figure(figsize=(5.6 * len(methods) + 1.0, 11.5), layout="constrained")
     figure.suptitle(title)
     colours = LogNorm(*ERROR_RANGE_DEG, clip=True)
-    rim_deg = max(_rim_deg(outcomes) for outcomes in methods.values())
+    rim_deg = max(rim_of(outcomes) for outcomes in methods.values())
     panels = []
     for column, (name, outcomes) in enumerate(methods.items()):
         hits = sum(outcome.hit for outcome in outcomes)
@@ -78,19 +72,12 @@ def compared(methods: Mapping[str, Sequence[Outcome]], directions: NDArray[np.fl
 def _draw_starts(
     axes: PolarAxes, name: str, unit: NDArray[np.float64], outcomes: Sequence[Outcome], colours: LogNorm
 ) -> None:
-    from_z = np.arccos(np.clip(unit[:, 2], -1.0, 1.0))
-    _marks(axes, np.arctan2(unit[:, 1], unit[:, 0]), np.sin(from_z / 2.0), outcomes, colours)
-    rings = np.radians([45.0, 90.0, 135.0])
-    axes.set_rgrids(np.sin(rings / 2.0), ["45°", "90°", "135°"], angle=100.0, color="grey", fontsize="small")
+    _marks(axes, start_places(unit), outcomes, colours)
+    rings, names = [latitude_radius(ring) for ring in LATITUDES_DEG], [f"{ring:g}°" for ring in LATITUDES_DEG]
+    axes.set_rgrids(rings, names, angle=100.0, color="grey", fontsize="small")
     axes.set_ylim(0.0, 1.05)
     axes.set_thetagrids([0.0, 90.0, 180.0, 270.0], ["+x", "+y", "-x", "-y"])
     axes.set_title(f"{name}\ncentre +z, rim -z", fontsize="medium")
-
-
-def _rim_deg(outcomes: Sequence[Outcome]) -> float:
-    """See `TARGET_RIMS_DEG`."""
-    p95_deg = np.quantile(np.degrees([outcome.rotation_rad for outcome in outcomes]), 0.95)
-    return next(rim for rim in TARGET_RIMS_DEG if p95_deg <= rim)
 
 
 def _scale(figure: Figure, panels: Sequence[PolarAxes], colours: LogNorm) -> None:
@@ -102,10 +89,7 @@ def _scale(figure: Figure, panels: Sequence[PolarAxes], colours: LogNorm) -> Non
 
 
 def _draw_target(axes: PolarAxes, outcomes: Sequence[Outcome], colours: LogNorm, rim_deg: float) -> None:
-    errors = np.degrees(np.array([outcome.error[:3] for outcome in outcomes]))
-    angle_deg = np.linalg.norm(errors, axis=1)
-    # Yaw to the right and pitch upwards, as the picture moves.
-    _marks(axes, np.arctan2(errors[:, 0], errors[:, 1]), np.minimum(angle_deg, rim_deg), outcomes, colours)
+    _marks(axes, end_places(outcomes, rim_deg), outcomes, colours)
     axes.plot(np.linspace(0.0, 2.0 * pi, 181), np.full(181, HIT_DEG), color="tab:green", linewidth=1.2)
     rings = [0.25 * rim_deg, 0.5 * rim_deg, 0.75 * rim_deg, rim_deg]
     axes.set_rgrids(rings, [f"{ring:g}°" for ring in rings], angle=100.0, color="grey", fontsize="small")
@@ -116,13 +100,8 @@ def _draw_target(axes: PolarAxes, outcomes: Sequence[Outcome], colours: LogNorm,
     )
 
 
-def _marks(
-    axes: PolarAxes,
-    angle: NDArray[np.float64],
-    radius: NDArray[np.float64],
-    outcomes: Sequence[Outcome],
-    colours: LogNorm,
-) -> None:
+def _marks(axes: PolarAxes, places: Places, outcomes: Sequence[Outcome], colours: LogNorm) -> None:
+    angle, radius = places.T
     final_deg = np.degrees([outcome.rotation_rad for outcome in outcomes])
     for hit in (True, False):
         for accepted in (True, False):

@@ -18,7 +18,7 @@ LINE_S = 30.0
 COMPILING_S = 2.0
 """A shorter wait for a compiler needs no word."""
 
-COMPILING = "compiling the kernels, once on this machine"
+COMPILING = "compiling the kernels, once on this machine, for about a minute"
 
 
 class CompilingNews:

@@ -17,8 +17,8 @@ from coec import __version__
 from coec.adapters.depth.maps import PRECOMPUTED
 from coec.adapters.depth.model_cards import built_in_cards
 from coec.calibration.types import FramePair, Window
+from coec.reports.instants import second
 from coec.reports.page import Facts, Section
-from coec.reports.page.words import instant
 
 CALCULATING = ("numpy", "numba", "nlopt", "onnxruntime")
 """Packages that a decision is made with: it is theirs as well."""
@@ -45,7 +45,7 @@ class Made:
         versions = ", ".join(f"{package} {number}" for package, number in self.versions.items())
         return (
             ("Command", self.command),
-            ("Made", instant(self.wall_ns)),
+            ("Made", second(self.wall_ns)),
             ("Versions", versions),
             ("On", self.machine),
         )

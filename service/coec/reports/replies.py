@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
 from math import hypot
 from typing import Final
 
@@ -11,11 +10,11 @@ from rich.table import Table
 from rich.text import Text
 
 from coec.reports import console
+from coec.reports.holds import hold_text
+from coec.reports.instants import second
 from coec.reports.service_status import duration, losses, status
 from coec.schemas import replies, rig_state
 from coec.schemas.base import from_json
-
-NS_PER_S = 1_000_000_000
 
 
 def extrinsic(payload: bytes) -> None:
@@ -36,7 +35,9 @@ def extrinsic(payload: bytes) -> None:
         for row in reply.camera_from_cloud.matrix:
             console.show("  " + "  ".join(f"{value:+.6f}" for value in row))
     if reply.held:
-        console.show("held by command: nothing is applied", "bold yellow")
+        hold = reply.hold
+        told = hold_text("", None, None) if hold is None else hold_text(hold.sender, hold.since_ns, hold.reason)
+        console.show(f"nothing is applied: {told}", "bold yellow")
     if reply.pending is not None:
         waits = f": {reply.pending.waits.text}" if reply.pending.waits else ""
         console.show(f"a candidate from window {reply.pending.window_id} waits for `command/apply`{waits}", "yellow")
@@ -46,7 +47,7 @@ def extrinsic(payload: bytes) -> None:
                 + "  ".join(f"{name} {v:+.3f}" for name, v in zip(console.AXES, reply.pending.step, strict=True))
             )
     if reply.data_stamp_ns is not None:
-        console.show(f"from window {reply.window_id}, data until {_instant(reply.data_stamp_ns)}")
+        console.show(f"from window {reply.window_id}, data until {second(reply.data_stamp_ns)}")
 
 
 def health(payload: bytes) -> None:
@@ -56,7 +57,7 @@ def health(payload: bytes) -> None:
     console.out.print(
         f"{reply.vehicle}/{reply.pair}  ",
         console.styled(reply.state),
-        f" since {_instant(reply.since_ns)}{age}",
+        f" since {second(reply.since_ns)}{age}",
         sep="",
     )
     for reason in reply.reasons:
@@ -97,9 +98,14 @@ def history(payload: bytes) -> None:
         entry = item.entry
         if entry.kind != "estimate":
             outcome = console.styled(entry.code)
-            row = (str(entry.sequence), _instant(entry.wall_ns), entry.kind, outcome, entry.text)
+            row = (str(entry.sequence), second(entry.wall_ns), entry.kind, outcome, entry_text(entry))
             table.add_row(*row, entry.sender or "", item.sha256[:12])
     console.out.print(table)
+
+
+def entry_text(entry: replies.HistoryEntry) -> str:
+    """What happened, and for a command the reason that was given for it."""
+    return entry.text if entry.reason is None else f"{entry.text} Reason: {entry.reason}"
 
 
 def results_table(reply: replies.HistoryReply) -> Table:
@@ -108,7 +114,7 @@ def results_table(reply: replies.HistoryReply) -> Table:
     for result in reply.results:
         moved = [console.figure(value, sign=True) for value in result.correction]
         verdict = console.styled(result.verdict.decision)
-        table.add_row(_instant(result.data_stamp_ns), verdict, str(result.pairs), *moved, result.window_id)
+        table.add_row(second(result.data_stamp_ns), verdict, str(result.pairs), *moved, result.window_id)
     return table
 
 
@@ -141,14 +147,14 @@ def evidence(payload: bytes) -> None:
     for event in reply.events:
         why = "; ".join(reason.code for reason in event.reasons)
         windows_of = (event.window_before or "-", event.window_after or "-")
-        table.add_row(event.event_id, _instant(event.wall_ns), why, *windows_of, event.resolution or "still red")
+        table.add_row(event.event_id, second(event.wall_ns), why, *windows_of, event.resolution or "still red")
     console.out.print(table)
 
 
 def event(payload: bytes) -> None:
     """One red event."""
     reply = from_json(replies.EvidenceEvent, payload)
-    console.show(f"{reply.event_id}  began {_instant(reply.wall_ns)}, {reply.resolution or 'still red'}")
+    console.show(f"{reply.event_id}  began {second(reply.wall_ns)}, {reply.resolution or 'still red'}")
     for reason in reply.reasons:
         console.show(f"  {reason.code}: {reason.text}")
     console.show(f"windows: before {reply.window_before or '-'}, after {reply.window_after or '-'}")
@@ -156,7 +162,7 @@ def event(payload: bytes) -> None:
     table = console.table("check", "state", *names, right=range(2, 2 + len(names)))
     for point in reply.metrics:
         figures = [console.figure(point.metrics.get(name)) for name in names]
-        table.add_row(_instant(point.stamp_ns), console.styled(point.state), *figures)
+        table.add_row(second(point.stamp_ns), console.styled(point.state), *figures)
     console.out.print(table)
 
 
@@ -166,7 +172,7 @@ def rig(payload: bytes) -> None:
     until = (
         "nothing was looked at yet"
         if reply.stamp_ns is None
-        else f"by all that was seen until {_instant(reply.stamp_ns)}"
+        else f"by all that was seen until {second(reply.stamp_ns)}"
     )
     console.show(f"{reply.vehicle}  {until}")
     for reason in reply.reasons:
@@ -174,7 +180,7 @@ def rig(payload: bytes) -> None:
     table = console.table("sensor", "kind", "state", "moved, %", "since", "why", right=(3,))
     for sensor in reply.sensors:
         share = "-" if sensor.probability is None else f"{100.0 * sensor.probability:.1f}"
-        since = "-" if sensor.since_ns is None else _instant(sensor.since_ns)
+        since = "-" if sensor.since_ns is None else second(sensor.since_ns)
         why = "; ".join(reason.text for reason in sensor.reasons)
         table.add_row(sensor.name, sensor.kind, console.styled(sensor.state), share, since, why)
     console.out.print(table)
@@ -185,13 +191,13 @@ def rig(payload: bytes) -> None:
         for name in move.sensors:
             by = move.by.get(name)
             far.append(name if by is None else f"{name} by {hypot(*by.by[:3]):.2f}°")
-        over = "goes on" if move.over_ns is None else f"over since {_instant(move.over_ns)}"
-        console.show(f"last moved: {' and '.join(far)}, named at {_instant(move.since_ns)}, {over}")
+        over = "goes on" if move.over_ns is None else f"over since {second(move.over_ns)}"
+        console.show(f"last moved: {' and '.join(far)}, named at {second(move.since_ns)}, {over}")
     if reply.lidars:
         _lidars(reply)
     if reply.correction is not None:
         named, pairs = " and ".join(reply.correction.sensors), ", ".join(reply.correction.pairs)
-        console.show(f"last put right: {named}, in {pairs}, since {_instant(reply.correction.from_ns)}")
+        console.show(f"last put right: {named}, in {pairs}, since {second(reply.correction.from_ns)}")
     losses({"rig": reply.losses})
 
 
@@ -223,7 +229,7 @@ def _joint(joint: rig_state.JointReply) -> None:
     for pair in joint.pairs:
         steps = [f"{step:+.3f} ± {sigma:.3f}" for step, sigma in zip(pair.step, pair.sigma, strict=True)]
         table.add_row(pair.pair if pair.measured else f"{pair.pair} (by the others)", *steps)
-    console.show(f"all pairs together, from what each serves (deg, m), data until {_instant(joint.stamp_ns)}")
+    console.show(f"all pairs together, from what each serves (deg, m), data until {second(joint.stamp_ns)}")
     console.out.print(table)
     if joint.freedom:
         fit = "fit each other" if joint.consistent else "do not fit each other"
@@ -265,7 +271,3 @@ def _axes(axes: replies.Axes) -> None:
             title, console.figure(axis.correction, sign=True), console.figure(axis.sigma), axis.unit, axis.status
         )
     console.out.print(table)
-
-
-def _instant(stamp_ns: int) -> str:
-    return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC).isoformat(sep=" ").removesuffix("+00:00") + "Z"

@@ -23,7 +23,7 @@ from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.evaluation.local_shifts import LEAST_EDGES, LocalShifts, local_shifts
 from coec.geometry.cameras import pixel_rad
-from coec.reports.canvas import DPI, bgr_of, box
+from coec.reports.canvas import DPI, bgr_of, box, folded
 from coec.reports.instants import instant
 
 PICTURE_PX = (1060, 900)
@@ -68,7 +68,8 @@ def residual_map(
     """
     shifts = local_shifts(window, GreyImages(LimitsConfig()), T_camera_lidar, compensated=compensated)
     pair = window.pairs[len(window.pairs) // 2]
-    return _drawn(decode_grey(pair.camera.image, LimitsConfig()), shifts, sentences(window, shifts, name))
+    lines = folded(sentences(window, shifts, name), PICTURE_PX[0])
+    return _drawn(decode_grey(pair.camera.image, LimitsConfig()), shifts, lines)
 
 
 def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coec.errors import DecodeError
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Version of the models in this package. It is raised when a field is added; a field that changes its meaning
 or goes away needs a new `@v2` in the keys instead."""
 

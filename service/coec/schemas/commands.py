@@ -31,15 +31,21 @@ TO: Final = Argument(
     str,
     "id of an accepted window, or the beginning of a sha256 of `history`: what was served then is served again",
 )
+REASON: Final = Argument(
+    "reason", str, "why, for whoever asks later: stands in `history`, that of a `hold` in `extrinsic` and `health`"
+)
 SENSOR: Final = Argument("sensor", str, "of the rig: all pairs of this sensor, and no others")
 
 OF_PAIR: Final[Mapping[str, tuple[Argument, ...]]] = {"rollback": (TO,), "hold": (RELEASE,)}
-"""What a payload may hold, by command; the others take none."""
+"""What a payload may hold, by command, beside the reason that all take."""
+
+MAX_REASON: Final = 200
+"""Characters of a reason: two sentences. In UTF-8 they are far below the limit of a payload."""
 
 
 def arguments_of(command: str, *, for_rig: bool) -> tuple[Argument, ...]:
     """What the payload of a command may hold, for a pair or for the rig. A window is of one pair only."""
-    own = OF_PAIR.get(command, ())
+    own = (*OF_PAIR.get(command, ()), REASON)
     return (*(argument for argument in own if argument is not TO), SENSOR) if for_rig else own
 
 

@@ -186,6 +186,16 @@ class Candidate(Part):
     waits: Reason | None = Field(default=None, description="why it was not applied")
 
 
+class Hold(Part):
+    """A person holds the extrinsic as it is (`command/hold`)."""
+
+    since_ns: int | None = Field(
+        description="wall clock of the service, ns since 1970; null: an earlier version held it"
+    )
+    sender: str = Field(description="attachment of the command, or the name on a certificate, made harmless")
+    reason: str | None = Field(description="in the sender's words; null where none was given")
+
+
 class ExtrinsicReply(Message):
     """The calibration to use now. A reply exists before the first result: nominal, not_accepted, 0 %."""
 
@@ -216,6 +226,7 @@ class ExtrinsicReply(Message):
     config_hash: str
     pending: Candidate | None = None
     held: bool = Field(default=False, description="frozen by `command/hold`")
+    hold: Hold | None = Field(default=None, description="who holds it, since when and why; null while nobody does")
 
 
 class DataQuality(Part):
@@ -317,6 +328,7 @@ class HistoryEntry(Message):
     stamp_ns: int | None = Field(default=None, description="sensor time of the data behind it, ns")
     window_id: str | None = None
     sender: str | None = Field(default=None, description="attachment of a command, made harmless")
+    reason: str | None = Field(default=None, description="of a command, why, in the sender's words")
     camera_from_lidar: Transform | None = Field(default=None, description="what is served from here on (`extrinsic`)")
     result_sha256: str | None = Field(default=None, description="of the canonical JSON of the result (`estimate`)")
 

@@ -161,7 +161,7 @@ def _number(key: str, text: str) -> float:
         value = math.nan
     if not low <= value <= high:
         kind = "a whole number" if key in WHOLE else "a number"
-        raise UsageError(f"{key}={text} of a simulated drive: expected {kind} from {low:g} to {high:g}")
+        raise UsageError(f"{key}={text} of a simulated drive: expected {kind} from {low:.10g} to {high:.10g}")
     return value
 
 

@@ -129,6 +129,8 @@ def the_only(candidates: list[str], asked: str | None, what: str, root: Path) ->
         if asked not in candidates:
             raise SourceError(f"{root} has no {what} {asked}; there: {there}")
         return asked
+    if not candidates:
+        raise SourceError(f"{root} has no {what}: give the folder that holds the {what}s as they were unpacked")
     if len(candidates) != 1:
         raise SourceError(f"{root} has {len(candidates)} {what}s, choose one with ?{what}=...; there: {there}")
     return candidates[0]

@@ -86,7 +86,11 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     if not path.is_file():
         raise SourceError(f"{spec.path} has no {FILE_NAME}; for a KITTI folder write kitti360:... or kitti-raw:...")
     try:
-        document = ManifestDocument.model_validate(load_yaml(path))
+        text = load_yaml(path)
+    except ConfigError as error:
+        raise SourceError(str(error)) from error
+    try:
+        document = ManifestDocument.model_validate(text)
         camera = camera_of(document.camera)
         T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
         T_cloud_lidar = rigid_matrix(document.T_cloud_lidar, "T_cloud_lidar")

@@ -121,7 +121,7 @@ def vector_of(option: str, text: str) -> NDArray[np.float64]:
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise UsageError(f"{option} {text}: {error}") from error
+        raise UsageError(f"{option} {text}: give numbers with commas between, as 1,0,-0.5") from error
     return xi_of(f"{option} {text}", values)
 
 

@@ -52,8 +52,8 @@ def test_card_may_point_to_a_built_in_one(tmp_path: Path) -> None:
     ("text", "complaint"),
     [
         ("card: nonsense\n", "no built-in card 'nonsense'.*midas_small"),
-        ("card: midas_small\nsource: mine\n", "source: Extra inputs"),
-        (CARD + "colour: rgb\n", "colour: Extra inputs"),
+        ("card: midas_small\nsource: mine\n", "source: there is no such key"),
+        (CARD + "colour: rgb\n", "colour: there is no such key"),
         (CARD.replace("scale: 1.0", "scale: 0"), "input.scale"),
         (CARD.replace("scale: 1.0", "scale: 1.0, std: [1, 0, 1]"), "std must be positive"),
         (CARD.replace("kind: inverse_depth", "kind: metric_depth"), "unit_m"),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from coec.errors import UsageError
 from coec.runtime.api.payloads import MAX_SENDER, parse, proven_sender, sender_of
-from coec.schemas.commands import NAMES
+from coec.schemas.commands import MAX_REASON, NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -57,6 +57,17 @@ def test_what_is_no_command_is_refused_without_echo(name: str, payload: bytes) -
 
 
 @pytest.mark.fault("control characters and bombs as the name of a sender", "one harmless line in the log")
+@pytest.mark.fault("control characters and a novel as the reason of a command", "one line, or an error of ours")
+def test_a_reason_is_one_line_that_steers_no_terminal() -> None:
+    said = {"reason": " the mirror\nis \x1b[31mchanged\u202e, sagt Jürgen\x00 "}
+    for payload in (json.dumps(said).encode(), msgpack.packb(said)):
+        assert parse("hold", payload) == {"reason": "the mirror is [31mchanged , sagt Jürgen"}
+    assert parse("reset", json.dumps({"reason": "ü" * MAX_REASON}).encode()) == {"reason": "ü" * MAX_REASON}
+    assert parse("reset", msgpack.packb({"reason": "€" * MAX_REASON})) == {"reason": "€" * MAX_REASON}
+    with pytest.raises(UsageError, match="at most"):
+        parse("reset", json.dumps({"reason": "x" * (MAX_REASON + 1)}).encode())
+
+
 @pytest.mark.parametrize(
     ("attachment", "told"),
     [

@@ -14,6 +14,7 @@ from coec.calibration.lifecycle import (
     Change,
     Health,
     HealthState,
+    Hold,
     PairState,
     Provenance,
     Rules,
@@ -77,7 +78,8 @@ def test_what_was_known_before_nobody_looked_comes_back(tmp_path: Path) -> None:
 
 
 def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> None:
-    state = held(after_estimate(initial_state(RIG), estimate(1), 0, NEVER))
+    hold = Hold(7, "operator", "the mirror is being changed")
+    state = held(after_estimate(initial_state(RIG), estimate(1), 0, NEVER), hold)
     belief = Belief((1 / 3, 0.1, -0.0), (1e-9, 0.2, 0.3), 0.7)
     tests = Hypotheses(belief, (Hypothesis(1, 2.5, 1 / 7, belief, belief),), (0.1, 0.2, 0.3))
     monitor = MonitorState(Finding.SUSPECT, tests, Hypotheses(), {"dark": 0.1}, {"40": 2.5}, 0.5, (5, 6), stood=True)
@@ -86,12 +88,22 @@ def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> N
     first = (tmp_path / "state.json").read_bytes()
     back = restarted(tmp_path)
     assert back is not None
-    assert (back.frozen, back.monitor, back.flagged_since_ns, back.changes) == (True, monitor, 4, state.changes)
+    assert (back.hold, back.monitor, back.flagged_since_ns, back.changes) == (hold, monitor, 4, state.changes)
     assert back.pending is not None
     assert back.pending.contradicts
     assert np.array_equal(back.pending.T_camera_lidar, estimate(1).optimum.T_camera_lidar)
     saved(StateStore(tmp_path, "test"), RIG, back, {})
     assert (tmp_path / "state.json").read_bytes() == first
+
+
+def test_what_an_earlier_version_held_is_held_though_nobody_knows_by_whom(tmp_path: Path) -> None:
+    store = StateStore(tmp_path, "test")
+    saved(store, RIG, held(initial_state(RIG), Hold(7, "operator", "why")), {})
+    del store._pairs[RIG.pair]["hold"]
+    store.flush()
+    back = restarted(tmp_path)
+    assert back is not None
+    assert back.hold == Hold()
 
 
 def test_pairs_do_not_touch_each_other(tmp_path: Path) -> None:

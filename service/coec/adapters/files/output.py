@@ -17,6 +17,8 @@ def try_folder(folder: Path) -> None:
     Raises:
         OutputError: it cannot be made, or not be written to.
     """
+    if folder.is_file():
+        raise OutputError(f"cannot write to {folder}: it is a file; name a folder with --output")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # Permissions do not tell: of a full or read-only disk, or to root.

@@ -40,11 +40,25 @@ _TAIL_BYTES = _PREFIX.size + _FOOTER.size + len(MAGIC)
 
 
 class McapDamaged(CoecError):  # noqa: N818 - caught by name where it becomes a SourceError or a WindowError
-    """The file is not MCAP, is cut off, or a CRC does not agree; the message begins with the byte."""
+    """The file is not MCAP, is cut off, or a CRC does not agree; the message begins with the byte.
+
+    Attributes:
+        is_mcap: whether it begins as one: then something of it may be whole.
+    """
+
+    def __init__(self, message: str, *, is_mcap: bool = True) -> None:
+        super().__init__(message)
+        self.is_mcap = is_mcap
 
     def of(self, path: Path) -> str:
         """What it says of a recording, whoever recorded it, and what helps."""
+        if not self.is_mcap:
+            return f"{path} is no MCAP file: {self}"
         return f"{path} is damaged: {self}. `mcap recover` saves what is whole"
+
+
+def _no_mcap() -> McapDamaged:
+    return McapDamaged("byte 0: it does not begin as one does", is_mcap=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +131,7 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
     """
     size = _size(stream)
     if _read(stream, len(MAGIC), 0, size) != MAGIC:
-        raise McapDamaged("byte 0: not an MCAP file")
+        raise _no_mcap()
     crc = zlib.crc32(MAGIC)
     unpacked = 0
     at = len(MAGIC)
@@ -212,7 +226,12 @@ def read_attachment(path: Path, name: str) -> bytes | None:
 def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
     """The summary section, its CRC verified, and where it begins. Empty when there is none."""
     if size < len(MAGIC) + _TAIL_BYTES:
-        raise McapDamaged(f"byte {size}: the file is cut off" if size else "it is empty, of 0 bytes")
+        if size == 0:
+            raise McapDamaged("it is empty", is_mcap=False)
+        raise McapDamaged(f"byte {size}: the file is cut off")
+    stream.seek(0)
+    if _read(stream, len(MAGIC), 0, size) != MAGIC:
+        raise _no_mcap()
     footer_at = size - _TAIL_BYTES
     stream.seek(footer_at)
     tail = _read(stream, _TAIL_BYTES, footer_at, size)

@@ -94,6 +94,16 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
+class Hold:
+    """A person holds the extrinsic: since when (wall clock, ns since 1970), who, and why, in their words; None and
+    empty where that is not known."""
+
+    since_ns: int | None = None
+    sender: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Health:
     """A state with its reasons."""
 
@@ -129,7 +139,7 @@ class PairState:
         unseen_from: the health out of which time without a check took it; None while it has not. What the data decide
             goes on from there: how long a machine took for a check is none of their business.
         pending: what waits for `apply`.
-        frozen: whether a person holds the extrinsic.
+        hold: who holds the extrinsic as it is; None while nobody does.
         proven: whether a window, or commissioning, has confirmed what is served.
         track: the combination of accepted windows since the extrinsic last jumped; None before the first.
         monitor: what the checks since then add up to.
@@ -151,7 +161,7 @@ class PairState:
     reasons: tuple[Reason, ...] = (NOT_EVALUATED,)
     unseen_from: Health | None = None
     pending: Candidate | None = None
-    frozen: bool = False
+    hold: Hold | None = None
     proven: bool = False
     track: Track | None = None
     monitor: MonitorState = field(default_factory=MonitorState)
@@ -317,7 +327,7 @@ def _applied_or_waiting(state: PairState, pose: Matrix4, estimate: Estimate, rul
         return _served(state, pose, estimate)
     past = policy.remembered(state.changes, estimate.data_stamp_ns)
     waits = policy.objection(step, past, estimate.data_stamp_ns, rules)
-    if state.frozen:
+    if state.hold is not None:
         waits = Reason("held", "The extrinsic is held by command: the candidate waits for its release.")
     if waits is None:
         change = policy.Change(estimate.data_stamp_ns, tuple(abs(float(value)) for value in step))
@@ -504,14 +514,14 @@ def reset(state: PairState, rig: Rig) -> PairState:
     return replace(state, provenance=Provenance.NOMINAL, valid_from_ns=0, accepted=None, proven=False, track=None)
 
 
-def held(state: PairState) -> PairState:
+def held(state: PairState, hold: Hold) -> PairState:
     """A person freezes the extrinsic: estimates go on, nothing is applied."""
-    return replace(state, frozen=True)
+    return replace(state, hold=hold)
 
 
 def released(state: PairState) -> PairState:
     """The extrinsic may move again; what waits goes on waiting for `apply` or for the next window."""
-    return replace(state, frozen=False)
+    return replace(state, hold=None)
 
 
 def after_commissioning(state: PairState, T_commissioned: Matrix4) -> PairState:
@@ -529,7 +539,7 @@ def _replaced(state: PairState, pose: Matrix4, text: str) -> PairState:
 
 
 def _refuse_if_held(state: PairState) -> None:
-    if state.frozen:
+    if state.hold is not None:
         raise CommandRefusedError("held", 'The extrinsic is held: release it first with `hold` and {"release": true}.')
 
 

@@ -19,6 +19,7 @@ class Options:
     out: Annotated[
         Path,
         typer.Argument(
+            metavar="OUT",
             help="OUT.mcap: one ROS 2 MCAP of all frames. OUT.yaml: a daemon configuration for this recording.",
             show_default=False,
         ),

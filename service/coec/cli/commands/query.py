@@ -78,6 +78,14 @@ class Options:
         typer.Option(help="Of command/rollback: window or sha256 of `query history` to serve again.", metavar="HASH"),
     ] = None
     release: Annotated[bool, typer.Option("--release", help="Of command/hold: let go of what is held.")] = False
+    reason: Annotated[
+        str | None,
+        typer.Option(
+            help="Of any command: why, for whoever asks later; stands in `query history`, of a hold in extrinsic and "
+            "health, too.",
+            metavar="TEXT",
+        ),
+    ] = None
     sensor: Annotated[
         str | None,
         typer.Option(help="Of any command: for all pairs of this sensor of the rig.", metavar="NAME"),

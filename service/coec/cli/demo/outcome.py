@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from coec.cli.demo.watch import Moment
-
-ALARM = "miscalibrated"
+from coec.cli.demo.watch import ALARM, Moment
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +13,7 @@ class Ending:
     """What became of the drive; seconds of driving, None for what did not happen.
 
     Attributes:
-        false_alarm_s: the first alarm before the knock.
+        false_alarm_s: the first alarm before the knock, at an extrinsic that was right.
         alarm_s: the first alarm after it.
         repaired_s: when the service had, after the alarm, an estimate of its own within the limit, and was healthy.
         error_before_deg: error of what was served after the knock, before the repair: the largest.
@@ -57,7 +55,8 @@ def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float)
         knock_s: second of the drive at which the mount was bent.
         max_error_deg: an estimate must be nearer to the truth to count as a repair, also at the end.
     """
-    early = next((moment.drive_s for moment in timeline if moment.health == ALARM and moment.drive_s < knock_s), None)
+    # The workshop's calibration, which is served first, is wrong: who accuses it is right.
+    false = (m for m in timeline if m.health == ALARM and m.drive_s < knock_s and m.error_deg < max_error_deg)
     late = [moment for moment in timeline if moment.drive_s >= knock_s]
     alarm_s = next((moment.drive_s for moment in late if moment.health == ALARM), None)
     last = timeline[-1]
@@ -68,7 +67,7 @@ def outcome_of(timeline: Sequence[Moment], knock_s: float, max_error_deg: float)
     )
     return Ending(
         knock_s=knock_s,
-        false_alarm_s=early,
+        false_alarm_s=next((moment.drive_s for moment in false), None),
         alarm_s=alarm_s,
         repaired_s=next(repaired, None) if last.error_deg < max_error_deg else None,
         error_before_deg=max((moment.error_deg for moment in late), default=last.error_deg),

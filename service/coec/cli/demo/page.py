@@ -26,7 +26,7 @@ from coec.reports.page import (
     Text,
     Verdict,
 )
-from coec.reports.page_parts import TONES, copies_of, figures_block, file_picture
+from coec.reports.page_parts import TONES, copies_of, figures_block
 from coec.reports.provenance import Made
 from coec.schemas import replies
 
@@ -47,7 +47,8 @@ def demo_page(
     summary: Sequence[tuple[str, str]],
     outcome: Ending,
     result: replies.CalibrationResult | None,
-    files: Sequence[Path],
+    compared: Compare | None,
+    window: Path | None,
     made: Made,
 ) -> Page:
     """The page.
@@ -57,20 +58,15 @@ def demo_page(
         happened: what was different from before, and a remark, which may be empty.
         summary: names and values.
         result: of the window that repaired the mount; None: there is none.
-        files: that the demonstration has written.
-
-    Raises:
-        OutputError: a picture cannot be read any more.
+        compared: points on the image before and after the repair; None: they were not drawn.
+        window: the recorded one that repaired the mount; None: there is none.
     """
-    by_name = {path.stem: path for path in files if path.suffix == ".png"}
     sections = [Section("Error and health over the drive", (Charts((_curve(series, outcome),)),))]
-    if "closeup_before" in by_name and "closeup_after" in by_name:
-        before, after = (file_picture(by_name[f"closeup_{name}"]) for name in ("before", "after"))
-        pictures = Compare(before, after, "Before and after the repair")
-        sections.append(Section("Points on the image", (pictures,)))
+    if compared is not None:
+        sections.append(Section("Points on the image", (compared,)))
     sections.append(Section("What the service said", (_said(happened),)))
     if result is not None:
-        sections.append(Section("The window that repaired it", _repair(result, files)))
+        sections.append(Section("The window that repaired it", _repair(result, window)))
     verdict = (
         Verdict("good", "Repaired.", "The knock was noticed and repaired.")
         if outcome.passed
@@ -128,12 +124,11 @@ def _said(happened: Sequence[tuple[Moment, str]]) -> Table:
     return Table("Every moment at which it said something new", heads, rows, frozenset({0, 1, 4}))
 
 
-def _repair(result: replies.CalibrationResult, files: Sequence[Path]) -> tuple[Block, ...]:
+def _repair(result: replies.CalibrationResult, window: Path | None) -> tuple[Block, ...]:
     told = (
         f"{result.pairs} pairs, verdict {result.verdict.decision}, configuration {result.config_hash}. The figures are "
         "of its self-diagnosis, without the truth; a result is accepted if it keeps all limits."
     )
-    window = next((path for path in files if path.suffix == ".mcap"), None)
     left = () if window is None else (_window(window),)
     copies = copies_of(result.camera_from_lidar, result.camera_frame, result.lidar_frame)
     return Text((told,)), figures_block("Figures of self-diagnosis", result.metrics), copies, *left

@@ -10,18 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.adapters.files.output import write as write_file
-from coec.adapters.images.codec import decode_bgr, encode_png
+from coec.adapters.images.codec import decode_bgr
 from coec.adapters.mcap.windows import read_result, read_window
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Matrix4, Window
 from coec.cli.demo import story
-from coec.cli.demo.outcome import ALARM, Ending, is_repaired
+from coec.cli.demo.outcome import Ending, is_repaired
 from coec.cli.demo.page import demo_page
-from coec.cli.demo.watch import Moment, Seen, Watch
+from coec.cli.demo.watch import ALARM, Moment, Seen, Watch
 from coec.config import LimitsConfig
 from coec.geometry import cameras
 from coec.reports import console, page, pictures, provenance
 from coec.reports.overlay import draw
+from coec.reports.page import Compare
 from coec.reports.timeline_plot import timeline
 from coec.schemas import replies
 from coec.schemas.base import to_json
@@ -49,15 +50,16 @@ def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen
     written = [] if window is None else [window]
     plot = write_file(output / "timeline.png", timeline(watch.series, _marks(outcome), story.MAX_ERROR_DEG, _title()))
     written.append(plot)
-    result = None
+    result, compared = None, None
     if window is not None:
         result = read_result(window)
-        written += _overlays(output, window, blamed, watch, seen)
+        overlays, compared = _overlays(output, window, blamed, watch, seen)
+        written += overlays
     if result is not None:
         written.append(write_file(output / "result.json", to_json(result)))
     happened = list(zip(watch.timeline, _happenings(watch.timeline, outcome), strict=True))
     summary = _summary(outcome, watch.timeline)
-    told = demo_page(_title(), watch.series, happened, summary, outcome, result, written, provenance.here())
+    told = demo_page(_title(), watch.series, happened, summary, outcome, result, compared, window, provenance.here())
     written.append(page.write(output / "report.html", told))
     return Left(tuple(written), result)
 
@@ -84,26 +86,30 @@ def show(moments: Sequence[Moment], outcome: Ending, left: Left) -> None:
         console.out.print(console.styled("accepted"), ": the knock was noticed and repaired by the service", sep="")
 
 
-def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: Seen) -> list[Path]:
-    """Overlays and close-ups."""
+def _overlays(output: Path, path: Path, blamed: Matrix4, watch: Watch, seen: Seen) -> tuple[list[Path], Compare]:
+    """Overlays and close-ups, and the latter in one place."""
     window, configuration = read_window(path)
     truth = watch.truth(seen.moment.drive_s)
     before_deg = windows.rotation_error_deg(blamed, truth)
-    poses = {
-        "overlay_before": (blamed, f"after the knock: {before_deg:.2f} deg from the truth"),
-        "overlay_after": (seen.T_camera_lidar, f"after the repair: {seen.moment.error_deg:.2f} deg from the truth"),
-    }
-    whole = pictures.write_overlays(output, window, poses, configuration.motion_compensation)
-    cloud = compensate(pictures.middle(window), window.rig, enabled=configuration.motion_compensation)
-    near = [
-        write_file(output / f"closeup_{name}.png", _close_up(window, cloud, *poses[f"overlay_{name}"]))
-        for name in ("before", "after")
+    poses = (blamed, seen.T_camera_lidar)
+    titles = (
+        f"After the knock: what was served is {before_deg:.2f}° from the truth",
+        f"After the repair: what is served is {seen.moment.error_deg:.2f}° from the truth",
+    )
+    compensated = configuration.motion_compensation
+    cloud = compensate(pictures.middle(window), window.rig, enabled=compensated)
+    before, after = (_close_up(window, cloud, T_camera_lidar) for T_camera_lidar in poses)
+    drawn = {"overlay": pictures.overlays(window, poses, compensated), "closeup": [before, after]}
+    written = [
+        pictures.write_overlay(output, f"{kind}_{side}", picture, title)
+        for kind, both in drawn.items()
+        for side, picture, title in zip(("before", "after"), both, titles, strict=True)
     ]
-    return [*whole, *near]
+    return written, pictures.slid_pictures((before, after), (f"{titles[0]}.", f"{titles[1]}."))
 
 
-def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matrix4, title: str) -> bytes:
-    """PNG of the part of the picture in which the street is, with the points (N, 3) of the sweep."""
+def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matrix4) -> NDArray[np.uint8]:
+    """(height, width, 3) BGR: the part of the picture in which the street is, with the points (N, 3) of the sweep."""
     pair, rig = pictures.middle(window), window.rig
     left, top, width, height = story.CLOSE_UP_PX
     part = slice(top, top + height), slice(left, left + width)
@@ -112,7 +118,7 @@ def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matri
     camera = cameras.build(cameras.name_of(rig.camera), **{**intrinsics, **moved})
     image = np.ascontiguousarray(decode_bgr(pair.camera.image, LimitsConfig())[part])
     mask = None if rig.mask is None else np.ascontiguousarray(rig.mask[part])
-    return encode_png(draw(image, camera, T_camera_lidar, xyz_m, mask, title))
+    return draw(image, camera, T_camera_lidar, xyz_m, mask)
 
 
 def _title() -> str:

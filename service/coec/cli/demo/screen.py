@@ -115,7 +115,7 @@ def curve(series: Sequence[tuple[float, float, str]], width: int = CURVE_WIDTH) 
 
 def _before(t_s: float) -> Text:
     """While the worker starts: the drive waits for it."""
-    return Text(f"waits: kernels are being compiled, once on this machine, {t_s:.0f} s")
+    return Text(f"waits: kernels compile, once, for about a minute; {t_s:.0f} s so far")
 
 
 def _drive(second: float) -> Text:

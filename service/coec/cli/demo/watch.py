@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 import zenoh
@@ -18,6 +19,8 @@ from coec.schemas import replies
 from coec.schemas.base import from_json
 from coec.schemas.keys import Keys
 from coec.sources import windows
+
+ALARM: Final = "miscalibrated"
 
 ASK_S = 10.0
 """For one answer, on a machine that also draws the street."""
@@ -70,6 +73,7 @@ class Watch:
         pace: how far the drive may go on.
         series: everything seen: (second of the drive, error in degrees, health).
         timeline: the moments at which something was different from before.
+        alarms: how many the service has raised that are in the timeline.
         latest: None before the first answer.
     """
 
@@ -83,6 +87,7 @@ class Watch:
     started_s: float
     series: list[tuple[float, float, str]] = field(default_factory=list)
     timeline: list[Moment] = field(default_factory=list)
+    alarms: int = 0
     latest: Seen | None = None
 
     def may_pass(self, stamp_ns: int) -> bool:
@@ -100,6 +105,7 @@ class Watch:
         self.latest = seen
         rests = at_rest(seen.status.worker, seen.pair, sent)
         self.pace.saw(seen.health.evaluated_ns, at_rest=rests, stamp_ns=self.first_ns + round(drive_s * NS_PER_S))
+        self._catch_up(seen)
         self.series.append((drive_s, seen.moment.error_deg, seen.moment.health))
         if not self.timeline or _essence(seen.moment) != _essence(self.timeline[-1]):
             self.timeline.append(seen.moment)
@@ -108,6 +114,23 @@ class Watch:
     def events(self) -> tuple[replies.EvidenceEvent, ...]:
         """Red events that the service has kept."""
         return from_json(replies.EvidenceReply, self._ask(self.keys.evidence(self.pair))).events
+
+    def _catch_up(self, seen: Seen) -> None:
+        """On a busy machine an alarm may come and go between two looks: the service tells of it afterwards."""
+        told = seen.health.alarms
+        raised = 0 if told is None else told.confirmed + told.withdrawn + told.open
+        if raised <= self.alarms:
+            return
+        if seen.health.state == ALARM:
+            self.alarms = raised
+            return
+        events = self.events()
+        for event in events[self.alarms :]:
+            second = (event.stamp_ns - self.first_ns) / NS_PER_S
+            self.timeline = with_alarm(self.timeline, second)
+            served = next((error for at, error, _ in reversed(self.series) if at <= second), seen.moment.error_deg)
+            self.series = sorted([*self.series, (second, served, ALARM)], key=lambda point: point[0])
+        self.alarms = max(self.alarms, len(events))
 
     def _ask_all(self, drive_s: float) -> Seen:
         status = from_json(replies.StatusReply, self._ask(self.keys.status))
@@ -131,6 +154,13 @@ class Watch:
 
     def _ask(self, key: str) -> bytes:
         return ask_one(self.session, f"{key}?format=json", ASK_S).payload
+
+
+def with_alarm(timeline: Sequence[Moment], drive_s: float) -> list[Moment]:
+    """A timeline with an alarm that nobody saw, at a second of the drive: what was served is what was served before."""
+    before = [moment for moment in timeline if moment.drive_s <= drive_s]
+    alarm = [replace(moment, drive_s=round(drive_s, 2), health=ALARM) for moment in before[-1:]]
+    return [*before, *alarm, *timeline[len(before) :]]
 
 
 def _degrees(T_one: Matrix4, T_other: Matrix4) -> tuple[float, float, float]:

@@ -38,6 +38,8 @@ Every command is acknowledged: carried out, or refused and why. A payload is a m
 `sensor` names; `to` is not for a rig, as other pairs have other windows. `coec query command/NAME --payload JSON`
 gives one, with `--zenoh FILE` and a proof of who gives it ([security](security.md#commands)).
 
+All take {common}.
+
 {commands}
 ## Error codes
 
@@ -131,8 +133,9 @@ def keys_page() -> str:
         written=WRITTEN,
         keys=table(("key", "kind", "answer"), rows),
         parameters=table(("of", "parameters"), parameters),
+        common="; and ".join(map(_argument, (commands.REASON, commands.SENSOR))),
         commands=table(
-            ("command", "payload", "what it does"),
+            ("command", "also takes", "what it does"),
             [(code(name), _arguments(name), COMMANDS[name]) for name in commands.NAMES],
         ),
         max_payload=payloads.MAX_PAYLOAD,
@@ -189,8 +192,12 @@ def _type(body: dict[str, Any], shapes: Mapping[str, dict[str, Any]]) -> str:
 
 
 def _arguments(command: str) -> str:
-    given = dict.fromkeys((*commands.arguments_of(command, for_rig=False), commands.SENSOR))
-    return "; ".join(f"`{one.name}`: {KINDS[one.kind]}, {one.meaning}" for one in given)
+    """What this command takes beside what all take."""
+    return "; ".join(map(_argument, commands.OF_PAIR.get(command, ()))) or "–"
+
+
+def _argument(one: commands.Argument) -> str:
+    return f"`{one.name}`: {KINDS[one.kind]}, {one.meaning}"
 
 
 def _grammar(parser: Callable[..., Any]) -> str:

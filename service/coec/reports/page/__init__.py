@@ -1,8 +1,9 @@
 """Every page that coec leaves, made of one small vocabulary of blocks: a command says what it has to tell as a `Page`,
 `write` makes one HTML file of it that needs no other.
 
-`blocks` is the vocabulary, `charts` and `ticks` draw plots as SVG, `embedding` fits pictures into the page, `rendering`
-puts all of it through the templates beside it. What is told stands with who tells it: `calibration_page` and the like.
+`blocks` is the vocabulary, `charts`, `ticks` and `discs` draw plots as SVG, `embedding` fits pictures into the page,
+`rendering` puts all of it through the templates beside it. What is told stands with who tells it: `calibration_page`
+and the like.
 """
 
 from coec.reports.page.blocks import (
@@ -14,6 +15,7 @@ from coec.reports.page.blocks import (
     Compare,
     Copies,
     Copy,
+    Discs,
     Facts,
     FigureLine,
     Figures,
@@ -28,6 +30,7 @@ from coec.reports.page.blocks import (
     Verdict,
 )
 from coec.reports.page.charts import Chart, Ground, Limit, Mark, Series
+from coec.reports.page.discs import Disc, Dot, DotKind, Ring
 from coec.reports.page.rendering import render, write
 
 __all__ = [
@@ -40,6 +43,10 @@ __all__ = [
     "Compare",
     "Copies",
     "Copy",
+    "Disc",
+    "Discs",
+    "Dot",
+    "DotKind",
     "Facts",
     "FigureLine",
     "Figures",
@@ -49,6 +56,7 @@ __all__ = [
     "Page",
     "Picture",
     "Pictures",
+    "Ring",
     "Section",
     "Series",
     "Table",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from coec.reports.page.charts import Chart
+from coec.reports.page.discs import Disc, DotKind
 
 Tone = Literal["good", "unsure", "poor", "bad", "none"]
 """How something is meant, from what may be used to what must not; `none` says neither. It is a colour beside a word,
@@ -142,6 +143,15 @@ class Charts:
 
 
 @dataclass(frozen=True, slots=True)
+class Discs:
+    """Discs beside each other where there is room; `legend` says of each kind of dot what it stands for."""
+
+    template: ClassVar = "discs"
+    items: tuple[Disc, ...]
+    legend: tuple[tuple[DotKind, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class FigureLine:
     """A figure against its limit.
 
@@ -220,7 +230,7 @@ class Facts:
     codes: frozenset[str] = frozenset()
 
 
-Block = Text | Verdict | AxesTable | Copies | Pictures | Compare | Charts | Figures | Table | Facts
+Block = Text | Verdict | AxesTable | Copies | Pictures | Compare | Charts | Discs | Figures | Table | Facts
 """`template` of each names its file in `templates/blocks`."""
 
 

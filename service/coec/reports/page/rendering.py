@@ -19,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from coec.adapters.files import output
-from coec.reports.page import charts
+from coec.reports.page import charts, discs
 from coec.reports.page.blocks import Compare, Page, Picture, Pictures, Section, Trend
 from coec.reports.page.embedding import Embedded, embedded
 
@@ -107,6 +107,7 @@ def _environment() -> Environment:
     )
     made.globals.update(
         drawn=charts.drawn, legend=charts.legend, WIDE=charts.WIDE, NARROW=charts.NARROW, SMALL=charts.SMALL,
+        disc_place=discs.place, DISC_SIDE=discs.SIDE, DISC_RADIUS=discs.RADIUS,
         trend_paths=_trend_paths, TREND_WIDTH=TREND_WIDTH, TREND_HEIGHT=TREND_HEIGHT,
     )  # fmt: skip
     made.filters["prose"] = _prose

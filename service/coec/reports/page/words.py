@@ -1,12 +1,9 @@
-"""Numbers and times as a page writes them: true minus signs, no more digits than can be read, UTC."""
+"""Numbers as a page writes them: true minus signs, no more digits than can be read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from math import floor, isfinite, log10
-
-NS_PER_S = 1_000_000_000
 
 NONE = "–"
 """Stands where there is no number."""
@@ -44,19 +41,6 @@ def count(value: int, one: str, several: str | None = None) -> str:
 def percent(share: float | None, digits: int = 1) -> str:
     """A share of 1."""
     return NONE if share is None or not isfinite(share) else f"{100.0 * share:.{digits}f}\N{NARROW NO-BREAK SPACE}%"
-
-
-def instant(stamp_ns: int) -> str:
-    """UTC, to the second; a number that is no time stays a number."""
-    try:
-        return f"{datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S}Z"
-    except (ValueError, OverflowError, OSError):
-        return f"{stamp_ns} ns"
-
-
-def day(stamp_ns: int) -> str:
-    """UTC, to the day."""
-    return instant(stamp_ns).partition(" ")[0]
 
 
 def size(vector: Sequence[float | None]) -> float | None:

@@ -28,7 +28,7 @@ from coec.runtime.ingest.chooser import Chooser
 from coec.runtime.ingest.pair_stream import PairStream
 from coec.runtime.recording.recorder import Recorder
 from coec.runtime.recording.window_store import WindowStore
-from coec.schemas.commands import NAMES
+from coec.schemas.commands import NAMES, REASON
 from coec.schemas.replies import Acknowledgement
 
 _log = logging.getLogger(__name__)
@@ -94,12 +94,13 @@ class Commands:
     ) -> Acknowledgement:
         """Carry out a command of `payloads.NAMES`, or say why not. What is not begun by the deadline (steady clock), at
         which its sender gives up, is not done."""
+        reason = arguments.get(REASON.name) or None
         decided: dict[str, Callable[[], Acknowledgement]] = {
             "apply": self._apply,
             "rollback": partial(self._roll_back, arguments.get("to")),
             "reset": self._reset,
             "commission": self._commission,
-            "hold": partial(self._hold, release=bool(arguments.get("release", False))),
+            "hold": partial(self._hold, sender, reason, release=bool(arguments.get("release", False))),
         }
         begun = threading.Event()
 
@@ -116,9 +117,11 @@ class Commands:
                 text = f"You give commands faster than {PER_S:g} per second; nothing was done. Wait {wait_s:.1f} s."
                 acknowledged = self._acknowledge(name, "too_many", text, accepted=False)
             elif name == "calibrate":
-                acknowledged = self._noted(self._stream.ask(partial(in_time, self._calibrate), within_s), sender)
+                acknowledged = self._noted(
+                    self._stream.ask(partial(in_time, self._calibrate), within_s), sender, reason
+                )
             else:
-                decide = partial(self._decide, name, decided[name], sender)
+                decide = partial(self._decide, name, decided[name], sender, reason)
                 acknowledged = self._with_durability(self._mailbox.ask(partial(in_time, decide), within_s))
         except BusyError as error:
             late = time.monotonic() >= deadline_s and not begun.is_set()
@@ -141,12 +144,12 @@ class Commands:
             fields = {"pair": self._pair.name, "command": known, "sender": sender, "code": why.reply_code}
             _log.warning(f"a command was not allowed: {why}", extra={"fields": {**fields, "count": count}})
 
-    def _noted(self, done: Acknowledgement, sender: str) -> Acknowledgement:
+    def _noted(self, done: Acknowledgement, sender: str, reason: str | None) -> Acknowledgement:
         """What is done has to be written down, and is, whether that can be waited for or not."""
         noted = threading.Event()
 
         def note() -> None:
-            self._write_down(done, sender)
+            self._write_down(done, sender, reason)
             noted.set()
 
         self._mailbox.post(note)
@@ -159,20 +162,22 @@ class Commands:
 
     # --- on the thread that decides ---------------------------------------------------------------------------------
 
-    def _decide(self, name: str, command: Callable[[], Acknowledgement], sender: str) -> Acknowledgement:
+    def _decide(
+        self, name: str, command: Callable[[], Acknowledgement], sender: str, reason: str | None
+    ) -> Acknowledgement:
         try:
             acknowledged = command()
         except lifecycle.CommandRefusedError as error:
             acknowledged = self._acknowledge(name, error.code, str(error), accepted=False)
         except NotFoundError as error:
             acknowledged = self._acknowledge(name, error.reply_code, str(error), accepted=False)
-        self._write_down(acknowledged, sender)
+        self._write_down(acknowledged, sender, reason)
         return acknowledged
 
-    def _write_down(self, done: Acknowledgement, sender: str) -> None:
-        fields = {"pair": self._pair.name, "command": done.command, "sender": sender}
+    def _write_down(self, done: Acknowledgement, sender: str, reason: str | None) -> None:
+        fields = {"pair": self._pair.name, "command": done.command, "sender": sender, "reason": reason}
         _log.info("a command came", extra={"fields": {**fields, "accepted": done.accepted, "code": done.code}})
-        self._store.note_command(done.command, done.code, done.text, sender, accepted=done.accepted)
+        self._store.note_command(done.command, done.code, done.text, sender, accepted=done.accepted, reason=reason)
         self._store.save()
         self._decider.tell_now()
 
@@ -195,10 +200,12 @@ class Commands:
         text = "The workshop calibration is served; the next accepted window may move it: see `hold`."
         return self._replaced("reset", "reset", text)
 
-    def _hold(self, *, release: bool) -> Acknowledgement:
-        self._store.update(lifecycle.released if release else lifecycle.held, None, completed=False)
+    def _hold(self, sender: str, reason: str | None, *, release: bool) -> Acknowledgement:
         if release:
+            self._store.update(lifecycle.released, None, completed=False)
             return self._acknowledge("hold", "released", "Accepted estimates may be applied again.")
+        hold = lifecycle.Hold(time.time_ns(), sender, reason or "")
+        self._store.update(partial(lifecycle.held, hold=hold), None, completed=False)
         return self._acknowledge("hold", "held", "The extrinsic stays as it is until it is released.")
 
     def _replaced(self, name: str, code: str, text: str, window_id: str | None = None) -> Acknowledgement:

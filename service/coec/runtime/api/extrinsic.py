@@ -73,8 +73,17 @@ def extrinsic_of(
         window_id=accepted.window_id if accepted else None,
         config_hash=accepted.config_hash if accepted else config_hash,
         pending=candidate_of(state) if state.pending else None,
-        held=state.frozen,
+        held=state.hold is not None,
+        hold=hold_of(state),
     )
+
+
+def hold_of(state: PairState) -> replies.Hold | None:
+    """Who holds what is served; None while nobody does."""
+    hold = state.hold
+    if hold is None:
+        return None
+    return replies.Hold(since_ns=hold.since_ns, sender=hold.sender, reason=hold.reason or None)
 
 
 def candidate_of(state: PairState) -> replies.Candidate | None:

@@ -9,7 +9,7 @@ from typing import Any, Final
 import msgpack
 
 from coec.errors import UsageError
-from coec.schemas.commands import NAMES, arguments_of
+from coec.schemas.commands import MAX_REASON, NAMES, REASON, arguments_of
 
 MAX_SENDER: Final = 96
 """Characters of a sender in log and history."""
@@ -42,6 +42,8 @@ def parse(name: str, payload: bytes, *, for_rig: bool = False) -> dict[str, Any]
             raise UsageError(f"`{name}` takes {takes}")
         if not isinstance(value, known[key]):
             raise UsageError(f"argument `{key}` of `{name}` must be of type {known[key].__name__}")
+    if REASON.name in document:
+        document[REASON.name] = _one_line(document[REASON.name])
     return document
 
 
@@ -62,6 +64,18 @@ def proven_sender(name: str) -> str:
     return f"{sender_of(name.encode('ascii', errors='replace'))} (certificate)"
 
 
+def _one_line(reason: str) -> str:
+    """Words of a person in one line that steers no terminal.
+
+    Raises:
+        UsageError: there are too many of them.
+    """
+    line = " ".join("".join(letter if letter.isprintable() else " " for letter in reason).split())
+    if len(line) > MAX_REASON:
+        raise UsageError(f"argument `reason` has {len(line)} characters: give {MAX_REASON} at most")
+    return line
+
+
 def _document(payload: bytes) -> dict[str, Any]:
     if not payload:
         return {}
@@ -69,7 +83,9 @@ def _document(payload: bytes) -> dict[str, Any]:
         raise UsageError(f"the payload has more than {MAX_PAYLOAD} bytes")
     try:
         document = (
-            json.loads(payload) if payload[:1] == b"{" else msgpack.unpackb(payload, max_map_len=8, max_str_len=256)
+            json.loads(payload)
+            if payload[:1] == b"{"
+            else msgpack.unpackb(payload, max_map_len=8, max_str_len=MAX_PAYLOAD)
         )
     except (ValueError, RecursionError, msgpack.UnpackException) as error:
         raise UsageError("the payload is neither a map in msgpack nor in JSON") from error

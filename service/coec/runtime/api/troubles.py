@@ -205,7 +205,7 @@ TROUBLES: Mapping[str, Trouble] = {
         "Where the new one is right: stop the service, remove `nominal.json` from `state.directory`, start it.",
     ),
     "held": Trouble(
-        "A person holds the extrinsic as it is; nothing ails the service.",
+        "A person holds the extrinsic as it is; its text says who, since when and why. Nothing ails the service.",
         "`coec query command/hold --release` releases it.",
     ),
 }

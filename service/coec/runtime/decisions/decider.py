@@ -25,6 +25,7 @@ from coec.calibration.frames.window import KeptPairs
 from coec.calibration.lifecycle import HealthState, PairState, Rules
 from coec.calibration.types import Decision, Matrix4, Reason
 from coec.config import CalibrationConfig, PairConfig
+from coec.reports.holds import hold_text
 from coec.runtime.decisions.incident_pictures import IncidentPictures
 from coec.runtime.decisions.mailbox import Mailbox
 from coec.runtime.decisions.pair_store import PairStore, Taken
@@ -507,7 +508,11 @@ class Decider:
             self._overdue,
         )
         said = {reason.code for reason in self._store.state.reasons}
-        held = Reason(HELD, "The extrinsic is held by command.") if self._store.state.frozen else None
+        hold = self._store.state.hold
+        held = None
+        if hold is not None:
+            told = hold_text(hold.sender, hold.since_ns, hold.reason)
+            held = Reason(HELD, f"The extrinsic is {told}.")
         return tuple(reason for reason in (*own, held) if reason is not None and reason.code not in said)
 
 

@@ -219,15 +219,18 @@ class PairStore:
             return Books(self.history.on_disk(), self._checks.on_disk(), self.incidents.on_disk())
         return Books(self.history.entries(), self._checks.checks(), self.incidents.events())
 
-    def note_command(self, name: str, code: str, text: str, sender: str, *, accepted: bool) -> None:
-        """A command was carried out or refused. Of equal refusals in a row only the first is written down."""
+    def note_command(
+        self, name: str, code: str, text: str, sender: str, *, accepted: bool, reason: str | None = None
+    ) -> None:
+        """A command was carried out or refused, for which its sender gave a reason, or none. Of equal refusals in a row
+        only the first is written down."""
         last = next(reversed(self.history.entries()), None)
         told = f"{name}: {text}"
         if not accepted and last is not None:
             entry = last.entry
             if (entry.kind, entry.code, entry.text) == ("command", code, told):
                 return
-        self.history.append(_entry("command", code, told).model_copy(update={"sender": sender}))
+        self.history.append(_entry("command", code, told).model_copy(update={"sender": sender, "reason": reason}))
 
     def note_commissioned(self, text: str, window_ids: tuple[str, ...]) -> None:
         """The rig has a baseline, learned from these windows."""

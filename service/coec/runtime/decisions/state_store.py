@@ -23,6 +23,7 @@ from coec.calibration.lifecycle import (
     Change,
     Health,
     HealthState,
+    Hold,
     PairState,
     Provenance,
     Status,
@@ -67,6 +68,14 @@ class StoredHealth(Part):
     reasons: tuple[replies.Reason, ...]
 
 
+class StoredHold(Part):
+    """`Hold` on the disk."""
+
+    since_ns: WallNs | None = None
+    sender: str = ""
+    reason: str = ""
+
+
 class StoredChange(Part):
     """`Change` on the disk."""
 
@@ -102,6 +111,7 @@ class StoredPair(Part):
     unseen_from: StoredHealth | None = None
     pending: StoredCandidate | None = None
     frozen: bool = False
+    hold: StoredHold | None = None
     proven: bool = False
     track: dict[str, Any] | None = None
     monitor: MonitorState = MonitorState()
@@ -204,7 +214,8 @@ class StateStore:
             if state.unseen_from is None
             else StoredHealth(state=state.unseen_from.state.value, reasons=_told(state.unseen_from.reasons)),
             pending=self._candidate(state.pending, rig) if state.pending else None,
-            frozen=state.frozen,
+            frozen=state.hold is not None,
+            hold=None if state.hold is None else StoredHold(**asdict(state.hold)),
             proven=state.proven,
             track=track_to_dict(state.track) if state.track else None,
             monitor=state.monitor,
@@ -311,6 +322,13 @@ def _track(stored: dict[str, Any]) -> Track:
     return track
 
 
+def _hold(stored: StoredPair) -> Hold | None:
+    """A file of an earlier version does not say who holds it."""
+    if not stored.frozen:
+        return None
+    return Hold() if stored.hold is None else Hold(**stored.hold.model_dump())
+
+
 def _state_of(stored: StoredPair) -> PairState:
     pending = stored.pending
     return PairState(
@@ -334,7 +352,7 @@ def _state_of(stored: StoredPair) -> PairState:
             Reason(pending.waits.code, pending.waits.text),
             pending.contradicts,
         ),
-        frozen=stored.frozen,
+        hold=_hold(stored),
         proven=stored.proven,
         track=_track(stored.track) if stored.track else None,
         monitor=stored.monitor,

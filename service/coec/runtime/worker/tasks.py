@@ -46,7 +46,7 @@ from coec.geometry.edges.alignment import EdgeFrames, alignment_of_parts
 from coec.geometry.projection import project
 from coec.geometry.vectors import lengths
 from coec.reports.instants import instant
-from coec.reports.overlay import draw
+from coec.reports.overlay import draw, titled
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Registered, Solved, WrittenFile
 from coec.runtime.worker.messages import unpack_lidars, unpack_pairs, unpack_sweeps
 
@@ -286,8 +286,8 @@ class Solver:
         image = decode_bgr(pair.camera.image, self._config.limits)
         T_camera_lidar = np.array(pose, dtype=np.float64)
         told = f"{title}\n{instant(pair.camera.stamp_ns)}"
-        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, told, scale)
-        return Drawn(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
+        picture = draw(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, scale)
+        return Drawn(encode_jpeg(titled(picture, told), OVERLAY_JPEG_QUALITY))
 
     def _scale(self, pair: str, sweep: LidarFrame) -> RangeScale:
         """Of the colours of a stream, which do not change from picture to picture."""

@@ -138,7 +138,8 @@ def _attachment(path: Path, name: str) -> bytes | None:
 
 
 def _damage(path: Path, error: McapDamaged) -> str:
-    return f"{error.of(path)}; the daemon does so for its own at start"
+    told = error.of(path)
+    return f"{told}; the daemon does so for its own at start" if error.is_mcap else told
 
 
 def _size(path: Path) -> int:

@@ -24,7 +24,7 @@ def run(output: Path, *, as_json: bool) -> int:
         OutputError: a file cannot be written.
     """
     started_s = time.monotonic()
-    console.say("demo: the street is built; on the first run of a machine kernels are compiled, for a minute")
+    console.say("demo: the street is built; on the first run of a machine kernels are compiled, for about a minute")
     acts: list[report.Performance] = []
     with driving() as vehicle, console.progress() as bars:
         task = bars.add_task("instants of the drives", total=len(story.ACTS) * len(vehicle.plan), note="")

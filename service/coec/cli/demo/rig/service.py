@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from coec.simulation.rig_drive import RigDrive
 
 START_S = 600.0
-"""To come up. The first run on a machine compiles the kernels, for one minute of quiet cores and many of busy ones; a
-service that ends meanwhile is noticed at once."""
+"""To come up. The first run on a machine compiles the kernels, for about a minute of two quiet cores and many of busy
+ones; a service that ends meanwhile is noticed at once."""
 
 ASK_S = 10.0
 """For one answer, on a machine that also draws the street."""
