@@ -220,9 +220,19 @@ def _look(edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool, suspe
     )
 
 
-def windows(rig: DrawnRig, poses: Poses, rng: np.random.Generator, off_by_rad: float = 0.0) -> dict[str, Measurement]:
+Lenses = Mapping[str, Array]
+"""(2,) by how many standard deviations the lens of each camera is displaced, down and across, by name."""
+
+
+def lenses(rig: DrawnRig, rng: np.random.Generator) -> Lenses:
+    """Of a rig: all windows of a camera share what its lens does."""
+    return {name: rng.normal(size=2) for name in rig.poses}
+
+
+def windows(
+    rig: DrawnRig, poses: Poses, lens: Lenses, rng: np.random.Generator, off_by_rad: float = 0.0
+) -> dict[str, Measurement]:
     """One window of each edge. One of them lies beside by an angle, if that is not zero: the first."""
-    lens = {name: rng.normal(size=2) for name in poses}
     found = {}
     for number, edge in enumerate(rig.graph.edges):
         sigma = WINDOW * np.exp(0.3 * rng.normal(size=6))

@@ -12,7 +12,8 @@ import numpy as np
 from coec.calibration.rig.attribution import RigState, SensorHealth, after_look, begun, sensors, served
 from coec.calibration.rig.evidence import Look
 from coec.calibration.rig.joint import estimate
-from coec.evaluation.rig_evidence import BUILT, FOUR, FULL, SINGLE, Bend, DrawnRig, checks, moved, off, windows
+from coec.evaluation.rig_evidence import BUILT, FOUR, FULL, SINGLE, Bend, DrawnRig, checks, lenses, moved, off, windows
+from coec.evaluation.rig_knocks import knocked_row
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 from coec.schemas.replies import Vector6
@@ -73,6 +74,7 @@ def report(drives: int, rigs: int, heard: Callable[[str], None]) -> RigMovesRepo
         allowed_s=ALLOWED_S,
         moves=tuple(_row(rig, fault, drives, heard) for rig, fault in FAULTS),
         joint=tuple(joint_row(rig, rigs) for rig in (FOUR, FULL)),
+        knocked=tuple(knocked_row(rig, rigs) for rig in (FOUR, FULL)),
     )
 
 
@@ -111,7 +113,7 @@ def drive(rig: DrawnRig, fault: Fault, number: int) -> Drive:
     delay_s: float | None = None if who else 0.0
     wrong = False
     state = begun(rig.graph)
-    for name, window in windows(rig, before, rng).items():
+    for name, window in windows(rig, before, lenses(rig, rng), rng).items():
         state = served(state, name, window.T_camera_lidar, window.uncertainty.sigma)
     for at, named in _named(rig, state, checks(rig, before, after, bend, at_s, at_s + ALLOWED_S, rng)):
         wrong = wrong or not named <= (who if at >= at_s else set())
@@ -136,7 +138,7 @@ def joint_row(rig: DrawnRig, rigs: int) -> JointRow:
     for number in range(rigs):
         rng = np.random.default_rng([SEED, number, *rig.name.encode()])
         poses = off(rig.poses, BUILT, rng)
-        told = windows(rig, poses, rng)
+        told = windows(rig, poses, lenses(rig, rng), rng)
         result = estimate(rig.graph, told)
         consistent += result.consistent
         for edge in rig.graph.edges:
@@ -145,7 +147,7 @@ def joint_row(rig: DrawnRig, rigs: int) -> JointRow:
             of_rig += error**2
             of_pairs += se3.difference(told[edge.name].T_camera_lidar, truth) ** 2
             nees.append(float(error @ np.linalg.solve(result.between(edge.name, edge.name), error)) / 6.0)
-        biased = estimate(rig.graph, windows(rig, poses, rng, STEP_RAD))
+        biased = estimate(rig.graph, windows(rig, poses, lenses(rig, rng), rng, STEP_RAD))
         found += biased.left_out == rig.graph.edges[0].name
         missed += biased.consistent
     ratio = np.sqrt(of_rig / of_pairs)

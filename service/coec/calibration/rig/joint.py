@@ -4,6 +4,9 @@ Do the pairs fit each other? The squared residuals are χ² distributed with as 
 to close, six each. Where they are not, the edge without which they are is left out, if it is the only one (Baarda's
 test); if several would do, nothing is left out, all loops are told that do not close, and what is claimed widens by
 what they miss (Birge 1932).
+
+After a move of a sensor, what was known before it is in the graph beside the windows of since then (`before`): loops
+close then that do not otherwise, as those between the cameras of a single LiDAR.
 """
 
 from __future__ import annotations
@@ -15,8 +18,9 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.rig.before import Before
 from coec.calibration.rig.system import Measured, Solution, System
-from coec.calibration.rig.types import RigGraph
+from coec.calibration.rig.types import RigGraph, whose
 from coec.calibration.tracker import Measurement, chi_square_tail
 from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
@@ -57,12 +61,13 @@ class JointEstimate:
         poses: T_sensor_rig (4, 4) of each sensor, by name, the rig held by where the vehicle was built.
         T_a_b: (4, 4) of each edge of the graph, measured or not, by name.
         covariance: (6·E, 6·E) of the perturbations of all edges about the axes of their first sensors, in the order of
-            `T_a_b`: those between edges included. Where nothing measured an edge it is as wide as `system.BUILT` has it.
+            `T_a_b`: those between edges included. Where nothing measured an edge it is as wide as `system.BUILT`.
         measured: edges that a window told.
         chi2, freedom, chance: how well all windows fit each other: the sum of squares, its degrees of freedom, 0 where
             no loop closes, and the chance of one as large.
-        left_out: the edge that alone did not fit, if one was; `chi2` is that with it.
-        open_loops: loops that do not close, the least likely first.
+        left_out: the edge that alone did not fit, if one was; `chi2` is that with it. After a move it may be what was
+            known of that edge before which does not fit what is now: then its window is not left out.
+        open_loops: loops that do not close, the least likely first; `types.was` of a name is what was known before.
         widened: factor on all standard deviations, for what the loops miss.
     """
 
@@ -90,8 +95,9 @@ class JointEstimate:
         return self.covariance[i : i + 6, j : j + 6]
 
 
-def estimate(graph: RigGraph, windows: Mapping[str, Measurement]) -> JointEstimate:
-    """The rig from one window of each edge that has one, by its name. Windows that tell no axis are left aside.
+def estimate(graph: RigGraph, windows: Mapping[str, Measurement], before: Before | None = None) -> JointEstimate:
+    """The rig from one window of each edge that has one, by its name, and from what was known `before` a move. Windows
+    that tell no axis are left aside.
 
     Raises:
         ValueError: no window tells anything; one is of no edge; a pose is not rigid, or a covariance no covariance.
@@ -101,7 +107,8 @@ def estimate(graph: RigGraph, windows: Mapping[str, Measurement]) -> JointEstima
     measured = tuple(name for name in graph.edge if name in windows and windows[name].told_axes())
     if not measured:
         raise ValueError("no window tells anything of this rig")
-    system = System.of(graph, {name: windows[name] for name in measured})
+    told = {name: windows[name] for name in measured}
+    system = System.of(graph, told) if before is None else System.of(before.joined(graph), {**told, **before.measured})
     solution = system.solved(frozenset())
     chi2, freedom = solution.chi2, solution.freedom
     chance = chi_square_tail(chi2, freedom) if freedom else 1.0
@@ -109,46 +116,54 @@ def estimate(graph: RigGraph, windows: Mapping[str, Measurement]) -> JointEstima
     widened = 1.0
     loops: tuple[Loop, ...] = ()
     if chance < INCONSISTENT_AT:
-        loops = _open_loops(graph, system)
-        left_out = _alone_at_fault(system, solution, measured)
+        loops = _open_loops(system)
+        left_out = _alone_at_fault(system, solution)
         if left_out is not None:
             solution = system.solved(frozenset({left_out}))
         else:
             widened = sqrt(chi2 / freedom)
+    places = system.graph.place
+    rows = np.concatenate(
+        [np.arange(6) + 6 * k for k, edge in enumerate(system.graph.edges) if edge.name in graph.edge]
+    )
     return JointEstimate(
         stamp_ns=max(windows[name].stamp_ns for name in measured),
-        poses={sensor.name: pose for sensor, pose in zip(graph.sensors, solution.poses, strict=True)},
+        poses={sensor.name: solution.poses[places[sensor.name]] for sensor in graph.sensors},
         T_a_b={edge.name: system.predicted(solution.poses, edge.a, edge.b) for edge in graph.edges},
-        covariance=solution.of_edges * widened**2,
+        covariance=solution.of_edges[np.ix_(rows, rows)] * widened**2,
         measured=measured,
         chi2=chi2,
         freedom=freedom,
         chance=chance,
-        left_out=left_out,
+        left_out=None if left_out is None else whose(left_out),
         open_loops=loops,
         widened=widened,
     )
 
 
-def _alone_at_fault(system: System, solution: Solution, measured: Sequence[str]) -> str | None:
+def _alone_at_fault(system: System, solution: Solution) -> str | None:
     """The one edge without which the others fit, None if there is none or more than one. Links are taken for granted:
-    it is windows that fail."""
+    it is windows that fail. Where nothing tells the window of a pair from what was known of it before a move, that is
+    the one: what a pair says by itself stands."""
+    measured = [one.known.name for one in system.measured if one.known.name in system.graph.edge]
     without = {name: system.solved(frozenset({name})) for name in measured}
     by_gain = sorted(measured, key=lambda name: (without[name].chi2, name))
-    best = without[by_gain[0]]
+    first = by_gain[0]
+    best = without[first]
     if best.freedom and chi_square_tail(best.chi2, best.freedom) < INCONSISTENT_AT:
         return None
     if not best.freedom and solution.freedom <= 6:
         return None  # nothing is left that could speak for the others
-    if len(by_gain) > 1 and without[by_gain[1]].chi2 - best.chi2 < ALONE_BY:
+    as_good = [name for name in by_gain if without[name].chi2 - best.chi2 < ALONE_BY]
+    if any(whose(name) != whose(first) for name in as_good):
         return None
-    return by_gain[0]
+    return max(as_good, key=lambda name: (name != whose(name), name == first))
 
 
-def _open_loops(graph: RigGraph, system: System) -> tuple[Loop, ...]:
+def _open_loops(system: System) -> tuple[Loop, ...]:
     """The shortest loop through each edge and link, of those that do not close."""
     measured = {one.known.name: one for one in system.measured}
-    ways = [graph.loop_through(name, list(measured)) for name in measured]
+    ways = [system.graph.loop_through(name, list(measured)) for name in measured]
     found: dict[frozenset[str], tuple[str, ...]] = {}
     for way in ways:
         if way is not None:

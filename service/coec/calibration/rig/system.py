@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.rig.evidence import information_of
-from coec.calibration.rig.types import Known, RigGraph
+from coec.calibration.rig.types import Known, RigGraph, whose
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
@@ -57,6 +57,9 @@ OWNERS: Mapping[str, Owner] = {
     "stamps": CLOCKS,
 }
 """By the names of `confidence.budget`; any other error is the pair's own."""
+
+LASTING = frozenset({"lens_across", "lens_down", "lens_scale"})
+"""Errors of a sensor whatever it sees: how far edges of near things lie aside, or columns, is a matter of the scene."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,7 +192,7 @@ def _of_window(known: Known, window: Measurement) -> Measured:
         if shift.shape != (6,) or not np.isfinite(shift[told]).all() or np.abs(shift[told]).max() > 10.0:
             raise ValueError(f"{known.name}: the error {name} is no shift of six finite numbers")
         owner = OWNERS.get(name, OWN)
-        parts = ((f"{known.a} {name}", owner.of_a), (f"{known.b} {name}", owner.of_b))
+        parts = ((f"{whose(known.a)} {name}", owner.of_a), (f"{whose(known.b)} {name}", owner.of_b))
         if owner is OWN:
             parts = ((f"{known.name} {name}", 1.0), ("", 0.0))
         shared |= {of: part * np.where(told, shift, 0.0) for of, part in parts if part > 0.0}
