@@ -14,7 +14,7 @@ from coec.calibration.rig.joint import JointEstimate, estimate
 from coec.calibration.tracker import Measurement, Track, absorb, prior_sigma
 from coec.calibration.types import Matrix4
 from coec.config import TrackerConfig
-from coec.evaluation.rig_evidence import BUILT, NS_PER_S, DrawnRig, Lenses, Poses, lenses, moved, off, windows
+from coec.evaluation.rig_evidence import BUILT, NS_PER_S, DrawnRig, Lasting, Poses, moved, off, windows
 from coec.geometry import se3
 from coec.schemas.replies import Vector6
 from coec.schemas.rig import KnockedRow
@@ -41,11 +41,11 @@ def knocked_row(rig: DrawnRig, rigs: int) -> KnockedRow:
     consistent = also = 0
     for number in range(rigs):
         rng = np.random.default_rng([SEED, number, *rig.name.encode()])
-        lens, right = lenses(rig, rng), off(rig.poses, BUILT, rng)
-        before = _known(rig, right, lens, rng)
+        lasting, right = Lasting.of(rig, rng), off(rig.poses, BUILT, rng)
+        before = _known(rig, right, lasting, rng)
         shaken = off(right, SHAKEN / np.sqrt(2.0), rng)  # of two sensors of an edge together `SHAKEN`
         after = moved(shaken, (LIDAR,), KNOCK_RAD, rng)
-        told = _windows(rig, after, lens, rng)
+        told = _windows(rig, after, lasting, rng)
         with_before, without = estimate(rig.graph, told, before), estimate(rig.graph, told)
         consistent += with_before.consistent
         each = []
@@ -62,7 +62,7 @@ def knocked_row(rig: DrawnRig, rigs: int) -> KnockedRow:
         worst.append((max(one for one, _ in each), max(other for _, other in each)))
         turned = rig.graph.edges[0].a
         also += estimate(
-            rig.graph, _windows(rig, moved(after, (turned,), ALSO_RAD, rng), lens, rng), before
+            rig.graph, _windows(rig, moved(after, (turned,), ALSO_RAD, rng), lasting, rng), before
         ).consistent  # fmt: skip
     ratio = np.sqrt(of_rig / of_pairs)
     rx, ry, rz, tx, ty, tz = ratio.tolist()
@@ -80,12 +80,13 @@ def _error(joint: JointEstimate, edge: str, truth: Matrix4) -> NDArray[np.float6
     return se3.difference(joint.T_a_b[edge], truth)
 
 
-def _known(rig: DrawnRig, poses: Poses, lens: Lenses, rng: np.random.Generator) -> Before:
-    """What tracks of all windows before the knock say of the edges of the LiDAR."""
+def _known(rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator) -> Before:
+    """What tracks of all windows before the knock say of the edges of the LiDAR, and the last look at two LiDARs."""
     config, tracks = TrackerConfig(), dict[str, Track]()
     for number in range(WINDOWS):
-        for name, window in windows(rig, poses, lens, rng).items():
-            track = tracks.get(name) or Track.initial(window.T_camera_lidar, prior_sigma(config))
+        for name, window in windows(rig, poses, lasting, rng).items():
+            track = None if name in rig.graph.of_lidars else tracks.get(name)
+            track = track or Track.initial(window.T_camera_lidar, prior_sigma(config))
             tracks[name] = absorb(track, replace(window, stamp_ns=number * SLICE_NS), config)
     edges = [edge.name for edge in rig.graph.edges if LIDAR in (edge.a, edge.b)]
     known = {name: Measurement(tracks[name].T_camera_lidar, tracks[name].uncertainty, tracks[name].stamp_ns)
@@ -93,7 +94,7 @@ def _known(rig: DrawnRig, poses: Poses, lens: Lenses, rng: np.random.Generator) 
     return Before((LIDAR,), {name: remembered(one, WINDOWS * SLICE_NS) for name, one in known.items()})
 
 
-def _windows(rig: DrawnRig, poses: Poses, lens: Lenses, rng: np.random.Generator) -> dict[str, Measurement]:
+def _windows(rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator) -> dict[str, Measurement]:
     """One of each edge after the knock."""
-    found = windows(rig, poses, lens, rng)
+    found = windows(rig, poses, lasting, rng)
     return {name: replace(one, stamp_ns=(WINDOWS + 1) * SLICE_NS) for name, one in found.items()}

@@ -78,8 +78,8 @@ def test_neither_the_order_of_the_pairs_nor_the_frame_of_the_lidar_matters() -> 
     told, before = windows(STAR, AFTER, 3), known(STAR, 4, 0.5 * SIGMA)
     found = estimate(STAR, told, before)
     shuffled = RigGraph.of(STAR.sensors[::-1], STAR.edges[::-1])
-    backwards = replace(before, edges=dict(reversed(before.edges.items())))
-    again = estimate(shuffled, dict(reversed(told.items())), backwards)
+    backwards = replace(before, edges=dict(reversed(list(before.edges.items()))))
+    again = estimate(shuffled, dict(reversed(list(told.items()))), backwards)
     frame = se3.exp(np.array([0.3, -0.8, 1.1, 2.0, -1.0, 0.5]))
 
     def turned(one: Measurement) -> Measurement:

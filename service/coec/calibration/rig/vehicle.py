@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.rig import attribution
-from coec.calibration.rig.attribution import NS_PER_S, RigState, SensorHealth, SensorState
+from coec.calibration.rig.attribution import NS_PER_S, STEPPED2, RigState, SensorHealth, SensorState
 from coec.calibration.rig.before import Before, remembered
 from coec.calibration.rig.evidence import Look, of_window
 from coec.calibration.rig.joint import JointEstimate, estimate
@@ -24,7 +24,7 @@ from coec.calibration.rig.steps import MOST_LOOKS
 from coec.calibration.rig.types import RigGraph
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
-from coec.geometry import se3
+from coec.geometry import dense, se3
 
 ALIVE_NS = 60 * NS_PER_S
 """A pair without a look for so long is not waited for: 12 periods of the monitor."""
@@ -110,6 +110,7 @@ class VehicleRig:
         since_ns: since when each is in its state, by name.
         correction: the latest.
         looks: that were counted, by edge.
+        registered: the latest look at two LiDARs, by edge, whether or not another has said the same.
     """
 
     graph: RigGraph
@@ -125,6 +126,7 @@ class VehicleRig:
     since_ns: Mapping[str, int] = field(default_factory=dict)
     correction: Correction | None = None
     looks: Mapping[str, int] = field(default_factory=dict)
+    registered: Mapping[str, Windowed] = field(default_factory=dict)
 
 
 def begun(graph: RigGraph, serves: Mapping[str, Served], windows: Mapping[str, Windowed]) -> VehicleRig:
@@ -195,8 +197,9 @@ def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) ->
 
 
 def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
-    """Two LiDARs were registered: one look, of which both who moved and the joint estimate hear. No pair serves where
-    the one sits in the other: it is where that was found.
+    """Two LiDARs were registered: one look, of which who moved hears at once, and the joint estimate once another look
+    has said the same: a single one may be bad, or the first of after a move, and fits no window of before it. No pair
+    serves where the one sits in the other: it is where that was found.
 
     Raises:
         ValueError: it is of no edge of the rig.
@@ -204,9 +207,18 @@ def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
     measured = window.measurement
     found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns, measured)
     rig = after_look(_serving(rig, look.edge, found), look)
-    if _from_before_a_move(rig, look.edge, window):
+    before = rig.registered.get(look.edge)
+    rig = replace(rig, registered={**rig.registered, look.edge: window})
+    if before is None or not _say_the_same(before.measurement, measured) or _from_before_a_move(rig, look.edge, window):
         return rig
     return _followed(_combined(replace(rig, windows={**rig.windows, look.edge: window})), look.stamp_ns)
+
+
+def _say_the_same(one: Measurement, other: Measurement) -> bool:
+    """Whether two looks at an edge differ by no more than chance."""
+    apart = se3.difference(one.T_camera_lidar, other.T_camera_lidar)
+    covariance = one.uncertainty.covariance + other.uncertainty.covariance
+    return float(dense.squared(dense.inverse(covariance), apart)) < STEPPED2
 
 
 def _from_before_a_move(rig: VehicleRig, edge: str, window: Windowed) -> bool:
@@ -230,7 +242,7 @@ def forgotten(rig: VehicleRig) -> VehicleRig:
     histories = {name: replace(history, looks=()) for name, history in rig.believed.histories.items()}
     believed = RigState(histories)
     rig = replace(rig, believed=believed, windows={}, known={}, before=None, joint=None, event=None, move=None)
-    rig = replace(rig, since_ns={})
+    rig = replace(rig, since_ns={}, registered={})
     return replace(rig, sensors=attribution.sensors(believed, rig.graph))
 
 
@@ -246,15 +258,10 @@ def pairs_of(graph: RigGraph, sensors: tuple[str, ...]) -> tuple[str, ...]:
     )
 
 
-def inconsistent(rig: VehicleRig) -> tuple[str, ...]:
-    """Edges that do not fit the others: the one that alone does not, else all on loops that do not close."""
-    joint = rig.joint
-    if joint is None or joint.consistent:
-        return ()
-    if joint.left_out is not None:
-        return (joint.left_out,)
-    named = {name for loop in joint.open_loops for name in loop.names} or set(joint.measured)
-    return tuple(name for name in rig.graph.edge if name in named)
+def renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
+    """Whether a pair serves what frames since then told."""
+    start_ns = rig.serves[edge].start_ns
+    return start_ns is not None and start_ns >= since_ns
 
 
 def _serving(rig: VehicleRig, edge: str, serves: Served) -> VehicleRig:
@@ -292,7 +299,7 @@ def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     if not event.corrected:
         if _served(rig, fresh) and set(alive) <= set(fresh):
             return _followed(_corrected(rig, event, fresh, stamp_ns), stamp_ns)
-    elif alive and all(_renewed(rig, name, event.stepped_ns) for name in alive):
+    elif alive and all(renewed(rig, name, event.stepped_ns) for name in alive):
         return _over(rig, pairs, stamp_ns)
     if stamp_ns - event.since_ns > OVER_NS and not rig.believed.named:
         return _over(rig, pairs, stamp_ns)
@@ -307,7 +314,7 @@ def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     pairs = attribution.stepped(rig.believed)
     served, since_ns = _served(rig, pairs), rig.believed.stepped_ns
     if served:
-        is_over = all(_renewed(rig, name, since_ns) for name in served)
+        is_over = all(renewed(rig, name, since_ns) for name in served)
     else:
         kept = [rig.believed.histories[name].looks for name in pairs]
         is_over = all(len(looks) >= MOST_LOOKS and looks[0].stamp_ns >= since_ns for looks in kept)
@@ -317,12 +324,6 @@ def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
 def _served(rig: VehicleRig, edges: Sequence[str]) -> list[str]:
     """Of these edges those that a pair serves, which is what puts a move right."""
     return [name for name in edges if name not in rig.graph.of_lidars]
-
-
-def _renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
-    """Whether a pair serves what frames since then told."""
-    start_ns = rig.serves[edge].start_ns
-    return start_ns is not None and start_ns >= since_ns
 
 
 def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -> VehicleRig:
