@@ -9,7 +9,7 @@ from math import degrees, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.rig.before import SHAKEN, Before, remembered
+from coec.calibration.rig.before import SHAKEN, Before
 from coec.calibration.rig.joint import JointEstimate, estimate
 from coec.calibration.tracker import Measurement, Track, absorb, prior_sigma
 from coec.calibration.types import Matrix4
@@ -81,17 +81,20 @@ def _error(joint: JointEstimate, edge: str, truth: Matrix4) -> NDArray[np.float6
 
 
 def _known(rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator) -> Before:
-    """What tracks of all windows before the knock say of the edges of the LiDAR, and the last look at two LiDARs."""
+    """What tracks of all windows before the knock say of the pairs of the LiDAR."""
     config, tracks = TrackerConfig(), dict[str, Track]()
     for number in range(WINDOWS):
         for name, window in windows(rig, poses, lasting, rng).items():
-            track = None if name in rig.graph.of_lidars else tracks.get(name)
-            track = track or Track.initial(window.T_camera_lidar, prior_sigma(config))
+            track = tracks.get(name) or Track.initial(window.T_camera_lidar, prior_sigma(config))
             tracks[name] = absorb(track, replace(window, stamp_ns=number * SLICE_NS), config)
-    edges = [edge.name for edge in rig.graph.edges if LIDAR in (edge.a, edge.b)]
-    known = {name: Measurement(tracks[name].T_camera_lidar, tracks[name].uncertainty, tracks[name].stamp_ns)
-             for name in edges}  # fmt: skip
-    return Before((LIDAR,), {name: remembered(one, WINDOWS * SLICE_NS) for name, one in known.items()})
+    pairs = [edge.name for edge in rig.graph.edges if LIDAR in (edge.a, edge.b)]
+    known = {
+        name: (Measurement(tracks[name].T_camera_lidar, tracks[name].uncertainty, tracks[name].stamp_ns),)
+        for name in pairs
+        if name not in rig.graph.of_lidars
+    }
+    at_ns = WINDOWS * SLICE_NS
+    return Before.of((LIDAR,), known, at_ns, at_ns)
 
 
 def _windows(rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator) -> dict[str, Measurement]:

@@ -12,7 +12,7 @@ of that time had in common is noise to the scenes of this one; how a lens is dis
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import radians
 
@@ -42,6 +42,15 @@ class Before:
 
     sensors: tuple[str, ...]
     edges: Mapping[str, Measurement]
+
+    @classmethod
+    def of(
+        cls, sensors: tuple[str, ...], known: Mapping[str, Sequence[Measurement]], right_ns: int, stamp_ns: int
+    ) -> Before:
+        """By what was known of each edge at several times, the oldest first, in so far as it is of up to `right_ns`,
+        when nothing had moved; as sure as it is at `stamp_ns`, when these sensors had."""
+        right = {name: [one for one in of if one.stamp_ns <= right_ns] for name, of in known.items()}
+        return cls(sensors, {name: remembered(of[-1], stamp_ns) for name, of in right.items() if of})
 
     @property
     def measured(self) -> Mapping[str, Measurement]:

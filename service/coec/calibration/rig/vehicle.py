@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.rig import attribution
 from coec.calibration.rig.attribution import NS_PER_S, STEPPED2, RigState, SensorHealth, SensorState
-from coec.calibration.rig.before import Before, remembered
+from coec.calibration.rig.before import Before
 from coec.calibration.rig.evidence import Look, of_window
 from coec.calibration.rig.joint import JointEstimate, estimate
 from coec.calibration.rig.moves import Moved, movers
@@ -100,8 +100,8 @@ class VehicleRig:
         believed: who moved.
         windows: the newest of each edge, as far as it is of the rig as it is now.
         serves: what each pair serves.
-        known: what was known of each edge by windows, the latest two times, the older first: when a move is noticed,
-            the latest may be of after it.
+        known: what was known of each pair by all its windows, the latest two times, the older first: when a move is
+            noticed, the latest may be of after it.
         before: what was known before the event that is going on, as far as it is true after it.
         event: the one that is going on; None while all is calm.
         move: the latest event, over or not; None before the first.
@@ -205,8 +205,8 @@ def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
         ValueError: it is of no edge of the rig.
     """
     measured = window.measurement
-    found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns, measured)
-    rig = after_look(_serving(rig, look.edge, found), look)
+    found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns)
+    rig = after_look(replace(rig, serves={**rig.serves, look.edge: found}), look)
     before = rig.registered.get(look.edge)
     rig = replace(rig, registered={**rig.registered, look.edge: window})
     if before is None or not _say_the_same(before.measurement, measured) or _from_before_a_move(rig, look.edge, window):
@@ -370,8 +370,8 @@ def _before(rig: VehicleRig, event: Event) -> Before:
          if look.stamp_ns < min(rig.believed.stepped_ns, event.stepped_ns)),
         default=event.stepped_ns,
     )  # fmt: skip
-    known = {name: [one for one in rig.known.get(name, ()) if one.stamp_ns <= right_ns] for name in touched}
-    return Before(event.sensors, {name: remembered(of[-1], event.since_ns) for name, of in known.items() if of})
+    known = {name: rig.known[name] for name in touched if name in rig.known}
+    return Before.of(event.sensors, known, right_ns, event.since_ns)
 
 
 def _told(joint: JointEstimate, edge: str, own: Measurement) -> Told:
