@@ -20,5 +20,9 @@ def test_a_knocked_camera_is_named_on_drawn_drives_and_told_in_tables(
     assert (report.moves[0].right, report.moves[0].undecided, report.moves[0].wrong) == (1, 0, 0)
     assert report.joint[1].rms_ratio_all < 0.9
     assert report.joint[1].biased_found == 1
+    star = report.knocked[0]
+    assert star.worst_deg < star.worst_of_pairs_deg
+    assert star.rms_ratio_without == pytest.approx(1.0, abs=0.02), "alone, a star closes no loop"
+    assert star.consistent == 1
     monkeypatch.setattr(rig_moves, "FAULTS", ())
     assert "windows combined" in coec("sim", "rig-moves", "--rigs", 1).out

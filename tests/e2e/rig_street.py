@@ -1,11 +1,11 @@
-"""One street for a simulated rig of four fisheyes and a LiDAR, with nobody, the LiDAR or a camera knocked: an instant a
-second, of which each frame is drawn once, whatever number of drives has it."""
+"""Streets for simulated rigs, with nobody, a LiDAR or a camera knocked: an instant a second, of which each frame is
+drawn once, whatever number of drives has it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 
@@ -16,19 +16,15 @@ from coec.simulation.faults import SensorFault, Step
 from coec.simulation.journey import START_NS
 from coec.simulation.rig_drive import RigConfig, RigDrive
 from coec.simulation.rig_instants import instants
+from coec.simulation.rigs import FOUR_FISHEYES, RigLayout
 from coec.simulation.schedule import Arrival
 from drives import kept
 
 NS_PER_S = 1_000_000_000
 
 LIDAR = "roof"
-SECONDS, KNOCK_S = 96, 24
-SEED, CAMERA = 7, "fisheye700"
 PERIOD_S = 1.0
 """Between two instants."""
-
-STREET = ("rig street", SEED, CAMERA, SECONDS, KNOCK_S, ROWS)
-"""By which its frames are kept."""
 
 PART = 12
 """Frames that a process draws at once, one after the other: of about three instants."""
@@ -42,51 +38,95 @@ class Knock:
     turn_deg: float
 
 
-def config_of(knock: Knock | None) -> RigConfig:
-    """Of a drive; None: nobody is knocked. Rows of pictures that the LiDAR does not see are not drawn."""
-    faults: tuple[SensorFault, ...] = ()
-    if knock is not None:
-        faults = (SensorFault(knock.sensor, Step(KNOCK_S, float("inf"), ry=knock.turn_deg)),)
-    return RigConfig(
-        seed=SEED, seconds=SECONDS, camera=CAMERA, ego_hz=20.0, faults=faults, rows=ROWS, depth=True
-    )  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class Street:
+    """A drive of a rig along a street; what is knocked is knocked at `knock_s`.
+
+    Attributes:
+        layout: of which `lidars` send; instants are those of the first of these.
+        camera: of every camera, `fisheyeW`.
+        rows: of pictures that are drawn, shares of their height.
+    """
+
+    layout: RigLayout
+    lidars: tuple[str, ...]
+    seed: int
+    camera: str
+    seconds: int
+    knock_s: int
+    rows: tuple[float, float]
+
+    @property
+    def name(self) -> tuple[object, ...]:
+        """By which its frames are kept."""
+        sensors = (*self.layout.names, *self.lidars)
+        return ("rig street", self.seed, self.camera, self.seconds, self.knock_s, self.rows, sensors)
+
+    def config_of(self, knock: Knock | None) -> RigConfig:
+        """Of a drive; None: nobody is knocked."""
+        faults: tuple[SensorFault, ...] = ()
+        if knock is not None:
+            faults = (SensorFault(knock.sensor, Step(self.knock_s, float("inf"), ry=knock.turn_deg)),)
+        return RigConfig(
+            layout=self.layout, seed=self.seed, seconds=self.seconds, camera=self.camera, ego_hz=20.0, faults=faults,
+            rows=self.rows, depth=True,
+        )  # fmt: skip
+
+    def drive_of(self, knock: Knock | None) -> RigDrive:
+        """With the truth."""
+        return _drive_of(self, knock)
+
+    def frames_of(self, knock: Knock | None) -> list[Frame]:
+        """In the order of their stamps."""
+        found = dict(_as_built(self))
+        if knock is not None:
+            moved = self.drive_of(None).stream(knock.sensor)
+            after = [e for e in found if e.stream == moved and second_of(e.stamp_ns) >= self.knock_s]
+            config = self.config_of(knock)
+            found |= zip(after, kept((*self.name, knock, after), lambda: drawn(config, after)), strict=True)
+        return sorted(found.values(), key=lambda frame: frame.stamp_ns)
+
+    def truth(self, knock: Knock | None, camera: str, lidar: str, second: float) -> Matrix4:
+        """True T_camera_lidar (4, 4)."""
+        return self.drive_of(knock).pair(camera, lidar).truth(START_NS + round(second * NS_PER_S))
 
 
-@cache
-def drive_of(knock: Knock | None) -> RigDrive:
-    """With the truth."""
-    return config_of(knock).drive()
+FOUR_AND_ONE = Street(FOUR_FISHEYES, (LIDAR,), seed=7, camera="fisheye700", seconds=96, knock_s=24, rows=ROWS)
+"""Four fisheyes and a LiDAR. Rows of pictures that the LiDAR does not see are not drawn."""
 
-
-def frames_of(knock: Knock | None) -> list[Frame]:
-    """In the order of their stamps."""
-    found = dict(_as_built())
-    if knock is not None:
-        moved = drive_of(None).stream(knock.sensor)
-        after = [entry for entry in found if entry.stream == moved and second_of(entry.stamp_ns) >= KNOCK_S]
-        config = config_of(knock)
-        found |= zip(after, kept((*STREET, knock, after), lambda: drawn(config, after)), strict=True)
-    return sorted(found.values(), key=lambda frame: frame.stamp_ns)
-
-
-def truth(knock: Knock | None, camera: str, second: float) -> Matrix4:
-    """True T_camera_lidar (4, 4)."""
-    return drive_of(knock).pair(camera, LIDAR).truth(START_NS + round(second * NS_PER_S))
+TWO_AND_THREE = Street(
+    replace(FOUR_FISHEYES, cameras=FOUR_FISHEYES.cameras[:2]),
+    ("roof", "near_left", "near_right"),
+    seed=9, camera="fisheye500", seconds=100, knock_s=30, rows=ROWS,
+)  # fmt: skip
+"""Two fisheyes and three LiDARs, of which those on the flanks see some of what the one on the roof does."""
 
 
 def second_of(stamp_ns: int) -> float:
-    """Of the drive."""
+    """Of a drive."""
     return (stamp_ns - START_NS) / NS_PER_S
 
 
 @cache
-def _as_built() -> dict[Arrival, Frame]:
-    drive, config = drive_of(None), config_of(None)
+def _drive_of(street: Street, knock: Knock | None) -> RigDrive:
+    return street.config_of(knock).drive()
+
+
+@cache
+def _as_built(street: Street) -> dict[Arrival, Frame]:
+    drive, config = street.drive_of(None), street.config_of(None)
     entries: dict[Arrival, None] = {}
-    for instant in instants(drive, LIDAR, PERIOD_S):
-        entries |= dict.fromkeys((instant.sweep, *instant.pictures.values(), *instant.motions))
+    for instant in instants(drive, street.lidars[0], PERIOD_S):
+        sweeps = (instant.sweep, *(_nearest(drive, lidar, instant.sweep.stamp_ns) for lidar in street.lidars[1:]))
+        entries |= dict.fromkeys((*sweeps, *instant.pictures.values(), *instant.motions))
     plan = list(entries)
-    return dict(zip(plan, kept((*STREET, plan), lambda: drawn(config, plan)), strict=True))
+    return dict(zip(plan, kept((*street.name, plan), lambda: drawn(config, plan)), strict=True))
+
+
+def _nearest(drive: RigDrive, lidar: str, stamp_ns: int) -> Arrival:
+    """The sweep of a LiDAR that is nearest to a time."""
+    stream = drive.stream(lidar)
+    return min((e for e in drive.plan if e.stream == stream), key=lambda entry: abs(entry.stamp_ns - stamp_ns))
 
 
 def drawn(config: RigConfig, entries: Sequence[Arrival]) -> list[Frame]:

@@ -1,5 +1,6 @@
-"""A vehicle of four fisheyes and a LiDAR in a running service: nobody is knocked, its LiDAR is, one of its cameras is.
-Which it was is said of that sensor, and put right in all pairs of it."""
+"""Vehicles of several sensors in a running service: nobody is knocked, a LiDAR is, a camera is. Which it was is said of
+that sensor, and put right in all pairs of it. Four fisheyes and a LiDAR; two fisheyes and three LiDARs, which are
+looked at together, too."""
 
 from __future__ import annotations
 
@@ -24,16 +25,7 @@ from coec.geometry.se3 import inverse, rotation_angle_rad
 from coec.schemas.base import from_msgpack
 from coec.schemas.rig_state import RigCorrection, RigReply
 from e2e.processes import PATIENCE_S, Router, Service, service
-from e2e.rig_street import (
-    KNOCK_S,
-    LIDAR,
-    SECONDS,
-    Knock,
-    drive_of,
-    frames_of,
-    second_of,
-    truth,
-)
+from e2e.rig_street import FOUR_AND_ONE, LIDAR, TWO_AND_THREE, Knock, Street, second_of
 
 NAMED_S = 60.0
 """Of driving, within which a sensor that was knocked has to be named."""
@@ -60,6 +52,7 @@ STAGES = {
 class Story:
     """All that the service published of the rig while it was driven, in order, and what it said in the end."""
 
+    street: Street
     told: list[RigReply]
     last: RigReply
 
@@ -77,7 +70,7 @@ class Story:
     def named_s(self, sensor: str) -> float:
         """Seconds of driving between the knock and its being named."""
         stamps = [told.stamp_ns for told in self.told if sensor in moved_in(told) and told.stamp_ns is not None]
-        return second_of(min(stamps)) - KNOCK_S
+        return second_of(min(stamps)) - self.street.knock_s
 
     def turned_deg(self, sensor: str) -> float:
         """By how much it is said to have turned; the move is over."""
@@ -102,10 +95,10 @@ def moved_in(reply: RigReply) -> set[str]:
     return {sensor.name for sensor in reply.sensors if sensor.state in ("camera_moved", "lidar_moved")}
 
 
-def configuration(folder: Path, router: Router) -> Path:
+def configuration(street: Street, folder: Path, router: Router) -> Path:
     """Of a vehicle: sensors, each told once; pairs follow."""
     document = {
-        **document_of(drive_of(None), (LIDAR,), folder),
+        **document_of(street.drive_of(None), street.lidars, folder),
         "budget": {"cores": 64.0},  # sensor time is compressed
         "zenoh": {"connect": [router.endpoint], "listen": [router.endpoint]},
         "state": {"directory": "state", "min_free_bytes": 0},
@@ -117,7 +110,7 @@ def configuration(folder: Path, router: Router) -> Path:
     return path
 
 
-def driven(running: Service, frames: list[Frame]) -> Story:
+def driven(running: Service, street: Street, frames: list[Frame]) -> Story:
     """A second of driving at a time, each once the service has kept up; then until all is judged."""
     sensors = SensorKeys(tuple(sorted({frame.frame_id for frame in frames})))
     player = Player(running.session, sensors, "msgpack")
@@ -126,19 +119,25 @@ def driven(running: Service, frames: list[Frame]) -> Story:
     def heard(sample: zenoh.Sample) -> None:
         told.append(from_msgpack(RigReply, sample.payload.to_bytes()))
 
+    of_pair = {pair.name: (pair.camera.sensor, pair.lidar.sensor) for pair in running.config.pairs}
+
     def taken(status: Any) -> bool:
-        return all(pair["camera"]["received"] >= sent[pair["name"]] and pair["held"] < HELD for pair in status["pairs"])
+        for pair in status["pairs"]:
+            camera, lidar = of_pair[pair["name"]]
+            if pair["camera"]["received"] < sent[camera] or pair["lidar"]["received"] < sent[lidar]:
+                return False
+        return all(pair["held"] < HELD for pair in status["pairs"])
 
     published = running.session.declare_subscriber(running.keys.rig, zenoh.handlers.Callback(heard, indirect=False))
     try:
         assert not player.wait_for_listener(PATIENCE_S)
-        for second in range(SECONDS + 1):
+        for second in range(street.seconds + 1):
             part = [frame for frame in frames if second <= second_of(frame.stamp_ns) < second + 1]
             player.play(part, 0.0, threading.Event(), lambda *_: None)
             sent.update(frame.frame_id for frame in part)
             running.until(running.status, taken, f"second {second} of the drive")
         rest(running)
-        return Story(told, rig_of(running))
+        return Story(street, told, rig_of(running))
     finally:
         published.undeclare()
         player.close()
@@ -166,12 +165,13 @@ def rest(running: Service) -> None:
     running.until(running.status, rests, "rest")
 
 
-def errors_deg(running: Service, knock: Knock | None) -> dict[str, float]:
+def errors_deg(running: Service, street: Street, knock: Knock | None) -> dict[str, float]:
     """Of what every pair serves, against the truth at the end of the drive."""
     found = {}
     for pair in running.config.pairs:
         served = np.array(running.ask(running.keys.extrinsic(pair.name))["camera_from_lidar"]["matrix"])
-        found[pair.name] = float(np.degrees(rotation_angle_rad(served @ inverse(truth(knock, pair.name, SECONDS)))))
+        right = street.truth(knock, pair.camera.sensor, pair.lidar.sensor, street.seconds)
+        found[pair.name] = float(np.degrees(rotation_angle_rad(served @ inverse(right))))
     return found
 
 
@@ -179,6 +179,12 @@ def states_of(running: Service, pair: str) -> list[str]:
     """In which its health has been, by what was seen: a drive that is over makes pairs degraded by the clock."""
     entries = [one["entry"] for one in running.ask(running.keys.history(pair), ";limit=1000")["entries"]]
     return [entry["code"] for entry in entries if entry["kind"] == "state" and entry["stamp_ns"] is not None]
+
+
+def reasons_of(running: Service) -> list[list[str]]:
+    """Codes that the health of each pair gives now."""
+    healths = [running.ask(running.keys.health(pair.name)) for pair in running.config.pairs]
+    return [[reason["code"] for reason in health["reasons"]] for health in healths]
 
 
 def corrected(running: Service, pair: str) -> int:
@@ -192,10 +198,10 @@ def corrected(running: Service, pair: str) -> int:
 def test_a_right_rig_raises_no_alarm(
     tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
 ) -> None:
-    with service(configuration(tmp_path, router), router) as running:
-        cameras = drive_of(None).cameras
+    with service(configuration(FOUR_AND_ONE, tmp_path, router), router) as running:
+        cameras = FOUR_AND_ONE.drive_of(None).cameras
         assert {pair.name for pair in running.config.pairs} == set(cameras)
-        story = driven(running, frames_of(None))
+        story = driven(running, FOUR_AND_ONE, FOUR_AND_ONE.frames_of(None))
         said = story.lines()
         assert {sensor.state for sensor in story.told[0].sensors} == {"unknown"}
         assert story.named == set(), said
@@ -204,7 +210,7 @@ def test_a_right_rig_raises_no_alarm(
         assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
         assert set(story.last.looks) == set(cameras), said
         assert not any("miscalibrated" in states_of(running, camera) for camera in cameras)
-        errors = errors_deg(running, None)
+        errors = errors_deg(running, FOUR_AND_ONE, None)
         record_property("figure", f"{sum(story.last.looks.values())} looks, ≤ {max(errors.values()):.2f}° off")
         assert max(errors.values()) < MAX_ERROR_DEG, errors
         assert running.terminate() == 0
@@ -217,9 +223,9 @@ def test_a_right_rig_raises_no_alarm(
 def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
     tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
 ) -> None:
-    with service(configuration(tmp_path, router), router) as running:
-        cameras = drive_of(ROOF).cameras
-        story = driven(running, frames_of(ROOF))
+    with service(configuration(FOUR_AND_ONE, tmp_path, router), router) as running:
+        cameras = FOUR_AND_ONE.drive_of(ROOF).cameras
+        story = driven(running, FOUR_AND_ONE, FOUR_AND_ONE.frames_of(ROOF))
         said = story.lines()
         assert story.named == {LIDAR}, said
         assert story.turned_deg(LIDAR) == pytest.approx(ROOF.turn_deg, abs=MAX_ERROR_DEG), said
@@ -228,8 +234,8 @@ def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
         assert correction.sensors == (LIDAR,)
         assert set(correction.pairs) == set(cameras), said
         assert [corrected(running, camera) for camera in cameras] == [1] * len(cameras)
-        errors = errors_deg(running, ROOF)
-        put_right_s = second_of(correction.stamp_ns) - KNOCK_S
+        errors = errors_deg(running, FOUR_AND_ONE, ROOF)
+        put_right_s = second_of(correction.stamp_ns) - FOUR_AND_ONE.knock_s
         record_property(
             "figure",
             f"named {story.named_s(LIDAR):.0f} s, put right {put_right_s:.0f} s of driving after the knock; then "
@@ -249,15 +255,15 @@ def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
 def test_a_knocked_camera_is_named_and_put_right_and_no_other(
     tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
 ) -> None:
-    with service(configuration(tmp_path, router), router) as running:
-        others = set(drive_of(LEFT).cameras) - {LEFT.sensor}
-        story = driven(running, frames_of(LEFT))
+    with service(configuration(FOUR_AND_ONE, tmp_path, router), router) as running:
+        others = set(FOUR_AND_ONE.drive_of(LEFT).cameras) - {LEFT.sensor}
+        story = driven(running, FOUR_AND_ONE, FOUR_AND_ONE.frames_of(LEFT))
         said = story.lines()
         assert story.named == {LEFT.sensor}, said
         assert story.turned_deg(LEFT.sensor) == pytest.approx(LEFT.turn_deg, abs=MAX_ERROR_DEG), said
         assert 0.0 < story.named_s(LEFT.sensor) <= NAMED_S, said
         assert not any("miscalibrated" in states_of(running, camera) for camera in others)
-        errors = errors_deg(running, LEFT)
+        errors = errors_deg(running, FOUR_AND_ONE, LEFT)
         record_property(
             "figure",
             f"named {story.named_s(LEFT.sensor):.0f} s after the knock; then {errors[LEFT.sensor]:.2f}° off",
@@ -265,4 +271,44 @@ def test_a_knocked_camera_is_named_and_put_right_and_no_other(
         assert max(errors.values()) <= MAX_ERROR_DEG, errors
         assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
         assert states_of(running, LEFT.sensor)[-1] == "healthy"
+        assert running.terminate() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.fault(
+    "nothing, for a drive of two fisheyes and three LiDARs", "LiDARs are measured; no sensor is said to have moved"
+)
+def test_three_lidars_that_see_each_other_are_measured_and_nobody_is_named(
+    tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
+) -> None:
+    with service(configuration(TWO_AND_THREE, tmp_path, router), router) as running:
+        story = driven(running, TWO_AND_THREE, TWO_AND_THREE.frames_of(None))
+        said = story.lines()
+        assert story.named == set(), said
+        assert story.corrections == [], said
+        assert story.last.move is None, said
+        edges = {edge.name: edge for edge in story.last.lidars}
+        for name in ("roof to near_left", "roof to near_right"):
+            assert edges[name].state == "measured", edges[name]
+            assert edges[name].looks >= 3, edges[name]
+        assert not any("inconsistent_rig" in codes for codes in reasons_of(running)), reasons_of(running)
+        looked_at = {sensor.name: sensor.state for sensor in story.last.sensors}
+        assert set(looked_at.values()) == {"calibrated"}, said
+        record_property("figure", f"{sum(story.last.looks.values())} looks, {len(edges)} edges between LiDARs")
+        assert running.terminate() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.fault("one of three LiDARs of a running vehicle is knocked by 1.5°", "it alone is named, in a minute")
+def test_of_three_lidars_the_one_that_was_knocked_is_named(
+    tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
+) -> None:
+    with service(configuration(TWO_AND_THREE, tmp_path, router), router) as running:
+        story = driven(running, TWO_AND_THREE, TWO_AND_THREE.frames_of(ROOF))
+        said = story.lines()
+        assert story.named == {LIDAR}, said
+        assert 0.0 < story.named_s(LIDAR) <= NAMED_S, said
+        by = next(told.move.by[LIDAR].by for told in (*story.told, story.last) if told.move is not None)
+        assert hypot(*by[:3]) == pytest.approx(ROOF.turn_deg, abs=MAX_ERROR_DEG), said
+        record_property("figure", f"named {story.named_s(LIDAR):.0f} s of driving after the knock")
         assert running.terminate() == 0

@@ -164,6 +164,11 @@ def prior_sigma(config: TrackerConfig) -> NDArray[np.float64]:
     return np.array([radians(config.prior_deg)] * 3 + [config.prior_m] * 3)
 
 
+def creep_sigma(config: TrackerConfig) -> NDArray[np.float64]:
+    """(6,) how far a mount creeps in an hour, on every axis (rad, m): a random walk, its variance grows with time."""
+    return np.array([radians(config.drift_deg_per_sqrt_h)] * 3 + [config.drift_m_per_sqrt_h] * 3)
+
+
 def absorb(track: Track, measurement: Measurement, config: TrackerConfig) -> Track:
     """The track after another accepted window; a window that tells no axis leaves it as it is."""
     axes = measurement.told_axes()
@@ -200,9 +205,8 @@ def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belie
 
 
 def _drifted(belief: Belief, elapsed_h: float, config: TrackerConfig) -> Belief:
-    """A mount creeps: a random walk on every axis."""
-    walk = [radians(config.drift_deg_per_sqrt_h) ** 2] * 3 + [config.drift_m_per_sqrt_h**2] * 3
-    return replace(belief, covariance=belief.covariance + np.diag([elapsed_h * q for q in walk]))
+    """A mount creeps."""
+    return replace(belief, covariance=belief.covariance + np.diag(elapsed_h * creep_sigma(config) ** 2))
 
 
 def _disagreement(belief: Belief, measurement: Measurement, axes: list[int]) -> tuple[float, float]:

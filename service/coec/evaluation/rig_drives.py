@@ -21,7 +21,7 @@ from coec.calibration.types import FramePair, LidarFrame, Matrix4
 from coec.errors import CoecError
 from coec.evaluation.check_drives import CHECK_PAIRS
 from coec.evaluation.rig_evidence import WINDOW
-from coec.evaluation.rig_looks import TURN_S, SeenPair, due, graph_of, look_at
+from coec.evaluation.rig_looks import ROWS, TURN_S, SeenPair, due, graph_of, look_at
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 from coec.schemas.replies import Vector6
@@ -107,7 +107,9 @@ class KnockedDrive:
 
     def _config(self, faults: tuple[SensorFault, ...]) -> RigConfig:
         seconds = self.at_s + AFTER_S
-        return RigConfig(seed=FIRST_SEED + self.number, seconds=seconds, camera=self.camera, ego_hz=20.0, faults=faults)
+        return RigConfig(
+            seed=FIRST_SEED + self.number, seconds=seconds, camera=self.camera, ego_hz=20.0, faults=faults, rows=ROWS
+        )  # fmt: skip
 
 
 def looked_at(drive: KnockedDrive) -> RigDriveRow:

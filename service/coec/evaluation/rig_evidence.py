@@ -3,7 +3,8 @@
 Each pair has an estimator of its own, biased, and more so in one pair than in the others; streets displace it, together
 for as long as the street lasts; single checks scatter with longer tails than the attribution believes in, are bad in
 runs, faint, late, or missing for a whole drive. Sizes are those of `commissioning.baseline`, which were measured on the
-recordings; the shares are worse than what was seen on simulated drives (`monitor.likelihood`).
+recordings; the shares are worse than what was seen on simulated drives (`monitor.likelihood`). Looks at two LiDARs
+scatter as they do on rendered streets, and come when the service has them.
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ from coec.calibration.commissioning.baseline import (
     UNCOMMISSIONED_BIAS,
 )
 from coec.calibration.monitor.likelihood import WEAK_TIMES
+from coec.calibration.rig import lidar_looks
 from coec.calibration.rig.evidence import Look, information_of
 from coec.calibration.rig.steps import REACH
 from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4, Uncertainty
+from coec.config import LidarEdgesConfig
 from coec.evaluation.check_drives import CHECK_PAIRS
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
@@ -83,6 +86,13 @@ says nothing of it."""
 CHECK_S = 4.0
 """From the first frame of a check to its last."""
 
+LIDAR_LOOK = np.array([*np.radians([0.037, 0.020, 0.015]), 0.0092, 0.0040, 0.0048])
+"""(6,) standard deviation that a look at two LiDARs claims (rad, m): the median of 48 looks on six simulated streets
+(seeds 52000 to 52005), a roof LiDAR and one on each flank."""
+
+LIDAR_PERIOD_S, LIDAR_LATE_S = LidarEdgesConfig().period_s, 17.0
+"""Between two looks at two LiDARs, all of a vehicle at once, and from the first sweep of one to when it counts."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnRig:
@@ -124,16 +134,16 @@ def _rig(name: str, poses: Poses, pairs: Sequence[tuple[str, str]]) -> DrawnRig:
 
 SINGLE = _rig("one camera, one LiDAR", {"front": CAMERAS["front"], **ROOF}, [("front", "roof")])
 FOUR = _rig("four cameras, one LiDAR", {**CAMERAS, **ROOF}, [(camera, "roof") for camera in CAMERAS])
+_OF_CAMERAS = [
+    *((camera, "roof") for camera in CAMERAS),
+    *((camera, "short_left") for camera in ("front", "left", "rear")),
+    *((camera, "short_right") for camera in ("front", "right", "rear")),
+]
+APART = _rig("four cameras, three LiDARs, none between these", {**CAMERAS, **ROOF, **SHORT}, _OF_CAMERAS)
 FULL = _rig(
     "four cameras, three LiDARs",
     {**CAMERAS, **ROOF, **SHORT},
-    [
-        *((camera, "roof") for camera in CAMERAS),
-        *((camera, "short_left") for camera in ("front", "left", "rear")),
-        *((camera, "short_right") for camera in ("front", "right", "rear")),
-        ("roof", "short_left"),
-        ("roof", "short_right"),
-    ],
+    [*_OF_CAMERAS, ("roof", "short_left"), ("roof", "short_right")],
 )
 
 
@@ -160,46 +170,107 @@ class Bend:
     xi: Array
 
 
-def checks(
-    rig: DrawnRig, before: Poses, after: Poses, bend: Bend | None, at_s: float, until_s: float, rng: np.random.Generator
-) -> list[Look]:
-    """Looks of a drive in the order in which they come, the sensors being elsewhere from `at_s` on."""
-    found: list[tuple[float, Look]] = []
+@dataclass(frozen=True, slots=True, eq=False)
+class Happening:
+    """What happens on a drive: sensors are elsewhere from `at_s` on, and an edge may be bent. It ends at `until_s`."""
+
+    before: Poses
+    after: Poses
+    bend: Bend | None
+    at_s: float
+    until_s: float
+
+    def where(self, edge: Edge, at_s: float) -> Array:
+        """(6,) by how much an edge is off at a time."""
+        poses = self.before if at_s < self.at_s else self.after
+        here = se3.difference(poses[edge.a] @ se3.inverse(poses[edge.b]), edge.T_a_b)
+        if self.bend is not None and edge.name == self.bend.edge and at_s >= self.at_s:
+            return np.asarray(here + self.bend.xi)
+        return here
+
+    def is_blind(self, edge: Edge, rng: np.random.Generator) -> bool:
+        """Whether nothing is seen of an edge that stays as it is."""
+        still = all(np.array_equal(self.before[name], self.after[name]) for name in (edge.a, edge.b))
+        return still and bool(rng.random() < BLIND)
+
+
+Heard = tuple[float, Look]
+"""When a look is known, s, and what it says."""
+
+
+def looks(rig: DrawnRig, drive: Happening, rng: np.random.Generator) -> list[Heard]:
+    """Of a drive, in the order in which they are known."""
+    found: list[Heard] = []
     biased = int(rng.integers(len(rig.graph.edges)))
+    lidars_at_s = float(rng.uniform(0.0, LIDAR_PERIOD_S))
     for number, edge in enumerate(rig.graph.edges):
-        bias = UNCOMMISSIONED_BIAS * rng.normal(size=6) * (BIASED if number == biased else 1.0)
-        still = all(np.array_equal(before[name], after[name]) for name in (edge.a, edge.b))
-        blind = still and rng.random() < BLIND
-        period_s = float(rng.choice(PERIODS_S))
-        at, street, bad = float(rng.uniform(0.0, period_s)), STREET * rng.normal(size=6), np.zeros(6)
-        right = se3.difference(before[edge.a] @ se3.inverse(before[edge.b]), edge.T_a_b)
-        in_run, poor, suspected_ns = False, _poor(rng), None
-        while at < until_s:
-            poses = before if at < at_s else after
-            here = se3.difference(poses[edge.a] @ se3.inverse(poses[edge.b]), edge.T_a_b)
-            if bend is not None and edge.name == bend.edge and at >= at_s:
-                here = here + bend.xi
-            faint = bool(rng.random() < FAINT)
-            scatter = CHECK * (WEAK_TIMES if faint else 1.0)
-            told = scatter * rng.standard_t(TAILS, size=6) / np.sqrt(TAILS / (TAILS - 2.0))
-            seen = here + bias + poor * (street + told)
-            if not in_run or rng.random() >= SAME:
-                bad = REACH * rng.normal(size=6)
-            in_run = bool(rng.random() < (BAD_LASTS if in_run else BAD))
-            if in_run or (faint and rng.random() < FAINT_BAD):
-                seen = bad + CHECK * rng.normal(size=6)
-            late_s = float(rng.uniform(0.0, LATE_S))
-            flagged = float((np.abs(seen - right) / np.hypot(CHECK, UNCOMMISSIONED_BIAS)).max()) > FLAGGED
-            if not blind and rng.random() >= MISSING:
-                if not flagged:
-                    suspected_ns = None
-                elif suspected_ns is None:
-                    suspected_ns = round((at - CHECK_S) * NS_PER_S)
-                found.append((at + late_s, _look(edge, at, seen, scatter, faint, suspected_ns)))
-            if rng.random() < period_s / STREET_S:
-                street, poor = STREET * rng.normal(size=6), _poor(rng)
-            at += PERIODS_S[0] if flagged and not faint else period_s
-    return [look for _, look in sorted(found, key=lambda one: (one[0], one[1].edge))]
+        if edge.name in rig.graph.of_lidars:
+            found += _lidar_looks(edge, drive, lidars_at_s, rng)
+        else:
+            found += _checks(edge, drive, BIASED if number == biased else 1.0, rng)
+    return sorted(found, key=lambda one: (one[0], one[1].edge))
+
+
+def _checks(edge: Edge, drive: Happening, biased: float, rng: np.random.Generator) -> list[Heard]:
+    """Of one pair."""
+    found: list[Heard] = []
+    bias = UNCOMMISSIONED_BIAS * rng.normal(size=6) * biased
+    blind = drive.is_blind(edge, rng)
+    period_s = float(rng.choice(PERIODS_S))
+    at, street, bad = float(rng.uniform(0.0, period_s)), STREET * rng.normal(size=6), np.zeros(6)
+    right = drive.where(edge, -1.0)
+    in_run, poor, suspected_ns = False, _poor(rng), None
+    while at < drive.until_s:
+        faint = bool(rng.random() < FAINT)
+        scatter = CHECK * (WEAK_TIMES if faint else 1.0)
+        seen = drive.where(edge, at) + bias + poor * (street + _student(scatter, rng))
+        if not in_run or rng.random() >= SAME:
+            bad = REACH * rng.normal(size=6)
+        in_run = bool(rng.random() < (BAD_LASTS if in_run else BAD))
+        if in_run or (faint and rng.random() < FAINT_BAD):
+            seen = bad + CHECK * rng.normal(size=6)
+        late_s = float(rng.uniform(0.0, LATE_S))
+        flagged = float((np.abs(seen - right) / np.hypot(CHECK, UNCOMMISSIONED_BIAS)).max()) > FLAGGED
+        if not blind and rng.random() >= MISSING:
+            if not flagged:
+                suspected_ns = None
+            elif suspected_ns is None:
+                suspected_ns = round((at - CHECK_S) * NS_PER_S)
+            found.append((at + late_s, _look(edge, at, seen, scatter, faint, suspected_ns)))
+        if rng.random() < period_s / STREET_S:
+            street, poor = STREET * rng.normal(size=6), _poor(rng)
+        at += PERIODS_S[0] if flagged and not faint else period_s
+    return found
+
+
+def _lidar_looks(edge: Edge, drive: Happening, at_s: float, rng: np.random.Generator) -> list[Heard]:
+    """At two LiDARs, the first at a time."""
+    found: list[Heard] = []
+    bias, street = lidar_looks.BIAS * rng.normal(size=6), lidar_looks.PLACE * rng.normal(size=6)
+    blind = drive.is_blind(edge, rng)
+    while at_s < drive.until_s:
+        sigma = _varied(LIDAR_LOOK, rng)
+        seen = drive.where(edge, at_s) + bias + street + _student(sigma, rng)
+        if rng.random() < BAD:
+            seen = REACH * rng.normal(size=6)
+        if not blind and rng.random() >= MISSING:
+            T_a_b = se3.perturb(edge.T_a_b, seen)
+            look = lidar_looks.look_of(edge.name, round(at_s * NS_PER_S), T_a_b, np.diag(sigma**2))
+            found.append((at_s + LIDAR_LATE_S, look))
+        if rng.random() < LIDAR_PERIOD_S / STREET_S:
+            street = lidar_looks.PLACE * rng.normal(size=6)
+        at_s += LIDAR_PERIOD_S
+    return found
+
+
+def _student(sigma: Array, rng: np.random.Generator) -> Array:
+    """(6,) an error of these standard deviations, with long tails."""
+    return np.asarray(sigma * rng.standard_t(TAILS, size=6) / np.sqrt(TAILS / (TAILS - 2.0)))
+
+
+def _varied(sigma: Array, rng: np.random.Generator) -> Array:
+    """(6,) what one look or window claims of what is usual."""
+    return np.asarray(sigma * np.exp(0.3 * rng.normal(size=6)))
 
 
 def _poor(rng: np.random.Generator) -> float:
@@ -220,23 +291,57 @@ def _look(edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool, suspe
     )
 
 
-def windows(rig: DrawnRig, poses: Poses, rng: np.random.Generator, off_by_rad: float = 0.0) -> dict[str, Measurement]:
-    """One window of each edge. One of them lies beside by an angle, if that is not zero: the first."""
-    lens = {name: rng.normal(size=2) for name in poses}
+@dataclass(frozen=True, slots=True, eq=False)
+class Lasting:
+    """What all windows of a rig share.
+
+    Attributes:
+        lens: (2,) by how many standard deviations the lens of each camera is displaced, down and across, by name.
+        between: (6,) bias of looks at two LiDARs, by edge.
+    """
+
+    lens: Mapping[str, Array]
+    between: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, rig: DrawnRig, rng: np.random.Generator) -> Lasting:
+        """Drawn."""
+        lens = {name: rng.normal(size=2) for name in rig.poses}
+        return cls(lens, {name: lidar_looks.BIAS * rng.normal(size=6) for name in sorted(rig.graph.of_lidars)})
+
+
+def windows(
+    rig: DrawnRig, poses: Poses, lasting: Lasting, rng: np.random.Generator, off_by_rad: float = 0.0
+) -> dict[str, Measurement]:
+    """One window of each edge, of LiDARs a look. One of them lies beside by an angle, if that is not zero: the
+    first."""
     found = {}
     for number, edge in enumerate(rig.graph.edges):
-        sigma = WINDOW * np.exp(0.3 * rng.normal(size=6))
-        noise = np.diag(sigma**2)
-        # Far things tell pitch from height badly, and yaw from a shift to the side.
-        for one, other, sign in ((0, 4, 1.0), (1, 3, -1.0)):
-            noise[one, other] = noise[other, one] = sign * 0.7 * sigma[one] * sigma[other]
-        error = np.linalg.cholesky(noise) @ (rng.standard_t(TAILS * 2.0, size=6) / np.sqrt(1.5))
-        shared: dict[str, Array] = {}
-        if edge.a in CAMERAS:
-            shared = {"lens_down": LENS_RAD * np.eye(6)[0], "lens_across": LENS_RAD * np.eye(6)[1]}
-            error = error + shared["lens_down"] * lens[edge.a][0] + shared["lens_across"] * lens[edge.a][1]
+        T_a_b = poses[edge.a] @ se3.inverse(poses[edge.b])
         if number == 0 and off_by_rad > 0.0:
-            error = error + np.concatenate([off_by_rad * random_direction(rng), np.zeros(3)])
-        T_a_b = se3.perturb(poses[edge.a] @ se3.inverse(poses[edge.b]), error)
-        found[edge.name] = Measurement(T_a_b, Uncertainty(noise, shared, float("nan")), 0)
+            T_a_b = se3.perturb(T_a_b, np.concatenate([off_by_rad * random_direction(rng), np.zeros(3)]))
+        if edge.name in rig.graph.of_lidars:
+            found[edge.name] = _look_as_window(T_a_b, lasting.between[edge.name], rng)
+        else:
+            found[edge.name] = _window(T_a_b, lasting.lens[edge.a], rng)
     return found
+
+
+def _window(T_a_b: Matrix4, lens: Array, rng: np.random.Generator) -> Measurement:
+    """Of a camera and a LiDAR (4, 4)."""
+    sigma = _varied(WINDOW, rng)
+    noise = np.diag(sigma**2)
+    # Far things tell pitch from height badly, and yaw from a shift to the side.
+    for one, other, sign in ((0, 4, 1.0), (1, 3, -1.0)):
+        noise[one, other] = noise[other, one] = sign * 0.7 * sigma[one] * sigma[other]
+    error = np.linalg.cholesky(noise) @ (rng.standard_t(TAILS * 2.0, size=6) / np.sqrt(1.5))
+    shared = {"lens_down": LENS_RAD * np.eye(6)[0], "lens_across": LENS_RAD * np.eye(6)[1]}
+    error = error + shared["lens_down"] * lens[0] + shared["lens_across"] * lens[1]
+    return Measurement(se3.perturb(T_a_b, error), Uncertainty(noise, shared, float("nan")), 0)
+
+
+def _look_as_window(T_a_b: Matrix4, bias: Array, rng: np.random.Generator) -> Measurement:
+    """Of two LiDARs (4, 4)."""
+    sigma = _varied(LIDAR_LOOK, rng)
+    error = bias + lidar_looks.PLACE * rng.normal(size=6) + _student(sigma, rng)
+    return lidar_looks.window_of(0, se3.perturb(T_a_b, error), np.diag(sigma**2))

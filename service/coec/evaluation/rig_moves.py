@@ -10,9 +10,24 @@ from math import radians
 import numpy as np
 
 from coec.calibration.rig.attribution import RigState, SensorHealth, after_look, begun, sensors, served
-from coec.calibration.rig.evidence import Look
 from coec.calibration.rig.joint import estimate
-from coec.evaluation.rig_evidence import BUILT, FOUR, FULL, SINGLE, Bend, DrawnRig, checks, moved, off, windows
+from coec.evaluation.rig_evidence import (
+    APART,
+    BUILT,
+    FOUR,
+    FULL,
+    SINGLE,
+    Bend,
+    DrawnRig,
+    Happening,
+    Heard,
+    Lasting,
+    looks,
+    moved,
+    off,
+    windows,
+)
+from coec.evaluation.rig_knocks import knocked_row
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 from coec.schemas.replies import Vector6
@@ -52,6 +67,10 @@ FAULTS: tuple[tuple[DrawnRig, Fault], ...] = (
     (FULL, Fault("one LiDAR 1°", lidars=1)),
     (FULL, Fault("two cameras 1°", cameras=2)),
     (FULL, Fault("one pair disturbed by 1°", pairs=1)),
+    (APART, NOBODY),
+    (APART, Fault("one camera 1°", cameras=1)),
+    (APART, Fault("one LiDAR 1°", lidars=1)),
+    (APART, Fault("two cameras 1°", cameras=2)),
     (SINGLE, Fault("the LiDAR 1°", lidars=1)),
     (SINGLE, Fault("the camera 1°", cameras=1)),
 )
@@ -72,7 +91,8 @@ def report(drives: int, rigs: int, heard: Callable[[str], None]) -> RigMovesRepo
     return RigMovesReport(
         allowed_s=ALLOWED_S,
         moves=tuple(_row(rig, fault, drives, heard) for rig, fault in FAULTS),
-        joint=tuple(joint_row(rig, rigs) for rig in (FOUR, FULL)),
+        joint=tuple(joint_row(rig, rigs) for rig in (FOUR, FULL, APART)),
+        knocked=tuple(knocked_row(rig, rigs) for rig in (FOUR, FULL, APART)),
     )
 
 
@@ -111,21 +131,24 @@ def drive(rig: DrawnRig, fault: Fault, number: int) -> Drive:
     delay_s: float | None = None if who else 0.0
     wrong = False
     state = begun(rig.graph)
-    for name, window in windows(rig, before, rng).items():
+    for name, window in windows(rig, before, Lasting.of(rig, rng), rng).items():
         state = served(state, name, window.T_camera_lidar, window.uncertainty.sigma)
-    for at, named in _named(rig, state, checks(rig, before, after, bend, at_s, at_s + ALLOWED_S, rng)):
+    happening = Happening(before, after, bend, at_s, at_s + ALLOWED_S)
+    for at, named in _named(rig, state, looks(rig, happening, rng)):
+        if at > happening.until_s:
+            break
         wrong = wrong or not named <= (who if at >= at_s else set())
         if who and delay_s is None and at >= at_s and named == who:
             delay_s = at - at_s
     return Drive(delay_s, wrong)
 
 
-def _named(rig: DrawnRig, state: RigState, looks: Sequence[Look]) -> Iterator[tuple[float, set[str]]]:
+def _named(rig: DrawnRig, state: RigState, heard: Sequence[Heard]) -> Iterator[tuple[float, set[str]]]:
     """Time, seconds, and the sensors that were named then, whenever it was asked."""
-    for look in looks:
+    for at_s, look in heard:
         before, state = state, after_look(state, rig.graph, look)
         if state.asked_ns != before.asked_ns:
-            yield state.asked_ns / 1e9, {one.name for one in sensors(state, rig.graph) if one.health in MOVED}
+            yield at_s, {one.name for one in sensors(state, rig.graph) if one.health in MOVED}
 
 
 def joint_row(rig: DrawnRig, rigs: int) -> JointRow:
@@ -136,7 +159,7 @@ def joint_row(rig: DrawnRig, rigs: int) -> JointRow:
     for number in range(rigs):
         rng = np.random.default_rng([SEED, number, *rig.name.encode()])
         poses = off(rig.poses, BUILT, rng)
-        told = windows(rig, poses, rng)
+        told = windows(rig, poses, Lasting.of(rig, rng), rng)
         result = estimate(rig.graph, told)
         consistent += result.consistent
         for edge in rig.graph.edges:
@@ -145,7 +168,7 @@ def joint_row(rig: DrawnRig, rigs: int) -> JointRow:
             of_rig += error**2
             of_pairs += se3.difference(told[edge.name].T_camera_lidar, truth) ** 2
             nees.append(float(error @ np.linalg.solve(result.between(edge.name, edge.name), error)) / 6.0)
-        biased = estimate(rig.graph, windows(rig, poses, rng, STEP_RAD))
+        biased = estimate(rig.graph, windows(rig, poses, Lasting.of(rig, rng), rng, STEP_RAD))
         found += biased.left_out == rig.graph.edges[0].name
         missed += biased.consistent
     ratio = np.sqrt(of_rig / of_pairs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import median
 
 from coec.reports import console
@@ -9,7 +10,7 @@ from coec.schemas.rig import RigDrivesReport, RigMovesReport
 
 
 def show(report: RigMovesReport) -> None:
-    """Who moved, by fault; then what the rig knows of its pairs."""
+    """Who moved, by fault; then what the rig knows of its pairs, and what right after a LiDAR of it was knocked."""
     table = console.table(
         "rig", "fault", "drives", f"right in {report.allowed_s:g} s", "undecided", "wrong", "median", "latest",
         right=range(2, 8),
@@ -27,11 +28,28 @@ def show(report: RigMovesReport) -> None:
             of.rig,
             str(of.pairs),
             str(of.rigs),
-            f"{of.rms_ratio_all:.2f} ({' '.join(f'{ratio:.2f}' for ratio in of.rms_ratio)})",
+            _ratio(of.rms_ratio_all, of.rms_ratio),
             f"{of.nees:.2f}",
             *map(str, (of.consistent, of.biased_found, of.biased_missed)),
         )
     console.out.print(joint)
+    knocked = console.table(
+        "windows after a knocked LiDAR", "pairs", "rigs", "rms error, of single pairs", "without before", "NEES",
+        "worst pair", "single", "consistent", "camera too, missed", right=range(1, 10),
+    )  # fmt: skip
+    for after in report.knocked:
+        knocked.add_row(
+            after.rig,
+            str(after.pairs),
+            str(after.rigs),
+            _ratio(after.rms_ratio_all, after.rms_ratio),
+            f"{after.rms_ratio_without:.2f}",
+            f"{after.nees:.2f}",
+            f"{after.worst_deg:.2f}°",
+            f"{after.worst_of_pairs_deg:.2f}°",
+            *map(str, (after.consistent, after.also_missed)),
+        )
+    console.out.print(knocked)
 
 
 def show_drives(report: RigDrivesReport) -> None:
@@ -52,6 +70,10 @@ def show_drives(report: RigDrivesReport) -> None:
                 console.show(f"  {one.name}, {row.fault}: {' and '.join(one.moved)} not named")
     of = f"{report.looks} looks on {report.drives} drives with {report.camera}"
     console.show(f"{of}: {report.faint} faint, {report.blind} blind; {report.failed} drives failed")
+
+
+def _ratio(of_all: float, per_axis: Sequence[float]) -> str:
+    return f"{of_all:.2f} ({' '.join(f'{ratio:.2f}' for ratio in per_axis)})"
 
 
 def _late(seconds: tuple[float, ...]) -> tuple[str, str]:

@@ -37,12 +37,29 @@ class JointRow(Part):
     biased_missed: Count = Field(description="of which the pairs were said to fit each other all the same")
 
 
+class KnockedRow(Part):
+    """One window of each pair of a rig after a LiDAR of it was knocked, combined with what was known before."""
+
+    rig: str
+    rigs: Count = Field(description="drawn")
+    pairs: Count = Field(description="of one rig")
+    rms_ratio: Vector6 = Field(description="rms error of the rig estimate over that of the windows, per axis")
+    rms_ratio_all: float = Field(description="root of the mean of their squares")
+    rms_ratio_without: float = Field(description="the same of an estimate by these windows alone")
+    nees: float = Field(description="mean squared error of the rig estimate over what it claims, per axis: 1 is honest")
+    worst_deg: float = Field(description="error of the worst pair of all rigs")
+    worst_of_pairs_deg: float = Field(description="the same of the windows")
+    consistent: Count = Field(description="rigs whose windows were said to fit what was known before")
+    also_missed: Count = Field(description="of rigs of which a camera was turned by 0.5° as well, those said to fit")
+
+
 class RigMovesReport(Message):
     """What `coec sim rig-moves --json` prints."""
 
     allowed_s: float
     moves: tuple[MovesRow, ...]
     joint: tuple[JointRow, ...]
+    knocked: tuple[KnockedRow, ...]
 
 
 class Mounts(StrEnum):

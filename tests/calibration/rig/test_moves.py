@@ -71,3 +71,17 @@ def test_patterns_are_how_poses_step_as_sensors_move() -> None:
         for edge, of in zip(rig.edges, design, strict=True):
             stepped = se3.difference(after[edge.a] @ se3.inverse(after[edge.b]), edge.T_a_b)
             np.testing.assert_allclose(of @ xi, stepped, atol=1e-10)
+
+
+def test_edges_that_nobody_looked_at_since_speak_neither_for_nor_against_a_sensor() -> None:
+    """An edge between two LiDARs stepped after the last look at any camera. The one has three of these, the other one:
+    that makes neither likelier."""
+    rig = graph([*STAR, ("front", "bumper"), ("roof", "bumper")])
+    rounds, step = np.tile(COARSE, (2, 1, 1)), np.tile([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
+    likely = float(_log_normal(np.zeros(6)))
+    still = Steps(np.zeros((2, 6)), rounds, np.array([0.0, 3.0]), np.array([0.0, -700.0]), np.zeros(2), likely)
+    seen = Steps(step, rounds, np.ones(2), np.full(2, -700.0), np.zeros(2), float(_log_normal(step[0])))
+    found = who_moved(rig, {edge.name: seen if edge.name == "roof-bumper" else still for edge in rig.edges})
+    assert log(found.sensors["roof"] / found.sensors["bumper"]) == pytest.approx(0.0, abs=1.0)
+    assert found.sensors["roof"] + found.sensors["bumper"] > 0.8
+    assert found.when == 0

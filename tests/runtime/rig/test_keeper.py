@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from coec.adapters.files.state_file import StateFile
-from coec.runtime.api.rig import INCONSISTENT, RigAnswers, reply_of, troubles_of
+from coec.runtime.api.rig import RigAnswers, reply_of
+from coec.runtime.api.rig_troubles import INCONSISTENT, troubles_of
 from coec.runtime.rig.keeper import LAG_NS, QUIET_TICKS
 from coec.runtime.rig.rig_file import FILE
 from coec.schemas.base import from_json, to_json

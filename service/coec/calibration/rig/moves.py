@@ -255,7 +255,9 @@ class _Rows:
         edges = len(graph.edges)
         lasting = np.full(step.shape[:2], log(LINK_BREAKS))
         lasting[:, :edges] = _log_event() + log(EDGE_SHARE / max(edges, 1))
-        prior = np.minimum(np.logaddexp(lasting, np.stack(transient, axis=1)), log(0.999))
+        # Without a look since, nothing was disturbed for a while: such an edge says neither for nor against anybody.
+        for_a_while = np.where(looked, np.stack(transient, axis=1), -np.inf)
+        prior = np.minimum(np.logaddexp(lasting, for_a_while), log(0.999))
         return cls(
             xi=step,
             information=information,

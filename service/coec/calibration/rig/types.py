@@ -27,6 +27,20 @@ MOST_SENSORS = 12
 """Eight cameras, three LiDARs and the vehicle itself: what is solved is dense."""
 
 
+_WAS = " before"
+"""After a name. None that is configured has a space in it."""
+
+
+def was(name: str) -> str:
+    """What a sensor, an edge or a link is called as it was before a move."""
+    return name + _WAS
+
+
+def whose(name: str) -> str:
+    """Of which sensor, edge or link a name is, be it of before a move or of now."""
+    return name.removesuffix(_WAS)
+
+
 class Kind(StrEnum):
     """What a node is. The vehicle's own frame, where something measures it, is a node that cannot move."""
 

@@ -1,8 +1,9 @@
 """The rig of one vehicle, step by step: checks, accepted windows and what its pairs serve, put together.
 
 A move of a sensor is one event. It begins when the sensor is named (`attribution`). It is put right when every pair of
-it that is alive has an accepted window of after the move: the joint estimate (`joint`) then tells all of these pairs at
-once. It is over when they all serve what they were told or found since: their looks are counted from there.
+it that is alive has an accepted window of after the move: the joint estimate (`joint`), with what was known before it
+(`before`), then tells all pairs of the sensor at once, one move for all of them. It is over when they all serve what
+they were told or found since: their looks are counted from there.
 """
 
 from __future__ import annotations
@@ -14,15 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.rig import attribution
-from coec.calibration.rig.attribution import NS_PER_S, RigState, SensorHealth, SensorState
+from coec.calibration.rig.attribution import NS_PER_S, STEPPED2, RigState, SensorHealth, SensorState
+from coec.calibration.rig.before import Before
 from coec.calibration.rig.evidence import Look, of_window
 from coec.calibration.rig.joint import JointEstimate, estimate
-from coec.calibration.rig.moves import Moved
+from coec.calibration.rig.moves import Moved, movers
 from coec.calibration.rig.steps import MOST_LOOKS
 from coec.calibration.rig.types import RigGraph
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
-from coec.geometry import se3
+from coec.geometry import dense, se3
 
 ALIVE_NS = 60 * NS_PER_S
 """A pair without a look for so long is not waited for: 12 periods of the monitor."""
@@ -43,17 +45,19 @@ class Windowed:
 @dataclass(frozen=True, slots=True, eq=False)
 class Served:
     """What a pair serves (4, 4), known to `sigma` (6,), by frames since `start_ns`; None: not by frames, but as the
-    vehicle was built or a person wants it."""
+    vehicle was built or a person wants it. `known` is what all its windows together say of the mount, if any do."""
 
     T_a_b: Matrix4
     sigma: NDArray[np.float64]
     start_ns: int | None
+    known: Measurement | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
     """What the joint estimate says of a pair: (4, 4), and the covariance (6, 6) of its perturbation. Axes that the
-    window of the pair does not tell are as in that window, and NaN in the covariance."""
+    window of the pair does not tell are as in that window, and NaN in the covariance; of a pair without a window of
+    after the move, which is told by the others and by what was known of it before, none are."""
 
     T_a_b: Matrix4
     covariance: NDArray[np.float64]
@@ -96,6 +100,9 @@ class VehicleRig:
         believed: who moved.
         windows: the newest of each edge, as far as it is of the rig as it is now.
         serves: what each pair serves.
+        known: what was known of each pair by all its windows, the latest two times, the older first: when a move is
+            noticed, the latest may be of after it.
+        before: what was known before the event that is going on, as far as it is true after it.
         event: the one that is going on; None while all is calm.
         move: the latest event, over or not; None before the first.
         joint: the rig by these windows; None before the first, and while two windows of an edge are awaited.
@@ -103,12 +110,15 @@ class VehicleRig:
         since_ns: since when each is in its state, by name.
         correction: the latest.
         looks: that were counted, by edge.
+        registered: the latest look at two LiDARs, by edge, whether or not another has said the same.
     """
 
     graph: RigGraph
     believed: RigState
     serves: Mapping[str, Served]
     windows: Mapping[str, Windowed] = field(default_factory=dict)
+    known: Mapping[str, tuple[Measurement, ...]] = field(default_factory=dict)
+    before: Before | None = None
     event: Event | None = None
     move: Move | None = None
     joint: JointEstimate | None = None
@@ -116,6 +126,7 @@ class VehicleRig:
     since_ns: Mapping[str, int] = field(default_factory=dict)
     correction: Correction | None = None
     looks: Mapping[str, int] = field(default_factory=dict)
+    registered: Mapping[str, Windowed] = field(default_factory=dict)
 
 
 def begun(graph: RigGraph, serves: Mapping[str, Served], windows: Mapping[str, Windowed]) -> VehicleRig:
@@ -125,7 +136,8 @@ def begun(graph: RigGraph, serves: Mapping[str, Served], windows: Mapping[str, W
     for name in graph.edge:
         believed = attribution.served(believed, name, serves[name].T_a_b, serves[name].sigma)
     told = attribution.sensors(believed, graph)
-    return _combined(VehicleRig(graph, believed, dict(serves), dict(windows), sensors=told))
+    known = {name: (of.known,) for name, of in serves.items() if of.known is not None}
+    return _combined(VehicleRig(graph, believed, dict(serves), dict(windows), known, sensors=told))
 
 
 def going_on(rig: VehicleRig, event: Event) -> VehicleRig:
@@ -145,6 +157,7 @@ def grown(rig: VehicleRig, fresh: VehicleRig) -> VehicleRig:
         believed=believed,
         serves={**fresh.serves, **rig.serves},
         windows={**fresh.windows, **rig.windows},
+        known={**fresh.known, **rig.known},
         sensors=attribution.sensors(believed, fresh.graph),
     )
     return _combined(rig)
@@ -184,19 +197,28 @@ def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) ->
 
 
 def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
-    """Two LiDARs were registered: one look, of which both who moved and the joint estimate hear. No pair serves where
-    the one sits in the other: it is where that was found.
+    """Two LiDARs were registered: one look, of which who moved hears at once, and the joint estimate once another look
+    has said the same: a single one may be bad, or the first of after a move, and fits no window of before it. No pair
+    serves where the one sits in the other: it is where that was found.
 
     Raises:
         ValueError: it is of no edge of the rig.
     """
     measured = window.measurement
     found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns)
-    rig = replace(rig, serves={**rig.serves, look.edge: found})
-    rig = after_look(rig, look)
-    if _from_before_a_move(rig, look.edge, window):
+    rig = after_look(replace(rig, serves={**rig.serves, look.edge: found}), look)
+    before = rig.registered.get(look.edge)
+    rig = replace(rig, registered={**rig.registered, look.edge: window})
+    if before is None or not _say_the_same(before.measurement, measured) or _from_before_a_move(rig, look.edge, window):
         return rig
     return _followed(_combined(replace(rig, windows={**rig.windows, look.edge: window})), look.stamp_ns)
+
+
+def _say_the_same(one: Measurement, other: Measurement) -> bool:
+    """Whether two looks at an edge differ by no more than chance."""
+    apart = se3.difference(one.T_camera_lidar, other.T_camera_lidar)
+    covariance = one.uncertainty.covariance + other.uncertainty.covariance
+    return float(dense.squared(dense.inverse(covariance), apart)) < STEPPED2
 
 
 def _from_before_a_move(rig: VehicleRig, edge: str, window: Windowed) -> bool:
@@ -209,7 +231,7 @@ def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> V
     """A pair serves something else. The first that rests on frames tells where the edge is; later ones, while all is
     calm, are corrections of what looks tell as well."""
     before = rig.serves[edge]
-    rig = replace(rig, serves={**rig.serves, edge: serves})
+    rig = _serving(rig, edge, serves)
     if rig.event is None and before.start_ns is None and serves.start_ns is not None and rig.believed.calm:
         rig = replace(rig, believed=attribution.served(rig.believed, edge, serves.T_a_b, serves.sigma))
     return _followed(rig, stamp_ns)
@@ -219,24 +241,35 @@ def forgotten(rig: VehicleRig) -> VehicleRig:
     """Sensor time stepped back: looks of the old time are none of the new. What went before them stays."""
     histories = {name: replace(history, looks=()) for name, history in rig.believed.histories.items()}
     believed = RigState(histories)
-    rig = replace(rig, believed=believed, windows={}, joint=None, event=None, move=None, since_ns={})
+    rig = replace(rig, believed=believed, windows={}, known={}, before=None, joint=None, event=None, move=None)
+    rig = replace(rig, since_ns={}, registered={})
     return replace(rig, sensors=attribution.sensors(believed, rig.graph))
 
 
 def pairs_of(graph: RigGraph, sensors: tuple[str, ...]) -> tuple[str, ...]:
-    """Edges that end at any of these sensors, and not with both ends."""
-    return tuple(edge.name for edge in graph.edges if (edge.a in sensors) != (edge.b in sensors))
+    """Edges that a move of these sensors displaces: those that end at any of them, but for what lies between two on one
+    bar, which moved as one."""
+    moved = set(sensors)
+    bars = [set(mover.sensors) for mover in movers(graph) if len(mover.sensors) > 1]
+    return tuple(
+        edge.name
+        for edge in graph.edges
+        if {edge.a, edge.b} & moved and not any({edge.a, edge.b} <= bar <= moved for bar in bars)
+    )
 
 
-def inconsistent(rig: VehicleRig) -> tuple[str, ...]:
-    """Edges that do not fit the others: the one that alone does not, else all on loops that do not close."""
-    joint = rig.joint
-    if joint is None or joint.consistent:
-        return ()
-    if joint.left_out is not None:
-        return (joint.left_out,)
-    named = {name for loop in joint.open_loops for name in loop.names} or set(joint.measured)
-    return tuple(name for name in rig.graph.edge if name in named)
+def renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
+    """Whether a pair serves what frames since then told."""
+    start_ns = rig.serves[edge].start_ns
+    return start_ns is not None and start_ns >= since_ns
+
+
+def _serving(rig: VehicleRig, edge: str, serves: Served) -> VehicleRig:
+    """With what is served for an edge, and what is known of it by that."""
+    rig = replace(rig, serves={**rig.serves, edge: serves})
+    if serves.known is None:
+        return rig
+    return replace(rig, known={**rig.known, edge: (*rig.known.get(edge, ()), serves.known)[-2:]})
 
 
 def _noted(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
@@ -266,7 +299,7 @@ def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     if not event.corrected:
         if _served(rig, fresh) and set(alive) <= set(fresh):
             return _followed(_corrected(rig, event, fresh, stamp_ns), stamp_ns)
-    elif alive and all(_renewed(rig, name, event.stepped_ns) for name in alive):
+    elif alive and all(renewed(rig, name, event.stepped_ns) for name in alive):
         return _over(rig, pairs, stamp_ns)
     if stamp_ns - event.since_ns > OVER_NS and not rig.believed.named:
         return _over(rig, pairs, stamp_ns)
@@ -281,7 +314,7 @@ def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     pairs = attribution.stepped(rig.believed)
     served, since_ns = _served(rig, pairs), rig.believed.stepped_ns
     if served:
-        is_over = all(_renewed(rig, name, since_ns) for name in served)
+        is_over = all(renewed(rig, name, since_ns) for name in served)
     else:
         kept = [rig.believed.histories[name].looks for name in pairs]
         is_over = all(len(looks) >= MOST_LOOKS and looks[0].stamp_ns >= since_ns for looks in kept)
@@ -293,12 +326,6 @@ def _served(rig: VehicleRig, edges: Sequence[str]) -> list[str]:
     return [name for name in edges if name not in rig.graph.of_lidars]
 
 
-def _renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
-    """Whether a pair serves what frames since then told."""
-    start_ns = rig.serves[edge].start_ns
-    return start_ns is not None and start_ns >= since_ns
-
-
 def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -> VehicleRig:
     """All pairs of an event have a window of after it. What one pair tells by itself needs nobody to tell it, and where
     the pairs do not fit each other nobody is told."""
@@ -307,11 +334,11 @@ def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -
     if joint is None or not (joint.consistent or joint.left_out is not None):
         return rig
     measured = [name for name in fresh if name in joint.measured]
-    told = {
-        name: _told(joint, name, rig.windows[name].measurement) for name in measured if name not in rig.graph.of_lidars
-    }
+    told = {name: _told(joint, name, rig.windows[name].measurement) for name in _served(rig, measured)}
     if len(measured) < 2 or not told:
         return rig
+    if rig.before is not None:
+        told |= {name: _told_by_others(joint, name) for name in _served(rig, [*rig.before.edges]) if name not in fresh}
     return replace(rig, correction=Correction(stamp_ns, event.sensors, told))
 
 
@@ -332,7 +359,19 @@ def _begun_or_grown(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
     since_ns = stamp_ns if event is None else event.since_ns
     event = Event(sensors, since_ns, stepped_ns)
     moved = {sensor.name: sensor.moved for sensor in rig.sensors if sensor.name in sensors and sensor.moved is not None}
-    return _without_stale(replace(rig, event=event, move=Move(event, moved)))
+    return _without_stale(replace(rig, before=_before(rig, event), event=event, move=Move(event, moved)))
+
+
+def _before(rig: VehicleRig, event: Event) -> Before:
+    """What was known before an event: of each edge the latest of up to the last look that saw no move."""
+    touched = pairs_of(rig.graph, event.sensors)
+    right_ns = max(
+        (look.stamp_ns for name in touched for look in rig.believed.histories[name].looks
+         if look.stamp_ns < min(rig.believed.stepped_ns, event.stepped_ns)),
+        default=event.stepped_ns,
+    )  # fmt: skip
+    known = {name: rig.known[name] for name in touched if name in rig.known}
+    return Before.of(event.sensors, known, right_ns, event.since_ns)
 
 
 def _told(joint: JointEstimate, edge: str, own: Measurement) -> Told:
@@ -340,6 +379,12 @@ def _told(joint: JointEstimate, edge: str, own: Measurement) -> Told:
     apart = np.where(axes, se3.difference(joint.T_a_b[edge], own.T_camera_lidar), 0.0)
     covariance = np.where(axes[:, None] & axes, joint.between(edge, edge), np.nan)
     return Told(se3.perturb(own.T_camera_lidar, apart), covariance)
+
+
+def _told_by_others(joint: JointEstimate, edge: str) -> Told:
+    """Of a pair that no window of after the move tells: where the sensor that moved is by those of the others, and its
+    other sensor by what was known before."""
+    return Told(joint.T_a_b[edge], joint.between(edge, edge))
 
 
 def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:
@@ -351,8 +396,14 @@ def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:
         if name in told:
             T_a_b, sigma = told[name].T_a_b, np.sqrt(told[name].covariance.diagonal())
         believed = attribution.served(believed, name, T_a_b, sigma)
+    since_ns = rig.believed.stepped_ns if event is None else event.stepped_ns
+    known = {
+        name: tuple(one for one in of if name not in pairs or one.stamp_ns >= since_ns)
+        for name, of in rig.known.items()
+    }
     move = rig.move if event is None or rig.move is None else replace(rig.move, over_ns=stamp_ns)
-    return _noted(replace(rig, believed=attribution.settled(believed), event=None, move=move), stamp_ns)
+    believed = attribution.settled(believed)
+    return _noted(replace(rig, believed=believed, known=known, before=None, event=None, move=move), stamp_ns)
 
 
 def _without_stale(rig: VehicleRig) -> VehicleRig:
@@ -366,9 +417,9 @@ def _without_stale(rig: VehicleRig) -> VehicleRig:
 
 
 def _combined(rig: VehicleRig) -> VehicleRig:
-    """The joint estimate by the windows as they are now."""
+    """The joint estimate by the windows as they are now, and what was known before a move that is going on."""
     told = {name: window.measurement for name, window in rig.windows.items() if window.measurement.told_axes()}
-    return replace(rig, joint=estimate(rig.graph, told) if told else None)
+    return replace(rig, joint=estimate(rig.graph, told, rig.before) if told else None)
 
 
 def _last_ns(rig: VehicleRig, edge: str) -> int:

@@ -15,19 +15,17 @@ from coec.calibration.rig.attribution import SensorHealth, SensorState
 from coec.calibration.rig.joint import JointEstimate
 from coec.calibration.rig.moves import Moved
 from coec.calibration.rig.types import Kind, RigGraph
-from coec.calibration.rig.vehicle import Move, VehicleRig, inconsistent, pairs_of
+from coec.calibration.rig.vehicle import Move, VehicleRig, pairs_of
 from coec.calibration.types import Reason
 from coec.geometry import se3
 from coec.runtime.api.health import reasons_of
+from coec.runtime.api.rig_troubles import troubles_of
 from coec.runtime.api.snapshots import Snapshot
 from coec.runtime.rig.keeper import ONE_PAIR, RigKnown
 from coec.runtime.rig.lidar_side import LidarsKnown
 from coec.schemas import rig_state
 from coec.schemas.keys import Format, Keys
 from coec.schemas.replies import Maybe6x6, Vector6
-
-INCONSISTENT = "inconsistent_rig"
-"""Code of the reason that a pair does not fit the others of its vehicle."""
 
 
 class RigAnswers:
@@ -104,30 +102,6 @@ def reply_of(vehicle: str, known: RigKnown) -> rig_state.RigReply:
         looks=dict(rig.looks),
         losses=dict(known.losses),
     )
-
-
-def troubles_of(rig: VehicleRig) -> dict[str, tuple[Reason, ...]]:
-    """What does not fit, by pair."""
-    joint, pairs = rig.joint, inconsistent(rig)
-    if joint is None or not pairs:
-        return {}
-    if joint.left_out is not None:
-        why = f"its latest window does not fit those of the others, which fit each other without it ({_odds(joint)})"
-    elif joint.open_loops:
-        loop = joint.open_loops[0]
-        shift = "" if not isfinite(loop.translation_m) else f" and {100.0 * loop.translation_m:.1f} cm"
-        off = f"{degrees(loop.rotation_rad):.2f}°{shift}" if isfinite(loop.rotation_rad) else "more than chance"
-        why = (
-            f"the latest windows of {', '.join(loop.names)} should close a loop, and miss it by {off} ({_odds(joint)})"
-        )
-    else:
-        why = f"the latest windows of the pairs do not fit each other ({_odds(joint)})"
-    reason = Reason(INCONSISTENT, f"The pairs of the vehicle do not agree where its sensors are: {why}.")
-    return dict.fromkeys(pairs, (reason,))
-
-
-def _odds(joint: JointEstimate) -> str:
-    return f"χ² {joint.chi2:.1f} at {joint.freedom} degrees of freedom, p {joint.chance:.1g}"
 
 
 def _untold(graph: RigGraph, why: tuple[Reason, ...]) -> tuple[rig_state.SensorReply, ...]:

@@ -35,6 +35,16 @@ TROUBLES: Mapping[str, Trouble] = {
         "Nothing while windows come: one from before a move fits again with the next. If it stays, see to what a pair "
         "has of its own: intrinsics, clocks, masks; and to `links`.",
     ),
+    "sensor_suspected": Trouble(
+        "The pairs of the vehicle do not agree where its sensors are, and one of this pair may have moved; `coec query "
+        "rig` tells by how much, and how likely.",
+        "Nothing: the next looks name it, or say `inconsistent_rig`, or that all fits.",
+    ),
+    "sensor_moved": Trouble(
+        "A sensor of the pair moved, as `coec query rig` tells, and the pair serves what was before.",
+        "Nothing while windows come: one correction puts all its pairs right. If it stays, `health` says what the "
+        "windows of the pair lack, or the pair is held or waits for `apply`.",
+    ),
     "one_pair": Trouble(
         "Said of `rig`: the vehicle has one pair, which cannot tell its camera from its LiDAR.",
         "Nothing: `health` of the pair says whether either moved. A second camera on that LiDAR would tell them apart.",

@@ -112,4 +112,10 @@ def served_by(state: PairState, prior: NDArray[np.float64]) -> Served:
     pose: Matrix4 = state.T_camera_lidar
     if state.accepted is None:
         return Served(pose, prior, None)
-    return Served(pose, state.accepted.sigma, start_ns_of(state.accepted.window_id))
+    track = state.track
+    known = (
+        None
+        if track is None or not track.windows
+        else Measurement(track.T_camera_lidar, track.uncertainty, track.stamp_ns)
+    )
+    return Served(pose, state.accepted.sigma, start_ns_of(state.accepted.window_id), known)

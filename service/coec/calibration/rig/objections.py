@@ -1,0 +1,48 @@
+"""What the rig has against a pair: one thing at a time, whatever is going on.
+
+Windows of a rig that just moved do not fit those of before: while that is in question it is a suspicion, once a sensor
+is named it is a move, and only where neither is so do pairs contradict each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+
+from coec.calibration.rig.attribution import SensorHealth
+from coec.calibration.rig.vehicle import VehicleRig, pairs_of, renewed
+
+
+class Objection(StrEnum):
+    """`moved`: a sensor of it was named, and it serves what was before. `suspected`: windows of the rig do not fit each
+    other, and a sensor of it may have moved. `inconsistent`: they do not, and no sensor did."""
+
+    MOVED = "moved"
+    SUSPECTED = "suspected"
+    INCONSISTENT = "inconsistent"
+
+
+def objections(rig: VehicleRig) -> Mapping[str, Objection]:
+    """By pair; of those that fit there is none."""
+    found = dict.fromkeys(misfits(rig), Objection.INCONSISTENT)
+    undecided = {sensor.name for sensor in rig.sensors if sensor.health is SensorHealth.UNDECIDED}
+    for name in found:
+        if {rig.graph.edge[name].a, rig.graph.edge[name].b} & undecided:
+            found[name] = Objection.SUSPECTED
+    event = rig.event
+    if event is not None:
+        for name in pairs_of(rig.graph, event.sensors):
+            if name not in rig.graph.of_lidars and not renewed(rig, name, event.stepped_ns):
+                found[name] = Objection.MOVED
+    return found
+
+
+def misfits(rig: VehicleRig) -> tuple[str, ...]:
+    """Edges that do not fit the others: the one that alone does not, else all on loops that do not close."""
+    joint = rig.joint
+    if joint is None or joint.consistent:
+        return ()
+    if joint.left_out is not None:
+        return (joint.left_out,)
+    named = {name for loop in joint.open_loops for name in loop.names} or set(joint.measured)
+    return tuple(name for name in rig.graph.edge if name in named)
