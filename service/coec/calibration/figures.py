@@ -68,6 +68,14 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "ambiguous: another pose explains the window nearly as well",
             "Start nearer to the truth, or take a longer window with other scenes in it.",
         ),
+        "edges_once": Figure(
+            "Edges, counted once",
+            "σ",
+            "How significantly the LiDAR's edges lie on those of the images of a vehicle on the move, what all its "
+            "frames have in common counted once.",
+            "what fits is the same in all frames although the vehicle drives: lines along the road fit one another",
+            "Take a window that passes other things: houses, cars, posts and trees within reach of the LiDAR.",
+        ),
         "newton_step_deg": Figure(
             "Slope left, rotation",
             "°",

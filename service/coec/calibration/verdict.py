@@ -17,12 +17,14 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.looks import Looks
 from coec.calibration.confidence.loosened import LENS_FREE, Loosened
 from coec.calibration.figures import FIGURES
+from coec.calibration.frames.sampling import drives
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, Metric, Reason, StopReason, Verdict
+from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, FramePair, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
@@ -36,8 +38,9 @@ UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
 
 
 SAME_SCENE = 0.5
-"""Share of the frames below which the independent looks of a window say that it saw one scene: on recordings in motion
-they are worth three quarters of their number and more, of a standing vehicle a quarter to half."""
+"""Share of the frames below which the independent looks of a window say that it saw one scene: of a drive through
+streets they are worth four fifths of their number and more, of slow traffic and motorways a fifth to a third, of a
+standing vehicle a tenth to a quarter."""
 
 
 def counted_once(metrics: tuple[Metric, ...], looks: float, frames: int) -> tuple[Metric, ...]:
@@ -76,6 +79,15 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
         return ()
     gain = change.gain if change.of_camera and degrees(change.turn_rad) >= limits.min_change_deg else 0.0
     return (Metric(MOVED, gain, limits.max_change_gain, at_least=False),)
+
+
+def repetition_metric(looks: Looks | None, pairs: Sequence[FramePair], limits: VerdictConfig) -> tuple[Metric, ...]:
+    """What the edges tell when all that frames have in common counts once; nothing where they were not looked at, or
+    the vehicle is not known to drive. What stands still before a standing vehicle is its whole scene. What stands still
+    before one that drives are the lines that run along its road, of which any two fit each other."""
+    if looks is None or not drives(pairs):
+        return ()
+    return (Metric("edges_once", looks.significance, limits.min_edges_once, at_least=True),)
 
 
 def intrinsics_metric(loosened: Sequence[Loosened], limits: VerdictConfig) -> tuple[Metric, ...]:

@@ -144,6 +144,12 @@ class VerdictConfig(Stage):
         le=1,
         description="edge contrast of the next best basin over the best one's; above: ambiguous",
     )
+    min_edges_once: float = Field(
+        default=12.0,
+        gt=0,
+        description="edge significance of a vehicle on the move, what its frames have in common counted once; less has "
+        "been reached by guard rails that lie on lane markings (fused)",
+    )
     max_change_gain: float = Field(
         default=3.5,
         gt=0,
