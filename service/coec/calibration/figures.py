@@ -227,7 +227,7 @@ OTHER_ADVICE: Mapping[str, str] = MappingProxyType(
     {
         StopReason.AT_BOUND.value: "Start nearer to the truth, or widen the search (`search.rotation_deg`).",
         StopReason.EVALUATIONS.value: "Start nearer, or allow more evaluations (`search.max_evaluations`).",
-        "motion": "Take the window while the vehicle drives, not where it stands.",
+        "motion": "Take the window while the vehicle drives past things, not where it stands or sees its road alone.",
     }
 )
 """What to do about reasons of a verdict that are no figure, by their code."""

@@ -68,9 +68,7 @@ def test_a_motorway_is_in_between() -> None:
 
 
 @pytest.mark.parametrize("times", [2, 3])
-def test_the_same_frames_again_are_no_further_looks(
-    sharp_edges: EdgeWitness, sharp_street: Window, times: int
-) -> None:
+def test_the_same_frames_again_are_no_further_looks(sharp_edges: EdgeWitness, sharp_street: Window, times: int) -> None:
     frames, pose = chosen(sharp_edges.sharp, [0, 3, 6]), sharp_street.T_camera_lidar_start
     again = chosen(frames, [0, 1, 2] * times)
     assert look(again, pose).count == pytest.approx(look(frames, pose).count, rel=1e-9)
