@@ -39,7 +39,7 @@ UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
 
 SAME_SCENE = 0.5
 """Share of the frames below which the independent looks of a window say that it saw one scene: of a drive through
-streets they are worth four fifths of their number and more, of slow traffic and motorways a fifth to a third, of a
+streets they are worth seven tenths of their number and more, of slow traffic and motorways a fifth to a third, of a
 standing vehicle a tenth to a quarter."""
 
 
@@ -84,7 +84,7 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
 def repetition_metric(looks: Looks | None, pairs: Sequence[FramePair], limits: VerdictConfig) -> tuple[Metric, ...]:
     """What the edges tell when all that frames have in common counts once; nothing where they were not looked at, or
     the vehicle is not known to drive. What stands still before a standing vehicle is its whole scene. What stands still
-    before one that drives are the lines that run along its road, of which any two fit each other: on 26 simulated
+    before one that drives are the lines that run along its road, of which any two fit each other: on 25 simulated
     drives, most of them along motorways, they bring wrong poses to 13.7, and right ones that are accepted are at 29 and
     more."""
     if looks is None or not drives(pairs):
