@@ -6,12 +6,30 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.looks import Looks
 from coec.calibration.confidence.loosened import CLOCKS_FREE, LENS_FREE, Loosened
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, Metric, StopReason, Verdict
-from coec.calibration.verdict import change_metric, counted_once, intrinsics_metric, judge, shape_metrics
+from coec.calibration.types import (
+    INTRINSICS_OFF,
+    MOVED,
+    Decision,
+    EgoMotion,
+    FramePair,
+    Metric,
+    StopReason,
+    Verdict,
+    Window,
+)
+from coec.calibration.verdict import (
+    change_metric,
+    counted_once,
+    intrinsics_metric,
+    judge,
+    repetition_metric,
+    shape_metrics,
+)
 from coec.config import VerdictConfig
 from coec.geometry import se3
 
@@ -120,6 +138,31 @@ def test_range_edges_that_frames_have_in_common_count_once() -> None:
     once = {metric.name: metric.value for metric in counted_once(found, 2.0, FRAMES)}
     assert once == {"range_edges": 600.0, "edge_contrast": OUTSTANDING[0].value}
     assert counted_once(found, float("nan"), FRAMES) == found
+
+
+def at_speed(street: Window, speed_mps: float | None) -> list[FramePair]:
+    if speed_mps is None:
+        return [replace(pair, motion=None) for pair in street.pairs]
+    motion = EgoMotion(0, "ego", (speed_mps, 0.0, 0.0), (0.0, 0.0, 0.0))
+    return [replace(pair, motion=motion) for pair in street.pairs]
+
+
+def test_what_fits_a_driving_vehicle_by_the_lines_of_its_road_alone_is_not_accepted(street: Window) -> None:
+    pairs = at_speed(street, 30.0)
+    by_lines = Looks(count=2.5, significance=8.0)
+    verdict = verdict_on(of_objective=(*OUTSTANDING, *repetition_metric(by_lines, pairs, LIMITS)))
+    assert [reason.code for reason in verdict.reasons] == ["edges_once"]
+    past_trees = repetition_metric(Looks(count=3.0, significance=25.0), pairs, LIMITS)
+    assert verdict_on(of_objective=(*OUTSTANDING, *past_trees)).decision is Decision.ACCEPTED
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, None])
+def test_a_vehicle_that_is_not_known_to_drive_may_see_one_scene(street: Window, speed_mps: float | None) -> None:
+    assert repetition_metric(Looks(count=1.0, significance=8.0), at_speed(street, speed_mps), LIMITS) == ()
+
+
+def test_an_objective_without_edges_has_none_to_count_once(street: Window) -> None:
+    assert repetition_metric(None, at_speed(street, 30.0), LIMITS) == ()
 
 
 def changed(gain: float = 9.0, turn_deg: float = 1.0, support: float = 8.0, likeness: float = 0.9) -> ChangePoint:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from math import degrees
 
 import numpy as np
 
 from coec.calibration.confidence.from_before import summit_from_before
+from coec.calibration.confidence.looks import look
 from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LENS_FREE, Loosened, loosen
 from coec.calibration.confidence.modes import Rivals
 from coec.calibration.confidence.told import LENS
@@ -29,7 +31,14 @@ from coec.calibration.types import (
     Optimum,
     Window,
 )
-from coec.calibration.verdict import change_metric, counted_once, intrinsics_metric, judge, shape_metrics
+from coec.calibration.verdict import (
+    change_metric,
+    counted_once,
+    intrinsics_metric,
+    judge,
+    repetition_metric,
+    shape_metrics,
+)
 from coec.config import CalibrationConfig, config_hash
 from coec.errors import CalibrationError
 from coec.geometry import se3
@@ -75,11 +84,15 @@ def calibrate(
     # Self-diagnosis, equation (2).
     at_optimum = objective.evaluate(pose)
     change = None if found.edges is None else change_point(found.edges, pose)
+    seen = None if found.edges is None else look(found.edges.sharp, pose)
+    if seen is not None:
+        uncertainty = replace(uncertainty, looks=seen.count)
     looks, pairs = uncertainty.looks, len(window.pairs)
     changed = change_metric(change, config.verdict)
     metrics = (
         *counted_once(found.metrics, looks, pairs),
         *shape_metrics(at_optimum, curvature, uncertainty.sigma, config.verdict),
+        *repetition_metric(seen, window.pairs, config.verdict),
         *intrinsics_metric(loosened, config.verdict),
         *changed,
     )

@@ -68,6 +68,14 @@ FIGURES: Mapping[str, Figure] = MappingProxyType(
             "ambiguous: another pose explains the window nearly as well",
             "Start nearer to the truth, or take a longer window with other scenes in it.",
         ),
+        "edges_once": Figure(
+            "Edges, counted once",
+            "σ",
+            "How significantly the LiDAR's edges lie on those of the images of a vehicle on the move, what all its "
+            "frames have in common counted once.",
+            "what fits is the same in all frames although the vehicle drives: lines along the road fit one another",
+            "Take a window that passes other things: houses, cars, posts and trees within reach of the LiDAR.",
+        ),
         "newton_step_deg": Figure(
             "Slope left, rotation",
             "°",
@@ -219,7 +227,7 @@ OTHER_ADVICE: Mapping[str, str] = MappingProxyType(
     {
         StopReason.AT_BOUND.value: "Start nearer to the truth, or widen the search (`search.rotation_deg`).",
         StopReason.EVALUATIONS.value: "Start nearer, or allow more evaluations (`search.max_evaluations`).",
-        "motion": "Take the window while the vehicle drives, not where it stands.",
+        "motion": "Take the window while the vehicle drives past things, not where it stands or sees its road alone.",
     }
 )
 """What to do about reasons of a verdict that are no figure, by their code."""

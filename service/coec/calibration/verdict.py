@@ -17,12 +17,14 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.confidence.looks import Looks
 from coec.calibration.confidence.loosened import LENS_FREE, Loosened
 from coec.calibration.figures import FIGURES
+from coec.calibration.frames.sampling import drives
 from coec.calibration.objective.curvature import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
-from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, Metric, Reason, StopReason, Verdict
+from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, FramePair, Metric, Reason, StopReason, Verdict
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
@@ -36,8 +38,9 @@ UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
 
 
 SAME_SCENE = 0.5
-"""Share of the frames below which the independent looks of a window say that it saw one scene: on recordings in motion
-they are worth three quarters of their number and more, of a standing vehicle a quarter to half."""
+"""Share of the frames below which the independent looks of a window say that it saw one scene: of a drive through
+streets they are worth seven tenths of their number and more, of slow traffic and motorways a fifth to a third, of a
+standing vehicle a tenth to a quarter."""
 
 
 def saw_one_scene(looks: float, frames: int) -> bool:
@@ -84,6 +87,17 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
     return (Metric(MOVED, gain, limits.max_change_gain, at_least=False),)
 
 
+def repetition_metric(looks: Looks | None, pairs: Sequence[FramePair], limits: VerdictConfig) -> tuple[Metric, ...]:
+    """What the edges tell when all that frames have in common counts once; nothing where they were not looked at, or
+    the vehicle is not known to drive. What stands still before a standing vehicle is its whole scene. What stands still
+    before one that drives are the lines that run along its road, of which any two fit each other: on 25 simulated
+    drives, most of them along motorways, they bring wrong poses to 13.7, and right ones that are accepted are at 29 and
+    more."""
+    if looks is None or not drives(pairs):
+        return ()
+    return (Metric("edges_once", looks.significance, limits.min_edges_once, at_least=True),)
+
+
 def intrinsics_metric(loosened: Sequence[Loosened], limits: VerdictConfig) -> tuple[Metric, ...]:
     """How certainly another lens explains the window better than that of the rig; nothing where none was tried. One
     that moves the edges by less than matters gains nothing."""
@@ -115,8 +129,8 @@ def judge(
     details: Mapping[str, str] = MappingProxyType({}),
 ) -> Verdict:
     """Equation (2) over the metrics of the objective and of its optimum. A window that is too uncertain because its
-    `frames` are worth few independent `looks` is told to need motion. `details` say more of what a metric means in this
-    window, by its name."""
+    `frames` are worth few independent `looks` is told to need motion past other things. `details` say more of what a
+    metric means in this window, by its name."""
     reasons = [
         Reason(
             metric.name,
@@ -128,6 +142,6 @@ def judge(
     if stop is not StopReason.TOLERANCE:
         reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
     if saw_one_scene(looks, frames) and any(reason.code in UNCERTAIN for reason in reasons):
-        told = f"{frames} frames are worth {looks:.1f} independent ones: a window taken in motion tells more"
+        told = f"{frames} frames are worth {looks:.1f} independent ones: a window that passes other things tells more"
         reasons.append(Reason("motion", told))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

@@ -130,7 +130,7 @@ class VerdictConfig(Stage):
         default=0.5, ge=0, le=1, description="points in view over the most any pose of the box sees"
     )
     min_range_edges: int = Field(
-        default=1000,
+        default=800,
         ge=1,
         description="independent range jumps of the window's sweeps, with 6 dof twice as many; a few hundred fit wrong "
         "poses by chance (fused)",
@@ -143,6 +143,12 @@ class VerdictConfig(Stage):
         gt=0,
         le=1,
         description="edge contrast of the next best basin over the best one's; above: ambiguous",
+    )
+    min_edges_once: float = Field(
+        default=15.0,
+        gt=0,
+        description="edge significance of a vehicle on the move, what its frames have in common counted once; below: "
+        "guard rails fit lane markings as well (fused)",
     )
     max_change_gain: float = Field(
         default=3.5,

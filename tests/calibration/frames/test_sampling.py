@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from coec.calibration.frames.sampling import CheckSampler, stands
+from coec.calibration.frames.sampling import CheckSampler, drives, stands
 from coec.calibration.types import EgoMotion, FramePair, Window
 from coec.config import MonitorConfig, WindowConfig
 
@@ -44,6 +44,17 @@ def test_a_standing_vehicle_is_checked_like_any_other(street: Window) -> None:
     assert checks(street, stamps, speed_mps=0.0) == checks(street, stamps, speed_mps=5.0)
     window = WindowConfig(min_speed_mps=0.5)
     assert [stands(at(street, S, speed), window) for speed in (0.0, 0.4, 0.6, None)] == [True, True, False, False]
+
+
+def test_a_vehicle_drives_where_most_pairs_know_that_it_does(street: Window) -> None:
+    def driving(*speeds_mps: float | None) -> bool:
+        return drives([at(street, S, speed_mps) for speed_mps in speeds_mps])
+
+    assert driving(5.0, 5.0, 0.0)
+    assert not driving(5.0, 0.0, 0.0)
+    assert not driving(5.0, 5.0, None, None), "half of them is not most"
+    assert not driving(0.9, 0.9)
+    assert not driving()
 
 
 def test_pairs_hours_apart_are_not_one_check(street: Window) -> None:

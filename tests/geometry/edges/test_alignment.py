@@ -17,6 +17,7 @@ from coec.geometry.edges.alignment import (
     alignments_of_late,
     frame_alignment,
     significances,
+    strengths_on_each_map,
 )
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.projection import project
@@ -70,6 +71,15 @@ def test_every_camera_model_agrees_with_the_plain_form_between_pixels(model: str
     assert at.significance == pytest.approx(strength / np.sqrt(square), abs=1e-4)
     assert at.of_frames.mean() == pytest.approx(at.significance)
     assert at.of_frames[1] == 0.0
+
+
+def test_sweeps_on_the_maps_of_other_frames_are_those_of_maps_that_changed_places() -> None:
+    frames = frames_of(CAMERAS["double_sphere"], (2000, 0, 1501))
+    strengths = strengths_on_each_map(frames, POSE)
+    for on in range(3):
+        other = replace(frames, maps=np.ascontiguousarray(np.broadcast_to(frames.maps[on], frames.maps.shape)))
+        np.testing.assert_array_equal(strengths[:, on], frame_alignment(other, POSE).strength)
+    np.testing.assert_array_equal(np.diag(strengths), frame_alignment(frames, POSE).strength)
 
 
 def test_a_part_is_what_its_points_are_by_themselves() -> None:

@@ -35,8 +35,9 @@ class Noise:
     Attributes:
         covariance: (n, n) of the axes that were searched, radians and metres.
         information: (n, n) negative Hessian of the objective, likewise.
-        looks: how many independent looks the frames are worth: their number, if what one frame says of a sector tells
-            nothing of what the next one says there; one, if it says the same again.
+        looks: how many independent looks the frames are worth to where the optimum lies: their number, if what one
+            frame says of a sector tells nothing of what the next one says there; one, if it says the same again. How
+            often they say that this is the right hill is another question: see `confidence.looks`.
     """
 
     covariance: list[list[float]]

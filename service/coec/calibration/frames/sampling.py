@@ -7,6 +7,8 @@ frozen camera and a mount that is hit while the vehicle stands are what the moni
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from coec.calibration.types import FramePair
 from coec.config import MonitorConfig, WindowConfig
 
@@ -15,6 +17,15 @@ NS_PER_S = 1_000_000_000
 SPAN_PERIODS = 6
 """Periods that the pairs of one check may span. The slowest stream that the monitor is of use with, a pair a period,
 fills the four pairs of a check in four; two more allow for losses. Pairs further apart are not one inspection."""
+
+
+MOVING_MPS = 1.0
+"""Faster, a vehicle passes what it sees."""
+
+
+def drives(pairs: Sequence[FramePair]) -> bool:
+    """Whether the vehicle is known to be on the move in most of the pairs."""
+    return 2 * sum(pair.motion is not None and pair.motion.reaches(MOVING_MPS) for pair in pairs) > len(pairs)
 
 
 def stands(pair: FramePair, window: WindowConfig) -> bool:

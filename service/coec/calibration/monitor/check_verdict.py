@@ -24,6 +24,7 @@ from coec.calibration.commissioning.baseline import (
 )
 from coec.calibration.commissioning.quantiles import chi2_quantile
 from coec.calibration.estimators import sight_of
+from coec.calibration.frames.sampling import drives
 from coec.calibration.frames.timing import explained_by_motion
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import AT_POSE, Check, CheckInput, Expected, check_at, gather
@@ -67,9 +68,6 @@ MIN_LOOKS = 2.0
 one frame says the same as the one before although the vehicle has moved on, as between the guard rails of a highway,
 what is wrong with one is wrong with all, and with the next check. Checks of simulated highways with 64 beams are at 1.2
 to 1.9 of 6, and put right mounts 3 to 10 cm beside; 95 % of others are above 2.2, and within 2 cm."""
-
-MOVING_MPS = 1.0
-"""Faster, a vehicle passes what it sees. While it stands, its checks count as one anyway."""
 
 
 class Opinion(StrEnum):
@@ -212,7 +210,8 @@ def faintness(pairs: Sequence[FramePair], seen: Check, limits: MonitorLimits) ->
     """Why the edges of a check of some pairs count as faint; nothing where they do not."""
     short = {
         Faint.EDGES_IN_VIEW: seen.edges_in_view < MIN_EDGES_IN_VIEW * seen.pairs,
-        Faint.LOOKS: seen.looks < MIN_LOOKS and _moves(pairs),
+        # While a vehicle stands its checks count as one anyway.
+        Faint.LOOKS: seen.looks < MIN_LOOKS and drives(pairs),
         Faint.SIGNIFICANCE: edges_per_pair(seen) < limits.min_edges_per_pair,
         Faint.CONTRAST: seen.contrast < MIN_CONTRAST,
     }
@@ -238,13 +237,6 @@ def opinion(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimi
             return Opinion.FLAGGED
         undecided |= over > 1.0 or (said.gained and over > limits.insisted_share)
     return Opinion.UNDECIDED if undecided else Opinion.CLEAR
-
-
-def _moves(pairs: Sequence[FramePair]) -> bool:
-    """Whether the vehicle is known to be on the move in most of the pairs."""
-    speeds_mps = [pair.motion.speed_mps for pair in pairs if pair.motion is not None]
-    moving = [speed_mps for speed_mps in speeds_mps if speed_mps is not None and speed_mps >= MOVING_MPS]
-    return 2 * len(moving) > len(pairs)
 
 
 def _of_both(of_rotation: NDArray[np.float64], of_pose: NDArray[np.float64]) -> NDArray[np.float64]:

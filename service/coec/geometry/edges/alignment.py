@@ -134,6 +134,12 @@ def alignment_of_parts(
     return PartedAlignments(sums[:, :, :, 0], sums[:, :, :, 1])
 
 
+def strengths_on_each_map(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(F, F) Σ w·e of the range edges of each frame (rows) on the edge map of each (columns), at one pose (4, 4); on
+    the diagonal the strengths of `frame_alignment`."""
+    return np.asarray(_sums_on_each_map(*_arguments(frames), T_camera_lidar.astype(np.float32, order="C")))
+
+
 def alignments_of_late(
     frames: EdgeFrames,
     passing: NDArray[np.float32],
@@ -186,6 +192,23 @@ def _smooth_sums(
         k, f = task // frames, task % frames
         pose = poses[k, min(np.int64(f), poses.shape[1] - 1)]
         sums[k, f] = smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[f])
+    return sums
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _sums_on_each_map(
+    camera: Camera,
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    first_point: NDArray[np.int64],
+    maps: NDArray[np.int8],
+    pose: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    frames = first_point.shape[0] - 1
+    sums = np.empty((frames, frames))
+    for task in prange(frames * frames):
+        f, g = task // frames, task % frames
+        sums[f, g], _ = smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[g])
     return sums
 
 
