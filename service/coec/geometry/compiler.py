@@ -20,11 +20,18 @@ import numba
 from numba import njit, prange
 from numba.core import event
 from numba.core.codegen import get_host_cpu_features
+from numba.core.cpu_options import ParallelOptions
 
 import coec.geometry.cameras.compiled  # noqa: F401  makes the formulas known
 from coec.geometry import compile_news
 
-__all__ = ["njit", "on_one_thread", "prange"]
+__all__ = ["PRANGE", "njit", "on_one_thread", "prange"]
+
+_ARRAY_OPERATIONS = ("comprehension", "fusion", "inplace_binop", "numpy", "reduction", "setitem", "stencil")
+
+PRANGE: Any = ParallelOptions({"prange": True} | dict.fromkeys(_ARRAY_OPERATIONS, False))
+"""For `parallel=`: a kernel's `prange` is shared among threads, and nothing else of it. Left to itself numba makes a
+parallel loop of every operation on an array, too, however short: each takes a second to compile."""
 
 # Twelve hexadecimal digits are 48 bits: enough to tell the edits of one code base apart.
 _HASH_DIGITS = 12
