@@ -7,6 +7,7 @@ import os
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing.synchronize import Event
 from typing import Protocol
 
 from coec.sources.recording import Message
@@ -41,6 +42,8 @@ class Driven(Protocol):
 
 
 _drive: Drive | None = None
+_left: Event | None = None
+"""Set when nobody waits for what is being made any more."""
 
 
 def messages_by(config: Driven, processes: int) -> Iterator[Message]:
@@ -58,7 +61,8 @@ def messages_by(config: Driven, processes: int) -> Iterator[Message]:
     os.environ["NUMBA_NUM_THREADS"] = "1"
     try:
         spawn = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(processes, mp_context=spawn, initializer=_open, initargs=(config,))
+        left = spawn.Event()
+        pool = ProcessPoolExecutor(processes, mp_context=spawn, initializer=_open, initargs=(config, left))
         try:
             waiting: deque[Future[list[Message]]] = deque()
             for begin in range(0, count, PART):
@@ -68,6 +72,7 @@ def messages_by(config: Driven, processes: int) -> Iterator[Message]:
             while waiting:
                 yield from waiting.popleft().result()
         finally:  # also where the reader has gone before the end
+            left.set()
             pool.shutdown(cancel_futures=True)
     finally:
         if before is None:
@@ -76,11 +81,18 @@ def messages_by(config: Driven, processes: int) -> Iterator[Message]:
             os.environ["NUMBA_NUM_THREADS"] = before
 
 
-def _open(config: Driven) -> None:
-    global _drive  # one drive per process, as the pool's initializer gives it
-    _drive = config.drive()
+def _open(config: Driven, left: Event) -> None:
+    global _drive, _left  # one drive per process, as the pool's initializer gives it
+    _drive, _left = config.drive(), left
 
 
 def _part(begin: int) -> list[Message]:
     assert _drive is not None
-    return _drive.part(begin, begin + PART)
+    assert _left is not None
+    made: list[Message] = []
+    while len(made) < PART and not _left.is_set():
+        one = _drive.part(begin + len(made), begin + len(made) + 1)
+        if not one:
+            break
+        made += one
+    return made
