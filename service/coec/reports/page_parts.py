@@ -67,6 +67,10 @@ CAPTIONS: Mapping[str, tuple[str, str]] = {
         "LiDAR points drawn on the camera image at the extrinsic that was checked",
         "Points at the extrinsic that was checked, coloured by range. Where it is right they end where things end.",
     ),
+    "first_picture": (
+        "LiDAR points drawn on the first camera image of the drive",
+        "The first picture, with the points where the workshop's calibration puts them, coloured by range.",
+    ),
     "closeup_before": (
         "Part of the camera image with LiDAR points where the service put them before the repair",
         "Before the repair: LiDAR points where the service put them, coloured by range.",

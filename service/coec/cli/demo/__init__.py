@@ -20,7 +20,7 @@ from coec.adapters.files.rig import mask_to_png
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.calibration.types import Matrix4
-from coec.cli.demo import report, story
+from coec.cli.demo import first_look, report, story
 from coec.cli.demo.daemon import Daemon, DemoError, free_endpoint, running
 from coec.cli.demo.outcome import Ending, outcome_of
 from coec.cli.demo.pace import Pace
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 POLL_S = 0.2
 """Of the live view: it asks the service as any user would, by query."""
 
-START_S, DRIVE_S = 120.0, 600.0
+START_S, DRIVE_S = 240.0, 600.0
 """Limits for the service to come up and for the drive. The first run on a machine compiles the kernels."""
 
 
@@ -64,7 +64,8 @@ def run(output: Path, *, as_json: bool) -> int:
             screen.wait("The service starts, the street is built …")
             # Compiles what the renderers then find compiled, while the service compiles its own.
             with compile_news.heard_by(screen.hear):
-                next(drive.messages([0]))
+                picture, page = first_look.write(output, drive)
+            console.say(f"demo: the first picture is {picture}, and {page} shows it until there is more to tell")
             with connected(config.zenoh.connect, START_S) as session:
                 watch = Watch(
                     session,
