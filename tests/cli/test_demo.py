@@ -11,12 +11,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
+import cv2
 import pytest
 from rich.console import Console
 
 from cli.conftest import Coec
 from coec.calibration.types import EgoMotion
-from coec.cli.demo import report, story
+from coec.cli.demo import first_look, report, story
 from coec.cli.demo.outcome import Ending, outcome_of
 from coec.cli.demo.pace import LEAD_NS, STEP_NS, Pace, at_rest
 from coec.cli.demo.page import demo_page
@@ -217,10 +218,26 @@ def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
     assert top + height <= drive.rig.camera.height
 
 
+def test_there_is_something_to_look_at_before_the_service_says_anything(tmp_path: Path) -> None:
+    pytest.importorskip("embreex", reason="needs ray casting")
+    from coec.simulation.drive import SimulatedDrive
+
+    drive = SimulatedDrive(replace(story.drive_config(), seconds=2.0, camera="fisheye160", lidar="16"))
+    picture, page = first_look.write(tmp_path, drive)
+    seen = cv2.imread(str(picture))
+    assert seen is not None
+    assert float(seen.std()) > 10.0
+    told = page.read_text()
+    assert "Under way" in told
+    assert "data:image/" in told
+    assert page.name == story.REPORT, "the report takes its place"
+
+
 def check_files(document: Any) -> Path:
     """What the demonstration left; the window that it fetched."""
     written = [Path(path) for path in document["files"]]
     assert all(path.stat().st_size > 0 for path in written)
+    assert (written[0].parent / f"{first_look.PICTURE}.png").stat().st_size > 0
     assert {"timeline.png", "overlay_before.png", "overlay_after.png", "report.html"} <= {path.name for path in written}
     (window,) = (path for path in written if path.suffix == ".mcap")
     return window

@@ -1,13 +1,20 @@
-"""Where compiled kernels are kept: private, writable, and another place after every edit of a source. And for which
-processors."""
+"""Where compiled kernels are kept: private, writable, and another place after every edit of a source; by two processes
+at once; and for which processors."""
+
+from __future__ import annotations
 
 import os
 import stat
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
+from numba.core.caching import IndexDataCacheFile
 
 import coec
 from coec.geometry.compiler import kernel_cache_directory, with_wide_registers
@@ -94,3 +101,26 @@ def test_only_processors_that_hold_their_clock_use_registers_of_512_bits() -> No
     assert with_wide_registers("+avx2,-avx512f") == "+avx2,-avx512f"
     assert with_wide_registers(first) == first
     assert with_wide_registers(later) == f"{later},-prefer-256-bit"
+
+
+def test_who_save_a_kernel_for_different_types_at_once_do_not_get_the_code_of_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache_file: Any = IndexDataCacheFile
+    look, both_looked = cache_file._load_index, threading.Barrier(2)
+
+    def hesitate(self: object) -> Any:
+        found = look(self)
+        # Where one has to wait until the other has saved, nobody comes to meet it here.
+        with suppress(threading.BrokenBarrierError):
+            both_looked.wait(0.2)
+        return found
+
+    def save(types: str) -> None:
+        cache_file(str(tmp_path), "kernel", "stamp").save(types, f"code for {types}")
+
+    with monkeypatch.context() as patched, ThreadPoolExecutor(2) as pool:
+        patched.setattr(cache_file, "_load_index", hesitate)
+        list(pool.map(save, ("float32", "float64")))
+    kept = cache_file(str(tmp_path), "kernel", "stamp")
+    assert [kept.load(types) for types in ("float32", "float64")] == ["code for float32", "code for float64"]

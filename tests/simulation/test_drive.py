@@ -1,7 +1,9 @@
 """The drive as a recording: bytes, order, truth, faults."""
 
+import multiprocessing
 from collections.abc import Iterable
 from functools import lru_cache
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -19,6 +21,7 @@ from coec.geometry import cameras
 from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
 from coec.geometry.se3 import difference, exp
+from coec.simulation import parallel
 from coec.simulation.aboard import NEAREST_M
 from coec.simulation.drive import DriveConfig, SimulatedDrive
 from coec.simulation.faults import parse_fault
@@ -84,6 +87,15 @@ def test_another_lens_sees_the_same_drive_as_one_drawn_for_it_alone() -> None:
 def test_several_processes_give_the_same_bytes_in_the_same_order() -> None:
     config = small(camera_hz=2.0, lidar_hz=2.0, ego_hz=200.0).config
     assert fingerprint(messages_by(config, 2)) == fingerprint(SimulatedDrive(config).messages())
+
+
+def test_nothing_more_is_drawn_when_nobody_waits_for_it() -> None:
+    config, left = small().config, multiprocessing.get_context("spawn").Event()
+    parallel._open(config, left)
+    whole = SimulatedDrive(config).messages()
+    assert fingerprint(parallel._part(0)) == fingerprint(islice(whole, parallel.PART))
+    left.set()
+    assert parallel._part(0) == []
 
 
 def test_chosen_frames_are_those_of_the_whole_drive() -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 
 _STEEP = np.float32(math.tan(math.pi / 8.0))
 _EIGHTH, _QUARTER, _HALF = np.float32(math.pi / 4.0), np.float32(math.pi / 2.0), np.float32(math.pi)
@@ -40,7 +40,7 @@ def bearings(xyz_m: NDArray[np.float32]) -> Bearings:
     return Bearings(*_bearings(points_m))
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _bearings(
     xyz: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

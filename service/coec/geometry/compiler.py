@@ -7,6 +7,7 @@ outermost kernel, so after an edit to a camera formula a kernel in another file 
 Who imports this loads a compiler: 70 MB and a third of a second, which the process that serves queries does without.
 """
 
+import fcntl
 import hashlib
 import os
 import stat
@@ -19,12 +20,20 @@ from typing import Any
 import numba
 from numba import njit, prange
 from numba.core import event
+from numba.core.caching import IndexDataCacheFile
 from numba.core.codegen import get_host_cpu_features
+from numba.core.cpu_options import ParallelOptions
 
 import coec.geometry.cameras.compiled  # noqa: F401  makes the formulas known
 from coec.geometry import compile_news
 
-__all__ = ["njit", "on_one_thread", "prange"]
+__all__ = ["PRANGE", "njit", "on_one_thread", "prange"]
+
+_ARRAY_OPERATIONS = ("comprehension", "fusion", "inplace_binop", "numpy", "reduction", "setitem", "stencil")
+
+PRANGE: Any = ParallelOptions({"prange": True} | dict.fromkeys(_ARRAY_OPERATIONS, False))
+"""For `parallel=`: a kernel's `prange` is shared among threads, and nothing else of it. Left to itself numba makes a
+parallel loop of every operation on an array, too, however short: each takes a second to compile."""
 
 # Twelve hexadecimal digits are 48 bits: enough to tell the edits of one code base apart.
 _HASH_DIGITS = 12
@@ -125,6 +134,20 @@ if numba.config.CPU_FEATURES is None:  # type: ignore[attr-defined]  # features 
 if not os.environ.get("NUMBA_CACHE_DIR"):  # a directory chosen by the user wins
     # numba's configuration is a module that fills itself at run time.
     numba.config.CACHE_DIR = str(kernel_cache_directory(Path(__file__).parent))  # type: ignore[attr-defined]
+
+
+_save = IndexDataCacheFile.save
+
+
+def _save_alone(self: IndexDataCacheFile, key: Any, data: Any) -> None:
+    """One process at a time. Left to itself numba reads which files of a kernel there are, takes the next number, and
+    writes: of two processes that compile it for different types at once, one finds the machine code of the other."""
+    with Path(self._cache_path, "lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        _save(self, key, data)
+
+
+IndexDataCacheFile.save = _save_alone  # type: ignore[method-assign]  # it has no other handle
 
 
 class _Passes(event.Listener):

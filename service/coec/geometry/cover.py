@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 
 _RATIO = 1.2207440846057596
 """The real root of x⁴ = x + 1."""
@@ -26,12 +26,12 @@ def unit_ball(count: int) -> NDArray[np.float64]:
         x, y, z = number * _STEPS[0] + 0.5, number * _STEPS[1] + 0.5, number * _STEPS[2] + 0.5
         x, y, z = 2.0 * (x - np.floor(x)) - 1.0, 2.0 * (y - np.floor(y)) - 1.0, 2.0 * (z - np.floor(z)) - 1.0
         if x * x + y * y + z * z <= 1.0:
-            ball[found] = x, y, z
+            ball[found, 0], ball[found, 1], ball[found, 2] = x, y, z
             found += 1
     return ball
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def moved_by(
     pose: NDArray[np.float64], turn_rad: NDArray[np.float64], shift_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:

@@ -19,7 +19,6 @@ SMALL_RAD = 0.01
 sweep turns by less in all but sharp bends, and a sine takes as long as all the rest."""
 
 
-@njit(cache=True)
 def deskew(
     xyz_m: NDArray[np.float32],
     dt_s: NDArray[np.float64],
@@ -37,7 +36,21 @@ def deskew(
     Returns:
         (N, 3) float32: exp(ξ·dt)·p, the closed form of SE(3)'s exponential (Rodrigues).
     """
-    out = np.empty_like(xyz_m)
+    points_m = np.ascontiguousarray(xyz_m, np.float32).view()
+    # Compiled once, whether a sweep may be written to or not.
+    points_m.setflags(write=False)
+    moved_m: NDArray[np.float32] = _deskew(points_m, dt_s, angular_radps, linear_mps)
+    return moved_m
+
+
+@njit(cache=True)
+def _deskew(
+    xyz_m: NDArray[np.float32],
+    dt_s: NDArray[np.float64],
+    angular_radps: NDArray[np.float64],
+    linear_mps: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    out = np.empty(xyz_m.shape, np.float32)
     wx, wy, wz = angular_radps[0], angular_radps[1], angular_radps[2]
     vx, vy, vz = linear_mps[0], linear_mps[1], linear_mps[2]
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.culling import BUNDLE, NEVER_OUT, Bundles
 from coec.geometry.pixel_lookup import OUTSIDE, UNSURE, Certainty, certain_pixels, exact_pixel, filter_of
 from coec.geometry.prefetch import prefetch
@@ -127,7 +127,7 @@ def _of_every_bundle(first_point: NDArray[np.int64]) -> Bundles:
     return Bundles(np.zeros((count, 3)), np.full(count, NEVER_OUT), math.inf)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _count(
     camera: Camera, single: Camera, limits: Certainty, near_m: NDArray[np.float32], poses: NDArray[np.float64],
     xyz: NDArray[np.float32], range_bin: NDArray[np.unsignedinteger], first_point: NDArray[np.int64],
@@ -233,7 +233,7 @@ def _count_exactly(
     counts: NDArray[np.int32],
 ) -> None:  # fmt: skip
     """Adds one point in double precision."""
-    pixel = exact_pixel(camera, T, float(x), float(y), float(z))
+    pixel = exact_pixel(camera, T, np.float64(x), np.float64(y), np.float64(z))
     if pixel >= 0:
         counts[np.uint64(depth_bin[np.uint64(pixel)]) * columns + np.uint64(range_bin)] += np.int32(1)
 
@@ -286,7 +286,7 @@ def _information(
     return mi, points
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _informations(
     counts: NDArray[np.int32], first_task: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -294,5 +294,7 @@ def _informations(
     shape = (counts.shape[0], len(first_task) - 1)
     mi, points = np.empty(shape), np.empty(shape, np.int64)
     for k in prange(counts.shape[0]):
-        mi[k], points[k] = _information(counts[k], first_task)
+        mi_of_pose, points_of_pose = _information(counts[k], first_task)
+        for f in range(shape[1]):
+            mi[k, f], points[k, f] = mi_of_pose[f], points_of_pose[f]
     return mi, points

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def square_sums(grey: NDArray[np.uint8], side: int) -> NDArray[np.uint32]:
     """(h // side, w // side) sums of the pixels of each full square; a remainder at the right and the bottom is left
     out. grey: (h, w)."""
@@ -27,7 +27,7 @@ def square_sums(grey: NDArray[np.uint8], side: int) -> NDArray[np.uint32]:
     return sums
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def neighbour_differences(grey: NDArray[np.uint8], block_rows: int, block_columns: int) -> NDArray[np.float64]:
     """(block_rows, block_columns) means, over every second row of each block of an image (h, w), of the absolute
     differences to the neighbours on the right and below in sum. Blocks are as large as so many fit; what is beyond

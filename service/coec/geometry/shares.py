@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 
 
 def share_of_pixels(
@@ -23,7 +23,7 @@ def share_of_pixels(
     return share
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _count_reached(
     values: NDArray[np.float32],
     usable: NDArray[np.bool_],

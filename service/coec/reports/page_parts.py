@@ -56,6 +56,10 @@ CAPTIONS: Mapping[str, tuple[str, str]] = {
         "LiDAR points drawn on the camera image at the extrinsic that was checked",
         "Points at the extrinsic that was checked, coloured by range. Where it is right they end where things end.",
     ),
+    "first_picture": (
+        "LiDAR points drawn on the first camera image of the drive",
+        "The first picture, with the points where the workshop's calibration puts them, coloured by range.",
+    ),
     "close_ups": (
         "Enlarged parts of the image with the range edges of the LiDAR, at the start and at the result",
         "Close-ups where both extrinsics differ most: range edges should lie on the edges of the image.",

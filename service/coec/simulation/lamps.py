@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.types import Matrix4
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.simulation.mesh import Floats
 from coec.simulation.scene import Hits, Scene
 from coec.simulation.sky import Sky
@@ -74,7 +74,7 @@ def headlights(T_world_ego: Matrix4) -> Doubles:
     )
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _in_bore(
     origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, spine: Doubles, half_m: float, high_m: float,
     light: float, share: Floats, lamps: Floats,
@@ -106,7 +106,7 @@ def _in_bore(
         lamps[i] += light * (STRIP_LIGHT * facing / away + STRIP_BOUNCE)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _headlit(
     origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, beams: Doubles, lamps: Floats
 ) -> None:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from multiprocessing.synchronize import Event
 from typing import Any, Protocol
 
 from coec.sources.recording import Message
@@ -41,7 +42,11 @@ class Driven(Protocol):
         ...
 
 
+SPAWN = multiprocessing.get_context("spawn")
+
 _drive: Drive | None = None
+_left: Event | None = None
+"""Set when nobody waits for what is being made any more."""
 
 
 def messages_by(config: Driven, processes: int) -> Iterator[Message]:
@@ -54,14 +59,18 @@ def messages_by(config: Driven, processes: int) -> Iterator[Message]:
     if processes == 1 or count <= PART:
         yield from whole.messages()
         return
-    with spawned(processes, _open, config) as pool:
-        waiting: deque[Future[list[Message]]] = deque()
-        for begin in range(0, count, PART):
-            waiting.append(pool.submit(_part, begin))
-            if len(waiting) > 2 * processes:
+    left = SPAWN.Event()
+    with spawned(processes, _open, config, left) as pool:
+        try:
+            waiting: deque[Future[list[Message]]] = deque()
+            for begin in range(0, count, PART):
+                waiting.append(pool.submit(_part, begin))
+                if len(waiting) > 2 * processes:
+                    yield from waiting.popleft().result()
+            while waiting:
                 yield from waiting.popleft().result()
-        while waiting:
-            yield from waiting.popleft().result()
+        finally:  # also where the reader has gone before the end
+            left.set()
 
 
 @contextmanager
@@ -72,8 +81,7 @@ def spawned(processes: int, begin: Callable[..., None], *given: Any) -> Iterator
     before = os.environ.get("NUMBA_NUM_THREADS")
     os.environ["NUMBA_NUM_THREADS"] = "1"
     try:
-        spawn = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(processes, mp_context=spawn, initializer=begin, initargs=given)
+        pool = ProcessPoolExecutor(processes, mp_context=SPAWN, initializer=begin, initargs=given)
         try:
             yield pool
         finally:
@@ -85,11 +93,18 @@ def spawned(processes: int, begin: Callable[..., None], *given: Any) -> Iterator
             os.environ["NUMBA_NUM_THREADS"] = before
 
 
-def _open(config: Driven) -> None:
-    global _drive  # one drive per process, as the pool's initializer gives it
-    _drive = config.drive()
+def _open(config: Driven, left: Event) -> None:
+    global _drive, _left  # one drive per process, as the pool's initializer gives it
+    _drive, _left = config.drive(), left
 
 
 def _part(begin: int) -> list[Message]:
     assert _drive is not None
-    return _drive.part(begin, begin + PART)
+    assert _left is not None
+    made: list[Message] = []
+    while len(made) < PART and not _left.is_set():
+        one = _drive.part(begin + len(made), begin + len(made) + 1)
+        if not one:
+            break
+        made += one
+    return made

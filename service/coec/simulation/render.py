@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import Camera
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.projection import unproject
 from coec.simulation.mesh import Floats
 from coec.simulation.scene import Hits, Scene
@@ -221,7 +221,7 @@ def _rotated(vectors: Floats, rotation: Doubles) -> Floats:
     return out
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _tone(linear: Floats, exposure: float) -> NDArray[np.uint8]:
     out = np.empty(len(linear), np.uint8)
     for i in prange(len(linear)):

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.simulation.lamps import incident
 from coec.simulation.mesh import Floats
 from coec.simulation.scene import Hits, Scene
@@ -26,6 +26,9 @@ LAMP = 16
 
 DAY_HORIZON = 0.5
 """The horizon is brighter than this by day (`sky.draw_sky`): where it is darker, so is the skyline before it."""
+SALTS = np.arange(64)
+"""By which one noise differs from another. The compiler makes a function anew for every whole number that it is called
+with, but not for every entry of an array."""
 LAMP_RADIANCE = 2.0
 """Of a lamp that is looked at: white, twice a wall in full sun."""
 
@@ -102,39 +105,39 @@ def _line(u: float, period_m: float, width_m: float, footprint_m: float) -> floa
 def _texture(kind: int, u: float, v: float, foot: float) -> float:
     """Factor on the colour of a surface at its coordinates u, v (m; v is the height on walls)."""
     if kind == ASPHALT:
-        return (1.0 + 0.5 * _grain(u, v, 0.04, foot, 1) + 0.3 * _grain(u, v, 0.25, foot, 2)
-                + 0.3 * _grain(u, v, 2.5, foot, 3) + 0.2 * _grain(u, v, 11.0, foot, 4))  # fmt: skip
+        return (1.0 + 0.5 * _grain(u, v, 0.04, foot, SALTS[1]) + 0.3 * _grain(u, v, 0.25, foot, SALTS[2])
+                + 0.3 * _grain(u, v, 2.5, foot, SALTS[3]) + 0.2 * _grain(u, v, 11.0, foot, SALTS[4]))  # fmt: skip
     if kind == PAVING:
         joint = max(_line(u, 0.5, 0.02, foot), _line(v, 0.5, 0.02, foot))
         slab = _hash(np.int64(math.floor(u / 0.5)), np.int64(math.floor(v / 0.5)), 5) - 0.5
         fade = max(0.0, min(1.0, 1.5 - 2 * foot / 0.5))
-        return (1.0 - 0.5 * joint) * (1.0 + 0.22 * fade * slab + 0.3 * _grain(u, v, 0.1, foot, 6)
-                                      + 0.25 * _grain(u, v, 3.0, foot, 7))  # fmt: skip
+        return (1.0 - 0.5 * joint) * (1.0 + 0.22 * fade * slab + 0.3 * _grain(u, v, 0.1, foot, SALTS[6])
+                                      + 0.25 * _grain(u, v, 3.0, foot, SALTS[7]))  # fmt: skip
     if kind == GRASS:
-        return (1.0 + 0.8 * _grain(u, v, 0.07, foot, 8) + 0.6 * _grain(u, v, 0.4, foot, 9)
-                + 0.5 * _grain(u, v, 2.0, foot, 10) + 0.4 * _grain(u, v, 9.0, foot, 11))  # fmt: skip
+        return (1.0 + 0.8 * _grain(u, v, 0.07, foot, SALTS[8]) + 0.6 * _grain(u, v, 0.4, foot, SALTS[9])
+                + 0.5 * _grain(u, v, 2.0, foot, SALTS[10]) + 0.4 * _grain(u, v, 9.0, foot, SALTS[11]))  # fmt: skip
     if kind == BRICK:
         row = math.floor(v / 0.08)
         shifted = u + 0.12 * (row - 2 * math.floor(row / 2))
         joint = max(_line(v, 0.08, 0.012, foot), _line(shifted, 0.24, 0.012, foot))
         brick = _hash(np.int64(math.floor(shifted / 0.24)), np.int64(row), 12) - 0.5
         fade = max(0.0, min(1.0, 1.5 - 2 * foot / 0.1))
-        return (1.0 + 0.35 * joint) * (1.0 + 0.5 * fade * brick + 0.3 * _grain(u, v, 1.7, foot, 13))
+        return (1.0 + 0.35 * joint) * (1.0 + 0.5 * fade * brick + 0.3 * _grain(u, v, 1.7, foot, SALTS[13]))
     if kind in (PLASTER, CONCRETE):
-        return (1.0 + 0.15 * _grain(u, v, 0.05, foot, 14) + 0.12 * _grain(u, v, 0.6, foot, 15)
-                + 0.22 * _grain(u, 0.4 * v, 2.4, foot, 16))  # fmt: skip
+        return (1.0 + 0.15 * _grain(u, v, 0.05, foot, SALTS[14]) + 0.12 * _grain(u, v, 0.6, foot, SALTS[15])
+                + 0.22 * _grain(u, 0.4 * v, 2.4, foot, SALTS[16]))  # fmt: skip
     if kind == FOLIAGE:
-        return 1.0 + 0.9 * _grain(u, v, 0.12, foot, 17) + 0.7 * _grain(u, v, 0.5, foot, 18)
+        return 1.0 + 0.9 * _grain(u, v, 0.12, foot, SALTS[17]) + 0.7 * _grain(u, v, 0.5, foot, SALTS[18])
     if kind == BARK:
-        return 1.0 + 0.8 * _grain(4 * u, v, 0.2, foot, 19)
+        return 1.0 + 0.8 * _grain(4 * u, v, 0.2, foot, SALTS[19])
     if kind == TILES:
         return (1.0 - 0.45 * max(_line(v, 0.3, 0.04, foot), 0.6 * _line(u, 0.22, 0.03, foot))) * (
-            1.0 + 0.3 * _grain(u, v, 0.3, foot, 20) + 0.3 * _grain(u, v, 2.0, foot, 21)
+            1.0 + 0.3 * _grain(u, v, 0.3, foot, SALTS[20]) + 0.3 * _grain(u, v, 2.0, foot, SALTS[21])
         )
     if kind == MARKING:
-        worn = _grain(u, v, 0.3, foot, 22) + _grain(u, v, 0.05, foot, 23)
+        worn = _grain(u, v, 0.3, foot, SALTS[22]) + _grain(u, v, 0.05, foot, SALTS[23])
         return 1.0 + 0.35 * worn
-    return 1.0 + 0.08 * _grain(u, v, 0.6, foot, 24)
+    return 1.0 + 0.08 * _grain(u, v, 0.6, foot, SALTS[24])
 
 
 @njit(cache=True)
@@ -147,8 +150,8 @@ def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: boo
     cloud = 0.0
     if clouds > 0.0 and z > 0.02:
         u, v = x / (z + 0.12), y / (z + 0.12)
-        amount = (0.5 * _noise(1.3 * u, 1.3 * v, 31) + 0.3 * _noise(3.1 * u, 3.1 * v, 32)
-                  + 0.2 * _noise(7.7 * u, 7.7 * v, 33))  # fmt: skip
+        amount = (0.5 * _noise(1.3 * u, 1.3 * v, SALTS[31]) + 0.3 * _noise(3.1 * u, 3.1 * v, SALTS[32])
+                  + 0.2 * _noise(7.7 * u, 7.7 * v, SALTS[33]))  # fmt: skip
         cloud = min(max((amount - (0.75 - 0.5 * clouds)) * 5.0, 0.0), 1.0)
     for c in range(3):
         value = light[3, c] * (1 - blend) + light[2, c] * blend
@@ -157,7 +160,8 @@ def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: boo
         colour[c] = value + light[1, c] * glow * (1 - 0.6 * cloud)
         if clear and towards > 0.99996 and cloud < 0.5:
             colour[c] += 30.0 * light[1, c]
-    line = 0.012 + 0.05 * _noise(9.0 * math.atan2(y, x), 0.5, 34) + 0.012 * _noise(70.0 * math.atan2(y, x), 0.5, 35)
+    far = math.atan2(y, x)
+    line = 0.012 + 0.05 * _noise(9.0 * far, 0.5, SALTS[34]) + 0.012 * _noise(70.0 * far, 0.5, SALTS[35])
     if z < line:
         dark = min(max((line - z) / 0.004, 0.0), 1.0) * 0.55
         lit = min(light[3, 1] / DAY_HORIZON, 1.0)
@@ -166,7 +170,7 @@ def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: boo
         colour[2] = colour[2] * (1 - dark) + dark * lit * 0.27
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _shade(
     origin: Doubles,
     directions: Floats,
@@ -228,7 +232,7 @@ def _shade(
             if rz > 0.25 or (kind == LACQUER and rz > 0.02):
                 _sky(rx, ry, rz, light, clouds, False, mirrored)
             else:  # what stands opposite, a blotch
-                shade_of = 0.10 + 0.25 * _noise(0.35 * u + 3 * rx, 0.35 * v + 3 * rz, 40)
+                shade_of = 0.10 + 0.25 * _noise(0.35 * u + 3 * rx, 0.35 * v + 3 * rz, SALTS[40])
                 for c in range(3):
                     mirrored[c] = shade_of * (light[3, c] + 0.3 * light[1, c])
             for c in range(3):

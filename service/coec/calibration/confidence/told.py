@@ -182,7 +182,7 @@ def _told(frames: EdgeFrames, window: Window, pose: Matrix4) -> Told:
     passing = -(velocity[frame] + np.cross(turn[frame], xyz_m))
     begin_ns, end_ns = pairs[0].stamp_ns, pairs[-1].stamp_ns
     elapsed = np.array([(pair.stamp_ns - begin_ns) / max(end_ns - begin_ns, 1) - 0.5 for pair in pairs])
-    as_told = Told(frames, pose, passing.T.astype(np.float32), np.zeros((3, len(frame)), np.float32))
+    as_told = Told(frames, pose, passing.T.astype(np.float32, order="C"), np.zeros((3, len(frame)), np.float32))
     uv_px, _ = as_told.pixels(np.zeros(SIZE))
     row = np.clip(uv_px[:, 1] / frames.camera.height - 0.5, -0.5, 0.5)
     share = moves[frame] * np.stack([np.ones(len(frame)), elapsed[frame], row])

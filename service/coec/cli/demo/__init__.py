@@ -20,7 +20,7 @@ from coec.adapters.files.rig import mask_to_png
 from coec.adapters.zenoh.client import connected
 from coec.adapters.zenoh.window_fetch import fetch_window
 from coec.calibration.types import Matrix4
-from coec.cli.demo import report, story
+from coec.cli.demo import first_look, report, story
 from coec.cli.demo.daemon import Daemon, DemoError, free_endpoint, running
 from coec.cli.demo.outcome import Ending, outcome_of
 from coec.cli.demo.pace import Pace
@@ -65,7 +65,8 @@ def run(output: Path, *, as_json: bool) -> int:
             screen.wait("The service starts, the street is built …")
             # Compiles what the renderers then find compiled, while the service compiles its own.
             with compile_news.heard_by(screen.hear):
-                next(drive.messages([0]))
+                picture, page = first_look.write(output, drive)
+            console.say(f"demo: the first picture is {picture}, and {page} shows it until there is more to tell")
             with connected(config.zenoh.connect, START_S) as session:
                 watch = Watch(
                     session,

@@ -48,7 +48,9 @@ def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen
         OutputError: a file cannot be written.
     """
     written = [] if window is None else [window]
-    plot = write_file(output / "timeline.png", timeline(watch.series, _marks(outcome), story.MAX_ERROR_DEG, _title()))
+    plot = write_file(
+        output / "timeline.png", timeline(watch.series, _marks(outcome), story.MAX_ERROR_DEG, story.TITLE)
+    )
     written.append(plot)
     result, compared = None, None
     if window is not None:
@@ -59,8 +61,8 @@ def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen
         written.append(write_file(output / "result.json", to_json(result)))
     happened = list(zip(watch.timeline, _happenings(watch.timeline, outcome), strict=True))
     summary = _summary(outcome, watch.timeline)
-    told = demo_page(_title(), watch.series, happened, summary, outcome, result, compared, window, provenance.here())
-    written.append(page.write(output / "report.html", told))
+    told = demo_page(story.TITLE, watch.series, happened, summary, outcome, result, compared, window, provenance.here())
+    written.append(page.write(output / story.REPORT, told))
     return Left(tuple(written), result)
 
 
@@ -119,10 +121,6 @@ def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matri
     image = np.ascontiguousarray(decode_bgr(pair.camera.image, LimitsConfig())[part])
     mask = None if rig.mask is None else np.ascontiguousarray(rig.mask[part])
     return draw(image, camera, T_camera_lidar, xyz_m, mask)
-
-
-def _title() -> str:
-    return f"A mount that is knocked by {story.KNOCK_DEG:g}° while the vehicle drives"
 
 
 def _marks(outcome: Ending) -> list[tuple[float, str]]:

@@ -36,6 +36,10 @@ WORKSHOP = (0.6, -0.5, 0.4, 0.0, 0.0, 0.0)
 KNOCK_S, KNOCK_DEG = 36.0, 3.0
 """When and how far the mount is bent, in pitch: after the first window has been judged."""
 
+TITLE = f"A mount that is knocked by {KNOCK_DEG:g}° while the vehicle drives"
+REPORT = "report.html"
+"""The page, from the first picture on."""
+
 REST_S = 12.0
 """Of driving after the repair: two more checks of the monitor."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera, image_point, in_single_precision
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.pixel_lookup import moved
 
@@ -150,6 +150,7 @@ def alignments_of_late(
     """The alignments at many poses (K, 4, 4), with e interpolated between pixels, of range edges that pass at (3, E)
     m/s and were seen later than they were placed: by their shares (3, E) of three delays, s, those (K, 3) of each pose.
     To the last bits that of `frame_alignment` of edges moved by as much."""
+    passing, share, late_s = (np.ascontiguousarray(each, np.float32) for each in (passing, share, late_s))
     sums = _late_sums(*_arguments(frames), poses.astype(np.float32, order="C"), passing, share, late_s)
     return Alignments(sums[:, :, 0], sums[:, :, 1])
 
@@ -176,7 +177,7 @@ def _arguments(frames: EdgeFrames) -> _Arguments:
     return in_single_precision(frames.camera), frames.xyz_m, frames.weight, frames.first_point, frames.maps
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _smooth_sums(
     camera: Camera,
     xyz: NDArray[np.float32],
@@ -191,11 +192,12 @@ def _smooth_sums(
     for task in prange(poses.shape[0] * frames):
         k, f = task // frames, task % frames
         pose = poses[k, min(np.int64(f), poses.shape[1] - 1)]
-        sums[k, f] = smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[f])
+        told, square = smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[f])
+        sums[k, f, 0], sums[k, f, 1] = told, square
     return sums
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _sums_on_each_map(
     camera: Camera,
     xyz: NDArray[np.float32],
@@ -212,7 +214,7 @@ def _sums_on_each_map(
     return sums
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _late_sums(
     camera: Camera,
     xyz: NDArray[np.float32],
@@ -275,7 +277,7 @@ def smooth_sums_of_frame(
     return _total(told) / STRENGTH_STEPS, _total(square)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _smooth_sums_of_parts(
     camera: Camera,
     xyz: NDArray[np.float32],
@@ -299,7 +301,8 @@ def _smooth_sums_of_parts(
                 k = part[begin + i]
                 of_frame[k, 0] += told[i]
                 of_frame[k, 1] += square[i]
-        of_frame[:, 0] /= STRENGTH_STEPS
+        for k in range(parts):
+            of_frame[k, 0] /= STRENGTH_STEPS
     return sums
 
 
@@ -396,7 +399,7 @@ def _total(values: NDArray[np.float32]) -> float:
     return total
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _nearest_pixel_z(
     camera: Camera,
     xyz: NDArray[np.float32],

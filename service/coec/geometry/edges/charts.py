@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
 from coec.geometry.pixel_lookup import OUTSIDE, exact_pixel
 from coec.geometry.projection import unproject
@@ -111,7 +111,7 @@ def edge_charts(
     )
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _pixels(camera: Camera, height: int, width: int, unit: float, centre: NDArray[np.float32]) -> NDArray[np.int32]:
     """(height·width,) the pixel (row · columns + column) at the direction of each cell of a chart, or OUTSIDE."""
     pixel, here = np.empty(height * width, np.int32), np.eye(4)
@@ -124,7 +124,7 @@ def _pixels(camera: Camera, height: int, width: int, unit: float, centre: NDArra
     return pixel
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _cells(maps: NDArray[np.int8], pixel: NDArray[np.int32]) -> NDArray[np.int8]:
     """The cells of the charts of all maps (F, h·w), from the pixel of each cell of a chart."""
     per_chart = pixel.shape[0]
@@ -238,7 +238,7 @@ def _charted_z_at(
     return strength / (STRENGTH_STEPS * math.sqrt(max(float(square), 1.0)))
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _charted_z(
     words: NDArray[np.int32],
     height: int,
@@ -253,12 +253,12 @@ def _charted_z(
     z = np.empty(poses.shape[0])
     for k in prange(poses.shape[0]):
         narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
-        narrow[:] = poses[k, :3]
+        _narrow(poses[k], narrow)
         z[k] = _charted_z_at(words, height, width, unit, centre, xyz, weight, first_cell, narrow, scratch)
     return z
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _climb(
     words: NDArray[np.int32],
     height: int,
@@ -279,7 +279,7 @@ def _climb(
     for k in prange(starts.shape[0]):
         pose = starts[k].copy()
         narrow, scratch = np.empty((3, 4), np.float32), np.empty(xyz.shape[1], np.int32)
-        narrow[:] = pose[:3]
+        _narrow(pose, narrow)
         best = _charted_z_at(words, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
         step = steps.copy()
         halved, axis, last, way = 0, 0, -1, 0.0
@@ -294,7 +294,7 @@ def _climb(
                 trial = _moved(pose, axis, sign * step[axis])
                 if not _within(trial, centre, reach):
                     continue
-                narrow[:] = trial[:3]
+                _narrow(trial, narrow)
                 score = _charted_z_at(words, height, width, unit, middle, xyz, weight, first_cell, narrow, scratch)
                 if score > best:
                     best, pose, last, way, idle = score, trial, axis, sign, 0
@@ -304,11 +304,22 @@ def _climb(
                 halved += 1
                 if halved > halvings:
                     break
-                step *= 0.5
+                for each in range(6):
+                    step[each] *= 0.5
                 idle, axis, last = 0, 0, -1
-        ends[k] = pose
         scores[k] = best
+        for i in range(3):
+            for j in range(4):
+                ends[k, i, j] = pose[i, j]
     return ends, scores
+
+
+@njit(cache=True)
+def _narrow(pose: NDArray[np.float64], out: NDArray[np.float32]) -> None:
+    """The upper rows of a pose (4, 4) in single precision, into `out` (3, 4)."""
+    for i in range(3):
+        for j in range(4):
+            out[i, j] = pose[i, j]
 
 
 @njit(cache=True)

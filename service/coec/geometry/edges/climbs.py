@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera, in_single_precision
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, smooth_sums_of_frame
 
 MAX_SWEEPS = 8
@@ -56,7 +56,7 @@ def climbed(frames: EdgeFrames, climbs: list[Climb], moves: NDArray[np.float64])
     return [Summit(pose, score) for pose, score in zip(poses, scores.tolist(), strict=True)]
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _climb(
     camera: Camera,
     xyz: NDArray[np.float32],
@@ -84,7 +84,10 @@ def _climb(
                 fineness += 1
                 if fineness == moves.shape[0]:
                     break
-        poses[k], scores[k] = pose, best
+        scores[k] = best
+        for i in range(4):
+            for j in range(4):
+                poses[k, i, j] = pose[i, j]
     return scores
 
 

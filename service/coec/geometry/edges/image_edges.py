@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.thinning import thinned
 
 CLIP_SHARE = 0.95
@@ -190,7 +190,8 @@ class EdgeScales:
         """In whole steps of `STRENGTH_STEPS` to a deviation from the mean over the pixels that count; `VOID` where
         masked."""
         lit, part = self._lit[level], self._counted.halved(self._finest + level).slices
-        count, total, square = (math.fsum(column) for column in _row_sums(values[part], lit[part]).T)
+        (top, bottom, _), (left, right, _) = (cut.indices(size) for cut, size in zip(part, values.shape, strict=True))
+        count, total, square = (math.fsum(column) for column in _row_sums(values, lit, top, bottom, left, right).T)
         mean, mean_square = total / max(count, 1.0), square / max(count, 1.0)
         variance = mean_square - mean * mean
         # A map that does not vary beyond rounding has no edges.
@@ -206,7 +207,7 @@ def _gain(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.flo
     return _gain_over(lit, kernel)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _gain_over(lit: NDArray[np.bool_], kernel: NDArray[np.float32]) -> NDArray[np.float32]:
     """By squares: far from the border of a mask every pixel is the same, and most squares are far from it."""
     h, w = lit.shape
@@ -268,7 +269,7 @@ def _normalised_gradient(
     return _over_local_mean(gradient, clip, np.float32(max(floor, 1e-6)), out)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _gradient(
     grey: NDArray[np.uint8], inner: NDArray[np.bool_], upright: NDArray[np.float32], out: NDArray[np.float32]
 ) -> None:
@@ -280,9 +281,11 @@ def _gradient(
     right, down = spared * upright[0], spared * upright[1]
     out[0], out[h - 1], out[:, 0], out[:, w - 1] = 0.0, 0.0, 0.0, 0.0
     for y in prange(1, h - 1):
-        # Three rows of floats, in which all of this is exact: the loop over the pixels runs in vector registers.
-        above, here, below = grey[y - 1].astype(np.float32), grey[y].astype(np.float32), grey[y + 1].astype(np.float32)
-        across, along = above + np.float32(2.0) * here + below, below - above
+        # Rows of floats, in which all of this is exact: the loops over the pixels run in vector registers.
+        across, along = np.empty(w, np.float32), np.empty(w, np.float32)
+        for x in range(w):
+            above, here, below = np.float32(grey[y - 1, x]), np.float32(grey[y, x]), np.float32(grey[y + 1, x])
+            across[x], along[x] = above + np.float32(2.0) * here + below, below - above
         for x in range(1, w - 1):
             gx = across[x + 1] - across[x - 1]
             gy = along[x - 1] + np.float32(2.0) * along[x] + along[x + 1]
@@ -292,7 +295,7 @@ def _gradient(
             out[y, x] = steepness if inner[y, x] else np.float32(0.0)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _over_local_mean(
     values: NDArray[np.float32], clip: np.float32, floor: np.float32, out: NDArray[np.float32]
 ) -> NDArray[np.float32]:
@@ -319,8 +322,11 @@ def _over_local_mean(
             if y - r - 1 >= max(first - r, 0):
                 for x in range(w):
                     of_column[x] -= min(values[y - r - 1, x], clip)
-            padded[r + 1 : r + 1 + w] = of_column
-            total = padded[r + 1 : 2 * r + 1].sum()
+            for x in range(w):
+                padded[r + 1 + x] = of_column[x]
+            total = 0.0
+            for x in range(r + 1, 2 * r + 1):
+                total += padded[x]
             for x in range(w):
                 total += padded[x + 2 * r + 1] - padded[x]
                 square[x] = total
@@ -335,7 +341,7 @@ def _eroded(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return lit if lit.all() else _eroded_by(lit, 2)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _eroded_by(lit: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     h, w = lit.shape
     out = np.empty((h, w), np.bool_)
@@ -343,7 +349,7 @@ def _eroded_by(lit: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
         row = np.ones(w + 2 * reach, np.bool_)
         for near in range(max(y - reach, 0), min(y + reach + 1, h)):
             _both(row[reach : reach + w], lit[near])
-        out[y] = row[reach : reach + w]
+        out[y] = True
         for k in range(2 * reach + 1):
             _both(out[y], row[k : k + w])
     return out
@@ -355,7 +361,7 @@ def _both(out: NDArray[np.bool_], other: NDArray[np.bool_]) -> None:
         out[x] &= other[x]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _smoothed(
     values: NDArray[np.float32],
     lit: NDArray[np.bool_],
@@ -408,7 +414,7 @@ def _add_both(a: NDArray[np.float32], b: NDArray[np.float32], weight: np.float32
         out[x] += weight * (a[x] + b[x])
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """(h // 2, w // 2): mean of each square of four; a last odd row or column is left out."""
     h, w = values.shape[0] // 2, values.shape[1] // 2
@@ -427,7 +433,7 @@ def _halved_mask(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return lit[:h:2, :w:2] & lit[1:h:2, :w:2] & lit[:h:2, 1:w:2] & lit[1:h:2, 1:w:2]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _less(fine: NDArray[np.float32], coarse: NDArray[np.float32]) -> NDArray[np.float32]:
     """`fine` less `coarse`, a map of half its size that is interpolated between its pixels and repeated beyond its
     border. In place: returns `fine`."""
@@ -447,22 +453,25 @@ def _less(fine: NDArray[np.float32], coarse: NDArray[np.float32]) -> NDArray[np.
     return fine
 
 
-@njit(cache=True, parallel=True)
-def _row_sums(values: NDArray[np.float32], lit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(h, 3): of each row the number of pixels that count, their sum, the sum of their squares."""
-    sums = np.zeros((values.shape[0], 3))
-    for y in prange(values.shape[0]):
+@njit(cache=True, parallel=PRANGE)
+def _row_sums(
+    values: NDArray[np.float32], lit: NDArray[np.bool_], top: int, bottom: int, left: int, right: int
+) -> NDArray[np.float64]:
+    """(bottom - top, 3): of each row of a part the number of pixels that count, their sum, the sum of their squares."""
+    sums = np.zeros((bottom - top, 3))
+    for row in prange(bottom - top):
+        of_row, counted = values[top + row, left:right], lit[top + row, left:right]
         count, total, square = 0, 0.0, 0.0
-        for x in range(values.shape[1]):
-            value = float(values[y, x]) if lit[y, x] else 0.0
-            count += lit[y, x]
+        for x in range(of_row.shape[0]):
+            value = float(of_row[x]) if counted[x] else 0.0
+            count += counted[x]
             total += value
             square += value * value
-        sums[y, 0], sums[y, 1], sums[y, 2] = count, total, square
+        sums[row, 0], sums[row, 1], sums[row, 2] = count, total, square
     return sums
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=PRANGE)
 def _stepped(
     values: NDArray[np.float32], lit: NDArray[np.bool_], mean: np.float32, steps: np.float32
 ) -> NDArray[np.int8]:

@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.bearings import Bearings, bearings
-from coec.geometry.compiler import njit, prange
+from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.edges.scan_lines import BAND_RAD, telling
 
 BANDS = math.ceil(0.5 * math.pi / BAND_RAD)
@@ -92,6 +93,9 @@ def range_edges(
         row, rows, same_line = (band + BANDS).astype(np.uint16), 2 * BANDS, SAME_LINE_RAD
     else:
         row, rows, same_line = ring, int(ring.max(initial=0)) + 1, math.pi
+    # Compiled once, whether a sweep may be written to or not.
+    row = np.ascontiguousarray(row).view()
+    row.setflags(write=False)
     # Where all of a row are of one line, only who is next counts, and not how high.
     beside = same_line >= math.pi
     order, first, azimuth, elevation, range_m = _along_the_rows(
@@ -171,14 +175,23 @@ def _along_the_rows(
         if kind[r] == _MIXED:
             of_row = slice(first[r], first[r + 1])
             sequence = np.argsort(turned[of_row], kind="mergesort")
-            order[of_row], turned[of_row] = order[of_row][sequence], turned[of_row][sequence]
-            far_m[of_row] = far_m[of_row][sequence]
+            _take(order[of_row], sequence)
+            _take(turned[of_row], sequence)
+            _take(far_m[of_row], sequence)
             if not beside:
-                raised[of_row] = raised[of_row][sequence]
+                _take(raised[of_row], sequence)
     return order, first, turned, raised, far_m
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
+def _take(values: NDArray[Any], sequence: NDArray[np.int64]) -> None:
+    """Values (n,) in another sequence, in place."""
+    before = values.copy()
+    for i in range(sequence.shape[0]):
+        values[i] = before[sequence[i]]
+
+
+@njit(cache=True, parallel=PRANGE)
 def _jumps(
     first: NDArray[np.int64],
     azimuth: NDArray[np.float32],

@@ -7,18 +7,15 @@ leaves signals meant for the service alone, and answers every question under its
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
 import os
-import signal
 import sys
 
 from coec.adapters.system import allocator, logs
 from coec.config import Config
 from coec.errors import CoecError
 from coec.runtime.worker.link import Link
-
-PR_SET_PDEATHSIG = 1  # prctl(2)
+from coec.runtime.worker.parent import tie_to
 
 START = "start"
 """Kind of the first message, and of any later one that brings another configuration."""
@@ -30,7 +27,7 @@ DEPTH_MAPS_KEPT = 64
 def main(arguments: list[str]) -> int:
     """Serve until the service goes away; the exit status is 0 then."""
     descriptor, parent = (int(argument) for argument in arguments)
-    _tie_to(parent)
+    tie_to(parent)
     link = Link(descriptor)
     with contextlib.suppress(EOFError, OSError):
         config = Config.model_validate_json(link.receive()["settings"])
@@ -46,6 +43,7 @@ def _serve(link: Link, config: Config) -> None:
     # stays: to look through it for garbage took a tenth of the start.
     gc.disable()
     from coec.runtime.worker.dispatch import answer
+    from coec.runtime.worker.second_compiler import second_compiler
     from coec.runtime.worker.tasks import Solver
 
     gc.freeze()
@@ -57,7 +55,8 @@ def _serve(link: Link, config: Config) -> None:
                 solver = Solver(config, DEPTH_MAPS_KEPT)
             else:
                 solver.use(config)
-            solver.warm_up()
+            with second_compiler(config):
+                solver.warm_up()
         except CoecError as error:
             link.send({"kind": "unusable", "code": error.reply_code, "text": str(error)})
             return
@@ -65,15 +64,6 @@ def _serve(link: Link, config: Config) -> None:
         while (message := link.receive())["kind"] != START:
             link.send(answer(solver, message))
         config = Config.model_validate_json(message["settings"])
-
-
-def _tie_to(parent: int) -> None:
-    """Die with the parent thread that started this process; leave the signals of a terminal or a manager to it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # it died before the tie was made
-        sys.exit(0)
 
 
 if __name__ == "__main__":

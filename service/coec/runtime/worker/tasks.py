@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -24,43 +23,26 @@ from coec.calibration.commissioning.learning import commission
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.lidar_to_lidar.registration import register
 from coec.calibration.lidar_to_lidar.types import LidarEdge, LidarRig, SweepPair
-from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose, observe
+from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.ports import Silence
 from coec.calibration.types import (
-    CameraFrame,
-    DepthMap,
-    EgoMotion,
-    EncodedImage,
     Estimate,
     FramePair,
-    ImageFormat,
     LidarFrame,
     Reason,
     Rig,
     Window,
 )
 from coec.config import CalibrationConfig, Config, DepthConfig
-from coec.errors import CalibrationError, CoecError, DecodeError, RecordingError, StateError, WindowError
-from coec.geometry.cameras import scaled
-from coec.geometry.edges.alignment import EdgeFrames, alignment_of_parts
-from coec.geometry.projection import project
+from coec.errors import CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.vectors import lengths
 from coec.reports.instants import instant
 from coec.reports.overlay import draw, titled
 from coec.runtime.worker.jobs import Checked, Commissioned, Drawn, Registered, Solved, WrittenFile
 from coec.runtime.worker.messages import unpack_lidars, unpack_pairs, unpack_sweeps
+from coec.runtime.worker.warm_up import invented_window, warm_up
 
 _log = logging.getLogger(__name__)
-
-WARM_UP_POINTS = 4000
-WARM_UP_DEPTH_PX = (48, 64)
-
-WARM_UP_CAMERA_PX = 128
-"""Longer side of the images of the warm-up: kernels are compiled for types, not for sizes, and a few milliseconds of
-work on an image of this size would be more than a second on the camera's own."""
-
-WARM_UP_EVALUATIONS, WARM_UP_REACH_DEG = 4, 4.0
-"""Of the searches of the warm-up."""
 
 OVERLAY_JPEG_QUALITY = 88
 
@@ -102,29 +84,19 @@ class Solver:
         """Run every kernel once on a few invented points, so that no window waits for a compiler. Kernels are compiled
         for types: of pairs that differ in numbers alone, as most of a vehicle do, one is enough."""
         alike = {
-            (type(rig.camera), rig.sweep is None, pair.calibration): pair
+            (type(rig.camera), rig.sweep is None, pair.calibration): (rig, pair.calibration)
             for pair in self._config.pairs
             for rig in (self._rigs[pair.name],)
         }
-        for pair in alike.values():
-            short = {"max_evaluations": WARM_UP_EVALUATIONS, "reach_deg": WARM_UP_REACH_DEG}
-            search = pair.calibration.search.model_copy(update=short)
-            configuration = pair.calibration.model_copy(update={"search": search})
-            rig = _small(self._rigs[pair.name])
-            # Two kernels are those of the uncertainty of a result, and an invented window need not lead to one.
-            project(rig.camera, np.ones((1, 3)))
-            alignment_of_parts(_one_edge(rig), np.zeros(1, np.uint8), 1, np.eye(4)[None])
-            with contextlib.suppress(CalibrationError, DecodeError):
-                diagnose(_invented_window(rig), _Ramp(), self._images, configuration, None)
-            with contextlib.suppress(CalibrationError, DecodeError):
-                calibrate(_invented_window(rig), _Ramp(), self._images, configuration, Silence())
+        for rig, calibration in alike.values():
+            warm_up(rig, calibration, self._images)
         if self._config.lidar_edges.period_s > 0.0 and len({pair.lidar.place for pair in self._config.pairs}) > 1:
             self._warm_up_lidars()
 
     def _warm_up_lidars(self) -> None:
         if not installed():
             return
-        window = _invented_window(self._rigs[self._config.pairs[0].name])
+        window = invented_window(self._rigs[self._config.pairs[0].name])
         pairs = [SweepPair(pair.lidar, pair.lidar, pair.motion) for pair in window.pairs[:1]]
         register(LidarRig("a", "b", np.eye(4), np.eye(4)), pairs, Trees())
 
@@ -326,54 +298,3 @@ def _registered(edge: LidarEdge) -> Registered:
         edge.pairs,
         edge.reasons,
     )
-
-
-class _Ramp:
-    """Depth that grows from left to right, of any image: for the warm-up."""
-
-    @property
-    def identity(self) -> str:
-        return "warm-up"
-
-    def infer(self, frame: CameraFrame) -> DepthMap:
-        del frame
-        height, width = WARM_UP_DEPTH_PX
-        return DepthMap(np.tile(np.linspace(1.0, 2.0, width, dtype=np.float32), (height, 1)))
-
-
-def _small(rig: Rig) -> Rig:
-    """The rig with a camera of fewer pixels, and of as large a field of view; masked at a corner, so that what looks at
-    borders of masks finds one."""
-    scale = min(1.0, WARM_UP_CAMERA_PX / max(rig.camera.width, rig.camera.height))
-    camera = scaled(rig.camera, scale, scale)
-    mask = np.ones((camera.height, camera.width), np.bool_)
-    mask[0, 0] = False
-    return replace(rig, camera=camera, mask=mask)
-
-
-def _one_edge(rig: Rig) -> EdgeFrames:
-    """A range edge, and an image without any."""
-    maps = np.zeros((1, rig.camera.height, rig.camera.width), np.int8)
-    return EdgeFrames(rig.camera, np.ones((3, 1), np.float32), np.ones(1, np.float32), np.array([0, 1]), maps)
-
-
-def _invented_window(rig: Rig) -> Window:
-    """Pairs with points all around the LiDAR, seeded; as a window from the disk holds them, so that the kernels are
-    compiled for the same arrays: sweeps that may not be written to, images from a decoder, motion to compensate."""
-    rng = np.random.default_rng(0)
-    direction = rng.normal(size=(WARM_UP_POINTS, 3))
-    range_m = rng.uniform(5.0, 30.0, size=(WARM_UP_POINTS, 1))
-    xyz_m = (range_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
-    xyz_m.setflags(write=False)
-    width, height = rig.camera.width, rig.camera.height
-    jpeg = encode_jpeg(rng.integers(0, 256, (height, width), np.uint8))
-    image = EncodedImage(ImageFormat.JPEG, width, height, jpeg)
-    pairs = tuple(
-        FramePair(
-            CameraFrame(stamp, rig.camera_frame, image),
-            LidarFrame(stamp, rig.lidar_frame, xyz_m),
-            EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
-        )
-        for stamp in range(0, MIN_PAIRS * 100_000_000, 100_000_000)
-    )
-    return Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)

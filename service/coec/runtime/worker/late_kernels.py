@@ -1,0 +1,76 @@
+"""Kernels that a solve comes to after its edges are found, which is half of what compiling takes: each run once on next
+to nothing, for what is to be compiled before a solve needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from coec.calibration.objective.mutual_information import SearchBox
+from coec.calibration.search.global_search import sample_reach
+from coec.geometry.cameras import Camera, scaled
+from coec.geometry.edges.alignment import (
+    EdgeFrames,
+    alignment_of_parts,
+    alignments,
+    alignments_of_late,
+    significances,
+)
+from coec.geometry.edges.charts import charted_significances, climb, edge_charts, keep_apart
+from coec.geometry.edges.climbs import Climb, climbed
+from coec.geometry.mutual_information import BinnedFrames, information_of_each, mutual_information
+from coec.geometry.projection import project
+from coec.geometry.shares import share_of_pixels
+
+CAMERA_PX = 64
+"""Longer side of the image: kernels are compiled for types, not for sizes."""
+
+BLUR_RAD = 0.1
+"""Of a chart of few cells."""
+
+
+def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
+    """What is to be run, the last ones of a solve first."""
+    scale = min(1.0, CAMERA_PX / max(camera.width, camera.height))
+    camera = scaled(camera, scale, scale)
+    edges, pose = one_edge(camera), np.eye(4)
+    two, point = np.stack([pose, pose]), np.zeros((3, 1), np.float32)
+    charts = edge_charts(camera, edges.maps, BLUR_RAD, edges.xyz_m, edges.weight, np.zeros(1, np.int64))
+    steps, reach = np.full(6, 0.01), np.array([0.01, 0.01])
+    binned = _binned(camera)
+    values = np.ones((camera.height, camera.width), np.float32)
+    return (
+        lambda: climbed(edges, [Climb(pose, 0, 1)], pose[None, None]),
+        lambda: alignments_of_late(edges, point, point, point.T, two),
+        lambda: climb(charts, two, steps, 1, pose, reach),
+        lambda: charted_significances(charts, two),
+        lambda: information_of_each(binned, two),
+        lambda: mutual_information(binned, pose),
+        lambda: share_of_pixels(values, values > 0.0, np.ones(1, np.float32)),
+        lambda: significances(edges, two),
+        lambda: sample_reach(pose, SearchBox(0.1, 0.0), 8),
+        lambda: keep_apart(two, np.arange(2), 1, 3.0),
+        lambda: alignments(edges, two),
+        lambda: alignment_of_parts(edges, np.zeros(1, np.uint8), 1, two),
+        lambda: project(camera, np.ones((1, 3))),
+    )
+
+
+def one_edge(camera: Camera) -> EdgeFrames:
+    """A range edge, and an image without any."""
+    maps = np.zeros((1, camera.height, camera.width), np.int8)
+    return EdgeFrames(camera, np.ones((3, 1), np.float32), np.ones(1, np.float32), np.array([0, 1]), maps)
+
+
+def _binned(camera: Camera) -> BinnedFrames:
+    """A point in an image of one depth."""
+    return BinnedFrames(
+        camera=camera,
+        xyz_m=np.ones((3, 1), np.float32),
+        range_bin=np.zeros(1, np.uint8),
+        first_point=np.array([0, 1]),
+        depth_bin=np.zeros((1, camera.height * camera.width + 1), np.uint8),
+        depth_bins=1,
+        range_bins=1,
+    )

@@ -1,0 +1,100 @@
+"""What a worker does before its first job: every kernel is run once on a few invented points, so that no window waits
+for a compiler."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+
+import numpy as np
+
+from coec.adapters.images.codec import GreyImages, encode_jpeg
+from coec.calibration.calibrator import calibrate
+from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose
+from coec.calibration.ports import Silence
+from coec.calibration.types import (
+    CameraFrame,
+    DepthMap,
+    EgoMotion,
+    EncodedImage,
+    FramePair,
+    ImageFormat,
+    LidarFrame,
+    Rig,
+    Window,
+)
+from coec.config import CalibrationConfig
+from coec.errors import CalibrationError, DecodeError
+from coec.geometry.cameras import scaled
+from coec.geometry.edges.alignment import alignment_of_parts
+from coec.geometry.projection import project
+from coec.runtime.worker.late_kernels import one_edge
+
+POINTS = 4000
+DEPTH_PX = (48, 64)
+
+CAMERA_PX = 128
+"""Longer side of the images of the warm-up: kernels are compiled for types, not for sizes, and a few milliseconds of
+work on an image of this size would be more than a second on the camera's own."""
+
+EVALUATIONS, REACH_DEG = 4, 4.0
+"""Of the searches of the warm-up."""
+
+
+def warm_up(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> None:
+    """Of one pair: what a check and a solve of it run."""
+    search = calibration.search.model_copy(update={"max_evaluations": EVALUATIONS, "reach_deg": REACH_DEG})
+    configuration = calibration.model_copy(update={"search": search})
+    rig = small(rig)
+    with contextlib.suppress(CalibrationError, DecodeError):
+        diagnose(invented_window(rig), _Ramp(), images, configuration, None)
+    with contextlib.suppress(CalibrationError, DecodeError):
+        calibrate(invented_window(rig), _Ramp(), images, configuration, Silence())
+    # Two kernels are those of the uncertainty of a result, and an invented window need not lead to one.
+    project(rig.camera, np.ones((1, 3)))
+    alignment_of_parts(one_edge(rig.camera), np.zeros(1, np.uint8), 1, np.eye(4)[None])
+
+
+class _Ramp:
+    """Depth that grows from left to right, of any image."""
+
+    @property
+    def identity(self) -> str:
+        return "warm-up"
+
+    def infer(self, frame: CameraFrame) -> DepthMap:
+        del frame
+        height, width = DEPTH_PX
+        return DepthMap(np.tile(np.linspace(1.0, 2.0, width, dtype=np.float32), (height, 1)))
+
+
+def small(rig: Rig) -> Rig:
+    """The rig with a camera of fewer pixels, and of as large a field of view; masked at a corner, so that what looks at
+    borders of masks finds one."""
+    scale = min(1.0, CAMERA_PX / max(rig.camera.width, rig.camera.height))
+    camera = scaled(rig.camera, scale, scale)
+    mask = np.ones((camera.height, camera.width), np.bool_)
+    mask[0, 0] = False
+    return replace(rig, camera=camera, mask=mask)
+
+
+def invented_window(rig: Rig) -> Window:
+    """Pairs with points all around the LiDAR, seeded; as a window from the disk holds them, so that the kernels are
+    compiled for the same arrays: sweeps that may not be written to, images from a decoder, motion to compensate."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(POINTS, 3))
+    range_m = rng.uniform(5.0, 30.0, size=(POINTS, 1))
+    xyz_m = (range_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    xyz_m.setflags(write=False)
+    width, height = rig.camera.width, rig.camera.height
+    jpeg = encode_jpeg(rng.integers(0, 256, (height, width), np.uint8))
+    image = EncodedImage(ImageFormat.JPEG, width, height, jpeg)
+    pairs = tuple(
+        FramePair(
+            CameraFrame(stamp, rig.camera_frame, image),
+            LidarFrame(stamp, rig.lidar_frame, xyz_m),
+            EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
+        )
+        for stamp in range(0, MIN_PAIRS * 100_000_000, 100_000_000)
+    )
+    return Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)

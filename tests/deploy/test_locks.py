@@ -1,0 +1,69 @@
+"""What the lock files pin: all that is declared, with hashes, everything in one place."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from coec.adapters.system.installed import pinned_hashes
+from conftest import REPOSITORY
+
+LOCK, CHECKS = (REPOSITORY / name for name in ("requirements.lock", "requirements-checks.lock"))
+
+
+@pytest.fixture(scope="module")
+def project() -> Any:
+    return tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+
+
+def pinned(lock: Path) -> dict[str, str]:
+    """Versions by name."""
+    return dict(pinned_hashes(lock).keys())
+
+
+def missing(lines: list[str], *locks: Path) -> list[str]:
+    """Requirements that none of the locks meets."""
+    versions = {name: version for lock in locks for name, version in pinned(lock).items()}
+    requirements = [Requirement(line) for line in lines]
+    return [
+        str(each)
+        for each in requirements
+        if (name := canonicalize_name(each.name)) not in versions or versions[name] not in each.specifier
+    ]
+
+
+def twice(*locks: str) -> set[str]:
+    """What is pinned in each, for the same machines."""
+    lines = (set(re.findall(r"^[^#\s].*(?= \\$)", lock, re.MULTILINE)) for lock in locks)
+    return set.intersection(*lines)
+
+
+def test_what_coec_and_its_demonstration_need_is_pinned(project: Any) -> None:
+    assert missing(project["project"]["dependencies"], LOCK) == []
+    assert missing(project["dependency-groups"]["demo"], LOCK) == []
+    assert missing(project["build-system"]["requires"], LOCK) == []
+
+
+def test_what_the_checks_need_is_pinned_beside_it_and_nothing_twice(project: Any) -> None:
+    assert missing(project["dependency-groups"]["checks"], LOCK, CHECKS) == []
+    assert twice(LOCK.read_text(), CHECKS.read_text()) == set()
+    assert missing(["pytest", "mypy", "playwright", "pyarrow"], LOCK), "who only wants to see it fetches none of these"
+
+
+@pytest.mark.parametrize("lock", [LOCK, CHECKS], ids=lambda lock: lock.stem)
+def test_every_pin_has_hashes_and_no_address(lock: Path) -> None:
+    assert all(pinned_hashes(lock).values())
+    assert re.findall(r"https?:|file:|--(?:extra-)?index", lock.read_text()) == []
+
+
+def test_an_argument_that_is_not_known_is_refused_before_anything_is_made() -> None:
+    done = subprocess.run([REPOSITORY / "deploy" / "setup", "--cheks"], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "--cheks" in done.stderr

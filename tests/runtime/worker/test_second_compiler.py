@@ -1,0 +1,61 @@
+"""The process that helps the worker to compile its kernels."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from coec.config import Config
+from coec.geometry import compile_news
+from coec.runtime.worker import second_compiler
+from rig_said import pair_config
+
+CONFIG = Config(pairs=(pair_config("front"),))
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """Every one that is started, without its work."""
+    children: list[subprocess.Popen[bytes]] = []
+
+    def start(_: Config) -> subprocess.Popen[bytes]:
+        children.append(subprocess.Popen(["sleep", "60"]))
+        return children[-1]
+
+    monkeypatch.setattr(second_compiler, "_started", start)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    return children
+
+
+def test_there_is_none_where_nothing_is_compiled(started: list[subprocess.Popen[bytes]]) -> None:
+    with second_compiler.second_compiler(CONFIG):
+        pass
+    compile_news.tell("a kernel of somebody else's")
+    assert started == []
+
+
+def test_there_is_one_from_the_first_kernel_to_the_end_of_the_warm_up(started: list[subprocess.Popen[bytes]]) -> None:
+    with second_compiler.second_compiler(CONFIG):
+        compile_news.tell("one")
+        compile_news.tell("another")
+        (child,) = started
+        assert child.poll() is None
+    assert child.returncode is not None
+
+
+def test_there_is_none_beside_a_single_processor(
+    started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    with second_compiler.second_compiler(CONFIG):
+        compile_news.tell("one")
+    assert started == []
+
+
+def test_it_takes_a_configuration_and_ends_when_all_is_compiled() -> None:
+    command = [sys.executable, "-m", "coec.runtime.worker.second_compiler", str(os.getpid())]
+    done = subprocess.run(command, input=CONFIG.model_dump_json().encode(), capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")
