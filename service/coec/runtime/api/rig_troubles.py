@@ -10,8 +10,14 @@ from coec.calibration.rig.objections import Objection, objections
 from coec.calibration.rig.vehicle import VehicleRig
 from coec.calibration.types import Reason
 
-INCONSISTENT, MOVED, SUSPECTED = "inconsistent_rig", "sensor_moved", "sensor_suspected"
-"""Codes of the reasons."""
+INCONSISTENT = "inconsistent_rig"
+"""Code of the reason that a pair does not fit the others of its vehicle."""
+
+MOVED = "sensor_moved"
+"""That a sensor of it moved, and it serves what was before."""
+
+SUSPECTED = "sensor_suspected"
+"""That it does not fit, and a sensor of it may have moved."""
 
 
 def troubles_of(rig: VehicleRig) -> dict[str, tuple[Reason, ...]]:
