@@ -31,6 +31,8 @@ NAMED_S = 60.0
 """Of driving, within which a sensor that was knocked has to be named."""
 
 MAX_ERROR_DEG = 0.3
+MAX_ERROR_TOGETHER_DEG = 0.2
+"""Of a pair by itself, and of one that all pairs of a knocked sensor put right together."""
 
 HELD = 8
 """Pairs of frames that may wait in the service before more are sent."""
@@ -241,10 +243,11 @@ def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
             f"named {story.named_s(LIDAR):.0f} s, put right {put_right_s:.0f} s of driving after the knock; then "
             f"{max(errors.values()):.2f}° off at most",
         )
-        assert max(errors.values()) <= MAX_ERROR_DEG, errors
+        assert max(errors.values()) <= MAX_ERROR_TOGETHER_DEG, errors
         assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
         last = {camera: states_of(running, camera)[-1] for camera in cameras}
-        assert set(last.values()) == {"healthy"}, last
+        # A pair whose own looks lie beside what all say may find that they do not add up; none accuses its mount.
+        assert set(last.values()) <= {"healthy", "degraded"}, last
         assert running.terminate() == 0
 
 
