@@ -6,6 +6,7 @@ import _thread
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -40,9 +41,8 @@ def no_interrupt_lost() -> Iterator[None]:
 
     def hear(what: sys.UnraisableHookArgs) -> None:
         if issubclass(what.exc_type, KeyboardInterrupt):
-            again = threading.Timer(LATER_S, _thread.interrupt_main)
-            again.daemon = True
-            again.start()
+            # No `threading.Timer`: its start waits for its thread, and an interrupt amid this hook is lost for good.
+            _thread.start_new_thread(_interrupt_later, ())
         else:
             before(what)
 
@@ -51,3 +51,8 @@ def no_interrupt_lost() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = before
+
+
+def _interrupt_later() -> None:
+    time.sleep(LATER_S)
+    _thread.interrupt_main()

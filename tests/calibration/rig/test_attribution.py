@@ -8,7 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.calibration.rig.attribution import RigState, SensorHealth, after_look, begun, sensors, served
+from coec.calibration.rig.attribution import (
+    NAMED_AT,
+    RigState,
+    SensorHealth,
+    after_look,
+    after_window,
+    begun,
+    sensors,
+    served,
+)
 from coec.calibration.rig.evidence import information_of
 from coec.calibration.rig.types import Edge, Kind, Link, RigGraph, Sensor
 from coec.geometry import se3
@@ -54,11 +63,27 @@ def test_two_sensors_at_once_take_one_answer_more_than_one_alone(who: tuple[str,
             state = after_look(state, rig, look(edge, after, at_s, SIGMA * rng.normal(size=6)))
             if state.asked_ns != before.asked_ns:
                 asked.append(state)
-    probable = [set(who) <= {name for name, p in one.posterior.sensors.items() if p >= 0.95}
+    probable = [set(who) <= {name for name, p in one.posterior.sensors.items() if p >= NAMED_AT}
                 for one in asked if one.posterior is not None]  # fmt: skip
     first_said, first_named = probable.index(True), [one.named for one in asked].index(frozenset(who))
     assert first_named - first_said == answers - 1
     assert all(one.named <= set(who) for one in asked)
+
+
+@pytest.mark.fault(
+    "bent looks at one pair of a LiDAR that was knocked",
+    "its camera is not named beside the LiDAR before a window of it says so",
+)
+def test_a_camera_beside_its_one_lidar_is_named_by_a_window_and_not_by_looks() -> None:
+    rig = graph(STAR)
+    after = with_moved("front", "roof")
+    state = driven(rig, POSES, after, rounds=(4, 12))
+    assert _named(state, rig) == {"roof"}
+    (front,) = (sensor for sensor in sensors(state, rig) if sensor.name == "front")
+    assert front.health is SensorHealth.UNDECIDED
+    assert front.reasons[0].text.endswith("a window of it decides.")
+    window = look(rig.edges[0], after, 100.0, np.zeros(6))
+    assert _named(after_window(state, rig, window), rig) == {"front", "roof"}
 
 
 def test_nothing_happened_and_nobody_is_named() -> None:

@@ -90,7 +90,7 @@ def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("metadata", "said"),
     [
-        ("", "is no metadata of rosbag2"),
+        ("", "is empty"),
         ("[1]", "is no metadata of rosbag2"),
         ("{", "is not valid YAML"),
         ("rosbag2_bagfile_information: {storage_identifier: mcap}", "relative_file_paths"),

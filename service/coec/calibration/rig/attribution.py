@@ -7,13 +7,15 @@ A sensor is named by two answers in a row, with a look in between, and by two of
 run of bad looks says of one pair, or one pair that was looked at before the others, the next look denies. Where two
 sensors are said to have moved at once it takes one answer more, for each: a bad look at one pair just after a sensor of
 many was knocked makes its other sensor seem to have moved as well. An accepted window is a witness of another kind:
-with it one answer suffices.
+with it one answer suffices. And looks alone name no sensor whose every pair is with one that seems to have moved, too:
+all that speaks for it is that its pair steps otherwise than the rest, as a pair does whose looks at a knocked mount are
+bent. Of a camera beside the one LiDAR of a vehicle a window decides.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import degrees
@@ -29,9 +31,9 @@ from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
 from coec.calibration.types import Matrix4, Reason
 from coec.geometry import dense
 
-NAMED_AT = 0.95
-"""Probability from which a sensor is named, if it was before, and below whose complement it is called calibrated.
-Between: undecided."""
+NAMED_AT, SUSPECTED_AT = 0.99, 0.05
+"""Probability from which a sensor is named, if it was before: of a hundred that are named one may be wrong. And that
+below which it is called calibrated. Between: undecided."""
 
 ANSWERS, ANSWERS_FOR_TWO = 2, 3
 """In a row, that name a sensor by itself, and beside another. The second on drawn drives of
@@ -199,8 +201,9 @@ def _asked(state: RigState, graph: RigGraph, answers: Mapping[str, int]) -> RigS
     times_ns = _times_ns(histories, state.stepped_ns)
     posterior = _posterior(histories, times_ns, graph)
     stepped_ns = times_ns[posterior.when]
-    probable = [name for name, p in posterior.sensors.items() if p >= NAMED_AT]
+    probable = _probable(posterior)
     needed = ANSWERS if len(probable) == 1 else ANSWERS_FOR_TWO
+    hidden = {name for name in probable if _is_hidden(name, probable, graph)}
     claimed = {
         name: min(state.claimed.get(name, 0) + answers.get(name, 1), ANSWERS_FOR_TWO)
         for name in probable
@@ -211,8 +214,23 @@ def _asked(state: RigState, graph: RigGraph, answers: Mapping[str, int]) -> RigS
         posterior=posterior,
         stepped_ns=stepped_ns,
         claimed=claimed,
-        named=frozenset(name for name, count in claimed.items() if count >= needed or name in state.named),
+        named=frozenset(
+            name
+            for name, count in claimed.items()
+            if name in state.named or (name in answers if name in hidden else count >= needed)
+        ),
     )
+
+
+def _probable(of: Posterior) -> tuple[str, ...]:
+    """Sensors that may be named."""
+    return tuple(name for name, p in of.sensors.items() if p >= NAMED_AT)
+
+
+def _is_hidden(name: str, probable: Collection[str], graph: RigGraph) -> bool:
+    """Whether every pair of a sensor is with another that may be named."""
+    far_ends = {edge.b if edge.a == name else edge.a for edge in graph.edges if name in (edge.a, edge.b)}
+    return far_ends <= set(probable)
 
 
 def _seen_by_two(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:
@@ -263,14 +281,17 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
         return SensorState(sensor.name, sensor.kind, SensorHealth.UNKNOWN, 0.0, None, (Reason("not_looked_at", text),))
     probability = of.sensors[sensor.name]
     disturbed = max((of.disturbed[name] for name in edges), default=0.0)
-    moved = of.steps.get(sensor.name) if probability > 1.0 - NAMED_AT else None
+    moved = of.steps.get(sensor.name) if probability > SUSPECTED_AT else None
     if sensor.name in state.named:
         health = _moved(sensor)
         reasons: tuple[Reason, ...] = (_named(sensor, probability, moved, looked, of),)
-    elif max(probability, disturbed) > 1.0 - NAMED_AT:
+    elif max(probability, disturbed) > SUSPECTED_AT:
         health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
         if probability >= NAMED_AT:
-            text = f"It seems to have moved ({100.0 * probability:.1f} %); the next looks at its pairs decide."
+            decides = (
+                "a window of it decides" if _is_hidden(sensor.name, _probable(of), graph) else "the next looks decide"
+            )
+            text = f"It seems to have moved ({100.0 * probability:.1f} %); {decides}."
             reasons = (Reason("one_more_look", text), *reasons[1:])
     else:
         health = SensorHealth.CALIBRATED
@@ -296,12 +317,12 @@ def _undecided(
     sensor: Sensor, probability: float, disturbed: float, edges: list[str], of: Posterior
 ) -> tuple[Reason, ...]:
     reasons = []
-    if probability > 1.0 - NAMED_AT:
+    if probability > SUSPECTED_AT:
         rivals = [" and ".join(names) for names, _ in of.sets if sensor.name not in names][:3]
         or_else = f" or {', or '.join(rivals)}" if rivals else ", or nothing did"
         text = f"It moved{or_else}: the pairs that were looked at cannot tell ({100.0 * probability:.0f} %)."
         reasons.append(Reason("cannot_tell", text))
-    if disturbed > 1.0 - NAMED_AT:
+    if disturbed > SUSPECTED_AT:
         pair = max(edges, key=lambda name: of.disturbed[name])
         text = f"{pair} is off, and other pairs deny that a sensor moved: {100.0 * disturbed:.0f} %."
         reasons.append(Reason("pair_disturbed", text))
