@@ -31,9 +31,9 @@ from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
 from coec.calibration.types import Matrix4, Reason
 from coec.geometry import dense
 
-NAMED_AT, SUSPECTED_AT = 0.99, 0.05
-"""Probability from which a sensor is named, if it was before: of a hundred that are named one may be wrong. And that
-below which it is called calibrated. Between: undecided."""
+NAMED_AT = 0.95
+"""Probability from which a sensor is named, if it was before, and below whose complement it is called calibrated.
+Between: undecided."""
 
 ANSWERS, ANSWERS_FOR_TWO = 2, 3
 """In a row, that name a sensor by itself, and beside another. The second on drawn drives of
@@ -281,11 +281,11 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
         return SensorState(sensor.name, sensor.kind, SensorHealth.UNKNOWN, 0.0, None, (Reason("not_looked_at", text),))
     probability = of.sensors[sensor.name]
     disturbed = max((of.disturbed[name] for name in edges), default=0.0)
-    moved = of.steps.get(sensor.name) if probability > SUSPECTED_AT else None
+    moved = of.steps.get(sensor.name) if probability > 1.0 - NAMED_AT else None
     if sensor.name in state.named:
         health = _moved(sensor)
         reasons: tuple[Reason, ...] = (_named(sensor, probability, moved, looked, of),)
-    elif max(probability, disturbed) > SUSPECTED_AT:
+    elif max(probability, disturbed) > 1.0 - NAMED_AT:
         health, reasons = SensorHealth.UNDECIDED, _undecided(sensor, probability, disturbed, edges, of)
         if probability >= NAMED_AT:
             decides = (
@@ -317,12 +317,12 @@ def _undecided(
     sensor: Sensor, probability: float, disturbed: float, edges: list[str], of: Posterior
 ) -> tuple[Reason, ...]:
     reasons = []
-    if probability > SUSPECTED_AT:
+    if probability > 1.0 - NAMED_AT:
         rivals = [" and ".join(names) for names, _ in of.sets if sensor.name not in names][:3]
         or_else = f" or {', or '.join(rivals)}" if rivals else ", or nothing did"
         text = f"It moved{or_else}: the pairs that were looked at cannot tell ({100.0 * probability:.0f} %)."
         reasons.append(Reason("cannot_tell", text))
-    if disturbed > SUSPECTED_AT:
+    if disturbed > 1.0 - NAMED_AT:
         pair = max(edges, key=lambda name: of.disturbed[name])
         text = f"{pair} is off, and other pairs deny that a sensor moved: {100.0 * disturbed:.0f} %."
         reasons.append(Reason("pair_disturbed", text))
