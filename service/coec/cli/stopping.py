@@ -42,7 +42,7 @@ def no_interrupt_lost() -> Iterator[None]:
     def hear(what: sys.UnraisableHookArgs) -> None:
         if issubclass(what.exc_type, KeyboardInterrupt):
             # No `threading.Timer`: its start waits for its thread, and an interrupt amid this hook is lost for good.
-            _thread.start_new_thread(_interrupt_later, ())
+            _thread.start_new_thread(_interrupt_later, (threading.get_ident(),))
         else:
             before(what)
 
@@ -53,6 +53,7 @@ def no_interrupt_lost() -> Iterator[None]:
         sys.unraisablehook = before
 
 
-def _interrupt_later() -> None:
+def _interrupt_later(thread: int) -> None:
     time.sleep(LATER_S)
-    _thread.interrupt_main()
+    # A signal, and no `interrupt_main`, which wakes nobody who waits.
+    signal.pthread_kill(thread, signal.SIGINT)
