@@ -32,10 +32,10 @@ def test_a_drive_that_has_a_result_is_not_checked_again(
     monkeypatch.setattr(check_drives, "PLACES", {"street": "", "highway": "scene=highway"})
     monkeypatch.setattr(check_run, "run", run)
     monkeypatch.setattr(check_run, "commissioned", lambda _: None)
-    first = coec("sim", "checks", "--output", tmp_path, "--rounds", 1, "--hours", 0.1, "--json")
+    first = coec("sim", "checks", "--output", tmp_path, "--rounds", 1, "--jobs", 1, "--hours", 0.1, "--json")
     assert (first.status, first.document["drives"], len(checked)) == (0, len(checked), len(set(checked)))
     (tmp_path / "drives" / f"{checked[0]}.json").write_text("half of a fi")
-    again = coec("sim", "checks", "--output", tmp_path, "--rounds", 1, "--hours", 0.1)
+    again = coec("sim", "checks", "--output", tmp_path, "--rounds", 1, "--jobs", 1, "--hours", 0.1)
     assert checked[-1] == checked[0]  # the damaged one
     assert len(checked) == first.document["drives"] + 1
     assert "resampled" in again.out

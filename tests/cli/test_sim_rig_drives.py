@@ -24,7 +24,7 @@ def test_what_was_drawn_is_kept_and_what_is_damaged_is_drawn_again(
         return RigDriveRow(name=drive.name, seed=FIRST_SEED + drive.number, camera=drive.camera, looks=())
 
     monkeypatch.setattr(rig_drives, "looked_at", looked_at)
-    words = ("sim", "rig-drives", "--output", tmp_path, "--camera", "fisheye128")
+    words = ("sim", "rig-drives", "--output", tmp_path, "--camera", "fisheye128", "--jobs", 1)
     report = RigDrivesReport.model_validate(coec(*words, "--drives", 1, "--json").document)
     assert report.drives == 1
     assert [(row.fault, row.right, row.undecided, row.wrong) for row in report.moves] == [

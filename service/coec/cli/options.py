@@ -29,6 +29,11 @@ Connect = Annotated[
     str | None, typer.Option(help="Zenoh endpoint of the router.", metavar="ENDPOINT", show_default=DEFAULT_CONNECT)
 ]
 
+Jobs = Annotated[
+    int | None, typer.Option(help="Processes, of one core and 1 GB each.", min=1, show_default="the cores")
+]
+"""Of a command that draws many drives."""
+
 DegreesOfFreedom = Literal["3", "6"]
 """Of a search: rotation only, or translation too."""
 

@@ -3,11 +3,13 @@ one."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from coec.adapters.files import output
 from coec.calibration.commissioning.baseline import Baseline
 from coec.cli.commands.sim_checks import Options
+from coec.cli.drives_at_once import finished
 from coec.errors import CalibrationError
 from coec.evaluation import check_drives, check_run, check_statistics
 from coec.reports import check_tables, console
@@ -22,6 +24,7 @@ def run(options: Options) -> int:
     Raises:
         SourceError: the optional extra is not installed.
         OutputError: a file cannot be written.
+        DrivesError: a process died.
     """
     require_extra()
     outings = list(check_drives.drives(options.rounds))
@@ -31,17 +34,19 @@ def run(options: Options) -> int:
         for drive in drives
         if (row := output.kept(_path(options.output, drive.name), CheckedDrive)) is not None
     }
-    baselines: dict[str, Baseline | None] = {}
+    left = ([drive for drive in outing if drive.name not in rows] for outing in outings)
+    waiting = [outing for outing in left if outing]
     with console.progress() as bars:
-        task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
-        for outing in outings:
-            missing = [drive for drive in outing if drive.name not in rows]
-            if not missing:
-                continue
-            for drive in missing:
-                if drive.rig not in baselines:
-                    baselines[drive.rig] = _commissioned(drive.rig)
-            for row in check_run.run(missing, baselines):
+        task = bars.add_task("drives", total=len(drives), completed=len(rows), note="commissioning")
+        rigs = sorted({drive.rig for outing in waiting for drive in outing})
+        baselines: dict[str, Baseline] = {}
+        for rig, learned in finished(_commissioned, rigs, options.jobs):
+            if isinstance(learned, CalibrationError):
+                console.show(f"{rig} cannot be commissioned: {learned}", "red")
+            else:
+                baselines[rig] = learned
+        for outing in finished(partial(check_run.run, baselines=baselines), waiting, options.jobs):
+            for row in outing:
                 output.write(_path(options.output, row.name), to_json(row))
                 rows[row.name] = row
                 bars.update(task, advance=1, note=row.name)
@@ -54,12 +59,11 @@ def run(options: Options) -> int:
     return 0
 
 
-def _commissioned(rig: str) -> Baseline | None:
+def _commissioned(rig: str) -> tuple[str, Baseline | CalibrationError]:
     try:
-        return check_run.commissioned(rig)
+        return rig, check_run.commissioned(rig)
     except CalibrationError as error:
-        console.show(f"{rig} cannot be commissioned: {error}", "red")
-        return None
+        return rig, error
 
 
 def _path(folder: Path, name: str) -> Path:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from pathlib import Path
 
 from coec.adapters.files import output
-from coec.adapters.system.cores import one_thread_each
 from coec.cli.commands.sim_matrix import Options
+from coec.cli.drives_at_once import finished
 from coec.config import CalibrationConfig
-from coec.errors import CoecError, UsageError
+from coec.errors import UsageError
 from coec.evaluation import matrix, matrix_drives, matrix_run
 from coec.evaluation.matrix_drives import MatrixDrive
 from coec.evaluation.matrix_run import CHECK_PAIRS, WINDOWS, Settings
@@ -23,12 +19,6 @@ from coec.schemas.matrix import MatrixRow
 from coec.simulation.source import require_extra
 
 
-class MatrixError(CoecError):
-    """The matrix could not be run to its end."""
-
-    reply_code = "matrix_failed"
-
-
 def run(options: Options) -> int:
     """Runs the drives that have no result in the folder yet, and writes report.json and a picture there.
 
@@ -36,7 +26,7 @@ def run(options: Options) -> int:
         UsageError: no drive fits.
         SourceError: the optional extra is not installed.
         OutputError: a file cannot be written.
-        MatrixError: a process died.
+        DrivesError: a process died.
     """
     require_extra()
     if WINDOWS * options.frames < CHECK_PAIRS:
@@ -51,7 +41,7 @@ def run(options: Options) -> int:
     waiting = [drive for drive in drives if drive.name not in rows]
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
-        for row in _run(waiting, settings, min(options.jobs or os.cpu_count() or 1, max(len(waiting), 1))):
+        for row in finished(partial(matrix_run.run, settings=settings), waiting, options.jobs):
             output.write(_path(options.output, row.name), to_json(row))
             rows[row.name] = row
             bars.update(task, advance=1, note=row.name)
@@ -73,22 +63,3 @@ def _kept(folder: Path, drive: MatrixDrive, settings: Settings) -> MatrixRow | N
     """The row of a drive that was run before with these settings; a damaged one is run again."""
     row = output.kept(_path(folder, drive.name), MatrixRow)
     return row if row is not None and row.settings == settings.fingerprint else None
-
-
-def _run(drives: Sequence[MatrixDrive], settings: Settings, jobs: int) -> Iterator[MatrixRow]:
-    """The rows of the drives, as they are finished, each made by one of `jobs` processes on one core."""
-    if jobs == 1:
-        yield from (matrix_run.run(drive, settings) for drive in drives)
-        return
-    with one_thread_each():
-        pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))
-        try:
-            for done in as_completed([pool.submit(matrix_run.run, drive, settings) for drive in drives]):
-                yield done.result()
-        except BrokenProcessPool as error:
-            raise MatrixError(
-                "a process that ran a drive died, for want of memory perhaps: start again with fewer --jobs, the "
-                "drives that are done are kept"
-            ) from error
-        finally:  # also where the caller has gone before the end
-            pool.shutdown(cancel_futures=True)

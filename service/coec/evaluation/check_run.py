@@ -94,9 +94,9 @@ def commissioned(rig: str) -> Baseline:
     )  # fmt: skip
 
 
-def run(drives: Sequence[CheckDrive], baselines: Mapping[str, Baseline | None]) -> list[CheckedDrive]:
+def run(drives: Sequence[CheckDrive], baselines: Mapping[str, Baseline]) -> list[CheckedDrive]:
     """The rows of drives that differ in their lens alone; whatever goes wrong is their `failure`. `baselines` of the
-    rigs by name."""
+    rigs that could be commissioned, by name."""
     rows = [
         CheckedDrive(name=drive.name, rig=drive.rig, place=drive.place, seed=drive.seed, source=source, poses=())
         for drive in drives

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from coec.cli.options import Json
+from coec.cli.options import Jobs, Json
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +22,7 @@ class Options:
     hours: Annotated[
         float, typer.Option(help="Hours of driving to resample from them, whole drives at a time.", min=0, max=10_000)
     ] = 100.0
+    jobs: Jobs = None
     as_json: Json = False
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from coec.cli.options import DegreesOfFreedom, Depth, Json
+from coec.cli.options import DegreesOfFreedom, Depth, Jobs, Json
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +31,7 @@ class Options:
     ] = None
     frames: Annotated[int, typer.Option(help="Pairs of a window; a drive has two windows.", min=2, max=100)] = 10
     depth: Depth = None
-    jobs: Annotated[
-        int | None, typer.Option(help="Processes, of one core and 1 GB each.", min=1, show_default="the cores")
-    ] = None
+    jobs: Jobs = None
     as_json: Json = False
 
 

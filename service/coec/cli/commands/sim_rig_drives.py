@@ -8,16 +8,17 @@ from typing import Annotated
 
 import typer
 
-from coec.cli.options import Json
+from coec.cli.options import Jobs, Json
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The arguments of the command."""
+    """The arguments of the command; None = not given."""
 
     output: Annotated[Path, typer.Option(help="Folder for report.json and drives/.", metavar="DIR", show_default=False)]
     drives: Annotated[int, typer.Option(help="Drives, each with every fault.", min=1, max=10_000)] = 30
     camera: Annotated[str, typer.Option(help="Of every camera of the rig, fisheyeW.", metavar="NAME")] = "fisheye700"
+    jobs: Jobs = None
     as_json: Json = False
 
 

@@ -1,0 +1,48 @@
+"""Many simulated drives at once, each made by one process on one core."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from typing import TypeVar
+
+from coec.adapters.system.cores import one_thread_each
+from coec.errors import CoecError
+
+_Drive = TypeVar("_Drive")
+_Row = TypeVar("_Row")
+
+
+class DrivesError(CoecError):
+    """Simulated drives could not be run to their end."""
+
+    reply_code = "drives_failed"
+
+
+def finished(work: Callable[[_Drive], _Row], drives: Sequence[_Drive], jobs: int | None) -> Iterator[_Row]:
+    """What `work` makes of each drive, as they are finished, by `jobs` processes (None: one for each core).
+
+    `work`, the drives and what is made of them go from process to process, unless one process is enough.
+
+    Raises:
+        DrivesError: a process died.
+    """
+    processes = min(jobs or os.cpu_count() or 1, len(drives))
+    if processes <= 1:
+        yield from map(work, drives)
+        return
+    with one_thread_each():
+        pool = ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn"))
+        try:
+            for done in as_completed([pool.submit(work, drive) for drive in drives]):
+                yield done.result()
+        except BrokenProcessPool as error:
+            raise DrivesError(
+                "a process that ran a drive died, for want of memory perhaps: start again with fewer --jobs, the "
+                "drives that are done are kept"
+            ) from error
+        finally:  # also where the caller has gone before the end
+            pool.shutdown(cancel_futures=True)

@@ -1,0 +1,37 @@
+"""Many simulated drives at once: every one is made once, by processes of one core each, and a dead one is told of."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+
+import pytest
+
+from cli.made_drives import died, made
+from coec.adapters.system.cores import ONE_THREAD
+from coec.cli.drives_at_once import DrivesError, finished
+
+
+@pytest.mark.parametrize("jobs", [1, 2, None])
+def test_every_drive_ismade_once(jobs: int | None) -> None:
+    assert sorted(number for number, _, _ in finished(partial(made, times=3), range(4), jobs)) == [0, 3, 6, 9]
+
+
+def test_several_processes_keep_to_a_core_each() -> None:
+    drives = list(finished(partial(made, times=1), range(4), 2))
+    assert os.getpid() not in {pid for _, pid, _ in drives}
+    assert all(threads == ONE_THREAD for _, _, threads in drives)
+
+
+def test_one_drive_needs_no_process_of_its_own() -> None:
+    ((_, pid, _),) = finished(partial(made, times=1), [1], 8)
+    assert pid == os.getpid()
+
+
+def test_nothing_to_do_is_nothing_done() -> None:
+    assert list(finished(died, [], None)) == []
+
+
+def test_a_process_that_dies_is_told_with_what_to_do() -> None:
+    with pytest.raises(DrivesError, match="fewer --jobs"):
+        list(finished(died, range(4), 2))
