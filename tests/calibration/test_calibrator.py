@@ -8,7 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.adapters.images.codec import GreyImages
+from coec.calibration import calibrator
 from coec.calibration.calibrator import calibrate
+from coec.calibration.confidence.looks import look
 from coec.calibration.ports import DepthModel, Silence
 from coec.calibration.types import CameraFrame, Decision, DepthMap, Estimate, StopReason, Window
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig
@@ -159,6 +161,17 @@ def test_sigma_covers_the_error(street: Window, stereo: DepthModel) -> None:
     assert (np.abs(estimate.correction[:3]) < 5.0 * estimate.sigma[:3]).all()
     assert (np.degrees(estimate.sigma[:3]) < 0.5).all()
     assert np.isnan(estimate.sigma[3:]).all()
+
+
+def test_frames_that_are_one_look_claim_less_of_where_the_camera_is(
+    sharp_street: Window, stereo: DepthModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CalibrationConfig(search=SearchConfig(dof=6))
+    several = solve(sharp_street, stereo, config).sigma
+    monkeypatch.setattr(calibrator, "look", lambda edges, pose: replace(look(edges, pose), count=1.0))
+    one = solve(sharp_street, stereo, config).sigma
+    assert (one >= several).all()
+    assert (one[3:] > several[3:]).all()
 
 
 def test_a_window_without_pairs_is_an_error(street: Window, stereo: DepthModel) -> None:

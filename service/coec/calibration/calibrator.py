@@ -10,9 +10,10 @@ from math import degrees
 import numpy as np
 
 from coec.calibration.confidence.from_before import summit_from_before
-from coec.calibration.confidence.looks import look
+from coec.calibration.confidence.looks import Looks, look
 from coec.calibration.confidence.loosened import CLOCKS_FREE, HELD_FREE, LENS_FREE, Loosened, loosen
 from coec.calibration.confidence.modes import Rivals
+from coec.calibration.confidence.shifted import shifted
 from coec.calibration.confidence.told import LENS
 from coec.calibration.confidence.uncertainty import measure_uncertainty
 from coec.calibration.estimators import ESTIMATORS, Found, sight_of
@@ -29,6 +30,7 @@ from coec.calibration.types import (
     Estimate,
     Matrix4,
     Optimum,
+    Uncertainty,
     Window,
 )
 from coec.calibration.verdict import (
@@ -68,25 +70,22 @@ def calibrate(
     curvature = measure_curvature(objective, search.T_camera_lidar, dof)
     held = tuple(axis for axis in TRANSLATIONS if axis not in every)
     held_m = config.verdict.held_translation_sigma_m
-    loosened = _loosened(found, sight.window, search.T_camera_lidar, held, held_m)
     rivals = (*found.rivals, *_from_before(found, sight.window, dof))
-    uncertainty = measure_uncertainty(objective, search.T_camera_lidar, every, rivals, loosened, sight.window, held_m)
+    loosened = _loosened(found, sight.window, search.T_camera_lidar, held, held_m)
+    seen = _looks(found, search.T_camera_lidar)
+    uncertainty = _uncertainty(found, sight.window, search.T_camera_lidar, every, rivals, loosened, seen, config)
     blind = unobservable(curvature, uncertainty.sigma, dof, config.verdict)
     if blind:
         search = without(blind, search, objective, window.T_camera_lidar_start, config.search, progress)
         curvature = measure_curvature(objective, search.T_camera_lidar, dof, blind)
         told = tuple(axis for axis in every if axis not in blind)
         loosened = _loosened(found, sight.window, search.T_camera_lidar, blind, config.verdict.max_sigma_m)
-        uncertainty = measure_uncertainty(
-            objective, search.T_camera_lidar, told, rivals, loosened, sight.window, held_m
-        )
+        seen = _looks(found, search.T_camera_lidar)
+        uncertainty = _uncertainty(found, sight.window, search.T_camera_lidar, told, rivals, loosened, seen, config)
     pose = search.T_camera_lidar
     # Self-diagnosis, equation (2).
     at_optimum = objective.evaluate(pose)
     change = None if found.edges is None else change_point(found.edges, pose)
-    seen = None if found.edges is None else look(found.edges.sharp, pose)
-    if seen is not None:
-        uncertainty = replace(uncertainty, looks=seen.count)
     looks, pairs = uncertainty.looks, len(window.pairs)
     changed = change_metric(change, config.verdict)
     metrics = (
@@ -136,6 +135,30 @@ def calibrate(
         ),
         moved=moved,
     )
+
+
+def _looks(found: Found, pose: Matrix4) -> Looks | None:
+    """How many looks the frames are worth at a pose (4, 4), where the estimator looked at edges."""
+    return None if found.edges is None else look(found.edges.sharp, pose)
+
+
+def _uncertainty(
+    found: Found,
+    window: Window,
+    pose: Matrix4,
+    moved: tuple[int, ...],
+    rivals: Sequence[Rivals],
+    loosened: Sequence[Loosened],
+    seen: Looks | None,
+    config: CalibrationConfig,
+) -> Uncertainty:
+    """Of `pose` (4, 4), searched along the axes `moved`. Frames that are worth fewer looks than there are axes leave
+    dents in every ridge, which is followed then."""
+    if seen is not None and seen.count < len(moved):
+        rivals = (*rivals, shifted(found.objective, pose, moved, config))
+    held_m = config.verdict.held_translation_sigma_m
+    uncertainty = measure_uncertainty(found.objective, pose, moved, rivals, loosened, window, held_m)
+    return uncertainty if seen is None else replace(uncertainty, looks=seen.count)
 
 
 def _loosened(
