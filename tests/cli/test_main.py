@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,6 +41,14 @@ def test_help_of_all_commands_imports_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={"PYTHONPATH": path})
     assert done.returncode == 0
     assert done.stderr.strip() == "[]"
+
+
+def test_a_user_without_a_home_gets_pictures_without_words_of_the_library_that_draws(tmp_path: Path) -> None:
+    code = "import sys; sys.argv = ['coec', '--version']\nfrom coec.cli import main; main()\nimport matplotlib.figure"
+    (tmp_path / "file").touch()
+    env = {"PYTHONPATH": ":".join(sys.path), "HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_command_is_declared_without_the_others() -> None:

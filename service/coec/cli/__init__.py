@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -111,6 +112,8 @@ def main() -> int:
     """Entry point; returns the exit status."""
     as_json = "--json" in sys.argv[1:]
     plain_text.never_fail()
+    # Where it keeps its fonts for want of a home, and that it looks for them, is told to nobody who asked for a picture.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         command = typer.main.get_command(application(sys.argv[1:]))
         if not plain_text.is_unicode(sys.stdout.encoding):

@@ -84,7 +84,7 @@ def run(output: Path, *, as_json: bool) -> int:
                 screen.wait("The window is fetched, the pictures are drawn …")
                 window, blamed = _fetch(watch, seen, output)
             daemon.end()
-            left = report.write(output, window, blamed, watch, seen, outcome)
+            left = report.write(output, picture, window, blamed, watch, seen, outcome)
     if as_json:
         console.print_json(_document(watch, outcome, left, started_s))
     else:

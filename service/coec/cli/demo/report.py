@@ -37,17 +37,20 @@ class Left:
     result: replies.CalibrationResult | None
 
 
-def write(output: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen: Seen, outcome: Ending) -> Left:
+def write(
+    output: Path, first: Path, window: Path | None, blamed: Matrix4, watch: Watch, seen: Seen, outcome: Ending
+) -> Left:
     """All of it into the folder.
 
     Args:
+        first: the picture of before the drive, which lies there already.
         window: the recorded window that lies there already; None without one.
         blamed: (4, 4) what was served when the alarm was raised.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    written = [] if window is None else [window]
+    written = [first] if window is None else [first, window]
     plot = write_file(
         output / "timeline.png", timeline(watch.series, _marks(outcome), story.MAX_ERROR_DEG, story.TITLE)
     )
