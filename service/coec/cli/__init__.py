@@ -112,7 +112,7 @@ def main() -> int:
     """Entry point; returns the exit status."""
     as_json = "--json" in sys.argv[1:]
     plain_text.never_fail()
-    # Where it keeps its fonts for want of a home, and that it looks for them, is told to nobody who asked for a picture.
+    # Who asked for a picture need not hear where its library keeps fonts for want of a home.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         command = typer.main.get_command(application(sys.argv[1:]))
