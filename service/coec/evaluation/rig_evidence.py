@@ -323,12 +323,12 @@ def windows(
         if edge.name in rig.graph.of_lidars:
             found[edge.name] = _look_as_window(T_a_b, lasting.between[edge.name], rng)
         else:
-            found[edge.name] = _window(T_a_b, lasting.lens[edge.a], rng)
+            found[edge.name] = window_of(T_a_b, lasting.lens[edge.a], rng)
     return found
 
 
-def _window(T_a_b: Matrix4, lens: Array, rng: np.random.Generator) -> Measurement:
-    """Of a camera and a LiDAR (4, 4)."""
+def window_of(T_a_b: Matrix4, lens: Array, rng: np.random.Generator) -> Measurement:
+    """Of a camera and a LiDAR that are at (4, 4), the lens displaced by (2,) standard deviations."""
     sigma = _varied(WINDOW, rng)
     noise = np.diag(sigma**2)
     # Far things tell pitch from height badly, and yaw from a shift to the side.

@@ -9,7 +9,7 @@ from math import radians
 
 import numpy as np
 
-from coec.calibration.rig.attribution import RigState, SensorHealth, after_look, begun, sensors, served
+from coec.calibration.rig.attribution import RigState, SensorHealth, after_look, after_window, begun, sensors, served
 from coec.calibration.rig.joint import estimate
 from coec.evaluation.rig_evidence import (
     APART,
@@ -28,6 +28,7 @@ from coec.evaluation.rig_evidence import (
     windows,
 )
 from coec.evaluation.rig_knocks import knocked_row
+from coec.evaluation.rig_windows import hurried
 from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 from coec.schemas.replies import Vector6
@@ -131,10 +132,12 @@ def drive(rig: DrawnRig, fault: Fault, number: int) -> Drive:
     delay_s: float | None = None if who else 0.0
     wrong = False
     state = begun(rig.graph)
-    for name, window in windows(rig, before, Lasting.of(rig, rng), rng).items():
+    lasting = Lasting.of(rig, rng)
+    for name, window in windows(rig, before, lasting, rng).items():
         state = served(state, name, window.T_camera_lidar, window.uncertainty.sigma)
     happening = Happening(before, after, bend, at_s, at_s + ALLOWED_S)
-    for at, named in _named(rig, state, looks(rig, happening, rng)):
+    looked = looks(rig, happening, rng)
+    for at, named in _named(rig, state, looked, hurried(rig, happening, looked, lasting, rng)):
         if at > happening.until_s:
             break
         wrong = wrong or not named <= (who if at >= at_s else set())
@@ -143,11 +146,14 @@ def drive(rig: DrawnRig, fault: Fault, number: int) -> Drive:
     return Drive(delay_s, wrong)
 
 
-def _named(rig: DrawnRig, state: RigState, heard: Sequence[Heard]) -> Iterator[tuple[float, set[str]]]:
-    """Time, seconds, and the sensors that were named then, whenever it was asked."""
-    for at_s, look in heard:
-        before, state = state, after_look(state, rig.graph, look)
-        if state.asked_ns != before.asked_ns:
+def _named(
+    rig: DrawnRig, state: RigState, looked: Sequence[Heard], accepted: Sequence[Heard]
+) -> Iterator[tuple[float, set[str]]]:
+    """Time, seconds, and the sensors that were named then, whenever it was asked; by looks and accepted windows."""
+    told = [*((heard, after_look) for heard in looked), *((heard, after_window) for heard in accepted)]
+    for (at_s, look), after in sorted(told, key=lambda one: one[0][0]):
+        before, state = state, after(state, rig.graph, look)
+        if state.posterior is not before.posterior:
             yield at_s, {one.name for one in sensors(state, rig.graph) if one.health in MOVED}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from math import radians
 
 import numpy as np
 import pytest
@@ -84,6 +85,49 @@ def test_a_camera_beside_its_one_lidar_is_named_by_a_window_and_not_by_looks() -
     assert front.reasons[0].text.endswith("a window of it decides.")
     window = look(rig.edges[0], after, 100.0, np.zeros(6))
     assert _named(after_window(state, rig, window), rig) == {"front", "roof"}
+
+
+BENT = np.array([radians(0.35), 0.0, radians(-0.3), 0.0, 0.0, 0.0])
+"""What looks of a poor street may be off by, all alike."""
+
+
+def test_a_window_that_denies_bent_looks_keeps_a_camera_from_being_named_beside_its_lidar() -> None:
+    rig, rng = graph(STAR), np.random.default_rng(5)
+    after, bent = with_moved("roof"), {**with_moved("roof"), "front": se3.perturb(POSES["front"], BENT)}
+    state = driven(rig, POSES, POSES, rounds=(4, 0))
+    for turn in range(4, 14):
+        for place, edge in enumerate(rig.edges):
+            error = SIGMA * rng.normal(size=6)
+            state = after_look(state, rig, look(edge, bent, 5.0 * turn + 0.5 * place, error))
+    assert state.posterior is not None
+    assert state.posterior.sensors["front"] >= NAMED_AT, "by looks it would be"
+    window = look(rig.edges[0], after, 50.0, np.zeros(6))
+    assert _named(after_window(state, rig, window), rig) == {"roof"}
+
+
+def test_a_window_of_before_the_step_is_no_answer() -> None:
+    rig = graph(STAR)
+    state = driven(rig, POSES, with_moved("front", "roof"), rounds=(4, 12))
+    window = look(rig.edges[0], POSES, 17.0, np.zeros(6))
+    assert _named(after_window(state, rig, window), rig) == {"roof"}
+
+
+@pytest.mark.fault("looks at a camera that are bad together, then none of it", "looks at others do not name it")
+def test_an_answer_without_a_new_look_at_a_sensor_is_none() -> None:
+    rig, rng = graph(STAR), np.random.default_rng(3)
+    state = driven(rig, POSES, POSES, rounds=(6, 0))
+    front, *others = rig.edges
+    for turn in range(3):
+        state = after_look(state, rig, look(front, with_moved("front"), 30.0 + turn, SIGMA * rng.normal(size=6)))
+    for turn in range(6):
+        for place, edge in enumerate(others):
+            error = SIGMA * rng.normal(size=6)
+            state = after_look(state, rig, look(edge, POSES, 35.0 + 5.0 * turn + 0.5 * place, error))
+    assert state.posterior is not None
+    assert state.posterior.sensors["front"] >= NAMED_AT
+    assert not _named(state, rig)
+    state = after_look(state, rig, look(front, with_moved("front"), 70.0, SIGMA * rng.normal(size=6)))
+    assert _named(state, rig) == {"front"}
 
 
 def test_nothing_happened_and_nobody_is_named() -> None:

@@ -11,7 +11,7 @@ import pytest
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.likelihood import WEAK_TIMES
 from coec.calibration.monitor.sensor_faults import CAUSES
-from coec.calibration.rig.evidence import of_check, of_window
+from coec.calibration.rig.evidence import BIAS_TIMES, of_check, of_window
 from coec.calibration.rig.steps import MOST_LOOKS, History, steps_at
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Uncertainty
@@ -73,7 +73,7 @@ def test_a_window_of_rotations_tells_rotations_and_what_windows_share_counts() -
     found = of_window("e", window)
     assert found is not None
     assert not found.information[3:].any()
-    assert found.information[0, 0] == pytest.approx(0.5 / SIGMA[0] ** 2)
+    assert found.information[0, 0] == pytest.approx(1.0 / (2.0 * SIGMA[0] ** 2 + (BIAS_TIMES * BIAS[0]) ** 2))
     assert of_window("e", replace(window, uncertainty=Uncertainty.unknown())) is None
 
 

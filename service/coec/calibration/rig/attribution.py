@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.commissioning.quantiles import chi2_quantile
-from coec.calibration.rig.evidence import Look
+from coec.calibration.rig.evidence import BIAS_TIMES, Look
 from coec.calibration.rig.moves import SEEN, Moved, Posterior, who_moved
 from coec.calibration.rig.steps import History, steps_at
 from coec.calibration.rig.types import Edge, Kind, RigGraph, Sensor
@@ -38,6 +38,10 @@ Between: undecided."""
 ANSWERS, ANSWERS_FOR_TWO = 2, 3
 """In a row, that name a sensor by itself, and beside another. The second on drawn drives of
 `evaluation.rig_moves` (seed 17900001): with two, a camera was named beside a knocked LiDAR on three of thirty."""
+
+LIKELY_AT = 0.5
+"""Probability from which a window confirms that a camera moved beside its LiDAR. Where looks at a camera were bent and
+its LiDAR alone was knocked, windows of drawn rigs say 0.01 to 0.1."""
 
 CALM_AT = 0.5
 """Probability of nobody, from which looks that grow old are taken for such of a right rig."""
@@ -53,10 +57,6 @@ are kept."""
 MOST_SUSPECTED = 4
 """Times at which pairs by themselves think they stepped that are asked of, the earliest: a sensor that moves is
 suspected by its pairs within a few looks."""
-
-BIAS_TIMES = 2.0
-"""Times the bias that looks of a rig usually have, to which the first of them are trusted: that of the next rig may be
-larger than those of the few which are known, and a bias is no move."""
 
 STEPPED2 = chi2_quantile(0.999, 6)
 """Squared distance in standard deviations, from which an edge has stepped: one in a thousand does so by chance."""
@@ -107,7 +107,8 @@ class RigState:
         posterior: who moved, as of when that was last asked; None before the first look.
         asked_ns: stamp of the look at which it was.
         stepped_ns: the step in question lies before looks from this stamp on.
-        claimed: sensors as probable as those that are named, and by how many answers in a row, no more than count.
+        claimed: sensors as probable as those that are named, and by how many answers in a row that know of a new look
+            at them, no more than count.
         named: those that moved.
     """
 
@@ -168,20 +169,18 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
     state = _with(state, look)
     if look.stamp_ns - state.asked_ns < EVERY_S * NS_PER_S:
         return state
-    return replace(_asked(state, graph, {}), asked_ns=look.stamp_ns)
+    return replace(_asked(state, graph, None), asked_ns=look.stamp_ns)
 
 
 def after_window(state: RigState, graph: RigGraph, look: Look) -> RigState:
     """The state after an accepted window, as a look at the stamp of its first frame: who moved is asked at once, as the
-    pair may serve what it says from now on, and who moved then is asked no more. It is another witness than the looks
-    before, with a search of its own: of the sensors of its edge its answer counts for as many as name one.
+    pair may serve what it says from now on, and who moved then is asked no more. If it is of after the step, its answer
+    counts for as many as name a sensor of its edge; a camera whose LiDAR moved as well it has to name by itself.
 
     Raises:
         ValueError: it is of no edge of the rig.
     """
-    state = _with(state, look)
-    edge = graph.edge[look.edge]
-    return _asked(state, graph, dict.fromkeys((edge.a, edge.b), ANSWERS))
+    return _asked(_with(state, look), graph, look)
 
 
 def _with(state: RigState, look: Look) -> RigState:
@@ -195,8 +194,8 @@ def _with(state: RigState, look: Look) -> RigState:
     return replace(state, histories={**state.histories, look.edge: history.after(look, state.calm)})
 
 
-def _asked(state: RigState, graph: RigGraph, answers: Mapping[str, int]) -> RigState:
-    """Who moved, by all looks? `answers`: for how many an answer counts, where not for one, by sensor."""
+def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
+    """Who moved, by all looks? `window` is what an accepted one says that is among them, if that is why it is asked."""
     histories = state.histories
     times_ns = _times_ns(histories, state.stepped_ns)
     posterior = _posterior(histories, times_ns, graph)
@@ -204,8 +203,18 @@ def _asked(state: RigState, graph: RigGraph, answers: Mapping[str, int]) -> RigS
     probable = _probable(posterior)
     needed = ANSWERS if len(probable) == 1 else ANSWERS_FOR_TWO
     hidden = {name for name in probable if _is_hidden(name, probable, graph)}
+    confirmed: set[str] = set()
+    if window is not None and window.stamp_ns >= stepped_ns:  # one of frames before tells of another mount
+        ends = {graph.edge[window.edge].a, graph.edge[window.edge].b}
+        doubted = ends & hidden
+        confirmed = ends - doubted
+        if doubted:
+            confirmed |= doubted & _likely_by(window, histories, times_ns, stepped_ns, graph)
     claimed = {
-        name: min(state.claimed.get(name, 0) + answers.get(name, 1), ANSWERS_FOR_TWO)
+        name: min(
+            state.claimed.get(name, 0) + (ANSWERS if name in confirmed else _is_news(name, graph, state)),
+            ANSWERS_FOR_TWO,
+        )
         for name in probable
         if _seen_by_two(name, graph, histories, stepped_ns)
     }
@@ -217,9 +226,20 @@ def _asked(state: RigState, graph: RigGraph, answers: Mapping[str, int]) -> RigS
         named=frozenset(
             name
             for name, count in claimed.items()
-            if name in state.named or (name in answers if name in hidden else count >= needed)
+            if name in state.named or (name in confirmed if name in hidden else count >= needed)
         ),
     )
+
+
+def _likely_by(
+    window: Look, histories: Mapping[str, History], times_ns: list[int], stepped_ns: int, graph: RigGraph
+) -> set[str]:
+    """The sensors that likely moved by an accepted window in place of all looks at its edge since a stamp: these may be
+    bent alike, or of a poor street; it is another witness, with a search of its own."""
+    history = histories[window.edge]
+    looks = tuple(look for look in history.looks if look.stamp_ns < stepped_ns or look is window)
+    by_window = _posterior({**histories, window.edge: replace(history, looks=looks)}, times_ns, graph)
+    return {name for name, p in by_window.sensors.items() if p >= LIKELY_AT}
 
 
 def _probable(of: Posterior) -> tuple[str, ...]:
@@ -231,6 +251,13 @@ def _is_hidden(name: str, probable: Collection[str], graph: RigGraph) -> bool:
     """Whether every pair of a sensor is with another that may be named."""
     far_ends = {edge.b if edge.a == name else edge.a for edge in graph.edges if name in (edge.a, edge.b)}
     return far_ends <= set(probable)
+
+
+def _is_news(name: str, graph: RigGraph, state: RigState) -> bool:
+    """Whether a pair of a sensor was looked at since who moved was last asked. A bad look does not become a better one
+    by what other pairs show of other sensors meanwhile."""
+    pairs = (state.histories[edge.name].looks for edge in graph.edges if name in (edge.a, edge.b))
+    return any(looks[-1].stamp_ns > state.asked_ns for looks in pairs if looks)
 
 
 def _seen_by_two(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:

@@ -21,6 +21,10 @@ from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
 
+BIAS_TIMES = 2.0
+"""Times the bias that looks of a rig usually have, to which the first of them are trusted, and a window beside them:
+that of the next rig may be larger than those of the few which are known, and a bias is no move."""
+
 LEAST_SIGMA, MOST_SIGMA = 1e-6, 10.0
 """Standard deviations that a look is trusted to at most and at least, rad or m: beyond, its numbers are no evidence but
 a fault of whoever sent them; from the upper one on an axis counts as not told."""
@@ -129,7 +133,7 @@ def of_check(
 
 def of_window(edge: str, window: Measurement) -> Look | None:
     """What an accepted window says; None where it tells no axis. Its frames share a street, so what they have in common
-    counts as noise here; the estimator's bias on the rig is that of checks.
+    counts as noise here. So does the bias of the estimator: that of checks is another, and beside them it is a step.
 
     Raises:
         ValueError: the pose is not rigid, or the covariance no covariance.
@@ -138,7 +142,7 @@ def of_window(edge: str, window: Measurement) -> Look | None:
     if not window.told_axes():
         return None
     noise = window.uncertainty.noise
-    shared = window.uncertainty.covariance - noise
+    shared = window.uncertainty.covariance - noise + np.diag((BIAS_TIMES * UNCOMMISSIONED_BIAS) ** 2)
     covariance = np.where(np.isfinite(noise), noise + np.nan_to_num(shared), np.nan)
     return Look(edge, window.stamp_ns, window.T_camera_lidar, information_of(covariance), STREET, UNCOMMISSIONED_BIAS)
 

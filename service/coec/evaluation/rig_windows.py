@@ -1,0 +1,67 @@
+"""Windows of a drawn rig that are hurried: of a pair that suspects a move one is cut at once, and what it says counts
+beside the looks (`calibration.monitor.urgency`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from coec.calibration.monitor.urgency import TRIES
+from coec.calibration.rig.evidence import of_window
+from coec.calibration.rig.types import Edge
+from coec.config import MonitorConfig
+from coec.evaluation.rig_evidence import NS_PER_S, DrawnRig, Happening, Heard, Lasting, window_of
+from coec.geometry import se3
+
+SLICE_S = MonitorConfig().urgent_slice_s
+
+SUSPECTED = 2
+"""Flagged looks in a row that make a pair suspect: a simulated vehicle that is looked at every five seconds does after
+nine."""
+
+TAKES_S = (3.0, 18.0)
+"""From the end of a slice to when its answer is known: a window of 25 frames takes the worker four seconds, and as many
+as four pairs of a LiDAR that was knocked wait for each other."""
+
+ACCEPTED = 0.7
+"""Share of windows that are accepted: 73 of 108 on the simulated streets of `coec sim matrix`, those by night, in rain
+and through wrong lenses among them. None of them was wrong."""
+
+
+def hurried(
+    rig: DrawnRig, drive: Happening, looks: Sequence[Heard], lasting: Lasting, rng: np.random.Generator
+) -> list[Heard]:
+    """What accepted windows say, in the order in which it is known; `looks` are those at all pairs."""
+    found: list[Heard] = []
+    for edge in rig.graph.edges:
+        if edge.name not in rig.graph.of_lidars:
+            found += _of_pair(edge, drive, [one for one in looks if one[1].edge == edge.name], lasting, rng)
+    return sorted(found, key=lambda one: (one[0], one[1].edge))
+
+
+def _of_pair(
+    edge: Edge, drive: Happening, looks: Sequence[Heard], lasting: Lasting, rng: np.random.Generator
+) -> list[Heard]:
+    """Of one pair: no more than so many in a suspicion, one after the other."""
+    found: list[Heard] = []
+    flagged, tries, known_s = 0, 0, -np.inf
+    for at_s, look in looks:
+        if look.stepped_ns is None:
+            flagged = tries = 0
+            continue
+        flagged += 1
+        if flagged < SUSPECTED or tries == TRIES or at_s < known_s:
+            continue
+        tries += 1
+        end_s = at_s + SLICE_S
+        known_s = end_s + float(rng.uniform(*TAKES_S))
+        begun, ended = drive.where(edge, at_s), drive.where(edge, end_s)
+        # A window that holds the move is refused.
+        if rng.random() < ACCEPTED and np.array_equal(begun, ended):
+            measured = window_of(se3.perturb(edge.T_a_b, ended), lasting.lens[edge.a], rng)
+            told = of_window(edge.name, measured)
+            assert told is not None
+            found.append((known_s, replace(told, stamp_ns=round(at_s * NS_PER_S))))
+    return found

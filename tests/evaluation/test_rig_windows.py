@@ -1,0 +1,49 @@
+"""Windows that pairs of a drawn rig are hurried to: of those that suspect, after a slice, and of one mount."""
+
+from __future__ import annotations
+
+from math import radians
+
+import numpy as np
+
+from coec.evaluation.rig_evidence import FOUR, NS_PER_S, Happening, Heard, Lasting, looks, moved
+from coec.evaluation.rig_windows import SLICE_S, TAKES_S, hurried
+from coec.geometry import se3
+
+AT_S, UNTIL_S = 100.0, 1000.0
+DRIVES = 12
+
+
+def driven(number: int) -> tuple[Happening, list[Heard], list[Heard]]:
+    """One whose front camera is knocked by 1°: what happens, the looks, and the windows."""
+    rng = np.random.default_rng([41, number])
+    after = moved(FOUR.poses, ("front",), radians(1.0), rng)
+    drive = Happening(FOUR.poses, after, None, AT_S, UNTIL_S)
+    looked = looks(FOUR, drive, rng)
+    return drive, looked, hurried(FOUR, drive, looked, Lasting.of(FOUR, rng), rng)
+
+
+def test_the_pair_that_was_knocked_has_windows_of_after_it_and_these_are_right() -> None:
+    told = 0
+    for number in range(DRIVES):
+        drive, _, windows = driven(number)
+        edge = FOUR.graph.edge["front-roof"]
+        for at_s, look in windows:
+            if look.edge != edge.name or look.stamp_ns < AT_S * NS_PER_S:
+                continue
+            told += 1
+            off = se3.difference(look.T_a_b, se3.perturb(edge.T_a_b, drive.where(edge, at_s)))
+            assert np.degrees(np.abs(off[:3]).max()) < 0.5, "of 1°"
+    assert told >= DRIVES
+
+
+def test_a_window_is_known_a_slice_and_a_solve_after_the_pair_suspects_and_holds_no_move() -> None:
+    for number in range(DRIVES):
+        _, looked, windows = driven(number)
+        assert windows == sorted(windows, key=lambda one: one[0])
+        for at_s, look in windows:
+            begin_s = look.stamp_ns / NS_PER_S
+            assert SLICE_S + TAKES_S[0] <= at_s - begin_s <= SLICE_S + TAKES_S[1]
+            suspecting = [one for at, one in looked if one.edge == look.edge and abs(at - begin_s) < 1e-6]
+            assert suspecting[0].stepped_ns is not None
+            assert look.edge != "front-roof" or not begin_s < AT_S <= begin_s + SLICE_S
