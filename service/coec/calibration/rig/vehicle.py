@@ -140,11 +140,13 @@ def begun(graph: RigGraph, serves: Mapping[str, Served], windows: Mapping[str, W
     return _combined(VehicleRig(graph, believed, dict(serves), dict(windows), known, sensors=told))
 
 
-def going_on(rig: VehicleRig, event: Event) -> VehicleRig:
-    """With an event of before a restart: windows of its edges from before the move are of no use."""
+def going_on(rig: VehicleRig, event: Event, before: Before) -> VehicleRig:
+    """With an event of before a restart, and what was known before that: windows of its edges from before the move are
+    of no use."""
     told = attribution.sensors(rig.believed, rig.graph)
     since_ns = {sensor.name: event.since_ns for sensor in told if sensor.name in rig.believed.named}
-    return _without_stale(replace(rig, event=event, move=Move(event, {}), sensors=told, since_ns=since_ns))
+    rig = replace(rig, event=event, before=before, move=Move(event, {}), sensors=told, since_ns=since_ns)
+    return _without_stale(rig)
 
 
 def grown(rig: VehicleRig, fresh: VehicleRig) -> VehicleRig:
@@ -158,9 +160,17 @@ def grown(rig: VehicleRig, fresh: VehicleRig) -> VehicleRig:
         serves={**fresh.serves, **rig.serves},
         windows={**fresh.windows, **rig.windows},
         known={**fresh.known, **rig.known},
+        before=_before_of_both(rig.before, fresh.before),
         sensors=attribution.sensors(believed, fresh.graph),
     )
     return _combined(rig)
+
+
+def _before_of_both(before: Before | None, fresh: Before | None) -> Before | None:
+    """What was known before one event, of the pairs of a rig and of those that join it."""
+    if before is None or fresh is None or before.sensors != fresh.sensors:
+        return before
+    return replace(before, edges={**fresh.edges, **before.edges})
 
 
 def after_look(rig: VehicleRig, look: Look) -> VehicleRig:

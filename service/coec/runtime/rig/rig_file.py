@@ -1,4 +1,5 @@
-"""What is known of a rig over a restart, `sensors.json`: where its pairs were, and which of its sensors had moved.
+"""What is known of a rig over a restart, `sensors.json`: where its pairs were, which of its sensors had moved, and what
+was known before they did.
 
 A sensor that is knocked while the service is down is told by the first looks after it.
 """
@@ -7,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,20 +18,25 @@ from pydantic import Field, ValidationError
 from coec.adapters.files.state_file import StateFile
 from coec.calibration.rig import attribution, vehicle
 from coec.calibration.rig.attribution import RigState
-from coec.calibration.rig.evidence import MOST_SIGMA
+from coec.calibration.rig.before import Before
+from coec.calibration.rig.evidence import MOST_SIGMA, information_of
 from coec.calibration.rig.steps import History
 from coec.calibration.rig.types import MOST_SENSORS
 from coec.calibration.rig.vehicle import Event, VehicleRig
-from coec.calibration.types import Matrix4, Reason
+from coec.calibration.tracker import Measurement
+from coec.calibration.types import Matrix4, Reason, Uncertainty
 from coec.errors import StateError
 from coec.geometry import se3
 from coec.schemas.base import Part
-from coec.schemas.replies import Row4
+from coec.schemas.replies import Maybe6x6, Row4, Vector6
 
 FILE = "sensors.json"
 
 MOST_PAIRS = 128
 """In a file that is looked at: twice as many as a vehicle may have, and as many edges between its LiDARs."""
+
+MOST_TERMS = 32
+"""Of a covariance, in a file that is looked at: three times as many as there are."""
 
 Rows = tuple[Row4, Row4, Row4, Row4]
 Sigma = Annotated[float, Field(gt=0, lt=MOST_SIGMA)]
@@ -45,13 +52,23 @@ class StoredEdge(Part):
     sigma: tuple[Sigma | None, Sigma | None, Sigma | None, Sigma | None, Sigma | None, Sigma | None]
 
 
+class StoredKnown(Part):
+    """Where a pair was by all its windows, exact: its covariance in parts, as those of a window are."""
+
+    T_camera_lidar: Rows
+    noise: Maybe6x6
+    systematic: dict[Name, Vector6] = Field(max_length=MOST_TERMS)
+    stamp_ns: Stamp
+
+
 class StoredEvent(Part):
-    """A move that was not over."""
+    """A move that was not over, and what was known before it of the pairs of its sensors."""
 
     sensors: tuple[Name, ...] = Field(min_length=1, max_length=MOST_SENSORS)
     since_ns: Stamp
     stepped_ns: Stamp
     named: tuple[Name, ...] = Field(max_length=MOST_SENSORS)
+    before: dict[Name, StoredKnown] = Field(default={}, max_length=MOST_PAIRS)
 
 
 class StoredRig(Part):
@@ -100,8 +117,9 @@ class RigFile:
             return replace(rig, believed=RigState(histories))
         named = frozenset(event.named) & frozenset(event.sensors)
         going_on = Event(event.sensors, event.since_ns, event.stepped_ns)
+        known = {name: _measurement(one) for name, one in event.before.items() if name in rig.graph.edge}
         believed = RigState(histories, stepped_ns=event.stepped_ns, named=named)
-        return vehicle.going_on(replace(rig, believed=believed), going_on)
+        return vehicle.going_on(replace(rig, believed=believed), going_on, Before(event.sensors, known))
 
     def remember(self, rig: VehicleRig) -> None:
         """Keep what is known; on the disk with the next `flush`."""
@@ -119,6 +137,7 @@ class RigFile:
                 "since_ns": event.since_ns,
                 "stepped_ns": max(event.stepped_ns, attribution.BEFORE_ALL_NS),
                 "named": sorted(rig.believed.named),
+                "before": {} if rig.before is None else {name: _stored(of) for name, of in rig.before.edges.items()},
             }
         with self._lock:
             self._body = {"edges": edges, "event": told}
@@ -145,12 +164,37 @@ def _sound(stored: StoredRig) -> StoredRig:
     """A checksum tells that a file is as it was written, not that who wrote it was this service.
 
     Raises:
-        ValueError: a pose is no rigid transform.
+        ValueError: a pose is no rigid transform, or a covariance is none.
     """
+    for known in () if stored.event is None else stored.event.before.values():
+        measured = _measurement(known)
+        if not se3.is_rigid(measured.T_camera_lidar):
+            raise ValueError("a pose is no rigid transform")
+        information_of(measured.uncertainty.noise)
+        if any(abs(value) >= MOST_SIGMA for shift in known.systematic.values() for value in shift):
+            raise ValueError("a shift is larger than any")
     for edge in stored.edges.values():
         if not (se3.is_rigid(_pose(edge.nominal)) and se3.is_rigid(_pose(edge.T_camera_lidar))):
             raise ValueError("a pose is no rigid transform")
     return stored
+
+
+def _stored(known: Measurement) -> dict[str, Any]:
+    noise = [[value if isfinite(value) else None for value in row] for row in known.uncertainty.noise.tolist()]
+    systematic = {name: shift.tolist() for name, shift in known.uncertainty.systematic.items()}
+    return {
+        "T_camera_lidar": known.T_camera_lidar.tolist(),
+        "noise": noise,
+        "systematic": systematic,
+        "stamp_ns": known.stamp_ns,
+    }
+
+
+def _measurement(stored: StoredKnown) -> Measurement:
+    """How many looks the windows were worth is asked of no mount that is gone."""
+    noise = np.array([[np.nan if value is None else value for value in row] for row in stored.noise])
+    systematic = {name: np.array(shift) for name, shift in stored.systematic.items()}
+    return Measurement(_pose(stored.T_camera_lidar), Uncertainty(noise, systematic, np.nan), stored.stamp_ns)
 
 
 def _pose(rows: Rows) -> Matrix4:

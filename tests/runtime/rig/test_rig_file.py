@@ -1,0 +1,93 @@
+"""A move that goes on over a restart is put right as it would have been without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coec.calibration.rig import vehicle
+from coec.calibration.rig.vehicle import VehicleRig
+from coec.calibration.types import Matrix4
+from coec.geometry import se3
+from coec.runtime.rig.rig_file import RigFile
+from driven_rig import STAR, Drive, Poses, pose_of
+from rigs import POSES, graph, with_moved
+
+AFTER: Poses = with_moved("roof")
+BLIND = "rear-roof"
+
+
+def knocked() -> Drive:
+    """The LiDAR was knocked and named; one of its cameras has seen nothing for more than a minute."""
+    drive = Drive(graph(STAR))
+    drive.looks(POSES, 8)
+    drive.looks(POSES, 13, blind=(BLIND,))
+    drive.looks(AFTER, 4, blind=(BLIND,))
+    assert drive.state.event is not None
+    assert drive.state.before is not None
+    return drive
+
+
+def restarted(rig: VehicleRig, folder: Path) -> VehicleRig:
+    file = RigFile(folder)
+    file.remember(rig)
+    file.flush()
+    found = RigFile(folder)
+    assert found.damage == ()
+    return found.recalled(vehicle.begun(rig.graph, rig.serves, rig.windows))
+
+
+def put_right(drive: Drive) -> Matrix4:
+    """What the blind pair is told once the others have a window of after the knock."""
+    drive.looks(AFTER, 2, blind=(BLIND,))
+    for name in ("front-roof", "left-roof"):
+        drive.window(name, AFTER, drive.at_s - 12.0)
+    assert drive.state.correction is not None
+    return drive.state.correction.pairs[BLIND].T_a_b
+
+
+@pytest.mark.fault("a kill between the knock of a LiDAR and its correction", "the correction is the same after it")
+def test_what_was_known_before_a_move_outlives_a_restart(tmp_path: Path) -> None:
+    without, with_restart = knocked(), knocked()
+    with_restart.state = restarted(with_restart.state, tmp_path)
+    told = put_right(with_restart)
+    assert told.tobytes() == put_right(without).tobytes()
+    away = se3.difference(told, pose_of(without.state.graph.edge[BLIND], AFTER))
+    assert np.degrees(np.abs(away[:3]).max()) < 0.2, "of 1°"
+
+
+def test_what_was_known_is_the_same_to_the_bit(tmp_path: Path) -> None:
+    rig = knocked().state
+    again = restarted(rig, tmp_path)
+    assert rig.before is not None
+    assert again.before is not None
+    assert again.before.sensors == rig.before.sensors
+    assert set(again.before.edges) == set(rig.before.edges)
+    for name, known in rig.before.edges.items():
+        found = again.before.edges[name]
+        assert found.T_camera_lidar.tobytes() == known.T_camera_lidar.tobytes()
+        assert found.uncertainty.noise.tobytes() == known.uncertainty.noise.tobytes()
+        assert {key: shift.tobytes() for key, shift in found.uncertainty.systematic.items()} == {
+            key: shift.tobytes() for key, shift in known.uncertainty.systematic.items()
+        }
+        assert found.stamp_ns == known.stamp_ns
+
+
+def test_pairs_that_join_one_after_the_other_find_what_was_known_of_them(tmp_path: Path) -> None:
+    rig = knocked().state
+    file = RigFile(tmp_path)
+    file.remember(rig)
+    file.flush()
+    found = RigFile(tmp_path)
+    grown: VehicleRig | None = None
+    for count in (2, 3):
+        part = graph(STAR[:count])
+        serves = {name: rig.serves[name] for name in part.edge}
+        windows = {name: one for name, one in rig.windows.items() if name in part.edge}
+        fresh = found.recalled(vehicle.begun(part, serves, windows))
+        grown = fresh if grown is None else vehicle.grown(grown, fresh)
+    assert grown is not None
+    assert grown.before is not None
+    assert set(grown.before.edges) == {edge.name for edge in graph(STAR).edges}
