@@ -53,7 +53,10 @@ def forget(*folders: str) -> None:
 def use_interpreter_as_image_does() -> None:
     """`python` and `pip` in /usr/local/bin, for every user, as in the image that the Dockerfile starts from."""
     prefix = Path(sys.base_prefix)
-    if prefix != Path("/usr/local"):
+    if Path("/usr/local").parent == prefix:
+        # The system's own interpreter: it lies around that folder, and takes no packages.
+        _run(f"{prefix}/bin/python3", "-m", "venv", "/usr/local")
+    elif prefix != Path("/usr/local"):
         if prefix.is_relative_to("/root"):
             _run("chmod", "go+x", "/root")
         layers = f"lowerdir={prefix}:/usr/local"
