@@ -112,7 +112,10 @@ FORMS = {
     RIG_LIDARS: Form("coec lidars --help > help.txt"),
     # What it shows is tested in tests/cli/test_demo_rig.py.
     RIG_DEMO: Form("coec demo --help > help.txt && grep -q -e --rig help.txt"),
-    RIG_MOVES: Form(RIG_MOVES.replace("5", "1")),
+    # What it draws is tested in tests/cli/test_sim_rig_moves.py.
+    RIG_MOVES: Form(
+        "COLUMNS=200 coec sim rig-moves --help > help.txt && grep -q -e --drives help.txt && grep -q -e --rigs help.txt"
+    ),
     # Two frames are too few for an uncertainty: the verdict is negative.
     SIM_CALIBRATE: Form(f"{SIM_CALIBRATE} --frames 2", status=1),
     # What it looks at is tested in tests/cli/test_check.py; the slow form compares the figures.
