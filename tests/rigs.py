@@ -41,9 +41,13 @@ def graph(
 
 
 def look(edge: Edge, poses: Mapping[str, Matrix4], at_s: float, error: NDArray[np.float64]) -> Look:
-    """One that puts an edge where these poses have it, but for an error (6,)."""
-    T_a_b = se3.perturb(poses[edge.a] @ se3.inverse(poses[edge.b]), error)
-    return Look(edge.name, round(at_s * NS), T_a_b, np.diag(1.0 / SIGMA**2), PLACE, BIAS)
+    """One that puts an edge where these poses have it, but for an error (6,); a pair that was moved suspects so."""
+    right = poses[edge.a] @ se3.inverse(poses[edge.b])
+    stamp_ns, moved = round(at_s * NS), bool(np.abs(se3.difference(right, edge.T_a_b)).max() > 1e-6)
+    information = np.diag(1.0 / SIGMA**2)
+    return Look(
+        edge.name, stamp_ns, se3.perturb(right, error), information, PLACE, BIAS, stepped_ns=stamp_ns if moved else None
+    )
 
 
 def driven(

@@ -105,6 +105,21 @@ def test_a_window_that_denies_bent_looks_keeps_a_camera_from_being_named_beside_
     assert _named(after_window(state, rig, window), rig) == {"roof"}
 
 
+@pytest.mark.fault(
+    "a street bends all looks at a pair a little", "its camera is not named while the pair suspects nothing"
+)
+def test_a_camera_whose_only_pair_suspects_nothing_is_not_named() -> None:
+    rig, bent, named = graph(STAR), {**POSES, "front": se3.perturb(POSES["front"], BENT)}, []
+    for suspects in (False, True):
+        state, rng = driven(rig, POSES, POSES, rounds=(4, 0)), np.random.default_rng(9)
+        for turn in range(4, 14):
+            for place, edge in enumerate(rig.edges):
+                seen = look(edge, bent, 5.0 * turn + 0.5 * place, SIGMA * rng.normal(size=6))
+                state = after_look(state, rig, seen if suspects else replace(seen, stepped_ns=None))
+        named.append(_named(state, rig))
+    assert named == [set(), {"front"}]
+
+
 def test_a_window_of_before_the_step_is_no_answer() -> None:
     rig = graph(STAR)
     state = driven(rig, POSES, with_moved("front", "roof"), rounds=(4, 12))

@@ -211,7 +211,7 @@ def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
     claimed = {
         name: ANSWERS if name in confirmed else min(state.claimed.get(name, 0) + _is_news(name, graph, state), ANSWERS)
         for name in probable
-        if _seen_by_two(name, graph, histories, stepped_ns)
+        if name in confirmed or name in state.named or _is_witnessed(name, graph, histories, stepped_ns)
     }
     return replace(
         state,
@@ -255,12 +255,14 @@ def _is_news(name: str, graph: RigGraph, state: RigState) -> bool:
     return any(looks[-1].stamp_ns > state.asked_ns for looks in pairs if looks)
 
 
-def _seen_by_two(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:
-    """Whether two pairs of a sensor were looked at since a stamp, or it has one only. What a single one of several says
-    may be its own, such as a clock of one driver; another would deny it."""
-    pairs = [histories[edge.name] for edge in graph.edges if name in (edge.a, edge.b)]
-    looked = sum(bool(history.looks) and history.looks[-1].stamp_ns >= since_ns for history in pairs)
-    return len(pairs) == 1 or looked >= 2
+def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:
+    """Whether two pairs of a sensor were looked at since a stamp: what a single one of several says may be its own,
+    such as a clock of one driver; another would deny it. Of a sensor with one pair, whether that suspected a move by
+    itself: nobody else tells a street that bends all its looks a little from a small move."""
+    pairs = [histories[edge.name].looks for edge in graph.edges if name in (edge.a, edge.b)]
+    if len(pairs) == 1:
+        return any(look.stepped_ns is not None for look in pairs[0] if look.stamp_ns >= since_ns)
+    return sum(bool(looks) and looks[-1].stamp_ns >= since_ns for looks in pairs) >= 2
 
 
 def _times_ns(histories: Mapping[str, History], stepped_ns: int) -> list[int]:
