@@ -261,7 +261,8 @@ def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], 
     itself: nobody else tells a street that bends all its looks a little from a small move."""
     pairs = [histories[edge.name].looks for edge in graph.edges if name in (edge.a, edge.b)]
     if len(pairs) == 1:
-        return any(look.stepped_ns is not None for look in pairs[0] if look.stamp_ns >= since_ns)
+        clear = (look for look in pairs[0] if look.stamp_ns >= since_ns and not look.weak)
+        return any(look.stepped_ns is not None for look in clear)
     return sum(bool(looks) and looks[-1].stamp_ns >= since_ns for looks in pairs) >= 2
 
 
