@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+from pathlib import Path
 
 from coec.adapters.system.cores import ONE_THREAD
 
@@ -17,3 +19,9 @@ def died(number: int) -> int:
     if number == 1:
         os._exit(9)
     return number
+
+
+def begun(folder: Path) -> None:
+    """A drive that goes on for ever, once it has left the number of its process."""
+    (folder / str(os.getpid())).touch()
+    signal.pause()

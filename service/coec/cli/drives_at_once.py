@@ -10,6 +10,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
 from coec.adapters.system.cores import one_thread_each
+from coec.adapters.system.parent import die_with
 from coec.errors import CoecError
 
 _Drive = TypeVar("_Drive")
@@ -35,7 +36,9 @@ def finished(work: Callable[[_Drive], _Row], drives: Sequence[_Drive], jobs: int
         yield from map(work, drives)
         return
     with one_thread_each():
-        pool = ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn"))
+        spawn = multiprocessing.get_context("spawn")
+        # Of a command that is killed nothing goes on.
+        pool = ProcessPoolExecutor(processes, spawn, initializer=die_with, initargs=(os.getpid(),))
         try:
             for done in as_completed([pool.submit(work, drive) for drive in drives]):
                 yield done.result()
