@@ -34,7 +34,7 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_a_drive_that_has_a_result_is_not_run_again(coec: Coec, tmp_path: Path, ran: list[str]) -> None:
-    chosen = [drive.name for drive in matrix_drives.chosen(PAIR)]
+    chosen = [drive.name for drive in matrix_drives.chosen(1, PAIR)]
     first = coec("sim", "matrix", "--output", tmp_path, "--only", PAIR, "--dof", 3, "--jobs", 1, "--json")
     assert (first.status, ran, first.document["drives"]) == (0, chosen, len(chosen))
     assert (tmp_path / "normalised.png").read_bytes()[:4] == b"\x89PNG"
@@ -57,7 +57,7 @@ def test_what_does_not_fit_is_refused(coec: Coec, tmp_path: Path) -> None:
 def test_a_drive_is_drawn_solved_and_watched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(matrix_drives.LENSES, "tiny", "camera=pinhole240x120")
     settings = Settings((3, 6), 2, "stereo")
-    drive = MatrixDrive("room-empty", "tiny", "32", "day", "none", matrix_drives.SEEDS[0])
+    drive = MatrixDrive("room-empty", "tiny", "32", "day", "none", matrix_drives.FIRST_SEED)
     found = matrix_run.run(drive, settings)
     assert found.failure is None
     assert [len(found.windows[key]) for key in ("3", "6")] == [2, 2]
@@ -74,7 +74,7 @@ def test_a_drive_is_drawn_solved_and_watched(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_drive_that_cannot_be_drawn_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(matrix_drives.LENSES, "box", "camera=box")
-    drive = MatrixDrive("street", "box", "32", "day", "none", matrix_drives.SEEDS[0])
+    drive = MatrixDrive("street", "box", "32", "day", "none", matrix_drives.FIRST_SEED)
     found = matrix_run.run(drive, Settings((3,), 2, "stereo"))
     assert found.failure is not None
     assert "unknown camera 'box'" in found.failure

@@ -9,7 +9,7 @@ import pytest
 
 from coec.config import CalibrationConfig
 from coec.evaluation import matrix, matrix_drives, matrix_run
-from coec.evaluation.matrix_drives import DRIVES, SEEDS
+from coec.evaluation.matrix_drives import FIRST_SEED, SEEDS
 from coec.schemas.matrix import MatrixRow, SolvedWindow, Watched
 from coec.schemas.replies import Maybe6
 from coec.simulation.faults import parse_fault
@@ -17,6 +17,7 @@ from coec.simulation.lidar import LIDARS
 from coec.simulation.source import NUMBERS, WORDS
 from coec.sources.spec import parse_spec
 
+DRIVES = matrix_drives.drives(1)
 NOTHING: Maybe6 = (None,) * 6
 
 
@@ -139,7 +140,7 @@ def test_nothing_is_no_division_by_it() -> None:
 def test_the_matrix_is_large_and_every_drive_can_be_ordered() -> None:
     assert len(DRIVES) >= 60
     assert len({drive.name for drive in DRIVES}) == len(DRIVES)
-    assert {drive.seed for drive in DRIVES} == set(SEEDS)
+    assert {drive.seed for drive in DRIVES} == set(range(FIRST_SEED, FIRST_SEED + SEEDS))
     for drive in DRIVES:
         query = parse_spec(drive.source(40.0, 0.5, depth=False)).query
         assert set(query) <= {*NUMBERS, *WORDS}
@@ -148,19 +149,26 @@ def test_the_matrix_is_large_and_every_drive_can_be_ordered() -> None:
             parse_fault(fault)
 
 
+def test_a_round_has_the_same_kinds_of_drives_and_seeds_of_its_own() -> None:
+    second = matrix_drives.drives(2)
+    assert [one.name.rpartition("_s")[0] for one in second] == [one.name.rpartition("_s")[0] for one in DRIVES]
+    assert not {one.seed for one in second} & {one.seed for one in DRIVES}
+    assert {one.name.rpartition("_s")[2] for one in second} == {"4", "5", "6"}
+
+
 def test_faults_of_scene_light_and_fault_go_together() -> None:
-    drive = matrix_drives.MatrixDrive("tunnel", "fisheye", "64", "night", "dirt", SEEDS[0])
+    drive = matrix_drives.MatrixDrive("tunnel", "fisheye", "64", "night", "dirt", FIRST_SEED)
     source = drive.source(40.0, 0.5, depth=True)
     assert parse_spec(source).query["faults"] == "tunnel:0;night:0;dirt:0:share=0.25"
     assert "depth=yes" in source
 
 
 def test_drives_are_chosen_by_their_name() -> None:
-    night = matrix_drives.chosen("*_night_*")
+    night = matrix_drives.chosen(1, "*_night_*")
     assert night
     assert all(drive.light == "night" for drive in night)
-    assert matrix_drives.chosen(None) == DRIVES
-    assert matrix_drives.chosen("moon") == ()
+    assert matrix_drives.chosen(1, None) == DRIVES
+    assert matrix_drives.chosen(1, "moon") == ()
     assert CalibrationConfig().search.rotation_deg >= 10.0  # the box holds the farthest start
 
 

@@ -31,9 +31,9 @@ def run(options: Options) -> int:
     require_extra()
     if WINDOWS * options.frames < CHECK_PAIRS:
         raise UsageError(f"--frames {options.frames}: a check needs {CHECK_PAIRS} pairs, {WINDOWS} windows have fewer")
-    drives = matrix_drives.chosen(options.only)
+    drives = matrix_drives.chosen(options.number, options.only)
     if not drives:
-        names = ", ".join(drive.name for drive in matrix_drives.DRIVES[:3])
+        names = ", ".join(drive.name for drive in matrix_drives.drives(options.number)[:3])
         raise UsageError(f"no drive of the matrix is called {options.only!r}; they are called {names}, ...")
     dofs = matrix.DOFS if options.dof is None else (int(options.dof),)
     settings = Settings(dofs, options.frames, options.depth or CalibrationConfig().depth.model)

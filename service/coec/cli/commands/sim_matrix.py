@@ -19,6 +19,16 @@ class Options:
         Path,
         typer.Option(help="Folder for report.json, normalised.png and drives/.", metavar="DIR", show_default=False),
     ]
+    number: Annotated[
+        int,
+        typer.Option(
+            "--round",
+            help="The same kinds of drives, each round with seeds of its own.",
+            min=1,
+            max=10_000,
+            metavar="N",
+        ),
+    ] = 1
     only: Annotated[
         str | None,
         typer.Option(
@@ -36,7 +46,7 @@ class Options:
 
 
 def run(options: Options) -> int:
-    """Try estimator and monitor on simulated drives that nobody tuned to: scenes, lenses, LiDARs, light, faults.
+    """Try estimator and monitor on simulated drives: scenes, lenses, LiDARs, light, faults.
 
     A drive takes about half a minute of one core, the whole matrix most of an hour. What is done is kept in DIR: call
     again to go on. A DIR holds results of one state of the code; take another after a change.
