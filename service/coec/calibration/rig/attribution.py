@@ -60,6 +60,10 @@ suspected by its pairs within a few looks."""
 STEPPED2 = chi2_quantile(0.999, 6)
 """Squared distance in standard deviations, from which an edge has stepped: one in a thousand does so by chance."""
 
+POOREST = 3.0
+"""Times the scatter of streets that looks of a poor one are off by, all alike: those at right mounts with the faintest
+contrast lie 2.6 of its standard deviations off (`monitor.dispersion`)."""
+
 EVERY_S = 4.0
 """Between two times that it is asked who moved: it takes 0.03 to 0.1 s of a core, and looks come faster than they
 matter."""
@@ -149,14 +153,9 @@ def settled(state: RigState) -> RigState:
 
 def stepped(state: RigState) -> tuple[str, ...]:
     """Edges that lie elsewhere than before `stepped_ns`, by more than chance."""
-    found = []
-    for name, history in state.histories.items():
-        if history.looks:
-            step = steps_at(history, [state.stepped_ns])
-            apart = float(dense.squared(dense.inverse(step.covariance[0]), step.xi[0]))
-            if step.looks[0] >= SEEN and apart > STEPPED2:
-                found.append(name)
-    return tuple(found)
+    return tuple(
+        name for name, history in state.histories.items() if history.looks and _stepped(history, state.stepped_ns)
+    )
 
 
 def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
@@ -256,14 +255,24 @@ def _is_news(name: str, graph: RigGraph, state: RigState) -> bool:
 
 
 def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:
-    """Whether two pairs of a sensor were looked at since a stamp: what a single one of several says may be its own,
-    such as a clock of one driver; another would deny it. Of a sensor with one pair, whether that suspected a move by
-    itself: nobody else tells a street that bends all its looks a little from a small move."""
-    pairs = [histories[edge.name].looks for edge in graph.edges if name in (edge.a, edge.b)]
-    if len(pairs) == 1:
-        clear = (look for look in pairs[0] if look.stamp_ns >= since_ns and not look.weak)
-        return any(look.stepped_ns is not None for look in clear)
-    return sum(bool(looks) and looks[-1].stamp_ns >= since_ns for looks in pairs) >= 2
+    """Whether two pairs of a sensor were looked at since a stamp. What a single one of several says may be its own,
+    such as a clock of one driver; another would deny it. A sensor with one pair is witnessed while that pair suspects a
+    move by itself, or if it stepped farther than a poor street bends all looks: nobody else tells the two apart."""
+    of_pairs = [histories[edge.name] for edge in graph.edges if name in (edge.a, edge.b)]
+    if len(of_pairs) > 1:
+        return sum(bool(of.looks) and of.looks[-1].stamp_ns >= since_ns for of in of_pairs) >= 2
+    (history,) = of_pairs
+    clear = [look for look in history.looks if look.stamp_ns >= since_ns and not look.weak]
+    return bool(clear) and (clear[-1].stepped_ns is not None or _stepped(history, since_ns, POOREST))
+
+
+def _stepped(history: History, since_ns: int, place_times: float = 1.0) -> bool:
+    """Whether an edge lies elsewhere since a stamp, by more than chance; with so many times the scatter of streets."""
+    step = steps_at(history, [since_ns])
+    place = np.max([look.place for look in history.looks], axis=0)
+    covariance = step.covariance[0] + np.diag(2.0 * (place_times**2 - 1.0) * place**2)
+    apart = float(dense.squared(dense.inverse(covariance), step.xi[0]))
+    return bool(step.looks[0] >= SEEN and apart > STEPPED2)
 
 
 def _times_ns(histories: Mapping[str, History], stepped_ns: int) -> list[int]:
