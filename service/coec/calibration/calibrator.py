@@ -46,7 +46,7 @@ from coec.errors import CalibrationError
 from coec.geometry import se3
 
 CONTRADICTED = {HELD_FREE: "with the held centre", CLOCKS_FREE: "with the clocks"}
-"""What was set free, in words."""
+"""For people: with what a window disagrees if setting this assumption free turns the camera."""
 
 
 def calibrate(
@@ -138,7 +138,7 @@ def calibrate(
 
 
 def _looks(found: Found, pose: Matrix4) -> Looks | None:
-    """How many looks the frames are worth at a pose (4, 4), where the estimator looked at edges."""
+    """How many independent looks the frames are worth at a pose (4, 4); None if the estimator used no edges."""
     return None if found.edges is None else look(found.edges.sharp, pose)
 
 
@@ -152,8 +152,11 @@ def _uncertainty(
     seen: Looks | None,
     config: CalibrationConfig,
 ) -> Uncertainty:
-    """Of `pose` (4, 4), searched along the axes `moved`. Frames that are worth fewer looks than there are axes leave
-    dents in every ridge, which is followed then."""
+    """The uncertainty of `pose` (4, 4), found by a search along the axes `moved`.
+
+    Frames that are worth fewer looks than there are axes leave dents in every ridge of the objective. Only then the
+    ridges are followed (`shifted`).
+    """
     if seen is not None and seen.count < len(moved):
         rivals = (*rivals, shifted(found.objective, pose, moved, config))
     held_m = config.verdict.held_translation_sigma_m
@@ -164,13 +167,18 @@ def _uncertainty(
 def _loosened(
     found: Found, window: Window, pose: Matrix4, held: tuple[int, ...], known_m: float
 ) -> tuple[Loosened, ...]:
-    """What setting free what was told comes to, on bands that feel a lens which is off by pixels, and on the sharpest
-    edges."""
+    """What changes when the assumptions of the window (held centre, clocks, lens) are set free one by one.
+
+    It runs from bands that still feel a lens which is off by pixels to the sharpest edges; empty without edges.
+    """
     return () if found.edges is None else loosen(found.edges.to_the_sharpest, window, pose, held, known_m)
 
 
 def _from_before(found: Found, window: Window, dof: int) -> tuple[Rivals, ...]:
-    """With translations searched, the summit next to where the camera was before is a rival of what was found."""
+    """The summit next to the camera's place before the search, as a rival of the pose found.
+
+    Empty without edges, without searched translations, or without such a summit.
+    """
     if found.edges is None or dof <= TRANSLATIONS.start:
         return ()
     pose = found.search.T_camera_lidar
@@ -179,7 +187,7 @@ def _from_before(found: Found, window: Window, dof: int) -> tuple[Rivals, ...]:
 
 
 def _told_of_words(loosened: Sequence[Loosened]) -> str:
-    """What the window contradicts of what it was told, and by how much that turns the camera."""
+    """For people: which assumptions the window contradicts, and by how much the camera turns without each."""
     turns = [
         f"{CONTRADICTED[one.name]} set free, it turns by {degrees(float(np.linalg.norm(one.shift[:3]))):.1f}°"
         for one in loosened

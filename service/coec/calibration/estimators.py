@@ -40,43 +40,45 @@ from coec.geometry.thinning import thinned
 Seen = TypeVar("Seen")
 
 POLISHED_BASINS = 5
-"""Basins that are polished on the fused objective beside the start's: the true one was never below the second place."""
+"""How many basins are polished on the fused objective beside that of the start. The true basin never ranked below the
+second place."""
 
 POLISHED_ALIKE = 3
-"""Of those in one basin, and the start's, so many are polished: more come to the same end (the score of the settled one
-differs by 0.1 % at most on eight windows of nine, half of them simulated), and with two another basin won on the
-ninth."""
+"""At most so many polishes, that of the start included, may end in one basin: further ones come to the same end. On
+eight windows of nine, half of them simulated, the score of the settled pose differs by 0.1 % at most; with two, another
+basin won on the ninth."""
 
 PLAUSIBLE = 0.5
-"""Share of the best one's rank from which a basin, or what lies next to the start, is polished: a polish adds a tenth
-to a rank, a quarter at most, and what is half as high would have to double."""
+"""A basin, or the neighbourhood of the start, is polished if it has at least this share of the best rank. A polish adds
+a tenth to a rank, a quarter at most; a rank half as high as the best would have to double."""
 
 NEIGHBOURHOOD_RAD = radians(5.0)
-"""How far from the start what lies next to it may be."""
+"""Radius of the neighbourhood of the start."""
 
 SETTLED_POSES = 2
-"""Poses of the best basin that are settled: with six degrees of freedom, blurred edges can lead one of them astray (to
-0.5° and 8 cm in one window of 24 of a simulated fisheye of 700 px)."""
+"""How many poses of the best basin are settled. One is not enough: with six degrees of freedom, blurred edges can lead
+it astray (to 0.5° and 8 cm in one window of 24 of a simulated fisheye of 700 px)."""
 
 LEADING_DEPTH_POINTS = 150_000
-"""Points of the window's clouds, seen or not, that carry the depth witness of a fusion until its basin is known: its
-hill is degrees wide."""
+"""Points of the window's clouds, in view or not, that the depth witness of a fusion uses until its basin is known. Few
+are enough because its hill is degrees wide."""
 
 SEEN_DEPTH_POINTS = 100_000
-"""Points in view that carry it at the end, where there are not half as many already: counts of a histogram are known to
-their root, and what a thousand cells scatter by puts ripples on the hill, whose top the edges alone do not hold where
-little is near. Eight windows of four simulated drives, six degrees of freedom, starts 20° and 0.3 m away: root mean
-square 0.08° and 1.0 cm on the worst axes instead of 0.10° and 1.6 cm."""
+"""Points in view that the depth witness uses at the end, unless at least half as many are in view already. The counts
+of a histogram scatter by their square root; that scatter in a thousand cells puts ripples on the hill, and where little
+is near the edges alone do not hold its top. Measured on eight windows of four simulated drives with six degrees of
+freedom and starts 20° and 0.3 m away: root mean square 0.08° and 1.0 cm on the worst axes instead of 0.10° and 1.6
+cm."""
 
 TELLING = 2.0
-"""Standard deviations by which the depth witness stands out at a pose, from which more points are spent on it: below
-that it might be chance, and would not tell more with them."""
+"""More points are spent on the depth witness only where it stands out by at least so many standard deviations. Below
+that its peak may be chance, and more points would not make it tell more."""
 
 SETTLING = SearchBox(radians(8.0), 0.5)
-"""How far from a settled pose those are asked at most: by its summits, and by how wide its hill is."""
+"""How far from a settled pose these points are used at most: for its summits, and to measure how wide its hill is."""
 
 DISPLACED = SearchBox(SETTLING.rotation_rad + radians(2.0), SETTLING.translation_m + 3.0)
-"""The same of points before motion compensation, of which half a sweep at 40 m/s and 40°/s takes so much."""
+"""The same for points before motion compensation: in half a sweep, 40 m/s and 40°/s displace them by the difference."""
 
 SAME_BASIN_RAD = radians(1.5)
 """Poses nearer than this are one basin, not rivals."""
@@ -85,13 +87,17 @@ BETWEEN = (0.5, 0.75, 0.25)
 """Shares of the way from the pose to another summit at which a valley between them is looked for."""
 
 MAX_GREY_WIDTH_PX = 800
-"""Images are halved to at most this width before grey values are compared: about the spacing of a sweep's points."""
+"""Images are halved to at most this width before grey values are compared: pixels are then about as far apart as the
+points of a sweep."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """A window as an estimator sees it. Sweeps are motion-compensated, depth is inferred and images are decoded when an
-    estimator asks: of most windows it needs a part of each."""
+    """A window as an estimator sees it.
+
+    Sweeps are motion-compensated, depth is inferred and images are decoded only when an estimator asks for them,
+    because most windows need only a part of each.
+    """
 
     window: Window
     compensated: bool
@@ -132,7 +138,7 @@ class Sight:
 def sight_of(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, progress: Progress
 ) -> Sight:
-    """The window as `config` wants it seen; without a mask of the rig's, with the one its frames tell."""
+    """The window as `config` wants it seen. If the rig has no mask, one is found from the window's own frames."""
     sight = Sight(window, config.motion_compensation, depth, images, progress)
     return sight if window.rig.mask is not None or len(window.pairs) < MIN_FRAMES else _masked(sight)
 
@@ -158,8 +164,15 @@ def _masked(sight: Sight) -> Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What an estimator found: its objective, the search on it, the metrics that only this objective has, the other
-    summits that it came to within the basin, and the edges of the window where it looked at them."""
+    """What an estimator found.
+
+    Attributes:
+        objective: what it maximised.
+        search: the end of the search on it.
+        metrics: those that only this objective has.
+        rivals: other summits to which the search came within the same basin.
+        edges: the edges of the window; None if it used none.
+    """
 
     objective: Divisible
     search: SearchResult
@@ -172,7 +185,7 @@ Estimator = Callable[[Sight, CalibrationConfig], Found]
 
 
 def by_depth(sight: Sight, config: CalibrationConfig) -> Found:
-    """The paper's: BOBYQA on the mutual information of depth and range."""
+    """The paper's estimator: BOBYQA on the mutual information of depth and range."""
     return _by_mutual_information(depth_features(sight, sight.window.T_camera_lidar_start), sight, config)
 
 
@@ -194,7 +207,8 @@ def by_intensity(sight: Sight, config: CalibrationConfig) -> Found:
 
 
 def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
-    """Edges and depth: every basin of the edge witness within reach, ranked by both, the best polished on both."""
+    """Edges and depth: finds every basin of the edge witness within reach, ranks them by both witnesses, and polishes
+    the best on both."""
     window, progress = sight.window, sight.progress
     start = window.T_camera_lidar_start
     reach = SearchBox(radians(config.search.reach_deg), config.search.reach_m if config.search.dof == 6 else 0.0)
@@ -212,22 +226,22 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
     plausible = [basin for rank, basin in ranked[:POLISHED_BASINS] if rank >= least]
     ends, others = [], [basin for _, basin in ranked[len(plausible) :]]
     if fusion.rank(of_start) >= least:
-        # The neighbourhood of the start, whatever place the charts give it.
+        # The neighbourhood of the start is polished wherever the charts rank it.
         ends.append(polish_in_turn(fusion.ranking, start, to_rank, progress))
     else:
         others.append(of_start)
     for basin in plausible:
         there = sum(not _differ(end.T_camera_lidar, basin) for end in ends)
         if there < POLISHED_ALIKE:
-            # The coarser bands led the first one of a basin: they would lead the others to the same end.
+            # The coarser bands led the first polish of a basin. They would lead the others to the same end.
             bands = fusion.ranking[-1:] if there else fusion.ranking
             ends.append(polish_in_turn(bands, basin, to_rank, progress))
     polished = _with_ranks(fusion, [end.T_camera_lidar for end in ends])
 
     def preferred(end: tuple[float, Matrix4]) -> tuple[bool, float]:
         rank, pose = end
-        # A rank is an improbability: half its square, in nats, is what the window says against chance. A maximum
-        # outside of the reach is a rival, but what is asked for lies inside.
+        # Half the square of a rank is, in nats, what the window says against chance. A maximum outside of the reach
+        # is a rival, but the answer has to lie inside.
         told = 0.5 * rank**2 + log_prior(pose, start, window.start_known_to_rad)
         return not at_rim(pose, start, reach), told
 
@@ -253,7 +267,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
         found = replace(found, stop_reason=StopReason.AT_BOUND)
     others = [end.T_camera_lidar for end in settled if end is not best]
     if not _differ(start, best.T_camera_lidar):
-        # Where the window cannot tell the pose before the search from what was found, it has told nothing.
+        # A window that cannot tell the start from the pose found has told nothing.
         others.append(start)
     summits = (
         Rivals(finest, best.T_camera_lidar, tuple(others)),
@@ -268,10 +282,10 @@ def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[tuple[float, M
 
 def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> list[float]:
     """The largest edge contrast among those of `others` (4, 4) that are summits beside `pose` (4, 4), in a list; an
-    empty one where there is none.
+    empty list if none is a summit.
 
-    A climb may also end on the shoulder of the hill that `pose` is the top of, where turns and shifts make up for each
-    other: from there the way to the top leads down nowhere.
+    A climb may also end on the shoulder of the hill whose top is `pose`, because turns and shifts make up for each
+    other. From a shoulder the way to the top never leads down, so it is no rival.
     """
     contrasts = fusion.edge_contrasts(np.array(others).reshape(-1, 4, 4))
     for contrast, other in sorted(zip(contrasts, others, strict=True), key=lambda item: -item[0]):
@@ -282,16 +296,19 @@ def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> lis
 
 
 def least_range_edges(config: CalibrationConfig) -> float:
-    """Range jumps that it takes: as many for each degree of freedom. The more poses there are to try, the better one of
-    them fits by chance: the largest of N normal deviates grows as √(2·ln N), a significance as the root of the jumps,
-    and with the translations within 20 cm N is ten thousand times as large as for the rotations within 10° alone."""
+    """How many range jumps a window must have: in proportion to the degrees of freedom.
+
+    The more poses there are to try, the better one of them fits by chance: the largest of N normal deviates grows as
+    √(2·ln N), a significance as the root of the jumps. With the translations within 20 cm, N is ten thousand times as
+    large as for the rotations within 10° alone.
+    """
     return config.verdict.min_range_edges * config.search.dof / 3.0
 
 
 def runner_up(contrast: float, rivals: Sequence[float]) -> float:
-    """The largest edge contrast of the rivals over that of the pose; 0 without a rival that stands out at all.
+    """The largest edge contrast of the rivals over that of the pose; 0 if no rival stands out at all.
 
-    NaN where the pose itself does not stand out: nothing is behind it, and what is not a number passes no limit.
+    NaN if the pose itself does not stand out, so that the metric passes no limit.
     """
     return max((0.0, *rivals)) / contrast if contrast > 0.0 else nan
 
@@ -300,8 +317,8 @@ ESTIMATORS: Mapping[str, Estimator] = MappingProxyType({"mi": by_depth, "fused":
 
 
 def depth_features(sight: Sight, T_camera_lidar: Matrix4, at_most: int | None = None) -> list[Features]:
-    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4); of every sweep the
-    same share of its points, so that about `at_most` are left in all.
+    """What mutual information compares in every pair, with the camera at `T_camera_lidar` (4, 4). Every sweep gives the
+    same share of its points, so that about `at_most` are used in all.
 
     Raises:
         CalibrationError: a frame has no usable depth.
@@ -323,8 +340,8 @@ def _number(count: int, share: float) -> int:
 
 
 def _denser(sight: Sight, depth: MutualInformation, pose: Matrix4, config: CalibrationConfig) -> MutualInformation:
-    """The depth witness of a fusion near `pose` (4, 4), which sees some, with about `SEEN_DEPTH_POINTS` in view there;
-    as it is where half as many are."""
+    """The depth witness with about `SEEN_DEPTH_POINTS` in view at `pose` (4, 4); unchanged if at least half as many are
+    in view there already. Some must be."""
     seen = depth.evaluate(pose).points_in_view
     if 2 * seen >= SEEN_DEPTH_POINTS:
         return depth

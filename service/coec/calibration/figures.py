@@ -1,6 +1,6 @@
-"""What every figure of self-diagnosis tells, what it means when it does not keep its limit, and what to do then.
+"""What every figure of self-diagnosis measures, what it means beyond its limit, and what to do then.
 
-One table: reasons of verdicts are worded by it, and reports explain by it.
+Verdicts word their reasons from this one table, and reports explain the figures with it.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from coec.calibration.types import INTRINSICS_OFF, MOVED, StopReason
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure, for people.
+    """A figure, explained for people.
 
     Attributes:
         unit: of value and limit; empty for a share, a ratio, or a count.
         tells: what it measures, a sentence.
-        fails: what it means beyond its limit, no full stop.
+        fails: what it means beyond its limit, without a full stop.
         advice: what to do then.
     """
 
@@ -230,4 +230,4 @@ OTHER_ADVICE: Mapping[str, str] = MappingProxyType(
         "motion": "Take the window while the vehicle drives past things, not where it stands or sees its road alone.",
     }
 )
-"""What to do about reasons of a verdict that are no figure, by their code."""
+"""What to do about those reasons of a verdict that are not figures, by their code."""

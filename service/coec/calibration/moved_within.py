@@ -1,4 +1,4 @@
-"""What is said of a window within which the camera moved: by how much, when, and which of its pairs come after that."""
+"""Describes a move of the camera within a window: by how much, when, and which of the window's pairs come after it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coec.geometry import se3
 
 
 def moved_within(change: ChangePoint, edges: EdgeWitness, sight: Sight) -> MovedWithin:
-    """The change that the edges of a window tell, dated by the pairs between those of the window, too."""
+    """The change that the edges of a window show, dated also by the pairs recorded between those of the window."""
     window = sight.window
     stamps_ns = tuple(pair.stamp_ns for pair in window.pairs)
     told = step_time(change, DatedEdges(stamps_ns, edges), window.between, lambda pairs: _edges_of(pairs, sight))
@@ -25,7 +25,7 @@ def moved_within(change: ChangePoint, edges: EdgeWitness, sight: Sight) -> Moved
 
 
 def in_words(moved: MovedWithin, window: Window) -> str:
-    """By how much and when, after words that say that it moved."""
+    """By how much and when the camera moved, to be appended to a sentence that says that it moved."""
     turn_deg = degrees(se3.rotation_angle_rad(moved.T_after @ se3.inverse(moved.T_before)))
     before_s, after_s = (
         (stamp_ns - window.pairs[0].stamp_ns) / 1e9 for stamp_ns in (moved.last_before_ns, moved.first_after_ns)
@@ -34,7 +34,8 @@ def in_words(moved: MovedWithin, window: Window) -> str:
 
 
 def _edges_of(pairs: Sequence[FramePair], sight: Sight) -> DatedEdges | None:
-    """Nobody has looked at these pairs before: whichever cannot be used is left out."""
+    """The edges of some pairs; None if none are usable. These pairs were not decoded before, so any that cannot be
+    decoded is left out."""
     seen = []
     for pair in pairs:
         try:

@@ -28,7 +28,7 @@ class DepthModel(Protocol):
 
 
 class ImageReader(Protocol):
-    """Pixels of an exposure, for the witnesses that look at the image itself."""
+    """Pixels of an exposure, for the witnesses that use the image itself."""
 
     def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
         """(height, width) grey values.
@@ -64,7 +64,7 @@ class ImageReducer(Protocol):
 
 
 class Progress(Protocol):
-    """Hears how far a calibration has come; it has no say in the result."""
+    """Receives how far a calibration has come; it cannot influence the result."""
 
     def step(self, stage: str, done: int, total: int) -> None:
         """`done` of `total` parts of the stage are complete."""
@@ -72,24 +72,24 @@ class Progress(Protocol):
 
 
 class Silence:
-    """A `Progress` for callers who do not listen."""
+    """A `Progress` for callers that do not want to know."""
 
     def step(self, stage: str, done: int, total: int) -> None:
         """Nothing."""
 
 
 class Neighbourhood(Protocol):
-    """Points among which the nearest are looked up."""
+    """A set of points in which the nearest ones can be looked up."""
 
     def nearest(self, queries_m: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Indices (N, count) of the nearest points of each query (N, 3), the nearest first, and squared distances
-        (N, count) in m². There are at least `count` points. To the bit the same at each call."""
+        """Indices (N, count) of the nearest points of each query (N, 3), nearest first, and squared distances
+        (N, count) in m². The set must hold at least `count` points. Every call gives the same to the bit."""
         ...
 
 
 class NeighbourSearch(Protocol):
-    """Makes points ready to be looked up."""
+    """Prepares points for looking up the nearest ones."""
 
     def over(self, points_m: NDArray[np.float64]) -> Neighbourhood:
-        """Of finite points (M, 3)."""
+        """The neighbourhood over finite points (M, 3)."""
         ...

@@ -1,17 +1,17 @@
-"""Successive windows combined into one extrinsic: a slow track that averages noise away, and a fast one that notices a
-step at once.
+"""Combines successive windows into one extrinsic: a slow track averages noise away, a fast one notices a step at once.
 
-The slow track is an information filter on SE(3): its state is a pose and the covariance of the perturbation on its left
-(Barfoot, Furgale, "Associating uncertainty with three-dimensional poses", 2014), its update the Kalman update of that
-perturbation, and between windows the covariance grows with time so that a mount that creeps is followed. What windows
-have in common does not average away: it is carried beside the noise, and told with it.
+The slow track is an information filter on SE(3). Its state is a pose and the covariance of the perturbation on its left
+(Barfoot, Furgale, "Associating uncertainty with three-dimensional poses", 2014); its update is the Kalman update of
+that perturbation. Between windows the covariance grows with time, so that the track follows a mount that creeps. Errors
+that
+windows have in common do not average away: they are carried beside the noise and reported with it.
 
-A window is first asked whether it can come from the same mount: the squared Mahalanobis distance of its innovation is
-chi-square distributed if it does (Bar-Shalom, Li, Kirubarajan 2001, section 5.4). One that does not opens a fast track
-and moves nothing. If the next one agrees with the fast track and not with the slow, the mount has moved, and the slow
-track starts again from those two.
+Each window is first tested for whether it can come from the same mount: the squared Mahalanobis distance of its
+innovation is chi-square distributed if it does (Bar-Shalom, Li, Kirubarajan 2001, section 5.4). A window that fails the
+test opens a fast track and moves nothing. If the next window agrees with the fast track and not with the slow one, the
+mount has moved, and the slow track starts again from those two windows.
 
-All in plain floats (`linear`): the track survives restarts, and replays, to the byte.
+All arithmetic is in plain floats (`linear`), so that the track survives restarts and replays to the byte.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Measurement:
 
     Attributes:
         T_camera_lidar: (4, 4).
-        uncertainty: of the perturbation about the camera axes; its noise is NaN on axes that were not solved or could
+        uncertainty: of the perturbation about the camera axes; the noise is NaN on axes that were not solved or could
             not be observed.
         stamp_ns: sensor time of its last pair.
     """
@@ -78,10 +78,10 @@ class Belief:
 
     Attributes:
         T_camera_lidar: (4, 4).
-        covariance: (6, 6) of the perturbation on its left: noise, which averages away.
-        systematic: by its name, (6,) the shift of the pose by one standard deviation of an error that the windows in
-            it have in common, which does not.
-        observed: (6,) axes that any window told.
+        covariance: (6, 6) of the perturbation on the left of the pose: noise, which averages away.
+        systematic: by the name of each error that its windows have in common, which does not average away: (6,) the
+            shift of the pose by one standard deviation.
+        observed: (6,) axes that at least one window determined.
         windows: number of windows in it.
     """
 
@@ -93,7 +93,7 @@ class Belief:
 
     @property
     def uncertainty(self) -> Uncertainty:
-        """Both together."""
+        """Noise and systematic errors together."""
         return Uncertainty(self.covariance, self.systematic, np.nan)
 
 
@@ -103,12 +103,12 @@ class Track:
 
     Attributes:
         slow: what is served.
-        prior_sigma: (6,) spread of the first pose, radians and metres: what an axis falls back to after a step.
+        prior_sigma: (6,) spread of the first pose, radians and metres; after a step, axes fall back to it.
         stamp_ns: sensor time of the newest window.
         step: what the last window said.
         candidate: the fast track while a step is suspected.
         innovation: squared Mahalanobis distance of the last window from the slow track; 0 before the first.
-        chance: how probable a distance at least as large is without a step; 1 before the first.
+        chance: how probable a distance at least as large is without a step; 1 before the first window.
     """
 
     slow: Belief
@@ -121,7 +121,7 @@ class Track:
 
     @classmethod
     def initial(cls, T_camera_lidar: Matrix4, prior_sigma: NDArray[np.float64], stamp_ns: int = 0) -> Track:
-        """A track without windows, at a pose that is trusted to `prior_sigma` (6,).
+        """A track without windows, at a pose (4, 4) whose standard deviations are `prior_sigma` (6,).
 
         Raises:
             ValueError: the pose is not rigid, or a standard deviation is not a positive number.
@@ -140,12 +140,12 @@ class Track:
 
     @property
     def covariance(self) -> Matrix6:
-        """(6, 6) of the slow track: noise alone, without what all windows have in common."""
+        """(6, 6) of the slow track: noise alone, without the errors that all windows have in common."""
         return self.slow.covariance
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """(6,) axes that any window of the slow track told; the others are as they were at first."""
+        """(6,) axes that at least one window of the slow track determined; the others keep their first value."""
         return self.slow.observed
 
     @property
@@ -155,7 +155,7 @@ class Track:
 
     @property
     def uncertainty(self) -> Uncertainty:
-        """What to report: noise, and the errors that averaging cannot remove."""
+        """The uncertainty to report: noise, and the errors that averaging cannot remove."""
         return self.slow.uncertainty
 
 
@@ -165,12 +165,13 @@ def prior_sigma(config: TrackerConfig) -> NDArray[np.float64]:
 
 
 def creep_sigma(config: TrackerConfig) -> NDArray[np.float64]:
-    """(6,) how far a mount creeps in an hour, on every axis (rad, m): a random walk, its variance grows with time."""
+    """(6,) how far a mount creeps in an hour, on every axis (rad, m). Creep is a random walk: its variance grows with
+    time."""
     return np.array([radians(config.drift_deg_per_sqrt_h)] * 3 + [config.drift_m_per_sqrt_h] * 3)
 
 
 def absorb(track: Track, measurement: Measurement, config: TrackerConfig) -> Track:
-    """The track after another accepted window; a window that tells no axis leaves it as it is."""
+    """The track after another accepted window; a window that determines no axis leaves the track unchanged."""
     axes = measurement.told_axes()
     if not axes:
         return track
@@ -193,8 +194,8 @@ def absorb(track: Track, measurement: Measurement, config: TrackerConfig) -> Tra
 
 
 def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belief:
-    """A belief in one window alone; axes that it does not tell keep their place, but after a step nothing vouches for
-    them beyond the prior."""
+    """A belief from one window alone. Axes that the window does not determine keep their values, but with the spread of
+    the prior, because after a step nothing else vouches for them."""
     away = se3.difference(measurement.T_camera_lidar, track.T_camera_lidar)
     covariance = np.diag(track.prior_sigma**2)
     covariance[np.ix_(axes, axes)] = measurement.uncertainty.noise[np.ix_(axes, axes)]
@@ -205,13 +206,13 @@ def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> Belie
 
 
 def _drifted(belief: Belief, elapsed_h: float, config: TrackerConfig) -> Belief:
-    """A mount creeps."""
+    """The belief after `elapsed_h` hours in which the mount may have crept."""
     return replace(belief, covariance=belief.covariance + np.diag(elapsed_h * creep_sigma(config) ** 2))
 
 
 def _disagreement(belief: Belief, measurement: Measurement, axes: list[int]) -> tuple[float, float]:
-    """Squared Mahalanobis distance on the axes told, and its probability. What windows of one scene have in common
-    differs between scenes, so the window's systematic errors count as noise here."""
+    """Squared Mahalanobis distance of a window on the axes it determines, and the chance of one as large. Errors that
+    windows of one scene have in common differ between scenes, so the window's systematic errors count as noise here."""
     away = se3.difference(measurement.T_camera_lidar, belief.T_camera_lidar).tolist()
     spread = (belief.covariance + measurement.uncertainty.covariance).tolist()
     s = [[spread[i][j] for j in axes] for i in axes]
@@ -221,11 +222,11 @@ def _disagreement(belief: Belief, measurement: Measurement, axes: list[int]) -> 
 
 
 def _updated(belief: Belief, measurement: Measurement, axes: list[int]) -> Belief:
-    """The Kalman update with the window's perturbation from the belief, on the axes that it tells.
+    """The Kalman update with the window's perturbation from the belief, on the axes that the window determines.
 
     K = P Hᵀ (H P Hᵀ + R)⁻¹, ξ = K y, P ← (1 - K H) P (1 - K H)ᵀ + K R Kᵀ (Joseph's form: stays positive definite).
-    A systematic error is the same in every window and shifts the belief as it shifts the window, b ← (1 - K H) b + K s:
-    it is considered, not estimated (Schmidt 1966), for no number of windows tells it.
+    A systematic error is the same in every window and shifts the belief as it shifts the window, b ← (1 - K H) b + K s.
+    It is considered, not estimated (Schmidt 1966), because no number of windows can determine it.
     """
     p, r = belief.covariance.tolist(), measurement.uncertainty.noise.tolist()
     away = se3.difference(measurement.T_camera_lidar, belief.T_camera_lidar).tolist()
@@ -262,7 +263,7 @@ def chi_square_tail(x: float, degrees_of_freedom: int) -> float:
     half = 0.5 * x
     odd = degrees_of_freedom % 2 == 1
     total = erfc(sqrt(half)) if odd else 0.0
-    # Terms half^a / Γ(a + 1), a from 0 or from a half on in steps of one.
+    # Terms half^a / Γ(a + 1): a runs in steps of one from 0, or from a half.
     power = 0.5 if odd else 0.0
     term = exp(-half) * (2.0 * sqrt(half / pi) if odd else 1.0)
     for _ in range(degrees_of_freedom // 2):
@@ -286,10 +287,10 @@ def track_to_dict(track: Track) -> dict[str, Any]:
 
 
 def track_from_dict(document: Mapping[str, Any]) -> Track:
-    """What `track_to_dict` wrote.
+    """The track that `track_to_dict` wrote.
 
     Raises:
-        ValueError: something is missing, of another type or of another shape.
+        ValueError: something is missing, or has a wrong type or shape.
     """
     try:
         candidate = document["candidate"]

@@ -49,7 +49,8 @@ class ImageFormat(StrEnum):
 class EncodedImage:
     """An image as it came: compressed, or rows of raw pixels without padding, 16-bit values little-endian.
 
-    `width` and `height` are in pixels, read from the header when compressed, checked against limits before any decode.
+    `width` and `height` are in pixels; for a compressed image they come from its header. Both are checked against the
+    limits before anything is decoded.
     """
 
     format: ImageFormat
@@ -75,7 +76,7 @@ class CameraFrame:
 
 @dataclass(frozen=True, slots=True)
 class ImageQuality:
-    """What one check at an exposure tells, at half its size.
+    """Sharpness and exposure of one image, measured at half its size.
 
     Attributes:
         sharpness: mean squared gradient over twice the grey-value variance: 0 to about 1, falls with blur.
@@ -99,7 +100,7 @@ class LidarFrame:
         intensity: (N,) float32 or None.
         ring: (N,) uint16 or None.
         time_offset_s: (N,) float32 or None: when each point was measured, relative to `stamp_ns`.
-        timed_by: in a line for people, how the times were read of a message that leaves it open; empty otherwise.
+        timed_by: a line for people: how point times were read if the message leaves that open; empty otherwise.
     """
 
     stamp_ns: int
@@ -116,7 +117,7 @@ class LidarFrame:
 class EgoMotion:
     """Velocity of the vehicle at `stamp_ns`, expressed in the ego frame `frame_id` (x forward, y left, z up).
 
-    `linear_mps` is None where the sensor tells rotation only, as an IMU does: nothing stands in for it.
+    `linear_mps` is None if the sensor measures rotation only, as an IMU does; no other value replaces it.
     """
 
     stamp_ns: int
@@ -143,7 +144,7 @@ class EgoMotion:
 
 
 class Compensation(StrEnum):
-    """What motion compensation did to a pair, and if nothing, why."""
+    """What motion compensation did to a pair; if it did nothing, why."""
 
     DONE = "done"
     ROTATION_ONLY = "rotation_only"
@@ -183,11 +184,11 @@ class SweepTiming:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudFrame:
-    """The frame in which a driver gives points that were measured from elsewhere.
+    """The frame in which a driver gives its points, where that is not the LiDAR's own.
 
     Attributes:
         frame_id: of the clouds as they come.
-        T_cloud_lidar: (4, 4) pose of the LiDAR in it, metres.
+        T_cloud_lidar: (4, 4) pose of the LiDAR in that frame, metres.
     """
 
     frame_id: str
@@ -205,8 +206,8 @@ class Rig:
         T_lidar_ego: (4, 4) maps ego-frame coordinates to LiDAR coordinates; carries ego-motion to the sensor.
         mask: (height, width) bool or None; False = ignore this pixel (vehicle body, outside the lens).
         sweep: azimuth timing, or None when unknown or when the clouds carry per-point time.
-        camera_residual_px: what `camera` misses of the lens that it was fitted to, at most, pixels.
-        cloud: in which frame the LiDAR's driver gives its points; None: in the LiDAR's own.
+        camera_residual_px: by how many pixels at most `camera` differs from the lens that it was fitted to.
+        cloud: the frame in which the LiDAR's driver gives its points; None: the LiDAR's own.
     """
 
     pair: str
@@ -225,11 +226,10 @@ class Rig:
 class Window:
     """The pairs of one slice of sensor time, in order of their stamps, and the extrinsic that was current then.
 
-    `T_camera_lidar_start` (4, 4) is where the search starts: it is part of the window, so that a replay starts there
-    too. `start_known_to_rad` is how far it usually is from
-    the truth: half a turn where it is a guess.
+    `T_camera_lidar_start` (4, 4) is where the search starts. It is part of the window so that a replay starts there
+    too. `start_known_to_rad` is how far it usually is from the truth: half a turn if it is a guess.
 
-    `between` are further pairs of the slice, thinned, in order of their stamps, too. They enter no estimate: where the
+    `between` are further pairs of the slice, thinned, also in order of their stamps. They enter no estimate; if the
     camera moved between two pairs of the window, they tell when.
     """
 
@@ -323,18 +323,18 @@ class Metric:
 
 
 ELSEWHERE = frozenset({"newton_step_deg", "newton_step_m", *(stop.value for stop in StopReason)})
-"""Codes of reasons that refuse a result although a pose stands out in its window: where exactly it lies is open, not
-whether there is one. Every other reason says that the window cannot tell."""
+"""Codes of reasons that refuse a result although a pose stands out in its window: only its exact place is open. Every
+other reason says that the window cannot tell."""
 
 
 MOVED = "moved_within_window"
 """Code of the reason that refuses a window within which the camera moved."""
 
 INTRINSICS_OFF = "intrinsics_off"
-"""Code of the reason that refuses a window whose images another lens has taken than the one of the rig."""
+"""Code of the reason that refuses a window whose images were taken through another lens than the rig's."""
 
 TWO_POSES = ELSEWHERE | {MOVED, "runner_up"}
-"""Codes of the reasons that a window has which holds two poses, and tells both well."""
+"""Codes of the reasons that refuse a window in which the camera has two poses, both of which it shows well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,19 +347,19 @@ class Verdict:
 
     @property
     def tells_two_poses(self) -> bool:
-        """Of a refused window: the camera moved within it, and nothing else is wrong with it."""
+        """Whether a refused window failed only because the camera moved within it."""
         codes = {reason.code for reason in self.reasons}
         return MOVED in codes and codes <= TWO_POSES
 
     @property
     def tells_another_lens(self) -> bool:
-        """Of a refused window: a pose stands out in it, and through another lens it would do so more clearly."""
+        """Whether a refused window shows a pose that would stand out more clearly through another lens."""
         codes = {reason.code for reason in self.reasons}
         return INTRINSICS_OFF in codes and not codes & {"edge_contrast", "range_edges", "overlap"}
 
     @property
     def cannot_tell(self) -> bool:
-        """Of a refused window: it says nothing of where the camera is; too little to see, or more than one answer."""
+        """Whether a refused window says nothing about where the camera is: it shows too little, or several answers."""
         codes = {reason.code for reason in self.reasons}
         return not codes or not codes <= ELSEWHERE
 
@@ -369,9 +369,10 @@ class Uncertainty:
     """How far a pose may be off, about the camera axes, radians and metres.
 
     Attributes:
-        noise: (6, 6) covariance of what differs from window to window; NaN on axes that were not told.
-        systematic: by its name, (6,) the shift by one standard deviation of an error that windows have in common.
-        looks: how many independent looks the frames of the window are worth; NaN where that is not known.
+        noise: (6, 6) covariance of the errors that differ from window to window; NaN on axes that were not determined.
+        systematic: by the name of each error that windows have in common, (6,) the shift of the pose by one standard
+            deviation of it.
+        looks: how many independent looks the frames of the window are worth; NaN if unknown.
     """
 
     noise: NDArray[np.float64]
@@ -380,38 +381,38 @@ class Uncertainty:
 
     @classmethod
     def unknown(cls) -> Uncertainty:
-        """On every axis."""
+        """Unknown on every axis."""
         return cls(np.full((6, 6), np.nan), {}, np.nan)
 
     @classmethod
     def independent(cls, sigma: NDArray[np.float64]) -> Uncertainty:
-        """Noise alone, its axes uncorrelated: standard deviations (6,), NaN where an axis is not told."""
+        """Noise alone with uncorrelated axes, from standard deviations (6,); NaN on axes that were not determined."""
         told = np.isfinite(sigma)
         noise = np.where(told[:, None] & told, np.diag(np.where(told, sigma, 0.0) ** 2), np.nan)
         return cls(noise, {}, np.nan)
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """(6, 6) of both together."""
+        """(6, 6) of noise and systematic errors together."""
         shared = np.zeros((6, 6))
-        for name in sorted(self.systematic):  # to the bit the same, in whatever order they were kept
+        for name in sorted(self.systematic):  # sorted: the same to the bit, whatever order they are kept in
             shared += self.systematic[name][:, None] * self.systematic[name]
         return self.noise + shared
 
     @property
     def sigma(self) -> NDArray[np.float64]:
-        """(6,) standard deviations of both together; NaN on axes that were not told."""
+        """(6,) standard deviations of noise and systematic errors together; NaN on axes that were not determined."""
         return np.sqrt(self.covariance.diagonal())
 
     @property
     def pitch_height(self) -> float:
-        """Correlation of the errors of rx and ty, -1 to 1; NaN where either was not told. Only what is near tells a
-        turn from a shift."""
+        """Correlation of the errors of rx and ty, -1 to 1; NaN if either was not determined. It is small only if near
+        things were seen, because far ones cannot tell a turn from a shift."""
         return self._correlation(0, 4)
 
     @property
     def yaw_side(self) -> float:
-        """The same of ry and tx."""
+        """Correlation of the errors of ry and tx, likewise."""
         return self._correlation(1, 3)
 
     def _correlation(self, one: int, other: int) -> float:
@@ -422,13 +423,14 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovedWithin:
-    """The camera moved while a window was taken: two poses, one after the other, explain it, and one does not.
+    """The camera moved while a window was taken: two poses, one after the other, explain it, but no single pose does.
 
     Attributes:
-        last_before_ns, first_after_ns: stamps of the pairs between which it moved: of the window, or of those recorded
-            between its own.
-        pairs_after: how many pairs of the window there are after it.
-        T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after; turned about the camera's centre.
+        last_before_ns, first_after_ns: stamps of the two pairs between which it moved; either pair is of the window or
+            was recorded between those of the window.
+        pairs_after: how many pairs of the window come after the move.
+        T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after the move; they differ by a turn
+            about the camera's centre.
     """
 
     last_before_ns: int
@@ -446,12 +448,12 @@ class Estimate:
         correction: (6,) rotation vector (rad) and translation (m) from the nominal calibration, about the camera axes.
         uncertainty: of the pose; unknown on axes that were not solved.
         solved: (6,) bool, the axes that were searched and found.
-        unobservable: (6,) bool, the translations that were searched but that the window does not tell: along these
-            axes of the camera its centre, -Rᵀ·t in LiDAR coordinates, is that of the start.
-        compensation: how many pairs ended with which `Compensation`, by name.
+        unobservable: (6,) bool, the translations that were searched but that the window cannot determine. Along these
+            camera axes the camera's centre, -Rᵀ·t in LiDAR coordinates, stays that of the start.
+        compensation: how many pairs ended with each `Compensation`, by name.
         depth_identity: sha256 of the network, or `precomputed`.
         config_hash: of everything that decides the result.
-        moved: what the window was refused for, if the camera moved within it; None otherwise.
+        moved: the move for which the window was refused; None if the camera did not move within it.
     """
 
     window_id: str

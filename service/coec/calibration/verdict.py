@@ -1,10 +1,10 @@
-"""Whether an optimum may be believed: the paper's classifier, equation (2), on figures that need no knowledge of the
-rig.
+"""Decides whether an optimum may be believed: the paper's classifier, equation (2), on figures that need no knowledge
+of the rig.
 
     failed if MI < MI_lim or f' > f'_lim or f'' < f''_lim
 
-Each figure is a ratio of the window to itself, so one set of limits serves any scene, network and number of bins until
-a rig is commissioned.
+Each figure compares the window with itself. So one set of limits serves any scene, network and number of bins until a
+rig is commissioned.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from coec.calibration.types import INTRINSICS_OFF, MOVED, Decision, FramePair, M
 from coec.config import VerdictConfig
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
-"""Places of both in ξ = [rx ry rz tx ty tz]."""
+"""Places of rotation and translation in ξ = [rx ry rz tx ty tz]."""
 
 COUNTED = "range_edges"
-"""A figure that counts what the frames show, and that counts the same thing again for each that shows it."""
+"""The figure that counts what the frames show; it counts the same thing again for each frame that shows it."""
 
 UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
-"""Codes of reasons that more scenes would remedy."""
+"""Codes of reasons that a window with more scenes would remedy."""
 
 
 SAME_SCENE = 0.5
-"""Share of the frames below which the independent looks of a window say that it saw one scene: of a drive through
-streets they are worth seven tenths of their number and more, of slow traffic and motorways a fifth to a third, of a
-standing vehicle a tenth to a quarter."""
+"""A window saw one scene if its independent looks are fewer than this share of its frames. Measured shares: seven
+tenths and more on a drive through streets, a fifth to a third in slow traffic and on motorways, a tenth to a quarter
+with a standing vehicle."""
 
 
 def saw_one_scene(looks: float, frames: int) -> bool:
-    """Whether frames that are worth so many independent `looks` show the same again and again, as those of a vehicle
-    that stands do."""
+    """Whether frames that are worth so many independent `looks` show the same again and again, as those of a standing
+    vehicle do."""
     return looks < SAME_SCENE * frames
 
 
 def counted_once(metrics: tuple[Metric, ...], looks: float, frames: int) -> tuple[Metric, ...]:
-    """The metrics of an objective, with what frames have in common counted once, not in each of them. Where the number
-    of independent `looks` is not known the frames are counted."""
+    """The metrics of an objective, with what the frames have in common counted once, not once a frame. If the number of
+    independent `looks` is not finite, every frame counts."""
     share = looks / frames if isfinite(looks) else 1.0
     return tuple(replace(m, value=m.value * share) if m.name == COUNTED else m for m in metrics)
 
@@ -59,8 +59,8 @@ def counted_once(metrics: tuple[Metric, ...], looks: float, frames: int) -> tupl
 def shape_metrics(
     evaluation: Evaluation, curvature: Curvature, sigma: NDArray[np.float64], limits: VerdictConfig
 ) -> tuple[Metric, ...]:
-    """What any objective has to show at an optimum: no slope, a peak, standard deviations `sigma` (6,) worth the name,
-    enough in view."""
+    """What any objective has to show at an optimum: no slope, a peak, small standard deviations `sigma` (6,), and
+    enough points in view."""
     peakedness = float(np.min(curvature.peakedness(evaluation.score))) * radians(1.0) ** 2
     metrics = [
         Metric(
@@ -79,8 +79,9 @@ def shape_metrics(
 
 
 def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Metric, ...]:
-    """What the likeliest change within the window gains over no change; nothing where changes were not looked for. A
-    change of the scene gains nothing, nor does a turn below `min_change_deg`: scenes differ by that without a knock."""
+    """What the likeliest change within the window gains over no change; empty if nobody looked for a change. A change
+    of the scene gains nothing. A turn below `min_change_deg` gains nothing either, because scenes differ by that much
+    without a knock."""
     if change is None:
         return ()
     gain = change.gain if change.of_camera and degrees(change.turn_rad) >= limits.min_change_deg else 0.0
@@ -88,19 +89,21 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
 
 
 def repetition_metric(looks: Looks | None, pairs: Sequence[FramePair], limits: VerdictConfig) -> tuple[Metric, ...]:
-    """What the edges tell when all that frames have in common counts once; nothing where they were not looked at, or
-    the vehicle is not known to drive. What stands still before a standing vehicle is its whole scene. What stands still
-    before one that drives are the lines that run along its road, of which any two fit each other: on 25 simulated
-    drives, most of them along motorways, they bring wrong poses to 13.7, and right ones that are accepted are at 29 and
-    more."""
+    """How significant the edges are if all that frames have in common counts once; empty if no edges were used, or if
+    the vehicle is not known to drive.
+
+    For a standing vehicle, what stands still in its images is the whole scene. For a driving one, what stands still are
+    the lines along its road, and any two of those fit each other. On 25 simulated drives, most of them along motorways,
+    such lines bring wrong poses up to 13.7; right poses that are accepted are at 29 and more.
+    """
     if looks is None or not drives(pairs):
         return ()
     return (Metric("edges_once", looks.significance, limits.min_edges_once, at_least=True),)
 
 
 def intrinsics_metric(loosened: Sequence[Loosened], limits: VerdictConfig) -> tuple[Metric, ...]:
-    """How certainly another lens explains the window better than that of the rig; nothing where none was tried. One
-    that moves the edges by less than matters gains nothing."""
+    """How certainly another lens explains the window better than that of the rig; empty if none was tried. A lens that
+    hardly moves the edges (`Loosened.matters`) counts as 0."""
     return tuple(
         Metric(
             INTRINSICS_OFF,
@@ -114,8 +117,8 @@ def intrinsics_metric(loosened: Sequence[Loosened], limits: VerdictConfig) -> tu
 
 
 def _newton_step(curvature: Curvature, axes: slice) -> float:
-    """Largest |f'| / f'' over some axes, those not searched apart: how far away each axis alone puts its maximum;
-    infinite without one."""
+    """Largest |f'| / f'' over those of some axes that were searched: how far away each axis alone puts its maximum;
+    infinite if one has no maximum."""
     first, second = curvature.first_derivative[axes], curvature.second_derivative[axes]
     first, second = first[np.isfinite(first)], second[np.isfinite(first)]
     return float(np.max(np.abs(first) / second)) if (second > 0.0).all() else float("inf")
@@ -128,9 +131,9 @@ def judge(
     frames: int,
     details: Mapping[str, str] = MappingProxyType({}),
 ) -> Verdict:
-    """Equation (2) over the metrics of the objective and of its optimum. A window that is too uncertain because its
-    `frames` are worth few independent `looks` is told to need motion past other things. `details` say more of what a
-    metric means in this window, by its name."""
+    """Equation (2) over the metrics of the objective and of its optimum. If a window is too uncertain because its
+    `frames` are worth few independent `looks`, one reason more says that it needs motion past other things. `details`
+    holds, by the name of a metric, what its failure means in this window."""
     reasons = [
         Reason(
             metric.name,
