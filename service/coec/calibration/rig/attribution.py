@@ -1,15 +1,16 @@
-"""What several pairs of one vehicle say together of each of its sensors, look after look.
+"""What several pairs of one vehicle together say about each of its sensors, look after look.
 
-A knocked LiDAR moves the edges to all its cameras alike, a knocked camera its own alone: which sensors moved since the
-rig was last consistent is asked again every few seconds (`moves`), of steps at some times back (`steps`).
+A knocked LiDAR moves the edges to all its cameras alike; a knocked camera moves only its own. Every few seconds the
+question which sensors moved since the rig was last consistent is asked again (`moves`), about steps at several times in
+the past (`steps`).
 
-A sensor is named by two answers in a row, with a look in between, and by two of its pairs where it has as many: what a
-run of bad looks says of one pair, or one pair that was looked at before the others, the next look denies. Where two
-sensors are said to have moved at once it takes one answer more, for each: a bad look at one pair just after a sensor of
-many was knocked makes its other sensor seem to have moved as well. An accepted window is a witness of another kind:
-with it one answer suffices. And looks alone name no sensor whose every pair is with one that seems to have moved, too:
-all that speaks for it is that its pair steps otherwise than the rest, as a pair does whose looks at a knocked mount are
-bent. Of a camera beside the one LiDAR of a vehicle a window decides.
+A sensor is named (reported as moved) by two answers in a row, each of which knows of a new look at the sensor, and by
+looks at two of its pairs if it has as many. A run of bad looks at one pair, or one pair that was looked at before the
+others, is denied by the next look. An accepted window is another kind of witness: with it one answer suffices.
+
+Looks alone never name a sensor all of whose pairs are with sensors that also seem to have moved. All that speaks for
+such a sensor is that its pair steps otherwise than the rest, and so does a pair whose looks at a knocked mount are
+bent. So if the one LiDAR of a vehicle seems to have moved, a window decides whether a camera moved beside it.
 """
 
 from __future__ import annotations
@@ -32,40 +33,40 @@ from coec.calibration.types import Matrix4, Reason
 from coec.geometry import dense
 
 NAMED_AT = 0.95
-"""Probability from which a sensor is named, if it was before, and below whose complement it is called calibrated.
-Between: undecided."""
+"""A sensor that is at least so probable to have moved may be named; one below the complement is called calibrated.
+Between them it is undecided."""
 
 ANSWERS = 2
-"""In a row, that name a sensor."""
+"""How many answers in a row name a sensor."""
 
 LIKELY_AT = 0.5
-"""Probability from which a window confirms that a camera moved beside its LiDAR. Where looks at a camera were bent and
-its LiDAR alone was knocked, windows of drawn rigs say 0.01 to 0.1."""
+"""Probability from which a window confirms that a camera moved beside its LiDAR. If only the LiDAR was knocked and the
+looks at the camera were bent, windows of drawn rigs give 0.01 to 0.1."""
 
 CALM_AT = 0.5
-"""Probability of nobody, from which looks that grow old are taken for such of a right rig."""
+"""Probability that nobody moved, from which looks that grow old count as looks at a right rig."""
 
 NEWEST = 6
-"""Looks, the last of each edge, after each of which a step is looked for: of a LiDAR that was just knocked some edges
-tell already, and others were last looked at before."""
+"""A step is looked for after each of the so many newest last looks of the edges: just after a LiDAR is knocked, some of
+its edges show it already and others were last looked at before."""
 
 AGES_S = (10.0, 16.0, 26.0, 42.0, 68.0, 110.0)
-"""How long ago it is looked for otherwise, in steps that a robust mean bridges; and beyond these, before all looks that
-are kept."""
+"""How long ago a step is looked for otherwise, at intervals that a robust mean bridges; and beyond these, before all
+looks that are kept."""
 
 MOST_SUSPECTED = 4
-"""Times at which pairs by themselves think they stepped that are asked of, the earliest: a sensor that moves is
-suspected by its pairs within a few looks."""
+"""How many of the times at which pairs themselves suspect a step are tried, earliest first: the pairs of a sensor that
+moves suspect it within a few looks."""
 
 STEPPED2 = chi2_quantile(0.999, 6)
-"""Squared distance in standard deviations, from which an edge has stepped: one in a thousand does so by chance."""
+"""Squared distance in standard deviations from which an edge counts as stepped: one in a thousand does so by chance."""
 
 POOREST = 3.0
-"""Times the scatter of streets that looks of a poor one are off by, all alike: those at right mounts with the faintest
-contrast lie 2.6 of its standard deviations off (`monitor.dispersion`)."""
+"""A poor street displaces all looks by up to so many standard deviations of usual streets: looks at right mounts with
+the faintest contrast lie 2.6 of them off (`monitor.dispersion`)."""
 
 EVERY_S = 4.0
-"""Between two times that it is asked who moved: it takes 0.03 to 0.1 s of a core, and looks come faster than they
+"""Least time between two answers to who moved: one takes 0.03 to 0.1 s of a core, and looks come faster than they
 matter."""
 
 NS_PER_S = 1_000_000_000
@@ -74,7 +75,8 @@ BEFORE_ALL_NS = -(2**62)
 
 
 class SensorHealth(StrEnum):
-    """Of one sensor. `undecided`: something moved or is disturbed, and this may be it; `unknown`: nothing looked."""
+    """The state of one sensor. `undecided`: something moved or is disturbed, and it may be this sensor; `unknown`: no
+    look at it yet."""
 
     CALIBRATED = "calibrated"
     CAMERA_MOVED = "camera_moved"
@@ -89,7 +91,7 @@ class SensorState:
 
     Attributes:
         probability: that it moved.
-        moved: by how much, if it is in the likeliest set that moved.
+        moved: by how much it moved, if it is in the likeliest set of sensors that moved.
         reasons: why, in words; the first one says most.
     """
 
@@ -107,12 +109,12 @@ class RigState:
 
     Attributes:
         histories: of every edge, by name.
-        posterior: who moved, as of when that was last asked; None before the first look.
-        asked_ns: stamp of the look at which it was.
-        stepped_ns: the step in question lies before looks from this stamp on.
-        claimed: sensors as probable as those that are named, and by how many answers in a row that know of a new look
-            at them, no more than count.
-        named: those that moved.
+        posterior: the last answer to who moved; None before the first look.
+        asked_ns: stamp of the look after which who moved was last asked; windows leave it.
+        stepped_ns: the step in question lies before the looks from this stamp on.
+        claimed: the sensors that are probable enough to be named, each with the number of answers in a row that said so
+            and knew of a new look at it, `ANSWERS` at most.
+        named: the sensors that moved.
     """
 
     histories: Mapping[str, History]
@@ -124,19 +126,19 @@ class RigState:
 
     @property
     def calm(self) -> bool:
-        """Whether all looks up to now are those of a right rig."""
+        """Whether all looks up to now fit a right rig."""
         of = self.posterior
         return of is None or (of.nobody >= CALM_AT and all(p < CALM_AT for p in of.disturbed.values()))
 
 
 def begun(graph: RigGraph) -> RigState:
-    """Nothing was looked at: every edge is as the vehicle was built, as far as that is known."""
+    """The state before any look: every edge is as the vehicle was built, with unknown uncertainty."""
     return RigState({edge.name: History.at(edge.T_a_b, np.full(6, np.nan)) for edge in graph.edges})
 
 
 def served(state: RigState, edge: str, T_a_b: Matrix4, sigma: NDArray[np.float64]) -> RigState:
-    """A new pose (4, 4) is served for an edge, known to `sigma` (6,): steps of it are counted from there. Looks before
-    are of another mount, and are forgotten.
+    """The state after a new pose (4, 4), known to `sigma` (6,), is served for an edge. Steps of the edge are counted
+    from this pose. Earlier looks at the edge are of another mount and are forgotten.
 
     Raises:
         ValueError: there is no such edge.
@@ -147,12 +149,13 @@ def served(state: RigState, edge: str, T_a_b: Matrix4, sigma: NDArray[np.float64
 
 
 def settled(state: RigState) -> RigState:
-    """What was in question is answered for by what is served now: who moved is asked anew with the next look."""
+    """The state after an event is over, because what is served now accounts for it: the next look asks anew who
+    moved."""
     return RigState(state.histories)
 
 
 def stepped(state: RigState) -> tuple[str, ...]:
-    """Edges that lie elsewhere than before `stepped_ns`, by more than chance."""
+    """The edges that lie elsewhere since `stepped_ns` than before, by more than chance."""
     return tuple(
         name for name, history in state.histories.items() if history.looks and _stepped(history, state.stepped_ns)
     )
@@ -171,9 +174,11 @@ def after_look(state: RigState, graph: RigGraph, look: Look) -> RigState:
 
 
 def after_window(state: RigState, graph: RigGraph, look: Look) -> RigState:
-    """The state after an accepted window, as a look at the stamp of its first frame: who moved is asked at once, as the
-    pair may serve what it says from now on, and who moved then is asked no more. If it is of after the step, its answer
-    counts for as many as name a sensor of its edge; a camera whose LiDAR moved as well it has to name by itself.
+    """The state after an accepted window, given as a look at the stamp of its first frame.
+
+    Who moved is asked at once, because the pair may serve the window's pose from now on, and after that the question is
+    no longer asked. If the window begins after the step, its one answer is enough to name a sensor of its edge. A
+    camera whose LiDAR also seems to have moved is named only if the window says so by itself (`_likely_by`).
 
     Raises:
         ValueError: it is of no edge of the rig.
@@ -182,18 +187,19 @@ def after_window(state: RigState, graph: RigGraph, look: Look) -> RigState:
 
 
 def _with(state: RigState, look: Look) -> RigState:
-    """The state with one more look, of which nobody was asked."""
+    """The state with one more look, before anybody asks who moved."""
     if look.edge not in state.histories:
         raise ValueError(f"{look.edge}: no edge of this rig, it has {', '.join(sorted(state.histories))}")
     history = state.histories[look.edge]
     if not history.looks:
-        # Whoever looks has a bias of its own on this rig, however well the pose is known that is served.
+        # The estimator that looks has its own bias on this rig, however well the served pose is known.
         history = History.at(history.origin, np.hypot(np.nan_to_num(history.sigma), BIAS_TIMES * look.rig))
     return replace(state, histories={**state.histories, look.edge: history.after(look, state.calm)})
 
 
 def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
-    """Who moved, by all looks? `window` is what an accepted one says that is among them, if that is why it is asked."""
+    """The state after asking who moved, by all looks. `window` is the look of an accepted window among them, if the
+    window is the reason to ask."""
     histories = state.histories
     times_ns = _times_ns(histories, state.stepped_ns)
     posterior = _posterior(histories, times_ns, graph)
@@ -201,7 +207,7 @@ def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
     probable = _probable(posterior)
     hidden = {name for name in probable if _is_hidden(name, probable, graph)}
     confirmed: set[str] = set()
-    if window is not None and window.stamp_ns >= stepped_ns:  # one of frames before tells of another mount
+    if window is not None and window.stamp_ns >= stepped_ns:  # a window of earlier frames is of another mount
         ends = {graph.edge[window.edge].a, graph.edge[window.edge].b}
         doubted = ends & hidden
         confirmed = ends - doubted
@@ -228,8 +234,8 @@ def _asked(state: RigState, graph: RigGraph, window: Look | None) -> RigState:
 def _likely_by(
     window: Look, histories: Mapping[str, History], times_ns: list[int], stepped_ns: int, graph: RigGraph
 ) -> set[str]:
-    """The sensors that likely moved by an accepted window in place of all looks at its edge since a stamp: these may be
-    bent alike, or of a poor street; it is another witness, with a search of its own."""
+    """The sensors that likely moved if an accepted window replaces all looks at its edge since `stepped_ns`. Those
+    looks may all be bent alike, or come from a poor street; the window is another witness, with a search of its own."""
     history = histories[window.edge]
     looks = tuple(look for look in history.looks if look.stamp_ns < stepped_ns or look is window)
     by_window = _posterior({**histories, window.edge: replace(history, looks=looks)}, times_ns, graph)
@@ -237,27 +243,31 @@ def _likely_by(
 
 
 def _probable(of: Posterior) -> tuple[str, ...]:
-    """Sensors that may be named."""
+    """The sensors that are probable enough to be named."""
     return tuple(name for name, p in of.sensors.items() if p >= NAMED_AT)
 
 
 def _is_hidden(name: str, probable: Collection[str], graph: RigGraph) -> bool:
-    """Whether every pair of a sensor is with another that may be named."""
+    """Whether every pair of a sensor is with another sensor that may be named."""
     far_ends = {edge.b if edge.a == name else edge.a for edge in graph.edges if name in (edge.a, edge.b)}
     return far_ends <= set(probable)
 
 
 def _is_news(name: str, graph: RigGraph, state: RigState) -> bool:
-    """Whether a pair of a sensor was looked at since who moved was last asked. A bad look does not become a better one
-    by what other pairs show of other sensors meanwhile."""
+    """Whether a pair of a sensor was looked at since the last answer. Without this, one bad look could count in several
+    answers while other pairs show other sensors."""
     pairs = (state.histories[edge.name].looks for edge in graph.edges if name in (edge.a, edge.b))
     return any(looks[-1].stamp_ns > state.asked_ns for looks in pairs if looks)
 
 
 def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], since_ns: int) -> bool:
-    """Whether two pairs of a sensor were looked at since a stamp. What a single one of several says may be its own,
-    such as a clock of one driver; another would deny it. A sensor with one pair is witnessed while that pair suspects a
-    move by itself, or if it stepped farther than a poor street bends all looks: nobody else tells the two apart."""
+    """Whether enough was seen of a sensor since a stamp to name it.
+
+    If it has several pairs, two of them must have been looked at: a single one may have a fault of its own, such as the
+    clock of one driver, which another pair would deny. If it has one pair, nothing else tells a small move from a
+    street that bends all looks a little. That pair must then suspect a move by itself, or have stepped farther than such a
+    street bends looks.
+    """
     of_pairs = [histories[edge.name] for edge in graph.edges if name in (edge.a, edge.b)]
     if len(of_pairs) > 1:
         return sum(bool(of.looks) and of.looks[-1].stamp_ns >= since_ns for of in of_pairs) >= 2
@@ -267,7 +277,8 @@ def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], 
 
 
 def _stepped(history: History, since_ns: int, place_times: float = 1.0) -> bool:
-    """Whether an edge lies elsewhere since a stamp, by more than chance; with so many times the scatter of streets."""
+    """Whether an edge lies elsewhere since a stamp than before, by more than chance, if streets scatter its looks by
+    `place_times` their usual standard deviation."""
     step = steps_at(history, [since_ns])
     place = np.max([look.place for look in history.looks], axis=0)
     covariance = step.covariance[0] + np.diag(2.0 * (place_times**2 - 1.0) * place**2)
@@ -276,9 +287,9 @@ def _stepped(history: History, since_ns: int, place_times: float = 1.0) -> bool:
 
 
 def _times_ns(histories: Mapping[str, History], stepped_ns: int) -> list[int]:
-    """Stamps of looks from which on they may lie after a step, the newest first: times that no look lies between are
-    one. The likeliest of the last answer, `stepped_ns`, and those since which pairs are suspected by themselves do not
-    drift as looks grow old, as ages do."""
+    """The stamps to try, newest first: the looks from each on may lie after a step. Times with no look between them are
+    one. The likeliest time of the last answer, `stepped_ns`, and the times since which pairs suspect themselves are
+    included because, unlike ages, they do not drift as looks grow old."""
     looked = [history.looks for history in histories.values() if history.looks]
     last_ns = sorted({looks[-1].stamp_ns for looks in looked}, reverse=True)
     aged_ns = [last_ns[0] - round(age_s * NS_PER_S) for age_s in AGES_S]
@@ -286,13 +297,13 @@ def _times_ns(histories: Mapping[str, History], stepped_ns: int) -> list[int]:
     suspected = sorted({looks[-1].stepped_ns for looks in looked if looks[-1].stepped_ns is not None})[:MOST_SUSPECTED]
     all_ns = sorted({look.stamp_ns for looks in looked for look in looks})
     first_after = (bisect_left(all_ns, at_ns) for at_ns in (*just_after, *aged_ns, stepped_ns, *suspected))
-    # From the first of all on is before all.
+    # The stamp of the very first look is the same as before all looks.
     found = {all_ns[place] for place in first_after if 0 < place < len(all_ns)}
     return sorted({last_ns[0], *found, BEFORE_ALL_NS}, reverse=True)
 
 
 def _posterior(histories: Mapping[str, History], times_ns: list[int], graph: RigGraph) -> Posterior:
-    # Levers and axes as they were before: what was built may be far from it.
+    # Levers and axes as they were before the step, because the rig may be far from how it was built.
     edges = [Edge(edge.name, edge.a, edge.b, histories[edge.name].pose) for edge in graph.edges]
     current = RigGraph.of(graph.sensors, edges, graph.links)
     return who_moved(current, {name: steps_at(history, times_ns) for name, history in histories.items()})

@@ -1,13 +1,14 @@
-"""What was known before some sensors moved, as far as it is true after it.
+"""What was known before some sensors moved and is still true after the move.
 
-A knocked LiDAR leaves the cameras where they were to one another, and of that all that was known before is worth as
-much as ever. A sensor that moved is two nodes of the graph therefore: where it was, and where it is. What was known of
-its pairs joins the first of these to the sensors that stood still; windows of since then join the second. Between the
-two stands nothing, so the move is told by all of its pairs together, and loops close that did not: each pair has to
-tell the same one.
+A knocked LiDAR leaves the cameras where they were to one another, so all that was known about that still holds.
+Therefore a sensor that moved is two nodes of the graph: where it was, and where it is. What was known of its pairs
+joins the first node to the sensors that stood still; windows from after the move join the second. Nothing joins the two
+nodes.
+So all pairs of the sensor determine the move together, and loops close that did not before: every pair has to show the
+same move.
 
-What was known is less sure now than it was: mounts creep with time, and a knock shakes the others, too. What the scenes
-of that time had in common is noise to the scenes of this one; how a lens is displaced lasts.
+What was known is less certain than it was, because mounts creep with time and a knock shakes the other mounts too.
+Errors that the scenes of that time had in common are noise beside the scenes of now; a displaced lens stays displaced.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ from coec.calibration.tracker import NS_PER_H, Measurement, creep_sigma
 from coec.config import TrackerConfig
 
 SHAKEN = np.array([radians(0.02)] * 3 + [0.003] * 3)
-"""(6,) standard deviation by which a knock shifts what lies between two sensors of which it moves neither (rad, m).
-Chosen: a third of what a window tells; a mount that is shifted by more was knocked itself, and the loops tell."""
+"""(6,) standard deviation by which a knock changes the pose between two sensors neither of which it moves (rad, m).
+Chosen: a third of the uncertainty of a window. A mount that shifts by more was itself knocked, which the loops show."""
 
 CREEP = creep_sigma(TrackerConfig())
-"""(6,) of a mount in an hour (rad, m): as pairs have it unless they are told otherwise."""
+"""(6,) standard deviation of the creep of a mount in an hour (rad, m): the default of the pairs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Before:
-    """What was known.
+    """What was known before a move.
 
     Attributes:
-        sensors: that moved since.
-        edges: of each that ends at one of them and was known, by name.
+        sensors: those that moved since.
+        edges: what was known of each edge that ends at one of them, by name.
     """
 
     sensors: tuple[str, ...]
@@ -47,19 +48,19 @@ class Before:
     def of(
         cls, sensors: tuple[str, ...], known: Mapping[str, Sequence[Measurement]], right_ns: int, stamp_ns: int
     ) -> Before:
-        """By what was known of each edge at several times, the oldest first, in so far as it is of up to `right_ns`,
-        when nothing had moved; as sure as it is at `stamp_ns`, when these sensors had."""
+        """From what was known of each edge at several times, oldest first: the latest up to `right_ns`, when nothing
+        had moved yet, with the uncertainty that it has at `stamp_ns`, when these sensors had moved."""
         right = {name: [one for one in of if one.stamp_ns <= right_ns] for name, of in known.items()}
         return cls(sensors, {name: remembered(of[-1], stamp_ns) for name, of in right.items() if of})
 
     @property
     def measured(self) -> Mapping[str, Measurement]:
-        """By the names of the graph's other edges."""
+        """What was known, by the names that `joined` gives its edges."""
         return {was(name): known for name, known in self.edges.items()}
 
     def joined(self, graph: RigGraph) -> RigGraph:
-        """The graph with the sensors that moved as two nodes each, and what was known as edges of their own. Links
-        between sensors of one bar held before as they do now."""
+        """The graph with two nodes for each sensor that moved, and with extra edges for what was known. Links at those
+        sensors are doubled too, because a bar held before the move as it does now."""
         old = {name: was(name) if name in self.sensors else name for name in graph.place}
         sensors = [Sensor(was(sensor.name), sensor.kind) for sensor in graph.sensors if sensor.name in self.sensors]
         edges = [
@@ -72,7 +73,7 @@ class Before:
             for link in graph.links
             if {link.a, link.b} & set(self.sensors)
         ]
-        # No sensor is new: what bounds their number bounds these.
+        # No sensor is new: the limit on the number of sensors bounds these nodes, too.
         return RigGraph(
             tuple(sorted((*graph.sensors, *sensors), key=lambda sensor: sensor.name)),
             tuple(sorted((*graph.edges, *edges), key=lambda edge: edge.name)),
@@ -81,7 +82,7 @@ class Before:
 
 
 def remembered(known: Measurement, stamp_ns: int) -> Measurement:
-    """What was known of a pair as of its own stamp, as sure as it is at another, `stamp_ns`, on which a knock lies in
+    """What was known of a pair at its own stamp, with the uncertainty that it has at `stamp_ns`, after a knock in
     between."""
     hours = max(stamp_ns - known.stamp_ns, 0) / NS_PER_H
     uncertainty = known.uncertainty

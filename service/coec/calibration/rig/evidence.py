@@ -1,4 +1,5 @@
-"""What a look at one edge says, whatever looked: a window (strong, minutes apart) or a check (quick, seconds apart)."""
+"""What one look at an edge says, whatever made it: a window (strong, minutes apart) or a check (quick, seconds
+apart)."""
 
 from __future__ import annotations
 
@@ -22,12 +23,12 @@ from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
 
 BIAS_TIMES = 2.0
-"""Times the bias that looks of a rig usually have, to which the first of them are trusted, and a window beside them:
-that of the next rig may be larger than those of the few which are known, and a bias is no move."""
+"""The first looks of a rig, and a window beside them, are trusted only to so many times the usual bias of looks: the
+next rig may have a larger bias than the few that are known, and a bias must not pass for a move."""
 
 LEAST_SIGMA, MOST_SIGMA = 1e-6, 10.0
-"""Standard deviations that a look is trusted to at most and at least, rad or m: beyond, its numbers are no evidence but
-a fault of whoever sent them; from the upper one on an axis counts as not told."""
+"""Limits of the standard deviation of a look, rad or m. Below the lower one its numbers are no evidence but a fault of
+the sender; from the upper one on an axis counts as not determined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,14 +39,14 @@ class Look:
         edge: its name.
         stamp_ns: sensor time of the last pair of frames.
         T_a_b: (4, 4).
-        information: (6, 6) inverse of the covariance of what is new at every look, about the axes of a; zero on axes
-            that are not told.
-        place: (6,) standard deviation of what neighbouring looks share and other places do not.
-        rig: (6,) of what no place tells: the bias of whoever looks, as far as it is unknown.
-        share: how far it counts, 0 to 1: by the part of its frames that no look before it held.
-        weak: whether it has little to go by, and may lie anywhere.
-        stepped_ns: stamp of the first frame since which whoever looks at this edge alone has something against it; None
-            while it has nothing. Only where a step is looked for.
+        information: (6, 6) inverse of the covariance of the error that is new at every look, about the axes of a; zero
+            on axes that are not determined.
+        place: (6,) standard deviation of the error that neighbouring looks share and looks elsewhere do not.
+        rig: (6,) standard deviation of the error that is the same everywhere: the unknown bias of the estimator.
+        share: how much it counts, 0 to 1: the part of its frames that no earlier look held.
+        weak: whether it has little evidence, and may lie anywhere.
+        stepped_ns: stamp of the first frame since which the pair by itself suspects a step; None if it suspects none.
+            It only says at which times to look for a step.
     """
 
     edge: str
@@ -60,20 +61,22 @@ class Look:
 
     @property
     def log_bad(self) -> float:
-        """Logarithm of the share of such looks that are bad."""
+        """Logarithm of the share of bad looks among looks such as this."""
         return log(BAD_SHARE_WEAK if self.weak else BAD_SHARE)
 
     @property
     def log_bad_again(self) -> float:
-        """That it is bad once more where the one before it was, which was bad."""
+        """Logarithm of the chance that it is bad in the same place as the look before it, if that one was bad."""
         return log(BAD_SHARE_WEAK * SAME_AGAIN_WEAK if self.weak else BAD_AFTER_BAD * SAME_AGAIN)
 
 
 def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6, 6) inverse of a covariance (6, 6) over the axes that it tells (finite, below `MOST_SIGMA`), zero elsewhere.
+    """(6, 6) inverse of a covariance (6, 6) over the axes that it determines (finite, below `MOST_SIGMA`), zero
+    elsewhere.
 
     Raises:
-        ValueError: it has another shape or tells no axis; what it tells is not positive definite or absurdly small.
+        ValueError: it has another shape, determines no axis, is not symmetric and positive definite on those axes, or
+            is absurdly small there.
     """
     if covariance.shape != (6, 6):
         raise ValueError(f"a covariance must have the shape (6, 6), got {covariance.shape}")
@@ -98,18 +101,18 @@ def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 def of_check(
     edge: str, T_served: Matrix4, observation: Observation, share: float = 1.0, stepped_ns: int | None = None
 ) -> Look | None:
-    """What a check of the pose `T_served` (4, 4) says; None where it says nothing of the mount: the data were at fault,
-    or it holds no frame that is new. `stepped_ns` is since when the pair is suspected by itself, see `Look`.
+    """The look that a check of the pose `T_served` (4, 4) is; None if the check says nothing of the mount, because the
+    data were at fault, it holds no new frame, or it determines no axis. For `stepped_ns` see `Look`.
 
     Raises:
-        ValueError: the pose is not rigid, or the offset no six numbers.
+        ValueError: the pose is not rigid, or the offset is not six numbers.
     """
     _rigid(edge, T_served)
     if observation.causes or not share > 0.0:
         return None
     offset, variance = np.zeros(6), np.full(6, np.inf)
     place, rig = np.zeros(6), np.zeros(6)
-    # Looks of poor scenes are among the bad ones here, whose share was learned with the scatter of a street for all.
+    # Here looks at poor scenes count among the bad ones: their share was learned with the scatter of a street for all.
     observation = replace(observation, dispersion=1.0)
     for axes in (slice(0, 3), slice(3, 6)):
         told = told_by(observation, axes, None)
@@ -132,11 +135,13 @@ def of_check(
 
 
 def of_window(edge: str, window: Measurement) -> Look | None:
-    """What an accepted window says; None where it tells no axis. Its frames share a street, so what they have in common
-    counts as noise here. So does the bias of the estimator: that of checks is another, and beside them it is a step.
+    """The look that an accepted window is; None if the window determines no axis.
+
+    Its frames share a street, so the errors that they have in common count as noise here. So does the bias of the
+    estimator: checks have another bias, and the difference would look like a step.
 
     Raises:
-        ValueError: the pose is not rigid, or the covariance no covariance.
+        ValueError: the pose is not rigid, or the covariance is invalid.
     """
     _rigid(edge, window.T_camera_lidar)
     if not window.told_axes():

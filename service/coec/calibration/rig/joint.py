@@ -1,12 +1,13 @@
-"""Where everything is: the windows of all pairs of one time, combined over the graph (`system`).
+"""Where everything is: combines the windows of all pairs at one time over the graph (`system`).
 
-Do the pairs fit each other? The squared residuals are χ² distributed with as many degrees of freedom as there are loops
-to close, six each. Where they are not, the edge without which they are is left out, if it is the only one (Baarda's
-test); if several would do, nothing is left out, all loops are told that do not close, and what is claimed widens by
-what they miss (Birge 1932).
+If the pairs fit each other, the squared residuals are χ² distributed with six degrees of freedom for each loop to
+close. If they are not, the edge without which they are is left out, provided that it is the only such edge (Baarda's
+test). If
+several would do, nothing is left out: all loops that do not close are reported, and all standard deviations widen by
+what the loops miss (Birge 1932).
 
-After a move of a sensor, what was known before it is in the graph beside the windows of since then (`before`): loops
-close then that do not otherwise, as those between the cameras of a single LiDAR.
+After a move of a sensor, the graph also holds what was known before the move (`before`). That closes loops which are
+not there otherwise, such as those between the cameras of a single LiDAR.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from coec.geometry import dense, se3
 Array = NDArray[np.float64]
 
 INCONSISTENT_AT = 1e-3
-"""Chance of a sum of squares, below which the pairs do not fit each other: once in a thousand windows by chance, fifty
-hours of them."""
+"""Chance of a sum of squares below which the pairs do not fit each other: by chance that happens once in a thousand
+windows, which is fifty hours."""
 
 ALONE_BY = 12.0
-"""By how much more leaving out one edge lowers the sum of squares than leaving out any other, for it to be the only one
-at fault: odds of 400 to 1."""
+"""An edge alone is at fault if leaving it out lowers the sum of squares by so much more than leaving out any other
+does: odds of 400 to 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,9 +42,9 @@ class Loop:
     """A way along edges and links that ends where it begins.
 
     Attributes:
-        names: of these, in their order.
-        rotation_rad, translation_m: by how much it does not close.
-        chance: of an error that large or larger.
+        names: of the edges and links, in their order.
+        rotation_rad, translation_m: the error by which the loop does not close; NaN if not all axes were determined.
+        chance: probability of an error at least as large.
     """
 
     names: tuple[str, ...]
@@ -54,19 +55,20 @@ class Loop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointEstimate:
-    """The rig.
+    """The rig, as all windows together put it.
 
     Attributes:
         stamp_ns: of the newest window in it.
-        poses: T_sensor_rig (4, 4) of each sensor, by name, the rig held by where the vehicle was built.
+        poses: T_sensor_rig (4, 4) of each sensor, by name; the gauge is where the vehicle was built.
         T_a_b: (4, 4) of each edge of the graph, measured or not, by name.
         covariance: (6·E, 6·E) of the perturbations of all edges about the axes of their first sensors, in the order of
-            `T_a_b`: those between edges included. Where nothing measured an edge it is as wide as `system.BUILT`.
-        measured: edges that a window told.
-        chi2, freedom, chance: how well all windows fit each other: the sum of squares, its degrees of freedom, 0 where
-            no loop closes, and the chance of one as large.
-        left_out: the edge that alone did not fit, if one was; `chi2` is that with it. After a move it may be what was
-            known of that edge before which does not fit what is now: then its window is not left out.
+            `T_a_b`, including the covariances between edges. An edge that nothing measured is as wide as
+            `system.BUILT`.
+        measured: edges that a window measured.
+        chi2, freedom, chance: how well all windows fit each other: the sum of squares, its degrees of freedom (0 if no
+            loop closes), and the chance of a sum as large.
+        left_out: the edge that alone did not fit, if there is one; `chi2` includes it. After a move, what was known of
+            that edge before may be what does not fit; then its window is not left out.
         open_loops: loops that do not close, the least likely first; `types.was` of a name is what was known before.
         widened: factor on all standard deviations, for what the loops miss.
     """
@@ -89,18 +91,18 @@ class JointEstimate:
         return self.chance >= INCONSISTENT_AT
 
     def between(self, edge: str, other: str) -> Array:
-        """(6, 6) covariance of the errors of two edges; of one and itself its own."""
+        """(6, 6) covariance of the errors of two edges; for the same edge twice, its own covariance."""
         order = list(self.T_a_b)
         i, j = 6 * order.index(edge), 6 * order.index(other)
         return self.covariance[i : i + 6, j : j + 6]
 
 
 def estimate(graph: RigGraph, windows: Mapping[str, Measurement], before: Before | None = None) -> JointEstimate:
-    """The rig from one window of each edge that has one, by its name, and from what was known `before` a move. Windows
-    that tell no axis are left aside.
+    """The rig from one window for each edge that has one, by its name, and from what was known `before` a move. Windows
+    that determine no axis are ignored.
 
     Raises:
-        ValueError: no window tells anything; one is of no edge; a pose is not rigid, or a covariance no covariance.
+        ValueError: no window determines anything; one is of no edge; a pose is not rigid, or a covariance is invalid.
     """
     if strange := sorted(set(windows) - set(graph.edge)):
         raise ValueError(f"{', '.join(strange)}: no edge of this rig, it has {', '.join(graph.edge)}")
@@ -142,9 +144,9 @@ def estimate(graph: RigGraph, windows: Mapping[str, Measurement], before: Before
 
 
 def _alone_at_fault(system: System, solution: Solution) -> str | None:
-    """The one edge without which the others fit, None if there is none or more than one. Links are taken for granted:
-    it is windows that fail. Where nothing tells the window of a pair from what was known of it before a move, that is
-    the one: what a pair says by itself stands."""
+    """The one edge without which the others fit; None if there is none, or more than one. Links are taken for granted,
+    because it is windows that fail. If leaving out the window of a pair helps as much as leaving out what was known of
+    the pair before a move, the latter is left out: what a pair says by itself stands."""
     measured = [one.known.name for one in system.measured if one.known.name in system.graph.edge]
     without = {name: system.solved(frozenset({name})) for name in measured}
     by_gain = sorted(measured, key=lambda name: (without[name].chi2, name))
@@ -153,7 +155,7 @@ def _alone_at_fault(system: System, solution: Solution) -> str | None:
     if best.freedom and chi_square_tail(best.chi2, best.freedom) < INCONSISTENT_AT:
         return None
     if not best.freedom and solution.freedom <= 6:
-        return None  # nothing is left that could speak for the others
+        return None  # nothing is left that could confirm the others
     as_good = [name for name in by_gain if without[name].chi2 - best.chi2 < ALONE_BY]
     if any(whose(name) != whose(first) for name in as_good):
         return None
@@ -161,7 +163,7 @@ def _alone_at_fault(system: System, solution: Solution) -> str | None:
 
 
 def _open_loops(system: System) -> tuple[Loop, ...]:
-    """The shortest loop through each edge and link, of those that do not close."""
+    """Those loops that do not close, out of the shortest loop through each edge and link."""
     measured = {one.known.name: one for one in system.measured}
     ways = [system.graph.loop_through(name, list(measured)) for name in measured]
     found: dict[frozenset[str], tuple[str, ...]] = {}
@@ -169,12 +171,12 @@ def _open_loops(system: System) -> tuple[Loop, ...]:
         if way is not None:
             found.setdefault(frozenset(way), way)
     loops = [_closed([measured[name] for name in way]) for way in found.values()]
-    at = INCONSISTENT_AT / max(len(loops), 1)  # one of many is unlikely by chance
+    at = INCONSISTENT_AT / max(len(loops), 1)  # one of many loops may fail to close by chance
     return tuple(sorted((loop for loop in loops if loop.chance < at), key=lambda loop: (loop.chance, loop.names)))
 
 
 def _closed(way: Sequence[Measured]) -> Loop:
-    """What is left of a way along all of these, from the second end of the first one back to it."""
+    """The error left after a way along all of these, from the second end of the first one back to it."""
     here, at = np.eye(4), way[0].known.b
     covariance, told = np.zeros((6, 6)), np.ones(6, np.bool_)
     for one in way:

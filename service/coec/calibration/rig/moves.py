@@ -1,20 +1,20 @@
-"""Who moved? Every set of one or two sensors, and nobody, against the steps of all edges.
+"""Who moved? Weighs every set of one or two sensors, and nobody, against the steps of all edges.
 
-Given a set S that moved by x, an edge stepped by ξ = J·x + noise, those that S does not touch by noise alone; and any
-edge may be disturbed by itself, its step then being anywhere within reach. The marginal likelihood of S is a Gaussian
+If a set S moved by x, each edge that S touches stepped by ξ = J·x + noise, and every other edge by noise alone. Any
+edge may also be disturbed by itself; its step is then anywhere within reach. The marginal likelihood of S is a Gaussian
 integral over x, summed over which edges were disturbed and over how far mounts move:
 
     BF(S) = Σ over D, k   w_k · Π over e in D (ε_e · p_disturbed(ξ_e) / p(ξ_e)) · |1 + P_k·Λ|^(-1/2)
                           · exp(½ · ηᵀ·(P_k⁻¹ + Λ)⁻¹·η)        Λ = Σ Jᵀ·W·J, η = Σ Jᵀ·W·ξ over the other edges
 
-against nobody and no edge disturbed. It pays for each axis that a set sets free (Occam's factor: MacKay 2003, chapter
-28), so the fewest moves win that explain all. How far a mount moves is `search.mount_prior`: a Cauchy density in three
-dimensions is a mixture of normal ones whose scales are MOUNT_RAD over the modulus of a standard normal variable; some
-quantiles of that stand for all.
+relative to nobody moved and no edge disturbed. A set pays for each axis that it sets free (Occam's factor: MacKay 2003,
+chapter 28), so the fewest moves that explain all steps win. How far a mount moves follows `search.mount_prior`: a
+Cauchy density in three dimensions is a mixture of normal ones whose scales are MOUNT_RAD over the modulus of a standard
+normal variable; a few quantiles stand for all scales.
 
 Two sets can leave the very same pattern on all edges that were looked at, as the camera and the LiDAR of a single pair
-do. No evidence tells these apart, and what small lever arms and priors would whisper is not listened to: they share
-their probability evenly.
+do. No evidence tells such sets apart, so they share their probability evenly; the slight preferences that lever arms
+and priors would give are ignored.
 """
 
 from __future__ import annotations
@@ -38,41 +38,42 @@ from coec.geometry import dense, se3
 Array = NDArray[np.float64]
 
 SCALES = 4
-"""Quantiles that stand for the scales of the mount prior: σ = 0.33, 0.56, 1.0 and 3.2°; 25° are eight of the largest,
-which the next look outweighs."""
+"""Quantiles that stand for the scales of the mount prior: σ = 0.33, 0.56, 1.0 and 3.2°. A knock of 25° is eight of the
+largest, which the next look outweighs."""
 
 M_PER_RAD = TRANSLATIONS.moves[-1][0] / ROTATIONS.moves[-1][0]
-"""How far a knock shifts what it turns by one radian, as the change detector has it: 10 cm at 2°."""
+"""How far a knock shifts what it turns by one radian, as in the change detector: 10 cm at 2°."""
 
 EVENT_HOURS = 1000.0
 """Hours of driving between two knocks of any kind. Chosen: a fleet's workshop sees a mount bent about once a year."""
 
 LOOK_BACK_HOURS = 120.0 / 3600.0
-"""Within which a step is looked for: as long as looks are kept apart."""
+"""How far back a step is looked for: as long as looks are kept apart."""
 
 TWO_SHARE, EDGE_SHARE = 0.1, 0.01
-"""Of such events that move two sensors, and that are of one edge alone and last (a clock of one driver, a curtain of
-spray before one pair). Chosen; the rest is of one sensor."""
+"""Shares of such events that move two sensors, and that lastingly disturb one edge alone (a clock of one driver, a
+curtain of spray before one pair). Chosen; the rest move one sensor."""
 
 LINK_BREAKS = 0.01
-"""Of knocks to a bar that bend it. Chosen."""
+"""Share of knocks to a bar that bend it. Chosen."""
 
 SEEN = 0.5
-"""Good looks since, from which an edge counts as looked at."""
+"""Good looks since the step from which an edge counts as looked at."""
 
 SAME_SPAN = 1e-6
-"""Of the length of a pattern, by which it may miss the span of others and still lie in it: far above rounding."""
+"""Share of its length by which a pattern may miss the span of others and still lie in it: far above rounding."""
 
 ANY_TWO = log(1e-3)
-"""Log odds of any one sensor against nobody, from which two are looked at: below, neither of two says enough."""
+"""Log odds of any one sensor against nobody from which sets of two are tried: below them, neither of two says
+enough."""
 
 CONTENDER = 0.005
-"""Probability of a set, from which it is compared with others that leave the same pattern."""
+"""Probability of a set from which it is compared with others that leave the same pattern."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mover:
-    """What moves as one: a sensor, or all that are on one bar."""
+    """What moves as one: a sensor, or all sensors on one bar."""
 
     sensors: tuple[str, ...]
 
@@ -94,12 +95,12 @@ class Posterior:
     """What is believed of who moved.
 
     Attributes:
-        nobody: probability.
-        sets: the sensors of each set that is worth a word, and its probability; likeliest first.
-        sensors: probability that it moved, by name.
-        disturbed: that something else than a sensor lastingly disturbs an edge, by name.
-        steps: of each sensor in the likeliest set.
-        when: which of the times is the likeliest.
+        nobody: probability that nobody moved.
+        sets: the sensors of each set with a probability of at least `CONTENDER`, and that probability; likeliest first.
+        sensors: probability that each sensor moved, by name.
+        disturbed: probability that something other than a sensor lastingly disturbs an edge, by name.
+        steps: by how much each sensor in the likeliest set moved, by name.
+        when: index of the likeliest time.
         looked_at: edges that were looked at since.
     """
 
@@ -126,14 +127,15 @@ def movers(graph: RigGraph) -> tuple[Mover, ...]:
 
 
 def patterns(graph: RigGraph, of: Sequence[Mover]) -> Array:
-    """(M, E, 6, 6) how each edge and link, in their order, steps as each mover moves about the axes of its first
-    sensor, at the poses of the graph."""
+    """(M, E, 6, 6) how each edge and link, in the order of the graph, steps as each mover moves about the axes of its
+    first sensor, at the poses of the graph."""
     poses = dict(zip((sensor.name for sensor in graph.sensors), graph.poses, strict=True))
     return np.array([[_pattern(known, mover, poses) for known in graph.known] for mover in of])
 
 
 def who_moved(graph: RigGraph, steps: Mapping[str, Steps]) -> Posterior:
-    """The posterior over all sets, from what each edge says of a step at each of the same T times, all as likely."""
+    """The posterior over all sets, from what each edge says of a step at each of the same T times. All times are
+    equally likely beforehand."""
     rows = _Rows.of(graph, steps)
     moving = movers(graph)
     design = patterns(graph, moving)
@@ -150,7 +152,7 @@ def who_moved(graph: RigGraph, steps: Mapping[str, Steps]) -> Posterior:
     log_nobody = rows.base + rows.either.sum(axis=1) + np.log1p(-np.exp(_log_event()))
     excess = np.logaddexp.reduce((log_prior + log_sets).ravel()) - np.logaddexp.reduce(log_nobody)
     if twos and excess > ANY_TWO:
-        # Of two that moved, one alone says something already.
+        # If two moved, one of them alone already says something.
         speaks = log_sets.max(axis=0) > log_nobody.max()
         twos = [(m, n) for m, n in twos if speaks[m] or speaks[n]]
         if twos:
@@ -191,11 +193,11 @@ class _Rows:
     xi: Array  # (T, E, 6)
     information: Array  # (T, E, 6, 6) inverse covariance of a step that is noise
     ratio: Array  # (T, E) log density of the step were it disturbed, over that of noise
-    log_disturbed: Array  # (T, E) prior of that
+    log_disturbed: Array  # (T, E) log prior of a disturbance
     lasting: Array  # (T, E) share of that prior that is not a transient
     looked_at: NDArray[np.bool_]  # (E,) since any of the times
-    log_still: Array  # (T, E) likelihood of all looks at one place, over that of a step by noise alone
-    base: Array  # (T,) of a step of all edges by noise alone, over that of all at one place
+    log_still: Array  # (T, E) log likelihood of all looks at one place, over that of a step by noise alone
+    base: Array  # (T,) log likelihood of a step of all edges by noise alone, over that of all at one place
 
     @property
     def undisturbed(self) -> Array:
@@ -209,8 +211,8 @@ class _Rows:
 
     @property
     def either(self) -> Array:
-        """(T, E) of an edge whose sensors stand still: noise, such as another street, or some bad looks; or a
-        disturbance."""
+        """(T, E) log likelihood of an edge whose sensors stand still: either noise, such as another street or some bad
+        looks, or a disturbance."""
         return np.logaddexp(self.undisturbed + np.logaddexp(0.0, self.log_still) - log(2.0), self.bent)
 
     @property
@@ -235,11 +237,11 @@ class _Rows:
             covariance.append(np.tile(np.diag(2.0 * link.sigma**2), (times, 1, 1)))
             seen.append(np.ones(times))
             transient.append(np.full(times, -np.inf))
-            # Nothing was seen of it: noise alone and no step are one.
+            # No look is at a link: noise alone and no step are the same.
             stepped.append(np.full(times, 3.0 * log(2.0 * pi) + 0.5 * float(np.sum(np.log(2.0 * link.sigma**2)))))
         step, cov = np.stack(xi, axis=1), np.stack(covariance, axis=1)
         looked = np.stack(seen, axis=1) >= SEEN
-        # A turn is linear in a move to its square, a shift by lever arms of about a metre.
+        # Linearising a move errs by half the square of its turn; for shifts, with lever arms of about a metre.
         angle2 = np.sum(step[..., :3] ** 2, axis=-1)
         cov = cov + (0.5 * angle2[..., None] * np.ones(6))[..., None] ** 2 * np.eye(6)
         factor = dense.cholesky(cov)
@@ -255,7 +257,8 @@ class _Rows:
         edges = len(graph.edges)
         lasting = np.full(step.shape[:2], log(LINK_BREAKS))
         lasting[:, :edges] = _log_event() + log(EDGE_SHARE / max(edges, 1))
-        # Without a look since, nothing was disturbed for a while: such an edge says neither for nor against anybody.
+        # Without a look since, no transient disturbance is assumed: such an edge speaks neither for nor against
+        # anybody.
         for_a_while = np.where(looked, np.stack(transient, axis=1), -np.inf)
         prior = np.minimum(np.logaddexp(lasting, for_a_while), log(0.999))
         return cls(
@@ -272,11 +275,11 @@ class _Rows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pulls:
-    """What each edge says of each mover, and of each two together: Jᵀ·W·J and Jᵀ·W·ξ."""
+    """What each edge says of each mover, and of every two movers together: Jᵀ·W·J and Jᵀ·W·ξ."""
 
     precision: Array  # (T, M, M, E, 6, 6)
     moment: Array  # (T, M, E, 6)
-    touched: NDArray[np.bool_]  # (M, E) by a move of it, of edges that were looked at
+    touched: NDArray[np.bool_]  # (M, E) whether a move of the mover displaces the edge, and the edge was looked at
 
     @classmethod
     def of(cls, design: Array, rows: _Rows) -> _Pulls:
@@ -288,7 +291,7 @@ class _Pulls:
         )
 
     def together(self, sets: Sequence[tuple[int, ...]]) -> tuple[Array, Array]:
-        """Of sets of one size n: (T, S, E, 6n, 6n) and (T, S, E, 6n)."""
+        """Precision (T, S, E, 6n, 6n) and moment (T, S, E, 6n) for S sets of the same size n."""
         times, edges, size = self.moment.shape[0], self.moment.shape[2], 6 * len(sets[0])
         precision = np.zeros((times, len(sets), edges, size, size))
         moment = np.zeros((times, len(sets), edges, size))
@@ -301,10 +304,10 @@ class _Pulls:
 
 
 def _evidence(sets: Sets, rows: _Rows, pulls: _Pulls) -> tuple[Array, Array]:
-    """Of each set of one size, at each time: log marginal likelihood (T, S) over that of nobody and nothing disturbed,
-    and the probability that each edge is lastingly disturbed (T, S, E).
+    """For sets of the same size, at each time: the log marginal likelihood (T, S) over that of nobody moved and nothing
+    disturbed, and the probability that each edge is lastingly disturbed (T, S, E).
 
-    Of the edges that a set touches none is disturbed, or one, or with the likeliest one another.
+    Of the edges that a set touches, these cases count: none is disturbed; one is; the likeliest one and one more are.
     """
     precision, moment = pulls.together(sets)
     times, edges = rows.ratio.shape
@@ -316,7 +319,7 @@ def _evidence(sets: Sets, rows: _Rows, pulls: _Pulls) -> tuple[Array, Array]:
         found[place].append(_Case(out, log_evidence))
     cases = []
     for place, of_set in enumerate(found):
-        if len(of_set) < 4:  # with two of two disturbed nothing speaks for the set
+        if len(of_set) < 4:  # if both of two edges are disturbed, nothing speaks for the set
             continue
         worst = max(of_set[1:], key=lambda case: float(case.log_evidence.max())).out[0]
         cases += [(place, (worst, *case.out)) for case in of_set[1:] if case.out[0] != worst]
@@ -349,7 +352,7 @@ def _marginal(
     rows: _Rows,
     touched: NDArray[np.bool_],
 ) -> Array:
-    """(T, C) log evidence of each case, a set by its number and the edges that are disturbed, at each time."""
+    """(T, C) log evidence of each case at each time. A case is the number of a set and the edges that are disturbed."""
     if not cases:
         return np.zeros((len(rows.xi), 0))
     places = [place for place, _ in cases]
@@ -371,7 +374,7 @@ def _marginal(
 
 
 def _variances() -> list[Array]:
-    """(6,) of a move, for each scale of the mount prior."""
+    """(6,) variances of a move, for each scale of the mount prior."""
     scales = [MOUNT_RAD / normal_quantile(0.5 + 0.5 * (k + 0.5) / SCALES) for k in range(SCALES)]
     return [np.array([s] * 3 + [s * M_PER_RAD] * 3) ** 2 for s in scales]
 
@@ -387,7 +390,7 @@ def _names(moving: Sequence[Mover], one: tuple[int, ...]) -> tuple[str, ...]:
 def _pattern(known: Known, mover: Mover, poses: Mapping[str, Array]) -> Array:
     origin = se3.inverse(poses[mover.sensors[0]])
     a_moves, b_moves = known.a in mover.sensors, known.b in mover.sensors
-    if a_moves == b_moves:  # a bar that moves as a whole leaves what lies between its ends
+    if a_moves == b_moves:  # a bar that moves as a whole does not change what lies between its ends
         return np.zeros((6, 6))
     if a_moves:
         return se3.adjoint(poses[known.a] @ origin)
@@ -395,10 +398,10 @@ def _pattern(known: Known, mover: Mover, poses: Mapping[str, Array]) -> Array:
 
 
 def _shared(sets: Sequence[tuple[int, ...]], probability: Array, design: Array, looked_at: NDArray[np.bool_]) -> Array:
-    """(S,) the probabilities, those of sets that leave one pattern shared evenly between the smallest of them."""
+    """(S,) the probabilities; sets that leave the same pattern pool theirs, shared evenly by the smallest of them."""
     contenders = [number for number in range(len(sets)) if probability[number] >= CONTENDER]
     moves_row = np.abs(design).max(axis=(2, 3)) > 0.0
-    # Sets that leave one pattern touch the same edges: few are left to compare.
+    # Sets that leave the same pattern touch the same edges, so few are left to compare.
     touched = [tuple((moves_row[list(one)].any(axis=0) & looked_at).tolist()) for one in sets]
     shared, done = probability.copy(), set[int]()
     for number in contenders:
@@ -432,7 +435,7 @@ def _span(one: tuple[int, ...], design: Array, looked_at: NDArray[np.bool_]) -> 
 
 
 def _same(one: Array, other: Array) -> bool:
-    """Whether two bases of as many vectors span the same."""
+    """Whether two bases span the same space."""
     if one.shape != other.shape:
         return False
     missed = other - dense.product(one, dense.product(one.T, other))
@@ -442,7 +445,7 @@ def _same(one: Array, other: Array) -> bool:
 def _steps(
     rows: _Rows, t: int, design: Array, one: tuple[int, ...], moving: Sequence[Mover], graph: RigGraph
 ) -> dict[str, Moved]:
-    """By how much each sensor of a set moved, had it: edges that do not fit count less, as in a mixture."""
+    """By how much each sensor of a set moved, if the set did. Edges that do not fit count less, as in a mixture."""
     size, variance = 6 * len(one), np.tile(_variances()[0], len(one))
     columns = np.concatenate([design[m] for m in one], axis=2)  # (E, 6, size)
     weight = np.ones(columns.shape[0])
@@ -459,7 +462,7 @@ def _steps(
         away = rows.xi[t] - dense.applied(columns, x)
         q = dense.squared(rows.information[t], away)
         whole = dense.squared(rows.information[t], rows.xi[t])
-        # Of noise about the move, against a disturbance by itself.
+        # Odds of a disturbance by itself against noise about the move.
         log_odds = rows.log_disturbed[t] + rows.ratio[t] - 0.5 * whole + 0.5 * q
         weight = 1.0 / (1.0 + np.exp(np.clip(log_odds, -50.0, 50.0)))
     poses = dict(zip((sensor.name for sensor in graph.sensors), graph.poses, strict=True))

@@ -1,7 +1,7 @@
-"""What the rig has against a pair: one thing at a time, whatever is going on.
+"""What the rig has against a pair: one objection at a time, whatever is going on.
 
-Windows of a rig that just moved do not fit those of before: while that is in question it is a suspicion, once a sensor
-is named it is a move, and only where neither is so do pairs contradict each other.
+Windows of a rig that just moved do not fit those of before. While that is in question the objection is a suspicion;
+once a sensor is named it is a move; only if neither holds do the pairs contradict each other.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from coec.calibration.rig.vehicle import VehicleRig, pairs_of, renewed
 
 
 class Objection(StrEnum):
-    """`moved`: a sensor of it was named, and it serves what was before. `suspected`: windows of the rig do not fit each
-    other, and a sensor of it may have moved. `inconsistent`: they do not, and no sensor did."""
+    """`moved`: a sensor of the pair was named, and the pair still serves a pose of before the move. `suspected`: the
+    windows of the rig do not fit each other, and a sensor of the pair may have moved. `inconsistent`: the windows do
+    not fit each other, and no sensor moved."""
 
     MOVED = "moved"
     SUSPECTED = "suspected"
@@ -23,7 +24,7 @@ class Objection(StrEnum):
 
 
 def objections(rig: VehicleRig) -> Mapping[str, Objection]:
-    """By pair; of those that fit there is none."""
+    """The objection to each pair, by name; a pair that fits has none."""
     found = dict.fromkeys(misfits(rig), Objection.INCONSISTENT)
     undecided = {sensor.name for sensor in rig.sensors if sensor.health is SensorHealth.UNDECIDED}
     for name in found:
@@ -38,7 +39,7 @@ def objections(rig: VehicleRig) -> Mapping[str, Objection]:
 
 
 def misfits(rig: VehicleRig) -> tuple[str, ...]:
-    """Edges that do not fit the others: the one that alone does not, else all on loops that do not close."""
+    """Edges that do not fit the others: the only one at fault if there is one, else all on loops that do not close."""
     joint = rig.joint
     if joint is None or joint.consistent:
         return ()

@@ -1,9 +1,9 @@
-"""What the looks at one edge say of a step at some time: where it was before, where it is since, and how well that is
-known.
+"""What the looks at one edge say about a step at some time: where the edge was before, where it is since, and how well
+that is known.
 
-Either side is a robust mean. A look is a good one, Student-distributed about the place of the edge, or a bad one that
-lies anywhere within reach: the model of `monitor.likelihood`, in all six axes at once. The mean is the mode of that
-mixture (expectation maximisation, from several looks, the likeliest end of all).
+Each side is a robust mean. A good look is Student-distributed about the place of the edge; a bad look lies anywhere
+within reach. This is the model of `monitor.likelihood`, in all six axes at once. The mean is the mode of that mixture,
+found by expectation maximisation from several looks; the likeliest end is taken.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from coec.geometry import dense, se3
 Array = NDArray[np.float64]
 
 MOST_LOOKS = 24
-"""Kept apart, of each edge: two minutes at one every five seconds. Those before are counted together."""
+"""Looks of each edge that are kept one by one: two minutes at one every five seconds. Older ones are counted
+together."""
 
 MEMORY_LOOKS = 360.0
-"""Of which those before are a mean, at most: half an hour, so that a mount that creeps is followed."""
+"""The older looks together count as so many at most: half an hour, so that the mean follows a mount that creeps."""
 
 REACH = np.array([*ROTATIONS.reach, *TRANSLATIONS.reach])
-"""(6,) standard deviation of what bad looks say (rad, m)."""
+"""(6,) standard deviation of the offsets of bad looks (rad, m)."""
 
 STARTS, TURNS = 3, 5
-"""Looks from which a mean is sought, and rounds of it: the means of drawn looks stand still after four."""
+"""Looks from which a mean is sought, and rounds of the search: the means of drawn looks stand still after four."""
 
 _NOTHING = np.eye(6) / MOST_SIGMA**2
-"""Information of a side of which nothing is known."""
+"""Information about a side of which nothing is known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,9 +45,9 @@ class History:
     """The looks at one edge since its last state that was consistent.
 
     Attributes:
-        origin: (4, 4) the pose that offsets are counted from.
-        information, moment: (6, 6) and (6,) what is known of the offset, by what went before the looks that are kept.
-        looks: in the order of their stamps, `MOST_LOOKS` at most.
+        origin: (4, 4) the pose from which offsets are counted.
+        information, moment: (6, 6) and (6,) what is known of the offset from before the kept looks.
+        looks: the kept looks in the order of their stamps, `MOST_LOOKS` at most.
     """
 
     origin: Matrix4
@@ -56,16 +57,16 @@ class History:
 
     @classmethod
     def at(cls, T_a_b: Matrix4, sigma: Array) -> History:
-        """Without looks: the edge is where it was last said to be (4, 4), to `sigma` (6,); NaN or zero where that is
-        not known."""
+        """A history without looks: the edge is at T_a_b (4, 4), known to `sigma` (6,); NaN or zero where that is not
+        known."""
         with np.errstate(invalid="ignore"):
             known = np.isfinite(sigma) & (sigma > 0.0) & (sigma < MOST_SIGMA)
         variance = np.where(known, np.where(known, sigma, 1.0) ** 2, MOST_SIGMA**2)
         return cls(T_a_b, np.diag(1.0 / variance), np.zeros(6))
 
     def after(self, look: Look, calm: bool) -> History:
-        """With one more look. Where all is `calm`, what goes is counted with those before; else it is forgotten: it may
-        be of after the step that is in question."""
+        """The history with one more look. The look that drops out is counted with the older ones if all is `calm`; else
+        it is forgotten, because it may be from after the step in question."""
         looks = sorted((*self.looks, look), key=lambda one: one.stamp_ns)
         if len(looks) <= MOST_LOOKS:
             return replace(self, looks=tuple(looks))
@@ -81,22 +82,22 @@ class History:
 
     @property
     def sigma(self) -> Array:
-        """(6,) standard deviation of where it was before; NaN where nothing is known."""
+        """(6,) standard deviation of where the edge was before the kept looks; NaN where nothing is known."""
         variance = dense.inverse(self.information).diagonal()
         return np.sqrt(np.where(variance < 0.99 * MOST_SIGMA**2, variance, np.nan))
 
     @property
     def mean(self) -> Array:
-        """(6,) the offset by what went before."""
+        """(6,) the offset, by what is known from before the kept looks."""
         return np.asarray(dense.solved(dense.cholesky(self.information), self.moment[:, None])[:, 0])
 
     @property
     def pose(self) -> Matrix4:
-        """(4, 4) where it was before the looks that are kept."""
+        """(4, 4) where the edge was before the kept looks."""
         return se3.perturb(self.origin, self.mean)
 
     def counted(self) -> History:
-        """With all looks that are kept counted together with those before: of a rig at which nothing has happened."""
+        """The history with all kept looks counted together with the older ones, for a rig to which nothing happened."""
         if not self.looks:
             return self
         whole = _Stack.of(self.origin, self.looks).mean(
@@ -109,15 +110,15 @@ class History:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """Of one edge, for each of T times at which it may have stepped.
+    """The step of one edge, for each of T times at which it may have stepped.
 
     Attributes:
-        xi: (T, 6) from where it was before to where it is since.
-        covariance: (T, 6, 6).
-        looks: (T,) good ones since.
-        log_transient: (T,) logarithm of the chance that these are bad ones at one place instead.
-        log_stepped: (T,) log likelihood of all looks, over what a step of ξ leaves of it: N(ξ; xi, covariance).
-        log_still: that of all looks, bad ones among them, at one place.
+        xi: (T, 6) the step from where the edge was before to where it is since.
+        covariance: (T, 6, 6) of that step.
+        looks: (T,) number of good looks since.
+        log_transient: (T,) logarithm of the chance that these are bad looks at one place instead.
+        log_stepped: (T,) log likelihood of all looks, apart from the factor N(ξ; xi, covariance) of a step of ξ.
+        log_still: log likelihood of all looks, bad ones among them, at one place.
     """
 
     xi: Array
@@ -129,7 +130,7 @@ class Steps:
 
 
 def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
-    """What the looks say of a step at each of some times: those from that stamp on lie after it."""
+    """What the looks say of a step at each of some times: looks from that stamp on lie after the step."""
     stamps = np.array([look.stamp_ns for look in history.looks], np.int64)
     after = stamps[None, :] >= np.asarray(times_ns, np.int64)[:, None]
     stack = _Stack.of(history.origin, history.looks)
@@ -140,12 +141,12 @@ def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
     for t, (was, is_now) in enumerate(zip(before.offset, since.offset, strict=True)):
         xi[t] = se3.difference(se3.perturb(history.origin, is_now), se3.perturb(history.origin, was))
     place = np.max(np.array([look.place for look in history.looks]).reshape(-1, 6), axis=0, initial=0.0)
-    covariance = before.covariance + since.covariance + np.diag(2.0 * place**2)  # one place before, another one since
+    covariance = before.covariance + since.covariance + np.diag(2.0 * place**2)  # one for the street before, one for the street since
     good = since.good
     looks = good.sum(axis=1)
     again = np.array([look.log_bad_again for look in history.looks])
     first = np.array([look.log_bad for look in history.looks]) - again
-    # The first bad one is rarer than the next.
+    # The first bad look is rarer than a bad one after it.
     log_transient = (good * again).sum(axis=1) + np.max(good, axis=1, initial=0.0) * np.max(first, initial=0.0)
     return Steps(
         xi,
@@ -159,8 +160,8 @@ def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Means:
-    """Of some looks, in T ways: offset (T, 6), covariance (T, 6, 6), how far each look is a good one (T, N), and their
-    log evidence (T,): the integral of their likelihood over the offset (Laplace)."""
+    """Means of T selections of some looks: offset (T, 6), covariance (T, 6, 6), how far each look is a good one (T, N),
+    and the log evidence (T,), which is the integral of their likelihood over the offset (Laplace)."""
 
     offset: Array
     covariance: Array
@@ -174,10 +175,10 @@ class _Stack:
 
     offset: Array  # (N, 6)
     information: Array  # (N, 6, 6)
-    axes: Array  # (N,) told
-    log_good: Array  # (N,) logarithm of the density of a good one where it is likeliest, with its share
-    log_bad: Array  # (N,) the same of a bad one where it lies
-    share: Array  # (N,)
+    axes: Array  # (N,) number of axes determined
+    log_good: Array  # (N,) logarithm of the peak density of a good look, times the share of good ones
+    log_bad: Array  # (N,) logarithm of the density of a bad look at its offset, times the share of bad ones
+    share: Array  # (N,) how much each look counts
 
     @classmethod
     def of(cls, origin: Matrix4, looks: Sequence[Look]) -> _Stack:
@@ -195,8 +196,8 @@ class _Stack:
         return cls(offset, information, axes, log_good, np.log(bad) + within.sum(axis=1), share)
 
     def weights(self, mean: Array) -> tuple[Array, Array, Array]:
-        """Of each look about a mean (T, S, 6): its log density, its weight in the next mean, and how far it is a good
-        one; (T, S, N) each."""
+        """For each look about a mean (T, S, 6): its log density, its weight in the next mean, and how far it is a good
+        one; each (T, S, N)."""
         away = self.offset - mean[:, :, None, :]
         q = dense.squared(self.information, away)
         log_good = self.log_good - 0.5 * (FREEDOM + self.axes) * np.log1p(q / FREEDOM)
@@ -205,7 +206,7 @@ class _Stack:
         return self.share * density, good * np.minimum((FREEDOM + self.axes) / (FREEDOM + q), 1.0), good
 
     def mean(self, mask: NDArray[np.bool_], information: Array, moment: Array) -> _Means:
-        """Of the looks in each row of a mask (T, N), with what is known beside them."""
+        """The means of the looks in each row of a mask (T, N), combined with what else is known."""
         known = dense.solved(dense.cholesky(information), moment[:, None])[:, 0]
         if not len(self.offset):
             covariance = np.broadcast_to(dense.inverse(information), (len(mask), 6, 6))
@@ -227,7 +228,7 @@ class _Stack:
         return _Means(mean[rows, best], covariance, good[rows, best] * mask, log_evidence)
 
     def _starts(self, row: NDArray[np.bool_], known: Array) -> Array:
-        """(STARTS + 1, 6) from where the mean of a row is sought: some of its looks, and what is known."""
+        """(STARTS + 1, 6) where the search for the mean of a row starts: at some of its looks, and at what is known."""
         there = np.flatnonzero(row)
         if not len(there):
             return np.broadcast_to(known, (STARTS + 1, 6))
@@ -235,7 +236,8 @@ class _Stack:
         return np.concatenate([self.offset[some], known[None]])
 
     def _sums(self, weight: Array, information: Array, moment: Array) -> tuple[Array, Array]:
-        """Information (..., 6, 6) and moments (..., 6) of the looks, weighted (..., N), and of what is known."""
+        """Summed information (..., 6, 6) and moments (..., 6) of what is known and of the looks weighted by (...,
+        N)."""
         pulled = dense.applied(self.information, self.offset)
         precision = np.broadcast_to(information, (*weight.shape[:-1], 6, 6)).copy()
         moments = np.broadcast_to(moment, (*weight.shape[:-1], 6)).copy()

@@ -1,13 +1,13 @@
-"""The least squares over the graph of a rig: where all sensors are, from what was measured between them.
+"""The least squares over the graph of a rig: finds where all sensors are from what was measured between them.
 
-The unknowns are the poses of the sensors, moved by x (6,) each from where the vehicle was built, and one number for
-every error that windows share: a lens that is displaced displaces every pair of its camera, in a way that each window
-tells for itself (`confidence.budget`). Least squares over both, iterated from the poses found (Gauss, Newton):
+The unknowns are the poses of the sensors, each moved by x (6,) from where the vehicle was built, and one number for
+every error that windows share. For example, a displaced lens displaces every pair of its camera; how far, each window
+states for itself (`confidence.budget`). Least squares over both, iterated from the poses found (Gauss, Newton):
 
     ξ_measured = x_a - Ad(T_a_b) · x_b + Σ s_k · z_k + noise,      x ~ N(0, P),  z ~ N(0, 1)
 
-The gauge: only differences are measured, so the whole rig is held by what is known of the mounts before, every sensor
-alike. What is told of a pair does not depend on it, its covariance and those between pairs neither.
+The gauge: only differences are measured, so a prior on every mount, the same for all sensors, holds the whole rig in
+place. The pose of a pair, its covariance and the covariances between pairs do not depend on the gauge.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from coec.geometry import dense, se3
 Array = NDArray[np.float64]
 
 BUILT = np.array([radians(5.0)] * 3 + [0.3] * 3)
-"""How far each sensor may be from where the vehicle was built (rad, m): wide beside all that is measured, as it only
-holds what nothing else does."""
+"""How far each sensor may be from where the vehicle was built (rad, m): wide beside all that is measured, because it
+only has to hold what nothing else holds."""
 
 ROUNDS, STILL = 8, 1e-12
-"""Of Gauss and Newton at most, and the step (rad, m) at which they stand still."""
+"""Most Gauss-Newton rounds, and the step (rad, m) below which they stop."""
 
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """Whose a systematic error is: by which of its ends an edge shares it with others. Of neither end, it is the
-    pair's own."""
+    """Which sensor owns a systematic error: through which of its ends an edge shares the error with other edges. If
+    through neither, the error is the pair's own."""
 
     of_a: float
     of_b: float
 
 
 LENS, SWEEP, CLOCKS, OWN = Owner(1.0, 0.0), Owner(0.0, 1.0), Owner(sqrt(0.5), sqrt(0.5)), Owner(0.0, 0.0)
-"""Parts by standard deviation. A stamp is rounded at either sensor."""
+"""Parts of each owner, by standard deviation. Stamps are rounded at both sensors, so each clock owns √½."""
 
 OWNERS: Mapping[str, Owner] = {
     "lens_across": LENS,
@@ -56,10 +56,11 @@ OWNERS: Mapping[str, Owner] = {
     "columns": SWEEP,
     "stamps": CLOCKS,
 }
-"""By the names of `confidence.budget`; any other error is the pair's own."""
+"""The owner of each error by its name in `confidence.budget`; any other error is the pair's own."""
 
 LASTING = frozenset({"lens_across", "lens_down", "lens_scale"})
-"""Errors of a sensor whatever it sees: how far edges of near things lie aside, or columns, is a matter of the scene."""
+"""Errors that a sensor has whatever it sees. The others change with the scene: how far edges of near things, or
+columns, lie aside depends on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,11 +70,11 @@ class Measured:
     known: Known
     T_a_b: Matrix4
     information: Array  # (6, 6) of the noise
-    shared: Mapping[str, Array]  # by whose error it is, (6,)
+    shared: Mapping[str, Array]  # (6,) shift by one standard deviation, by owner and name of the error
 
     @property
     def covariance(self) -> Array:
-        """(6, 6) of all errors; on axes that were not told as wide as `BUILT`."""
+        """(6, 6) of all errors; at least as wide as `BUILT` on axes that were not determined."""
         noise = dense.inverse(self.information + np.diag(1.0 / BUILT**2) * 1e-2)
         for name in sorted(self.shared):
             noise = noise + self.shared[name][:, None] * self.shared[name]
@@ -82,7 +83,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Poses (S of (4, 4)), the sum of squares with its degrees of freedom, and the covariance of all edges."""
+    """The poses (S of (4, 4)), the sum of squares with its degrees of freedom, and the covariance of all edges."""
 
     poses: tuple[Matrix4, ...]
     chi2: float
@@ -92,7 +93,7 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class System:
-    """All that was measured, and the errors in common, each a number of its own."""
+    """All measurements, and the names of the shared errors, each of which is one unknown."""
 
     graph: RigGraph
     measured: tuple[Measured, ...]
@@ -100,10 +101,10 @@ class System:
 
     @classmethod
     def of(cls, graph: RigGraph, windows: Mapping[str, Measurement]) -> System:
-        """Of one window of each edge that has one, by its name, and all links.
+        """The system of one window for each edge that has one, by its name, and of all links.
 
         Raises:
-            ValueError: a pose is not rigid, or a covariance no covariance.
+            ValueError: a pose is not rigid, or a covariance is invalid.
         """
         measured = []
         for known in graph.known:
@@ -121,7 +122,7 @@ class System:
         return np.asarray(poses[self.graph.place[a]] @ se3.inverse(poses[self.graph.place[b]]))
 
     def solved(self, without: frozenset[str]) -> Solution:
-        """The least squares, without some edges."""
+        """The least-squares solution without some edges."""
         built = self.graph.poses
         poses, shared = built, np.zeros(len(self.errors))
         there = [one for one in self.measured if one.known.name not in without]
@@ -159,7 +160,7 @@ class System:
         )
 
     def _linear(self, one: Measured, poses: Sequence[Matrix4], shared: Array) -> tuple[Array, Array]:
-        """Of what was measured: its derivative (6, unknowns), and by how much it is off (6,) at some poses."""
+        """The derivative (6, unknowns) of a measurement, and its residual (6,) at some poses."""
         known = one.known
         away = se3.difference(one.T_a_b, self.predicted(poses, known.a, known.b))
         common = np.zeros((6, len(self.errors)))

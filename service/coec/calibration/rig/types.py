@@ -24,25 +24,25 @@ from coec.calibration.types import Matrix4
 from coec.geometry import se3
 
 MOST_SENSORS = 12
-"""Eight cameras, three LiDARs and the vehicle itself: what is solved is dense."""
+"""Eight cameras, three LiDARs and the vehicle itself. It is bounded because the equations that are solved are dense."""
 
 
 _WAS = " before"
-"""After a name. None that is configured has a space in it."""
+"""Suffix of a name. No configured name has a space in it."""
 
 
 def was(name: str) -> str:
-    """What a sensor, an edge or a link is called as it was before a move."""
+    """The name for a sensor, an edge or a link as it was before a move."""
     return name + _WAS
 
 
 def whose(name: str) -> str:
-    """Of which sensor, edge or link a name is, be it of before a move or of now."""
+    """The sensor, edge or link that a name stands for, whether as it was before a move or as it is now."""
     return name.removesuffix(_WAS)
 
 
 class Kind(StrEnum):
-    """What a node is. The vehicle's own frame, where something measures it, is a node that cannot move."""
+    """What a node is. The vehicle's own frame, if something measures it, is a node that cannot move."""
 
     CAMERA = "camera"
     LIDAR = "lidar"
@@ -59,7 +59,7 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """What can be measured: T_a_b (4, 4) as the vehicle was built. `name` is that of the pair."""
+    """A relation that can be measured: T_a_b (4, 4) as the vehicle was built. `name` is that of the pair."""
 
     name: str
     a: str
@@ -79,7 +79,7 @@ class Link:
 
 
 class Known(NamedTuple):
-    """An edge or a link, by what they have in common."""
+    """An edge or a link: the fields that both have."""
 
     name: str
     a: str
@@ -89,7 +89,7 @@ class Known(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RigGraph:
-    """Sensors, edges and links, each in the order of their names: what is decided does not depend on how they came."""
+    """Sensors, edges and links, each in the order of their names, so that no decision depends on the order of input."""
 
     sensors: tuple[Sensor, ...]
     edges: tuple[Edge, ...]
@@ -100,8 +100,8 @@ class RigGraph:
         """The graph.
 
         Raises:
-            ValueError: too many sensors; a name twice, an edge to a sensor that is not there or to itself, a pose that
-                is not rigid, a link whose standard deviations are not six positive numbers.
+            ValueError: too many sensors or none; a name twice; an edge to a missing sensor, or from a sensor to itself;
+                a pose that is not rigid; a link whose standard deviations are not six positive numbers.
         """
         if not 1 <= len(sensors) <= MOST_SENSORS:
             raise ValueError(f"a rig has 1 to {MOST_SENSORS} sensors, got {len(sensors)}: leave some out of it")
@@ -140,8 +140,8 @@ class RigGraph:
 
     @cached_property
     def poses(self) -> tuple[Matrix4, ...]:
-        """T_sensor_rig (4, 4) of each sensor as the vehicle was built, its first sensor being the origin; so is the
-        first of any part that no edge joins to it."""
+        """T_sensor_rig (4, 4) of each sensor as the vehicle was built. The first sensor is the origin, and so is the
+        first sensor of every part that no edge or link joins to it."""
         found: dict[str, Matrix4] = {}
         for sensor in self.sensors:
             if sensor.name not in found:
@@ -155,7 +155,8 @@ class RigGraph:
         return frozenset(edge.name for edge in self.edges if kinds[edge.a] is kinds[edge.b] is Kind.LIDAR)
 
     def joined_to(self, origin: str) -> Mapping[str, Matrix4]:
-        """T_sensor_origin (4, 4) as the vehicle was built, by name, of each sensor that edges or links join to one."""
+        """T_sensor_origin (4, 4) as the vehicle was built, of each sensor that edges or links join to `origin`, by
+        name."""
         found: dict[str, Matrix4] = {origin: np.eye(4)}
         reached = [origin]
         for name in reached:  # grows as it goes: breadth first
@@ -169,8 +170,8 @@ class RigGraph:
         return found
 
     def loop_through(self, closing: str, among: Sequence[str]) -> tuple[str, ...] | None:
-        """The shortest loop through the edge or link `closing` along those of the names `among`: their names, from that
-        one on. None if there is none."""
+        """The shortest loop through the edge or link `closing` that runs along those named in `among`: their names,
+        `closing` first. None if there is none."""
         by_name = {known.name: known for known in self.known}
         first = by_name[closing]
         others = [by_name[name] for name in sorted(among) if name != closing]

@@ -1,9 +1,10 @@
-"""The rig of one vehicle, step by step: checks, accepted windows and what its pairs serve, put together.
+"""The rig of one vehicle, step by step: combines checks, accepted windows and what the pairs serve.
 
-A move of a sensor is one event. It begins when the sensor is named (`attribution`). It is put right when every pair of
-it that is alive has an accepted window of after the move: the joint estimate (`joint`), with what was known before it
-(`before`), then tells all pairs of the sensor at once, one move for all of them. It is over when they all serve what
-they were told or found since: their looks are counted from there.
+A move of a sensor is one event. It begins when the sensor is named (`attribution`). It is put right when every live
+pair
+of the sensor has an accepted window from after the move: the joint estimate (`joint`), with what was known before the
+move (`before`), then corrects all pairs of the sensor at once, with one move for all of them. The event is over when
+all these pairs serve the correction or a pose that they found since; their looks are counted from that pose on.
 """
 
 from __future__ import annotations
@@ -27,16 +28,15 @@ from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
 
 ALIVE_NS = 60 * NS_PER_S
-"""A pair without a look for so long is not waited for: 12 periods of the monitor."""
+"""An event does not wait for a pair without a look for so long: 12 periods of the monitor."""
 
 OVER_NS = 900 * NS_PER_S
-"""After which an event is over whose sensors are not thought to have moved any more, whatever its pairs serve: five
-slices."""
+"""After so long an event is over, whatever its pairs serve, if no sensor is named any more: five slices."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Windowed:
-    """An accepted window of a pair: what it says, and the stamp of its first pair of frames."""
+    """An accepted window of a pair: its measurement and the stamp of its first pair of frames."""
 
     measurement: Measurement
     start_ns: int
@@ -44,8 +44,9 @@ class Windowed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Served:
-    """What a pair serves (4, 4), known to `sigma` (6,), by frames since `start_ns`; None: not by frames, but as the
-    vehicle was built or a person wants it. `known` is what all its windows together say of the mount, if any do."""
+    """The pose (4, 4) that a pair serves, known to `sigma` (6,), from frames since `start_ns`. `start_ns` is None if
+    the pose comes from no frames but from how the vehicle was built or from a person. `known` is what all windows of
+    the pair together say of the mount, if there are any."""
 
     T_a_b: Matrix4
     sigma: NDArray[np.float64]
@@ -55,9 +56,12 @@ class Served:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """What the joint estimate says of a pair: (4, 4), and the covariance (6, 6) of its perturbation. Axes that the
-    window of the pair does not tell are as in that window, and NaN in the covariance; of a pair without a window of
-    after the move, which is told by the others and by what was known of it before, none are."""
+    """What the joint estimate says of a pair: a pose (4, 4) and the covariance (6, 6) of its perturbation.
+
+    Axes that the pair's own window does not determine are as in that window, and NaN in the covariance. A pair without
+    a
+    window from after the move has no such axes: the other pairs and what was known of it before determine its pose.
+    """
 
     T_a_b: Matrix4
     covariance: NDArray[np.float64]
@@ -65,7 +69,7 @@ class Told:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
-    """One for all pairs of the sensors that moved, decided at a stamp."""
+    """One correction for all pairs of the sensors that moved, decided at a stamp."""
 
     stamp_ns: int
     sensors: tuple[str, ...]
@@ -74,7 +78,8 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Sensors that were named, since a stamp; their move lies before another. `corrected`: their pairs were told."""
+    """Sensors that have been named since the stamp `since_ns`; their move lies before the stamp `stepped_ns`.
+    `corrected`: whether the correction of their pairs has been decided."""
 
     sensors: tuple[str, ...]
     since_ns: int
@@ -84,8 +89,8 @@ class Event:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """An event, for who asks later: by how much its sensors had moved, by name, as far as that was known when they were
-    named; and the stamp at which it was over, None while it goes on."""
+    """An event, kept for later queries: by how much each of its sensors moved, by name, as far as that was known when
+    they were named; and the stamp at which the event was over, None while it goes on."""
 
     event: Event
     moved: Mapping[str, Moved]
@@ -94,23 +99,23 @@ class Move:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleRig:
-    """All that is known.
+    """All that is known of the rig.
 
     Attributes:
         believed: who moved.
-        windows: the newest of each edge, as far as it is of the rig as it is now.
+        windows: the newest window of each edge, if it is of the rig as it is now.
         serves: what each pair serves.
-        known: what was known of each pair by all its windows, the latest two times, the older first: when a move is
-            noticed, the latest may be of after it.
-        before: what was known before the event that is going on, as far as it is true after it.
-        event: the one that is going on; None while all is calm.
+        known: what all windows of each pair said together, the latest two versions, the older first: when a move is
+            noticed, the latest may be from after it.
+        before: what was known before the current event and is still true after it.
+        event: the current event; None while all is calm.
         move: the latest event, over or not; None before the first.
-        joint: the rig by these windows; None before the first, and while two windows of an edge are awaited.
-        sensors: what is believed of each, by name.
-        since_ns: since when each is in its state, by name.
-        correction: the latest.
-        looks: that were counted, by edge.
-        registered: the latest look at two LiDARs, by edge, whether or not another has said the same.
+        joint: the rig by these windows; None while no window determines anything.
+        sensors: what is believed of each sensor, in the order of names.
+        since_ns: since when each sensor is in its state, by name.
+        correction: the latest correction.
+        looks: number of looks counted, by edge.
+        registered: the latest look at two LiDARs, by edge, whether or not another one agreed with it.
     """
 
     graph: RigGraph
@@ -130,8 +135,8 @@ class VehicleRig:
 
 
 def begun(graph: RigGraph, serves: Mapping[str, Served], windows: Mapping[str, Windowed]) -> VehicleRig:
-    """Nothing was looked at; every edge is where its pair serves it, as well as that is known. `windows` are those that
-    this rests on."""
+    """The rig before any look: every edge is where its pair serves it, with that uncertainty. `windows` are the windows
+    that the served poses rest on."""
     believed = attribution.begun(graph)
     for name in graph.edge:
         believed = attribution.served(believed, name, serves[name].T_a_b, serves[name].sigma)
@@ -141,8 +146,8 @@ def begun(graph: RigGraph, serves: Mapping[str, Served], windows: Mapping[str, W
 
 
 def going_on(rig: VehicleRig, event: Event, before: Before) -> VehicleRig:
-    """With an event of before a restart, and what was known before that: windows of its edges from before the move are
-    of no use."""
+    """The rig with an event that began before a restart, and what was known before that event. Windows of its edges
+    from before the move are dropped."""
     told = attribution.sensors(rig.believed, rig.graph)
     since_ns = {sensor.name: event.since_ns for sensor in told if sensor.name in rig.believed.named}
     rig = replace(rig, event=event, before=before, move=Move(event, {}), sensors=told, since_ns=since_ns)
@@ -150,7 +155,7 @@ def going_on(rig: VehicleRig, event: Event, before: Before) -> VehicleRig:
 
 
 def grown(rig: VehicleRig, fresh: VehicleRig) -> VehicleRig:
-    """With the pairs of another rig, of which nothing was looked at yet, beside its own."""
+    """The rig with the pairs of another rig, at which there was no look yet, added to its own."""
     histories = {**fresh.believed.histories, **rig.believed.histories}
     believed = replace(rig.believed, histories=histories, posterior=None)
     rig = replace(
@@ -167,17 +172,17 @@ def grown(rig: VehicleRig, fresh: VehicleRig) -> VehicleRig:
 
 
 def _before_of_both(before: Before | None, fresh: Before | None) -> Before | None:
-    """What was known before one event, of the pairs of a rig and of those that join it."""
+    """What was known before one event, for the pairs of a rig together with those that join it."""
     if before is None or fresh is None or before.sensors != fresh.sensors:
         return before
     return replace(before, edges={**fresh.edges, **before.edges})
 
 
 def after_look(rig: VehicleRig, look: Look) -> VehicleRig:
-    """A check, or whatever else looked, says where an edge is.
+    """The rig after a check, or any other look, says where an edge is.
 
     Raises:
-        ValueError: it is of no edge of the rig.
+        ValueError: the look is of no edge of the rig.
     """
     believed = attribution.after_look(rig.believed, rig.graph, look)
     asked = believed.asked_ns != rig.believed.asked_ns
@@ -189,11 +194,11 @@ def after_look(rig: VehicleRig, look: Look) -> VehicleRig:
 
 
 def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) -> VehicleRig:
-    """A window of an edge was accepted; `stamp_ns` is when that was known. It says where the edge is, and who moved.
-    One that began before a move of its sensors tells of neither mount.
+    """The rig after a window of an edge was accepted, which was known at `stamp_ns`. The window says where the edge is
+    and who moved. A window that began before a move of its sensors is ignored, because it shows neither mount.
 
     Raises:
-        ValueError: it is of no edge of the rig, or its pose or covariance are none.
+        ValueError: it is of no edge of the rig, or its pose or covariance is invalid.
     """
     if _from_before_a_move(rig, edge, window):
         return rig
@@ -207,12 +212,14 @@ def after_window(rig: VehicleRig, edge: str, window: Windowed, stamp_ns: int) ->
 
 
 def after_lidars(rig: VehicleRig, look: Look, window: Windowed) -> VehicleRig:
-    """Two LiDARs were registered: one look, of which who moved hears at once, and the joint estimate once another look
-    has said the same: a single one may be bad, or the first of after a move, and fits no window of before it. No pair
-    serves where the one sits in the other: it is where that was found.
+    """The rig after two LiDARs were registered to each other, which is one look.
+
+    Attribution uses the look at once. The joint estimate uses it once the next look agrees with it: a single look may
+    be bad, or the first after a move, which fits no window from before. No pair serves the pose between two LiDARs, so
+    the pose found counts as served.
 
     Raises:
-        ValueError: it is of no edge of the rig.
+        ValueError: the look is of no edge of the rig.
     """
     measured = window.measurement
     found = Served(measured.T_camera_lidar, measured.uncertainty.sigma, window.start_ns)
@@ -232,14 +239,14 @@ def _say_the_same(one: Measurement, other: Measurement) -> bool:
 
 
 def _from_before_a_move(rig: VehicleRig, edge: str, window: Windowed) -> bool:
-    """Whether it began before its sensors moved."""
+    """Whether a window began before a sensor of its edge moved."""
     event = rig.event
     return event is not None and window.start_ns < event.stepped_ns and edge in pairs_of(rig.graph, event.sensors)
 
 
 def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> VehicleRig:
-    """A pair serves something else. The first that rests on frames tells where the edge is; later ones, while all is
-    calm, are corrections of what looks tell as well."""
+    """The rig after a pair serves another pose. The first pose that rests on frames says where the edge is, if all is
+    calm; later ones do not, because they correct what looks show as well."""
     before = rig.serves[edge]
     rig = _serving(rig, edge, serves)
     if rig.event is None and before.start_ns is None and serves.start_ns is not None and rig.believed.calm:
@@ -248,7 +255,8 @@ def after_served(rig: VehicleRig, edge: str, serves: Served, stamp_ns: int) -> V
 
 
 def forgotten(rig: VehicleRig) -> VehicleRig:
-    """Sensor time stepped back: looks of the old time are none of the new. What went before them stays."""
+    """The rig after sensor time stepped back: looks of the old time are dropped, as are windows and the event. What was
+    known before those looks stays."""
     histories = {name: replace(history, looks=()) for name, history in rig.believed.histories.items()}
     believed = RigState(histories)
     rig = replace(rig, believed=believed, windows={}, known={}, before=None, joint=None, event=None, move=None)
@@ -257,8 +265,8 @@ def forgotten(rig: VehicleRig) -> VehicleRig:
 
 
 def pairs_of(graph: RigGraph, sensors: tuple[str, ...]) -> tuple[str, ...]:
-    """Edges that a move of these sensors displaces: those that end at any of them, but for what lies between two on one
-    bar, which moved as one."""
+    """Edges that a move of these sensors displaces: those that end at any of them, except edges between two sensors of
+    a bar that moved as one."""
     moved = set(sensors)
     bars = [set(mover.sensors) for mover in movers(graph) if len(mover.sensors) > 1]
     return tuple(
@@ -269,13 +277,13 @@ def pairs_of(graph: RigGraph, sensors: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def renewed(rig: VehicleRig, edge: str, since_ns: int) -> bool:
-    """Whether a pair serves what frames since then told."""
+    """Whether a pair serves a pose from frames since `since_ns`."""
     start_ns = rig.serves[edge].start_ns
     return start_ns is not None and start_ns >= since_ns
 
 
 def _serving(rig: VehicleRig, edge: str, serves: Served) -> VehicleRig:
-    """With what is served for an edge, and what is known of it by that."""
+    """The rig with a new served pose for an edge, and with what that says is known of the edge."""
     rig = replace(rig, serves={**rig.serves, edge: serves})
     if serves.known is None:
         return rig
@@ -283,7 +291,7 @@ def _serving(rig: VehicleRig, edge: str, serves: Served) -> VehicleRig:
 
 
 def _noted(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
-    """What is believed of the sensors now, and since when."""
+    """The rig with what is now believed of the sensors, and since when."""
     told = attribution.sensors(rig.believed, rig.graph)
     before = {sensor.name: sensor.health for sensor in rig.sensors}
     since_ns = {
@@ -297,7 +305,7 @@ def _noted(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
 
 
 def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
-    """The event that is going on, if one is: does it begin, may it be put right, is it over?"""
+    """The rig with its event carried on: it may begin, be put right, or be over."""
     rig = _begun_or_grown(rig, stamp_ns)
     event = rig.event
     if event is None:
@@ -317,8 +325,9 @@ def _followed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
 
 
 def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
-    """Something moved, and nothing tells what: that is over when every pair that stepped serves what it found since;
-    or, if only edges between LiDARs did, when all that is kept of them is of after it."""
+    """The rig when something moved but no sensor is named. That is over when every pair that stepped serves a pose that
+    it found since. If only edges between LiDARs stepped, it is over when all their kept looks are from after the
+    step."""
     if rig.believed.calm:
         return rig
     pairs = attribution.stepped(rig.believed)
@@ -332,13 +341,13 @@ def _settled_unnamed(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
 
 
 def _served(rig: VehicleRig, edges: Sequence[str]) -> list[str]:
-    """Of these edges those that a pair serves, which is what puts a move right."""
+    """Those of these edges that a pair serves. Only their serving a new pose puts a move right."""
     return [name for name in edges if name not in rig.graph.of_lidars]
 
 
 def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -> VehicleRig:
-    """All pairs of an event have a window of after it. What one pair tells by itself needs nobody to tell it, and where
-    the pairs do not fit each other nobody is told."""
+    """The rig once all live pairs of an event have a window from after it. There is no correction if only one pair was
+    measured, because that pair already knows, or if the pairs do not fit each other."""
     rig = replace(rig, event=replace(event, corrected=True))
     joint = rig.joint
     if joint is None or not (joint.consistent or joint.left_out is not None):
@@ -353,7 +362,8 @@ def _corrected(rig: VehicleRig, event: Event, fresh: list[str], stamp_ns: int) -
 
 
 def _begun_or_grown(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
-    """A sensor that was not named before is: windows of its edges from before the move are of no use any more."""
+    """The rig with a new or larger event if a sensor is newly named. Windows of its edges from before the move are
+    dropped."""
     named, event = rig.believed.named, rig.event
     if not named or (event is not None and named <= set(event.sensors)):
         return rig
@@ -373,7 +383,7 @@ def _begun_or_grown(rig: VehicleRig, stamp_ns: int) -> VehicleRig:
 
 
 def _before(rig: VehicleRig, event: Event) -> Before:
-    """What was known before an event: of each edge the latest of up to the last look that saw no move."""
+    """What was known before an event: for each edge the latest knowledge up to the last look that saw no move."""
     touched = pairs_of(rig.graph, event.sensors)
     right_ns = max(
         (look.stamp_ns for name in touched for look in rig.believed.histories[name].looks
@@ -392,13 +402,14 @@ def _told(joint: JointEstimate, edge: str, own: Measurement) -> Told:
 
 
 def _told_by_others(joint: JointEstimate, edge: str) -> Told:
-    """Of a pair that no window of after the move tells: where the sensor that moved is by those of the others, and its
-    other sensor by what was known before."""
+    """The pose of a pair without a window from after the move. The windows of other pairs place the sensor that moved,
+    and what was known before places its other sensor."""
     return Told(joint.T_a_b[edge], joint.between(edge, edge))
 
 
 def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:
-    """What the pairs of an event were told, or serve, is where their edges are from now on."""
+    """The rig after an event: from now on the edges of its pairs are where the correction put them, or else where they
+    are served."""
     believed, event, last = rig.believed, rig.event, rig.correction
     told = last.pairs if last is not None and event is not None and last.stamp_ns >= event.since_ns else {}
     for name in pairs:
@@ -417,7 +428,7 @@ def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:
 
 
 def _without_stale(rig: VehicleRig) -> VehicleRig:
-    """Without the windows of an event's edges that began before the move."""
+    """The rig without those windows of the event's edges that began before the move."""
     event = rig.event
     if event is None:
         return rig
@@ -427,7 +438,7 @@ def _without_stale(rig: VehicleRig) -> VehicleRig:
 
 
 def _combined(rig: VehicleRig) -> VehicleRig:
-    """The joint estimate by the windows as they are now, and what was known before a move that is going on."""
+    """The rig with the joint estimate from its present windows and from what was known before the current event."""
     told = {name: window.measurement for name, window in rig.windows.items() if window.measurement.told_axes()}
     return replace(rig, joint=estimate(rig.graph, told, rig.before) if told else None)
 
