@@ -1,7 +1,7 @@
-"""Is the extrinsic that is served still right? A sequential decision over short checks, one every few seconds.
+"""Is the served extrinsic still right? A sequential decision over short checks, one every few seconds.
 
 Evidence is the log-likelihood ratio of "the mount has moved" against "it has not" (`hypotheses`), over checks of pairs
-that were not counted yet. Its thresholds follow from how often a right mount may be accused (`alarm_levels`).
+that were not counted yet. The thresholds follow from how often a right mount may be accused (`alarm_levels`).
 """
 
 from __future__ import annotations
@@ -24,36 +24,39 @@ from coec.config import MonitorConfig
 
 ROTATIONS = Axes(three([radians(2.5)] * 3), (three([radians(0.3)] * 3), three([radians(2.0)] * 3)))
 TRANSLATIONS = Axes((0.1, 0.1, 0.1), ((0.03, 0.03, 0.03), (0.1, 0.1, 0.1)))
-"""What bad checks say (1.8 to 2.5° and 6 to 8 cm on simulated drives through tunnels, open roads and nights, or more);
-and the moves that are looked for: what a mount creeps by, and what a knock does (rad, m)."""
+"""The reach of bad checks (1.8 to 2.5° and 6 to 8 cm or more, on simulated drives through tunnels, open roads and
+nights), and the moves that are looked for: the creep of a mount, and a knock (rad, m)."""
 
 QUESTIONS = len(ROTATIONS.moves) + len(TRANSLATIONS.moves)
-"""Hypotheses that begin at every check: each may accuse."""
+"""Number of hypotheses that begin at every check; each of them may accuse."""
 
 CLEARS_AT = 0.4
-"""Share of the evidence that makes a mount suspect, below which it clears again."""
+"""A suspect mount clears again below this share of the evidence that makes it suspect."""
 
 ABOVE = 4.0
-"""Nats above the evidence that confirms, which is the most: a repaired mount clears within three checks."""
+"""Evidence is capped so many nats above the level that confirms, so that a repaired mount clears within three
+checks."""
 
 DOUBTFUL_CHECKS = 2.0
-"""Clear checks after a faint one that count as faint, too: what made it so, a guard rail along a highway, did not end
-with it. Of 25 checks of simulated highways with 64 beams six were clear, four of them alone between faint ones and as
-far off as these; by day in streets, garages and rooms one check in thirty is faint."""
+"""So many clear checks after a faint one count as faint too, because what made it faint, such as a guard rail along a
+highway, did not end with it. Of 25 checks of simulated highways with 64 beams six were clear; four of these stood alone
+between faint ones and were as far off as they. By day in streets, garages and rooms one check in thirty is faint."""
 
 WEAK_SHARE = 0.5
-"""A flagged check with faint edges counts half of another where checks are at odds with each other."""
+"""A flagged check with faint edges counts half as much as another towards checks being at odds with each other."""
 
 AT_ODDS_AT, MOST_AT_ODDS = 1.5, 3.0
-"""Flagged checks in a row at which, while they do not add up to a move, they are at odds: two; and the most."""
+"""Flagged checks in a row from which they are at odds if they do not add up to a move (which takes two), and the most
+that are counted."""
 
 ASTRAY2 = chi2_quantile(0.95, AXES)
-"""Squared distance of where the checks have put the rotations from the pose that is served, above which no move but the
-pose itself is doubted, until a window has vouched for it: of right rigs of which nothing is known one in twenty is."""
+"""Squared distance between the rotations that the checks have found and those served. Above it, no move but the served
+pose itself is doubted, until a window has vouched for that pose. Of right rigs about which nothing is known one in
+twenty lies above."""
 
 BLIND_AT, MOST_BLIND = 1.2, 3.5
-"""Evidence in independent checks by which a cause in the data is believed: more than one; and the most, so that a
-cause that went away is forgotten after three."""
+"""Independent checks that show a cause in the data before it is believed (more than one), and the most that are
+counted, so that a cause that went away is forgotten after three."""
 
 S_PER_H = 3600.0
 
@@ -63,8 +66,8 @@ def _unknown() -> NDArray[np.float64]:
 
 
 class Finding(StrEnum):
-    """What the checks so far say. `unknown`: nothing was seen that could tell. `at_odds`: they accuse the mount,
-    but do not add up to a move: it is elsewhere every time, or was from the first check on."""
+    """What the checks so far say. `unknown`: no check could tell yet. `at_odds`: the checks accuse the mount but do not
+    add up to a move, because they put it elsewhere every time, or already did at the first check."""
 
     UNKNOWN = "unknown"
     CLEAR = "clear"
@@ -74,8 +77,8 @@ class Finding(StrEnum):
 
 
 ACCUSING = frozenset({Finding.SUSPECT, Finding.CONFIRMED, Finding.AT_ODDS})
-"""Findings that make a window wanted soon, and one that is elsewhere a second witness. A mount that moved beyond the
-reach of a check is at odds with itself, too."""
+"""Findings because of which a window is wanted soon, and a window that finds another pose is a second witness. A mount
+that moved beyond the reach of a check leads to `at_odds`, too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,27 +87,29 @@ class Observation:
 
     Attributes:
         stamp_ns: of the last pair.
-        pair_stamps_ns: of all of them, ascending.
+        pair_stamps_ns: of all pairs, ascending.
         metrics: every figure with its limit.
-        offset: (6,) from the current pose to where the check puts the mount, the estimator's bias removed where known
-            (rad, m): rotations of the optimum over rotations, translations of that over all axes. To first order the
-            errors of the one do not tell those of the other.
-        sigma: (6,) its standard deviation on a street.
-        noise: (6,) the part of it that is new at every check.
-        place: (6,) the part that all checks of a street share; the rest is the rig's.
-        dispersion: times `noise` and `place` that checks of this scene scatter by, 1 at least; see `dispersion`.
+        offset: (6,) from the current pose to where the check puts the mount, less the estimator's bias where known
+            (rad, m). Rotations come from the optimum over rotations, translations from the optimum over all axes. To
+            first order the errors of the two are independent.
+        sigma: (6,) standard deviation of `offset` on a street.
+        noise: (6,) the part of `sigma` that is new at every check.
+        place: (6,) the part of `sigma` that all checks of a street share; the rest belongs to the rig.
+        dispersion: factor by which checks of this scene scatter more than `noise` and `place`, at least 1; see
+            `dispersion`.
         distance2: squared distance in standard deviations over its limit.
         flagged: the pose is wrong, or the data are.
         weak: the edges at the local optimum are fainter than they should be.
         flagged_by_paper: equation (2) with learned limits; None until the rig is commissioned.
-        causes: what is wrong with the data, those that hide others first; such a check says nothing of the pose.
+        causes: what is wrong with the data, those that hide others first; a check with a cause says nothing of the
+            pose.
         first_derivative, second_derivative: (6,) ∂MI/∂ξ and -∂²MI/∂ξ² at the pose: the paper's f' and f'' on each axis
             (nats per rad or m, and per rad² or m²).
         drift: of the local optimum from the commissioned calibration; None until the rig is commissioned.
         dirty: blocks of the image, by number, that have no contrast in any pair; for commissioned rigs in daylight.
-        textured: blocks that could be, 0 where it is not known.
+        textured: number of blocks that could be dirty; 0 if unknown.
         standing_stamps_ns: of the pairs that were taken while the vehicle stood.
-        undecided: by itself it neither accuses the pose nor acquits it.
+        undecided: the check by itself neither accuses the pose nor acquits it.
     """
 
     stamp_ns: int
@@ -131,30 +136,30 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class AlarmLevels:
-    """Evidence, nats, at which a mount is suspect, and at which it has moved."""
+    """Evidence, nats, at which a mount is suspect, and at which its move is confirmed."""
 
     suspect: float
     confirmed: float
 
     @property
     def clear(self) -> float:
-        """Below it a suspicion is over."""
+        """Evidence, nats, below which a suspicion is over."""
         return CLEARS_AT * self.suspect
 
     @property
     def most(self) -> float:
-        """More is not counted."""
+        """The most evidence that is counted, nats."""
         return self.confirmed + ABOVE
 
 
 def alarm_level(config: MonitorConfig, hours: float) -> float:
-    """Evidence, nats, that a right mount comes to once in so many hours on average, or more rarely, at a check per
-    period: the logarithm of the number of hypotheses that begin in that time."""
+    """Evidence, nats, that a right mount reaches once in so many hours on average, or more rarely, with one check per
+    period. It is the logarithm of the number of hypotheses that begin in that time."""
     return log(max(QUESTIONS * hours * S_PER_H / config.period_s, 1.0))
 
 
 def alarm_levels(config: MonitorConfig) -> AlarmLevels:
-    """Those of the configured hours. No single check comes to any of them."""
+    """The levels for the configured hours. No single check reaches any of them."""
     suspect = max(alarm_level(config, config.hours_between_false_suspicions), MOST_STEP + 1.0)
     return AlarmLevels(suspect, max(alarm_level(config, config.hours_between_false_alarms), suspect + 1.0))
 
@@ -164,17 +169,17 @@ class MonitorState:
     """What the checks so far add up to: plain values that go through JSON as they are.
 
     Attributes:
-        outcome: see there.
-        turned, shifted: the hypotheses of the rotations and of the translations.
+        outcome: what the checks so far say.
+        turned, shifted: the hypotheses about the rotations and about the translations.
         blind: evidence of every cause in the data, in independent checks, by code.
-        dirt: the same for every block of the image that was dirty in all checks since, by its number.
-        at_odds: flagged checks in a row.
-        last_stamps_ns: of the pairs of the last check.
+        dirt: by number, every block of the image that was dirty in the last checks, and in how many in a row.
+        at_odds: number of flagged checks in a row.
+        last_stamps_ns: stamps of the pairs of the last check.
         stood: whether the vehicle stood at the end of the last check.
-        astray2: squared distance of where all checks have put the rotations, see `learnt_distance2`.
-        counted: checks that counted, those that did in part by that part; no more than `AT_ODDS_AT`.
-        vouched: whether a window has found what is served to be right.
-        doubtful: checks to come that count as faint, however clear.
+        astray2: squared distance of the rotations that all checks have found, see `learnt_distance2`.
+        counted: number of checks that counted, partial ones by their part; at most `AT_ODDS_AT`.
+        vouched: whether a window has found the served pose to be right.
+        doubtful: number of checks to come that count as faint, however clear they are.
     """
 
     outcome: Finding = Finding.UNKNOWN
@@ -192,14 +197,14 @@ class MonitorState:
 
     @property
     def evidence(self) -> float:
-        """Log-likelihood ratio of the move that most speaks for, nats; 0 where nothing speaks for one."""
+        """Log-likelihood ratio of the move with the most evidence, nats; 0 if nothing speaks for a move."""
         leading = (hypotheses.leading for hypotheses in (self.turned, self.shifted))
         return max((0.0, *(test.evidence for test in leading if test is not None)))
 
 
 def after_observation(state: MonitorState, observation: Observation, levels: AlarmLevels) -> MonitorState:
-    """The state after one more check. It counts by the share of its pairs that the last one did not hold; while the
-    vehicle stands, only the first says something new of the mount."""
+    """The state after one more check. The check counts by the share of its pairs that the last check did not hold.
+    While the vehicle stands, only the first check says something new of the mount."""
     fresh, told_before = _fresh(state, observation)
     stands = observation.pair_stamps_ns[-1] in set(observation.standing_stamps_ns)
     dirt = _dirt_after(state.dirt, observation, fresh)
@@ -216,7 +221,7 @@ def after_observation(state: MonitorState, observation: Observation, levels: Ala
         state, blind=blind, dirt=dirt, last_stamps_ns=observation.pair_stamps_ns, stood=stands, doubtful=doubtful
     )
     if codes or told_before or fresh == 0.0:
-        # Neither for nor against: the data cannot tell, or have told before.
+        # Neither for nor against: the data cannot tell, or were counted before.
         return after
     after = _weighed(after, replace(observation, weak=observation.weak or state.doubtful > 0.0), fresh, levels)
     return replace(after, outcome=_outcome(state.outcome, after, levels))
@@ -228,22 +233,22 @@ def doubtful_after(doubtful: float, weak: bool, fresh: float) -> float:
 
 
 def share_told(state: MonitorState, observation: Observation) -> float:
-    """How far a check says something that those before it did not, 0 to 1; see `after_observation`."""
+    """The share of a check that is new compared with the checks before it, 0 to 1; see `after_observation`."""
     fresh, told_before = _fresh(state, observation)
     return 0.0 if told_before else fresh
 
 
 def _fresh(state: MonitorState, observation: Observation) -> tuple[float, bool]:
-    """Share of the pairs that the last check did not hold, and whether they are of a place where the vehicle stood then
-    and stands still: of one place there is one independent check, however long the vehicle stands there."""
+    """The share of the pairs that the last check did not hold, and whether the vehicle has stood in one place since
+    that check. One place gives one independent check, however long the vehicle stands there."""
     counted, standing = set(state.last_stamps_ns), set(observation.standing_stamps_ns)
     fresh = sum(stamp not in counted for stamp in observation.pair_stamps_ns) / len(observation.pair_stamps_ns)
     return fresh, state.stood and standing.issuperset(observation.pair_stamps_ns)
 
 
 def _weighed(state: MonitorState, observation: Observation, fresh: float, levels: AlarmLevels) -> MonitorState:
-    """The hypotheses after a check that counts by `fresh`. Where its edges are faint it may make the mount suspect,
-    but does not confirm: a full solve has to."""
+    """The state with its hypotheses after a check that counts by `fresh`. A check with faint edges may make the mount
+    suspect but does not confirm a move: a full solve has to."""
     most = levels.suspect if observation.weak else levels.most
     turned, shifted, astray2 = state.turned, state.shifted, state.astray2
     told = told_by(observation, slice(0, 3), turned.before)
@@ -254,7 +259,7 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
     if told is not None:
         shifted = after_check(shifted, told, TRANSLATIONS, fresh, most)
     step = fresh * (WEAK_SHARE if observation.weak else 1.0)
-    # Check after check too far off, and edges that insist on nothing: of images and sweeps that are not of one moment.
+    # Checks that are all too far off with edges that insist on nothing come from images and sweeps of different times.
     if not observation.flagged and not (observation.undecided and observation.distance2 > 1.0):
         at_odds = state.at_odds if observation.weak or observation.undecided else 0.0
     else:
@@ -264,8 +269,8 @@ def _weighed(state: MonitorState, observation: Observation, fresh: float, levels
 
 
 def told_by(observation: Observation, axes: slice, before: Three | None) -> Told | None:
-    """What a check tells of three axes, `before` being the offset of the one before it; None where it does not tell all
-    of them."""
+    """What a check says about three axes; None unless it determines all of them. `before` is the offset of the check
+    before it."""
     columns = (observation.offset, observation.sigma, observation.noise, observation.place)
     offset, sigma, noise, place = ([float(value) for value in column[axes]] for column in columns)
     if not all(isfinite(value) for value in (*offset, *sigma, *noise, *place)) or min(noise) <= 0.0:
@@ -284,7 +289,7 @@ def told_by(observation: Observation, axes: slice, before: Three | None) -> Told
 
 
 def diagnose(state: MonitorState) -> Cause | None:
-    """What is wrong, if anything is certain enough: a cause in the data first; a bent mount only once confirmed."""
+    """What is wrong, if anything is certain enough: first a cause in the data; a bent mount only once confirmed."""
     for code, cause in CAUSES.items():
         if state.blind.get(code, 0.0) >= BLIND_AT:
             return cause
@@ -292,7 +297,8 @@ def diagnose(state: MonitorState) -> Cause | None:
 
 
 def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: float) -> dict[str, float]:
-    """Whatever shows contrast once is not dirty; a check that cannot tell changes nothing."""
+    """The runs of dirty blocks after a check. A block that shows contrast once is not dirty; a check that cannot tell
+    changes nothing."""
     if observation.textured == 0:
         return dict(dirt)
     dirty = {str(block) for block in observation.dirty}
@@ -300,7 +306,7 @@ def _dirt_after(dirt: Mapping[str, float], observation: Observation, fresh: floa
 
 
 def _outcome(before: Finding, after: MonitorState, levels: AlarmLevels) -> Finding:
-    """With hysteresis: what was suspected stays so until little speaks for it."""
+    """The finding, with hysteresis: a suspicion or confirmation lasts until little evidence is left for it."""
     evidence = after.evidence
     if evidence >= levels.confirmed:
         return Finding.CONFIRMED

@@ -1,8 +1,7 @@
 """A short check of a few pairs: where the edges put the extrinsic near a pose, and how good the pose itself is.
 
-What a full calibration does within tens of degrees, a check does within `REACH_RAD` of the pose it is asked about, and
-in all six degrees of freedom whatever the calibration searches: a shifted mount must be seen even where only rotations
-are estimated.
+A full calibration searches tens of degrees; a check searches only within `REACH_RAD` of the pose that it checks. It
+always searches all six degrees of freedom, because a shifted mount must be seen even if only rotations are estimated.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from coec.geometry.edges.image_edges import Rectangle
 from coec.geometry.projection import project
 
 DEPTH_POINTS = 60_000
-"""Points of the sweeps of a check, seen or not, that carry the depth witness: its hill is degrees wide."""
+"""Points of the sweeps of a check, in view or not, that the depth witness uses: its hill is degrees wide."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,13 +49,13 @@ class Expected:
 
 
 AT_POSE = Expected(np.zeros(6), np.zeros(6))
-"""Of a rig that was not commissioned."""
+"""What is expected of a rig that was not commissioned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckInput:
-    """Some pairs with all that a check at any pose needs. Entries are per pair, in order; `features`, what depth and
-    ranges are compared by, is inferred when it is asked for, and raises CalibrationError where a frame has no depth."""
+    """Some pairs with all that a check at any pose needs. Entries are per pair, in order. `features` compare depth with
+    ranges; calling it infers the depth, and raises CalibrationError if a frame has none."""
 
     rig: Rig
     pairs: tuple[FramePair, ...]
@@ -65,7 +64,7 @@ class CheckInput:
     features: Callable[[], tuple[Features, ...]]
 
     def of(self, indices: Sequence[int]) -> CheckInput:
-        """That of some of the pairs alone, by their indices."""
+        """The input for some of the pairs alone, by their indices."""
         return CheckInput(
             self.rig,
             tuple(self.pairs[i] for i in indices),
@@ -77,18 +76,18 @@ class CheckInput:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Check:
-    """What a check at a pose tells.
+    """What a check at a pose finds.
 
     Attributes:
-        T_rotation: (4, 4) local optimum over rotations, the camera's centre being that of the pose.
+        T_rotation: (4, 4) local optimum over rotations, with the camera's centre of the pose.
         T_pose: (4, 4) local optimum over all six degrees of freedom.
-        offset_rotation, offset_pose: (6,) ξ from the pose to these (rad, m).
+        offset_rotation, offset_pose: (6,) ξ from the pose to these optima (rad, m).
         edges: significance of the edges at the pose.
-        edges_at_best: that at the local optimum over rotations.
-        edges_in_view: range edges that lie in the images there, of all pairs.
-        looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 where they do not tell.
-        of_rotation, of_pose: how far the edges insist on these local optima.
-        contrast: how far the edges at the local optimum stand above other poses, standard deviations.
+        edges_at_best: their significance at the local optimum over rotations.
+        edges_in_view: number of range edges, of all pairs, that lie in the images at that optimum.
+        looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 if that is unknown.
+        of_rotation, of_pose: how far the edges insist on these optima.
+        contrast: how far the edges at the local optimum over rotations stand above other poses, standard deviations.
         overlap: range edges in view at the pose over those that come into view within reach.
     """
 
@@ -112,7 +111,7 @@ def gather(sight: Sight, beyond_rad: float = 0.0) -> CheckInput:
 
     Args:
         sight: a window, whose start is the pose that the checks are about.
-        beyond_rad: how far beside it poses are to be checked.
+        beyond_rad: how far from that pose further poses are to be checked.
 
     Raises:
         CalibrationError: an image cannot be decoded, or is not of the camera's size.
@@ -129,15 +128,15 @@ def gather(sight: Sight, beyond_rad: float = 0.0) -> CheckInput:
 
 
 def seen_part(rig: Rig, sweeps: Sequence[PreparedSweep], pose: Matrix4, reach_rad: float) -> Rectangle:
-    """The part of the images in which the range edges of sweeps come to lie within so much of a pose (4, 4); all of it
-    where there are none."""
+    """The part of the images in which the range edges of sweeps lie at poses within `reach_rad` of a pose (4, 4); the
+    whole image if there are none."""
     part = outline(rig.camera, [sweep.edges for sweep in sweeps], pose, reach_rad)
     return Rectangle(0, 0, rig.camera.width, rig.camera.height) if part is None else part
 
 
 def join(sight: Sight, sweeps: Sequence[PreparedSweep], images: PreparedImages, reach_rad: float) -> CheckInput:
-    """What was prepared of two sensors, as one pair's: sweeps and images are those of the pairs of `sight`, in order;
-    poses within `reach_rad` of its start can be checked."""
+    """Joins what was prepared for two sensors into the input of a check of their pair. Sweeps and images are those of
+    the pairs of `sight`, in order. Poses within `reach_rad` of the start of `sight` can be checked."""
     window = sight.window
     pose = window.T_camera_lidar_start
     edges = lay(window.rig, window.pairs, sweeps, images, pose, reach_rad, compensated=sight.compensated)

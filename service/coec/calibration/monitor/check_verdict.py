@@ -1,7 +1,7 @@
-"""A check, judged: its figures against the limits of the rig, and what is wrong with its data.
+"""Judges a check: compares its figures with the limits of the rig, and finds what is wrong with its data.
 
-The figures are the paper's three, equation (2), and next to them a sharper question: how many standard deviations lie
-between the pose and the local optimum of both witnesses.
+The figures are the paper's three, equation (2), and one that tells more: how many standard deviations lie between the
+pose and the local optimum.
 """
 
 from __future__ import annotations
@@ -41,38 +41,38 @@ from coec.geometry import se3
 from coec.geometry.compiler import on_one_thread
 
 FALSE_ALARM_RATE = 0.01
-"""Share of checks at a right pose that may be flagged: the limit of an uncommissioned rig, and what commissioning aims
-at unless told otherwise."""
+"""Share of checks at a right pose that may be flagged: the limits of an uncommissioned rig follow from it, and it is
+the default aim of commissioning."""
 
 MIN_PAIRS = 4
-"""With fewer, a lamp post decides."""
+"""With fewer pairs, a single lamp post decides."""
 
 TELLING_CONTRAST = 9.0
-"""Standard deviations by which an optimum stands out from other poses, below which one check accuses nobody: checks of
-such scenes scatter more than three times as far as those of a street, see `dispersion`, and where those are good to
-0.08° half a degree is no more than two standard deviations then. Of 419 checks of right mounts on 168 simulated drives
-whose edges are clear five were below, four of them on highways; three of these five insisted on an optimum that was too
-far off, and two of the 414 others."""
+"""A check accuses only if its optimum stands out from other poses by so many standard deviations. Below that, checks
+scatter more than three times as far as those of a street (see `dispersion`): where a street is good to 0.08°, half a
+degree is then only two standard deviations. Of 419 checks with clear edges, of right mounts on 168 simulated drives,
+five were below, four of them on highways; three of these five insisted on an optimum that was too far off, and two of
+the 414 others."""
 
 LOST_SHARE = 0.5
-"""Of the significance at the optimum: where the expected pose has less, no scatter explains that in any scene."""
+"""Share of the significance at the optimum: if the expected pose has less, scatter explains that in no scene."""
 
 MIN_EDGES_IN_VIEW = 150.0
-"""Range edges in view, per pair, below which a check's edges count as faint, too, however well they fit: with fewer, a
-guard rail and a lane marking decide, in every pair the same. Of checks of right mounts on simulated drives all that
-ended more than 0.6° off, clear by the other figures, had 5 to 130; those that ended right had 150 and more, but for
-some on highways."""
+"""With fewer range edges in view per pair a check's edges count as faint, however well they fit: a guard rail and a
+lane marking then decide, the same in every pair. On simulated drives, all checks of right mounts that ended more than
+0.6° off and were clear by the other figures had 5 to 130; those that ended right had 150 and more, except some on
+highways."""
 
 MIN_LOOKS = 2.0
-"""Independent looks that the pairs of a vehicle on the move are worth, below which its edges count as faint, too: where
-one frame says the same as the one before although the vehicle has moved on, as between the guard rails of a highway,
-what is wrong with one is wrong with all, and with the next check. Checks of simulated highways with 64 beams are at 1.2
-to 1.9 of 6, and put right mounts 3 to 10 cm beside; 95 % of others are above 2.2, and within 2 cm."""
+"""If the pairs of a moving vehicle are worth fewer independent looks, the edges of a check count as faint. Frames that
+say the same although the vehicle has moved on, as between the guard rails of a highway, are all wrong if one is, and so
+is the next check. Checks of simulated highways with 64 beams are at 1.2 to 1.9 of 6 and put right mounts 3 to 10 cm
+beside; 95 % of others are above 2.2, and within 2 cm."""
 
 
 class Opinion(StrEnum):
-    """What the edges of one check say of its pose. Undecided: the optimum lies too far off for a right pose, and the
-    edges do not insist on it as they do beside a wrong one."""
+    """What the edges of one check say of its pose. Undecided: the optimum lies too far off for a right pose, but the
+    edges do not insist on it as they do near a wrong pose."""
 
     CLEAR = "clear"
     FLAGGED = "flagged"
@@ -80,7 +80,7 @@ class Opinion(StrEnum):
 
 
 class Faint(StrEnum):
-    """Of what a check whose edges are faint has too little."""
+    """What a check with faint edges has too little of."""
 
     EDGES_IN_VIEW = "edges_in_view"
     LOOKS = "looks"
@@ -93,15 +93,16 @@ UNCOMMISSIONED = MonitorLimits(
     max_farthest2_pose=chi2_quantile(1.0 - FALSE_ALARM_RATE / 2.0 / POSE_DOF, 1),
     min_edges_per_pair=4.0,
 )
-"""Of an uncommissioned rig. Edges at the right pose are at 10 to 24 on every recording tried."""
+"""Limits of an uncommissioned rig. `min_edges_per_pair`: at the right pose edges are at 10 to 24 on every recording
+tried."""
 
 
 @on_one_thread()
 def observe(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
 ) -> Observation:
-    """A check of the extrinsic at which `window` starts, with all its pairs: five to ten of the latest, in motion.
-    Depth is asked where the edges accuse the pose, or are too faint to tell.
+    """Checks the extrinsic at which `window` starts, with all its pairs: five to ten of the latest, in motion. Depth is
+    used only if the edges accuse the pose, are undecided, or are too faint to tell.
 
     Raises:
         CalibrationError: fewer than `MIN_PAIRS` pairs, or an image or its depth cannot be decoded.
@@ -118,7 +119,7 @@ def observe(
 def diagnose(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
 ) -> Observation:
-    """The same with both witnesses, whatever the edges say: for who asks once.
+    """The same with both witnesses, whatever the edges say: for a single question rather than a stream of checks.
 
     Raises:
         CalibrationError: as `observe`.
@@ -139,13 +140,13 @@ def _look(
 
 
 def expected_of(baseline: Baseline | None) -> Expected:
-    """Where the optima of a rig's checks are expected."""
+    """Where the optima of checks are expected on a rig."""
     return AT_POSE if baseline is None else Expected(baseline.rotation.expected, baseline.pose.expected)
 
 
 def with_depth(told: Observation, depth: DepthWitness, baseline: Baseline | None) -> Observation:
-    """A check with what depth says of its pose: figures for who reads them, and the paper's verdict. The edges have
-    decided."""
+    """A check with what depth says of its pose added: figures for the reader, and the paper's verdict. The decision
+    stays that of the edges."""
     limits = UNCOMMISSIONED if baseline is None else baseline.monitor
     return replace(
         told,
@@ -163,7 +164,7 @@ def with_depth(told: Observation, depth: DepthWitness, baseline: Baseline | None
 
 
 def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Baseline | None) -> Observation:
-    """A check at `pose` (4, 4) against the limits of the rig, and the causes of what is wrong with it."""
+    """A check at `pose` (4, 4) judged by the limits of the rig, with the causes of what is wrong with its data."""
     limits = UNCOMMISSIONED if baseline is None else baseline.monitor
     camera = evidence.rig.camera
     rotation, accuracy = uncommissioned(camera) if baseline is None else (baseline.rotation, baseline.pose)
@@ -174,7 +175,7 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
     causes = data_causes(evidence.scenes, None if baseline is None else baseline.scene)
     dirty, textured = ((), 0) if baseline is None or causes else dirty_blocks(evidence.scenes, baseline.scene)
     if not causes and not faint & {Faint.EDGES_IN_VIEW, Faint.LOOKS}:
-        # What few edges fit, another clock fits as well as another mount.
+        # Few edges fit another clock as well as they fit another mount.
         explained = explained_by_motion(
             evidence.edges.measured,
             evidence.rig,
@@ -207,7 +208,7 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
 
 
 def faintness(pairs: Sequence[FramePair], seen: Check, limits: MonitorLimits) -> frozenset[Faint]:
-    """Why the edges of a check of some pairs count as faint; nothing where they do not."""
+    """Why the edges of a check of some pairs count as faint; empty if they do not."""
     short = {
         Faint.EDGES_IN_VIEW: seen.edges_in_view < MIN_EDGES_IN_VIEW * seen.pairs,
         # While a vehicle stands its checks count as one anyway.
@@ -219,7 +220,7 @@ def faintness(pairs: Sequence[FramePair], seen: Check, limits: MonitorLimits) ->
 
 
 def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> tuple[float, float]:
-    """Squared distances of the local optima over three and six degrees of freedom, over their limits."""
+    """Squared distances of the local optima over three and over six degrees of freedom, each divided by its limit."""
     return (
         rotation.distance2(seen.offset_rotation, seen.pairs) / limits.max_distance2_rotation,
         pose.farthest2(seen.offset_pose, seen.pairs) / limits.max_farthest2_pose,
@@ -227,9 +228,9 @@ def over_limits(seen: Check, rotation: Accuracy, pose: Accuracy, limits: Monitor
 
 
 def opinion(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimits) -> Opinion:
-    """What a check says. It accuses where an optimum is off and its edges insist on that, in a scene that can tell; it
-    acquits where neither optimum is farther than a right pose has it. Next to a wrong pose a ripple may hold one
-    half-way: what edges gain by there is no acquittal."""
+    """What a check says. It accuses if an optimum is off and its edges insist on that, in a scene that can tell. It
+    acquits if neither optimum is farther off than it is at a right pose. Near a wrong pose a ripple may hold an optimum
+    half-way; if the edges gain by going there, the check does not acquit."""
     undecided = False
     for over, said in zip(over_limits(seen, rotation, pose, limits), (seen.of_rotation, seen.of_pose), strict=True):
         tells = seen.contrast >= TELLING_CONTRAST or said.kept < LOST_SHARE
@@ -240,7 +241,7 @@ def opinion(seen: Check, rotation: Accuracy, pose: Accuracy, limits: MonitorLimi
 
 
 def _of_both(of_rotation: NDArray[np.float64], of_pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6,) the rotations of the one, the translations of the other."""
+    """(6,) the rotations of `of_rotation` and the translations of `of_pose`."""
     return np.concatenate([of_rotation[:ROTATION_DOF], of_pose[ROTATION_DOF:]])
 
 

@@ -1,7 +1,7 @@
-"""The second witness of a check: what depth says of a pose that the edges accuse, or cannot tell.
+"""The second witness of a check: what depth says of a pose that the edges accuse or cannot judge.
 
-The edges are sharper by far, and a network costs more than all the rest of a check. Where the edges are clear, and the
-pose is where they put it, depth is not asked.
+The edges are far sharper, and a network costs more than all the rest of a check. So depth is not used if the edges are
+clear and confirm the pose.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from coec.geometry import se3
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthWitness:
     """What mutual information says of a pose (Borer et al. 2023). Derivatives are over rx ry rz tx ty tz; equation (2)
-    takes those of the rotations.
+    uses those of the rotations.
 
     Attributes:
         mi: equation (1), nats.
         first_derivative: (6,) ∂MI/∂ξ, nats per radian or metre.
         second_derivative: (6,) -∂²MI/∂ξ², nats per radian² or metre²; positive at a maximum.
-        agreement_rad: angle between its local optimum and that of the edges.
+        agreement_rad: angle between the local optimum of depth and that of the edges.
     """
 
     mi: float

@@ -1,6 +1,7 @@
-"""What one image and one sweep show of the sensors themselves, measured: what `sensor_faults` judges.
+"""Measures what one image and one sweep show of the sensors themselves; `sensor_faults` judges that.
 
-Apart from it, as measuring takes kernels, and the process that serves queries knows faults and loads no compiler.
+It is a module of its own because measuring takes compiled kernels, and the process that serves queries needs the faults
+but loads no compiler.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from coec.geometry.bearings import Bearings, grid_counts
 from coec.geometry.picture import level_counts, neighbour_differences
 
 BRIGHT_SHARE, BRIGHT_STEP = 0.9, 4
-"""Of the pixels, every fourth of every fourth row."""
+"""Share of the pixels below the grey value `bright`, and the sampling: every fourth pixel of every fourth row."""
 
 THUMBNAIL_CELL_PX = 8
-"""Pixels a side that are one of the thumbnail by which pictures are compared."""
+"""Side, in pixels of the image, of one pixel of the thumbnail by which pictures are compared."""
 
 
 def picture_facts(grey: NDArray[np.uint8]) -> PictureFacts:
@@ -43,7 +44,7 @@ def picture_facts(grey: NDArray[np.uint8]) -> PictureFacts:
 
 
 def sweep_facts(seen: Bearings, range_edges: int) -> SweepFacts:
-    """The facts of a sweep whose points lie so, and that has so many range edges."""
+    """The facts of a sweep, from the bearings of its points and the number of its range edges."""
     low, high = BAND_RANGE_RAD
     bands, sectors = grid_counts(seen.elevation, seen.azimuth, low, high, BANDS, SECTORS)
     return SweepFacts(bands, sectors, range_edges)

@@ -1,14 +1,14 @@
-"""Has the mount moved, when, and to where? One question for three axes at a time, asked again at every check.
+"""Has the mount moved, when, and to where? The question is asked for three axes at a time, again at every check.
 
-After Page (1954) and Lorden (1971): at every check begins a test of "it moved just now" against "it did not", which
-goes on for ever or ends by accusing. Where to is not known: each test learns it as it goes, and predicts every check
+After Page (1954) and Lorden (1971): every check begins a test of "it moved just now" against "it did not", which goes
+on for ever or ends by accusing. The new place is unknown, so each test learns it as it goes, and predicts every check
 from those before it (Lorden and Pollak 2005, nonanticipating estimation). Under a right mount the likelihood ratio of
-such a test is a martingale, so it comes to e^h in a share of at most e^-h of them (Ville), and by Lorden's theorem the
-mean run between false accusations is at least e^h checks: the threshold is the logarithm of a number of checks.
+such a test is a martingale, so it reaches e^h in a share of at most e^-h of the tests (Ville). By Lorden's theorem the
+mean run between false accusations is then at least e^h checks: the threshold is the logarithm of a number of checks.
 
-A right mount is not a point: the optimum of a check lies a little elsewhere in every street, and so it does at all
-neighbouring checks. Both sides of a test learn where; the one without a move may be elsewhere by no more than streets
-differ. So what streets do is no evidence, however long it lasts.
+A right mount is not a point: in every street the optimum lies a little elsewhere, at all neighbouring checks alike.
+Both sides of a test learn where it lies; on the side without a move it may be off by no more than streets differ. So
+what streets do is no evidence, however long it lasts.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from math import fsum
 from coec.calibration.monitor.likelihood import Belief, Three, Told, plus, score, three
 
 LEAST_STEP, MOST_STEP = -5.0, 6.0
-"""Nats that a check may speak against a test and for it: none decides alone, and three acquit."""
+"""Most nats by which one check may speak against a test, and for it: no check decides alone, and three acquit."""
 
 PLACE_TIMES = 1.5
-"""Times the standard deviation of places by which the one that a right mount is at may be farther off. A move is what
-no place explains, and of thousands of places in a hundred hours the farthest counts. Chosen
-between 1, with which most places four of them off accuse, and 2, with which a degree takes half a minute to be told
-within a place: places of simulated drives were within 1.3 standard deviations in 95 of 100."""
+"""Factor on the standard deviation of places for the place where a right mount is: a move is what no place explains,
+and of thousands of places in a hundred hours the farthest counts. Chosen between 1, with which most places four
+standard deviations off accuse, and 2, with which it takes half a minute to tell a move of a degree from a place. Places
+of simulated drives were within 1.3 standard deviations in 95 of 100."""
 
 THINNING = 2.0
-"""Ratio of the ages of neighbouring tests: the older, the sparser, as it matters less when exactly a move was."""
+"""Ratio of the ages of neighbouring tests: older tests are sparser, because the exact time of a move matters less."""
 
 OLDEST = 8192
 """Checks after which a test ends: eleven hours at one every five seconds."""
@@ -40,7 +40,7 @@ class Axes:
     """Three axes that are tested together.
 
     Attributes:
-        reach: standard deviation of what a bad check says, per axis (rad or m).
+        reach: standard deviation of the offset of a bad check, per axis (rad or m).
         moves: standard deviations of the moves that are looked for: small ones and large ones.
     """
 
@@ -53,10 +53,10 @@ class Hypothesis:
     """ "It moved just before `age` checks."
 
     Attributes:
-        kind: which of the moves.
-        age: checks since, those that count in part by that part.
+        kind: index of the move in `Axes.moves`.
+        age: number of checks since, partial ones by their part.
         evidence: log-likelihood ratio, nats.
-        moved, right: where the mount is, had it moved, and had it not.
+        moved, right: where the mount is if it moved, and if it did not.
     """
 
     kind: int
@@ -68,7 +68,8 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Hypotheses:
-    """All that go on over three axes, the youngest first, and where a right mount has been so far."""
+    """All running tests over three axes, the youngest first; where a right mount has been so far; and the offset of the
+    last check."""
 
     right: Belief | None = None
     running: tuple[Hypothesis, ...] = ()
@@ -76,20 +77,20 @@ class Hypotheses:
 
     @property
     def leading(self) -> Hypothesis | None:
-        """The one with the most evidence; the oldest of equals."""
+        """The test with the most evidence; of equals the oldest."""
         return max(reversed(self.running), key=lambda test: test.evidence, default=None)
 
 
 def after_check(tests: Hypotheses, told: Told, axes: Axes, share: float, most: float) -> Hypotheses:
-    """The tests after one more check that counts by `share`, 0 to 1. None comes to more evidence than `most`; a weak
-    check raises none above it, and none that was above falls to it by that."""
+    """The tests after one more check that counts by `share`, 0 to 1. The check raises no test above the evidence
+    `most`; a test that is above it already keeps its evidence."""
     right = tests.right if tests.right is not None else Belief((0.0, 0.0, 0.0), told.rig)
     begun = [_begun(kind, right, told, axes) for kind in range(len(axes.moves))]
     running = [_continued(test, told, axes, share, most) for test in (*begun, *tests.running)]
     scored = score(told, right.wider(_farthest(told.place)), axes.reach)
-    # Neighbouring checks say the same of their street: what they say of the rig is worth no more than a street.
+    # Neighbouring checks share the error of their street: about the rig they say no more than one street can.
     of_rig = plus(told.noise, told.place)
-    # Faint checks of one place are off alike, however many: they teach nothing of the rig.
+    # Faint checks of one place are all off alike, however many there are: nothing is learnt of the rig from them.
     learnt = right if told.weak else right.after(replace(told, noise=of_rig), scored, share)
     least = three([max(v, n / OLDEST) for v, n in zip(learnt.variance, of_rig, strict=True)])
     learnt = replace(learnt, variance=least)
@@ -97,9 +98,9 @@ def after_check(tests: Hypotheses, told: Told, axes: Axes, share: float, most: f
 
 
 def learnt_distance2(tests: Hypotheses, rig: Three) -> float:
-    """How far beside the pose that is served the checks have put the mount, in standard deviations, squared: what is
-    learnt of a mean of variance `rig` (per axis) that leaves v of it, itself varies by the rest. χ² of a right mount,
-    as long as nothing else speaks."""
+    """How far beside the served pose the checks have put the mount, in standard deviations, squared. The mean that is
+    learnt has variance `rig` (per axis) less the variance v that is left, so the distance of a right mount is χ²
+    distributed unless something else moves it."""
     if tests.right is None:
         return 0.0
     rows = zip(tests.right.mean, tests.right.variance, rig, strict=True)
@@ -113,7 +114,7 @@ def _begun(kind: int, right: Belief, told: Told, axes: Axes) -> Hypothesis:
 
 
 def _farthest(place: Three) -> Three:
-    """Variance of where a place may put a right mount, of that of places."""
+    """Variance of where a place may put a right mount, from the variance of places."""
     return three([PLACE_TIMES**2 * variance for variance in place])
 
 
@@ -133,7 +134,7 @@ def _continued(test: Hypothesis, told: Told, axes: Axes, share: float, most: flo
 
 
 def _thinned(running: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Per kind of move tests at ages that grow by a factor; always the one that leads, of every kind."""
+    """The tests to keep: for every kind of move those at ages that grow by a factor, and always the leading one."""
     kept: list[Hypothesis] = []
     for kind in sorted({test.kind for test in running}):
         of_kind = [test for test in running if test.kind == kind and test.age <= OLDEST]
@@ -141,7 +142,7 @@ def _thinned(running: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         sparse: list[Hypothesis] = []
         for place, test in enumerate(of_kind):
             older = of_kind[place + 1].age if place + 1 < len(of_kind) else None
-            # The next one would still be near enough to the last that was kept.
+            # Without this test the next one would still be near enough in age to the last that was kept.
             crowded = sparse and older is not None and older <= THINNING * sparse[-1].age
             if test is leading or not crowded:
                 sparse.append(test)

@@ -1,7 +1,7 @@
 """The edges of a check: range edges of some sweeps, laid onto the edge maps of the images of one camera.
 
-Joined of what was prepared of each sensor by itself (`sensors`): what is left to a pair is to place some thousand
-points at the instants of its exposures.
+Both are prepared for each sensor by itself (`sensors`). All that is left for each pair is to place some thousand points
+at the instants of its exposures.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CELL_STEP = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaidLevel:
-    """Range edges on the maps of one level, and the blur of these, an angle about the optical axis."""
+    """Range edges on the maps of one level, and the blur of these maps, an angle about the optical axis."""
 
     frames: EdgeFrames
     blur_rad: float
@@ -37,10 +37,10 @@ class LaidEdges:
     """The range edges that can come into view, on maps of several levels: the same points in the same order on each.
 
     Attributes:
-        sharp: on the sharpest edges: settles a pose.
-        whole: on blurred ones, layout and all.
-        bands: from fine to coarse; two at least.
-        measured: the pairs with nothing of their sweeps but these range edges, before motion compensation.
+        sharp: on the sharpest edges, which settle a pose.
+        whole: on blurred edges that keep the layout of the scene.
+        bands: from fine to coarse; at least two.
+        measured: the pairs, their sweeps reduced to these range edges, before motion compensation.
     """
 
     sharp: LaidLevel
@@ -55,7 +55,7 @@ class LaidEdges:
         return np.repeat(np.arange(len(first) - 1), np.diff(first))
 
     def of(self, indices: Sequence[int]) -> LaidEdges:
-        """Those of some of the pairs alone."""
+        """The edges of some of the pairs alone, by their indices."""
         return LaidEdges(
             _level_of(self.sharp, indices),
             _level_of(self.whole, indices),
@@ -69,7 +69,7 @@ class LaidEdges:
         p_camera = placed(frames, T_camera_lidar)
         uv_px, valid = project(frames.camera, p_camera)
         seen = valid & in_image(frames.camera, uv_px)
-        # What lies outside counts with the first sector, should a step bring it into view.
+        # Edges outside the image count with the first sector if a step brings them into view.
         sector = np.zeros(len(p_camera), np.uint8)
         sector[seen] = sectors(uv_px[seen])
 
@@ -93,7 +93,8 @@ def lay(
     *,
     compensated: bool,
 ) -> LaidEdges:
-    """Lays the range edges that come within the prepared part of the images from a pose (4, 4), as far as it may turn.
+    """Lays the range edges that come within the prepared part of the images at a pose (4, 4), or within `reach_rad` of
+    it.
 
     Args:
         sweeps: those of the pairs, in order.
@@ -122,7 +123,7 @@ def lay(
 
 
 _PIXELS_PER_BLUR = 2.0
-"""Of the finest band, see `BLUR_SIGMA_PX`."""
+"""Pixels per blur of the finest band, see `BLUR_SIGMA_PX`."""
 
 
 def placed(frames: EdgeFrames, T_camera_lidar: Matrix4) -> NDArray[np.float64]:

@@ -1,11 +1,11 @@
-"""How likely the offset of a check is: where the mount is right, and where it has moved to a place.
+"""How likely the offset of a check is, if the mount is right and if it has moved to some place.
 
-A check is one of two things. A good one lies about the mount, Student-distributed: most within its own uncertainty,
-some a few times as far. A bad one (a tunnel, an open road, a frame that a lorry fills) lies anywhere within reach, or
-once more where the one before it lay, as long as the scene stays the same. So no single check can be worth more than
+A check is good or bad. A good check lies about the mount, Student-distributed: mostly within its own uncertainty,
+sometimes a few times as far. A bad check (a tunnel, an open road, a frame that a lorry fills) lies anywhere within
+reach, or again where the check before it lay if the scene is still the same. So a single check is worth no more than
 the rarity of bad ones, and checks that contradict each other are worth nothing.
 
-Rotations and translations are told apart, three axes each. Plain floats: what is decided has to replay to the byte.
+Rotations and translations are treated separately, three axes each. Plain floats: decisions have to replay to the byte.
 """
 
 from __future__ import annotations
@@ -15,40 +15,42 @@ from dataclasses import dataclass
 from math import exp, fsum, lgamma, log, pi
 
 FREEDOM = 4.0
-"""Degrees of freedom of the Student distribution of good checks: heavier tails than the normal one. Chosen; of 261
-coordinates of good checks on three simulated drives one was farther than four standard deviations, here 4 would be."""
+"""Degrees of freedom of the Student distribution of good checks: its tails are heavier than normal. Chosen: of 261
+coordinates of good checks on three simulated drives one was farther off than four standard deviations; by this
+distribution 4 would be."""
 
 BAD_SHARE, BAD_AFTER_BAD, BAD_SHARE_WEAK = 0.01, 0.5, 0.8
-"""Share of checks that are bad though no cause was found in their data: after a good one, after a bad one, and of those
-with faint edges. Chosen to be on the safe side of a drive: none of 87 checks of simulated drives without poor stretches
-was bad; within tunnels, open roads and nights 14 of 56 with clear edges and some 57 of 63 with faint ones."""
+"""Share of checks that are bad although no cause was found in their data: after a good check, after a bad one, and of
+checks with faint edges. Chosen to be on the safe side: of 87 checks of simulated drives without poor stretches none was
+bad; within tunnels, open roads and nights 14 of 56 with clear edges were, and some 57 of 63 with faint ones."""
 
 SAME_AGAIN, SAME_AGAIN_WEAK = 0.03, 0.2
-"""Share of bad checks that lie where the one before lay, with clear and with faint edges. Chosen: with clear edges none
-was seen to. Less makes three checks certain sooner, more lets a scene that stays the same accuse later."""
+"""Share of bad checks that lie where the check before them lay, with clear and with faint edges. Chosen: with clear
+edges none was seen to. A smaller share makes three checks certain sooner; with a larger one a scene that stays the same
+accuses later."""
 
 FARTHER = 0.03
-"""Of its offset, by which a check is less certain: far from the pose the local optimum is found less exactly."""
+"""Share of its offset by which a check is less certain: far from the pose the local optimum is found less exactly."""
 
 WEAK_TIMES = 10.0
-"""Times the standard deviation of others that a check with faint edges has: by night on simulated drives the best of
-them, 6 of 63, lie 0.3 to 0.7° off the mount."""
+"""Factor on the standard deviation of a check with faint edges: by night on simulated drives the best of them, 6 of 63,
+lie 0.3 to 0.7° off the mount."""
 
 AXES = 3
-"""Of rotation, and of translation."""
+"""Axes of rotation, and of translation."""
 
 Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What one check tells of three axes (rad or m).
+    """What one check says about three axes (rad or m).
 
     Attributes:
-        offset: from the pose that is served.
-        noise: variance that is new at every check.
-        place: variance that neighbouring checks share and other places do not.
-        rig: variance of what no place tells: the estimator's bias on this rig, as far as it is unknown.
+        offset: from the served pose.
+        noise: variance of the error that is new at every check.
+        place: variance of the error that neighbouring checks share and checks elsewhere do not.
+        rig: variance of the error that is the same everywhere: the unknown bias of the estimator on this rig.
         before: the offset of the check before, if there was one.
         weak: whether its edges are faint.
     """
@@ -63,15 +65,15 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """Where the mount is, as far as is known: mean and variance per axis (rad or m, and squared); and how far the last
-    check was a bad one there, 0 to 1."""
+    """Where the mount is thought to be: mean and variance per axis (rad or m, and squared); and how far the last check
+    was a bad one under this belief, 0 to 1."""
 
     mean: Three
     variance: Three
     astray: float = 0.0
 
     def after(self, told: Told, scored: Scored, share: float) -> Belief:
-        """The belief after a check that scored so under it, and counts by `share`, 0 to 1."""
+        """The belief after a check that has the score `scored` under it and counts by `share`, 0 to 1."""
         # The farther out a good check lies, the less it weighs (the weight of the Student distribution, at most 1).
         weight = share * scored.good * min((FREEDOM + AXES) / (FREEDOM + self.distance2(told)), 1.0)
         precision = [1.0 / v + weight / n for v, n in zip(self.variance, told.noise, strict=True)]
@@ -81,23 +83,23 @@ class Belief:
         return Belief(three(mean), three(variance), 1.0 - scored.good)
 
     def wider(self, variance: Three) -> Belief:
-        """One that knows so much less."""
+        """The belief with its variance increased by so much."""
         return Belief(self.mean, plus(self.variance, variance), self.astray)
 
     def distance2(self, told: Told) -> float:
-        """Squared distance of a check from it in standard deviations."""
+        """Squared distance of a check from the mean, in standard deviations."""
         rows = zip(told.offset, self.mean, self.variance, told.noise, strict=True)
         return fsum((y - m) ** 2 / (v + n) for y, m, v, n in rows)
 
 
 def three(values: Sequence[float]) -> Three:
-    """Of three values."""
+    """Three values as floats in a tuple."""
     x, y, z = values
     return float(x), float(y), float(z)
 
 
 def plus(one: Three, other: Three) -> Three:
-    """Axis by axis."""
+    """The sum, axis by axis."""
     return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
@@ -105,7 +107,7 @@ _CONSTANT = lgamma((FREEDOM + AXES) / 2.0) - lgamma(FREEDOM / 2.0) - AXES / 2.0 
 
 
 def log_density(offset: Three, mean: Three, variance: Three) -> float:
-    """Of the multivariate Student distribution with independent scales, nats per rad³ or m³."""
+    """Log density of the multivariate Student distribution with independent scales, nats per rad³ or m³."""
     q = sum((y - m) ** 2 / v for y, m, v in zip(offset, mean, variance, strict=True))
     spread = log(variance[0] * variance[1] * variance[2])
     return _CONSTANT - 0.5 * spread - 0.5 * (FREEDOM + AXES) * log(1.0 + q / FREEDOM)
@@ -113,14 +115,15 @@ def log_density(offset: Three, mean: Three, variance: Three) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """A check under a belief: its log density, and how far it is a good one of this mount, 0 to 1."""
+    """The score of a check under a belief: its log density, and how far it is a good check of this mount, 0 to 1."""
 
     log_density: float
     good: float
 
 
 def score(told: Told, belief: Belief, reach: Three) -> Scored:
-    """A check where the mount is as believed. `reach`: standard deviations of bad checks, per axis."""
+    """The score of a check if the mount is where it is believed. `reach`: standard deviations of bad checks, per
+    axis."""
     bad = BAD_SHARE_WEAK if told.weak else BAD_SHARE + belief.astray * (BAD_AFTER_BAD - BAD_SHARE)
     good = log(1.0 - bad) + log_density(told.offset, belief.mean, plus(belief.variance, told.noise))
     astray = log(bad) + _log_density_of_bad(told, reach)

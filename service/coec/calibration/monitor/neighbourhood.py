@@ -1,8 +1,8 @@
-"""Where the edges of a check are most significant near a pose.
+"""Finds where the edges of a check are most significant near a pose.
 
-Straight up from the pose on the sharpest edges, and from coarse to fine: by the finest band from there, and from where
-a cover of all rotations within reach on the coarsest band has another hill. What is found next to the pose is believed
-unless another place is clearly better, and stands out. Nothing is drawn at random.
+One climb goes straight up from the pose on the sharpest edges. Others go from coarse to fine: by the finest band from
+the end of that climb, and from every other hill of the coarsest band that a cover of all rotations within reach shows.
+The optimum next to the pose is believed unless another place is clearly better and stands out. Nothing is random.
 """
 
 from __future__ import annotations
@@ -24,71 +24,71 @@ from coec.geometry.edges.charts import keep_apart
 from coec.geometry.thinning import thinned
 
 REACH_RAD = radians(4.0)
-"""How far about the pose a check searches. A pose further off leaves the local optimum at the rim, or nowhere: both are
-far beyond any limit."""
+"""How far about the pose a check searches. If the truth is farther off, the local optimum is at the rim or anywhere,
+and either is far beyond any limit."""
 
 COVER_SPACING = 0.9
 """Distance between the poses of the cover, in blurs of the coarsest band."""
 
 MOST_POSES = 1_500
-"""Of the cover: what the finest spacing that `COARSEST_BLUR_RAD` allows has."""
+"""Most poses of the cover: as many as with the finest spacing that `COARSEST_BLUR_RAD` allows."""
 
 COVER_POINTS = 2_000
-"""Range edges that the cover visits, at most; significance falls with the root of their number only."""
+"""Most range edges that score the cover; significance falls only with the root of their number."""
 
 BEGINNINGS, APART = 2, 1.5
-"""So many of the best poses of the cover are climbed from, so many blurs apart."""
+"""How many of the best poses of the cover begin a climb, and how many blurs they are apart."""
 
 FAIR_SHARE = 0.8
-"""Of the best of the cover, what a beginning has at least."""
+"""Share of the best score of the cover that a beginning must have."""
 
 OTHER_POSES, OTHER_POSES_RAD = 32, (radians(3.0), radians(28.0))
-"""Poses either way, turned about the axis of the LiDAR by so much, from which the mean and the standard deviation of a
-significance are taken. So turned, range edges stay on the strip of the image that was prepared, and in its layout: they
-lie as high as before, and on other things."""
+"""Number of poses either way, and the range of their turns about the LiDAR's axis, that give the mean and the standard
+deviation of a significance. After such turns range edges stay on the prepared strip of the image and in its layout:
+they lie as high as before, but on other things."""
 
 MIN_CONTRAST = 4.0
-"""Standard deviations by which an optimum stands out from other poses, below which its edges count as faint, and no
-other place is believed for them. Of 90 checks of 15 simulated drives those of streets and garages are at 11 to 38, of
-highways at 4.2 to 12; through a lens of 75° on a highway, and up to 1.4° off, at 0.7 to 1.2; in the dark up to 4.6,
-where significance itself is too small."""
+"""If an optimum stands out from other poses by fewer standard deviations, its edges count as faint, and no place other
+than the one next to the pose is believed. Of 90 checks of 15 simulated drives those of streets and garages are at 11 to
+38, of highways at 4.2 to 12; through a lens of 75° on a highway, and up to 1.4° off, at 0.7 to 1.2; in the dark up to
+4.6, where significance itself is too small."""
 
 SAME = 0.25
-"""Of the finest band's blur: ends of two climbs that are nearer are one."""
+"""Two climbs whose ends are nearer than this share of the finest band's blur have the same end."""
 
 NEAR_SHARE = 0.9
-"""Of the significance of the best maximum within reach on the sharpest edges, from which the one next to the pose is
-believed instead: a mount that is as it was is far likelier than one that moved to a place which fits hardly better.
-Between guard rails, lane markings and a horizon, all of which run to one point, edges fit nearly as well a degree
+"""The maximum next to the pose is believed if it has at least this share of the significance of the best maximum within
+reach, on the sharpest edges: a mount that did not move is far likelier than one that moved to a place which fits hardly
+better. Between guard rails, lane markings and a horizon, which all run to one point, edges fit nearly as well a degree
 beside. Of 180 checks of right mounts on simulated drives 27 with clear edges ended more than 0.45° off, most of them on
-highways; with this 15, of which 14 have few edges in view. From 0.8 to 0.95 it is 14 to 16."""
+highways; with this rule 15 did, of which 14 have few edges in view. From 0.8 to 0.95 it is 14 to 16."""
 
 HOPELESS_SHARE = 0.7
-"""Of what the optimum next to the pose has on the finest band: a climb that has less there is not followed to the
-sharpest edges."""
+"""A climb is not followed to the sharpest edges if on the finest band it has less than this share of the significance
+of the optimum next to the pose."""
 
 CLIMB_STEPS = 4.0
 """Half-width of the box of a climb, in blurs."""
 
 TOLERANCE, LEADING_TOLERANCE = 0.01, 0.1
-"""Last trust region of a climb, in blurs of its level: of one that settles a pose, and of one that leads to a finer
-level."""
+"""Last trust region of a climb, in blurs of its level: for a climb that settles a pose, and for one that leads to a
+finer level."""
 
 MAX_EVALUATIONS = 400
-"""Of a climb: an end, whatever the edges are like."""
+"""Most evaluations of a climb, so that it ends whatever the edges are like."""
 
 ROTATION_DOF, POSE_DOF = 3, 6
-"""Axes of ξ that the two optima of a check are searched over: rotations, and all."""
+"""Number of axes of ξ over which the two optima of a check are searched: rotations, and all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """What there is about a pose.
+    """What was found near a pose.
 
     Attributes:
-        T_rotation: (4, 4) local optimum over rotations, the camera's centre being that of the pose.
+        T_rotation: (4, 4) local optimum over rotations, with the camera's centre of the pose.
         T_pose: (4, 4) local optimum over all six degrees of freedom.
-        contrast: how far the edges of the finest band there stand above other poses, standard deviations.
+        contrast: how far the finest band at `T_rotation` stands above other poses, standard deviations.
     """
 
     T_rotation: Matrix4
@@ -113,13 +113,13 @@ def search(edges: LaidEdges, pose: Matrix4) -> Neighbourhood:
     thin = coarsest.frames.of_points(thinned(len(coarsest.frames.weight), COVER_POINTS))
     z = significances(thin, cover)
     z_best = float(z.max())
-    # What the sharpest edges have next to the pose may be a ripple of a hill that the finest band has whole.
+    # The maximum of the sharpest edges next to the pose may be a ripple on a hill that is whole on the finest band.
     ends = [_climb(finest.frames, near.pose, settled[:ROTATION_DOF], LEADING_TOLERANCE)]
     apart = APART * coarsest.blur_rad
     z_near = float(significances(thin, near.pose[None])[0])
     for number in keep_apart(cover, np.argsort(-z, kind="stable"), BEGINNINGS, _trace_of(apart)):
-        # Nearer than that it is on the same hill, unless that goes up from what is next to the pose: that is a ripple
-        # on its slope, and the finest band, whose reach is a few tenths of a degree, may not lead off it.
+        # A nearer beginning is on the same hill, unless it is higher than the maximum next to the pose. That maximum is
+        # then a ripple on the slope, and the finest band, whose reach is a few tenths of a degree, may not lead off it.
         if z[number] >= FAIR_SHARE * z_best and (_apart(cover[number], near.pose) > apart or z[number] > z_near):
             ends.append(_led(edges.bands, cover[number]))
     best = near
@@ -134,7 +134,7 @@ def search(edges: LaidEdges, pose: Matrix4) -> Neighbourhood:
 
 
 def _contrast(band: LaidLevel, pose: Matrix4) -> float:
-    """How far a pose stands above others, from which the same sweeps lie on other parts of the images; standard
+    """How far a pose stands above others at which the same sweeps lie on other parts of the images; standard
     deviations."""
     turned = np.tile(np.eye(4), (2 * OTHER_POSES, 1, 1))
     one_way = np.linspace(*OTHER_POSES_RAD, OTHER_POSES)
@@ -147,19 +147,20 @@ def _contrast(band: LaidLevel, pose: Matrix4) -> float:
 
 
 def _pose_of(edges: LaidEdges, rotation: _End) -> Matrix4:
-    """The optimum over six degrees of freedom next to that over three: straight up, or by way of the finest band."""
+    """The optimum over six degrees of freedom next to the one over three, climbed to directly or by way of the finest
+    band."""
     finest = edges.bands[0]
     settled = of_both(finest.blur_rad, POLISH_METRES_PER_RADIAN)
     near = _climb(edges.sharp.frames, rotation.pose, settled, TOLERANCE)
     led = _climb(finest.frames, rotation.pose, settled, LEADING_TOLERANCE)
     if float(np.abs(se3.difference(led.pose, near.pose) / settled).max()) < SAME:
-        return near.pose  # from there the way leads to the same end
+        return near.pose  # the way by the finest band leads to the same end
     far = _climb(edges.sharp.frames, led.pose, settled, TOLERANCE)
     return near.pose if near.significance >= NEAR_SHARE * far.significance else far.pose
 
 
 def _led(bands: tuple[LaidLevel, ...], pose: Matrix4) -> _End:
-    """Up the hills of the bands, from coarse to fine."""
+    """The end of a climb on the bands, from coarse to fine."""
     end = _End(pose, 0.0)
     for band in reversed(bands):
         end = _climb(
@@ -169,7 +170,7 @@ def _led(bands: tuple[LaidLevel, ...], pose: Matrix4) -> _End:
 
 
 def _climb(frames: EdgeFrames, start: Matrix4, step: NDArray[np.float64], tolerance: float) -> _End:
-    """The maximum next to a pose, along as many axes as there are steps."""
+    """The maximum next to a pose, along the first `len(step)` axes of ξ."""
     dof = len(step)
 
     def at(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,8 +1,8 @@
 """Why a check of the extrinsic went wrong: a bent mount, or data that cannot tell.
 
-Only a bent mount is a wrong calibration. Everything else is told apart from it by what it does to the frames
-themselves: a covered lens has no gradients, a lost beam no points, a wrong clock moves every sweep along the motion of
-the vehicle. Each cause needs most pairs of a check, so that one bad frame is none.
+Only a bent mount makes the calibration wrong. Every other cause is recognised by what it does to the frames themselves:
+a covered lens has no gradients, a lost beam no points, and a wrong clock moves every sweep along the motion of the
+vehicle. A cause has to show in most pairs of a check, so that one bad frame is no cause.
 """
 
 from __future__ import annotations
@@ -20,61 +20,63 @@ BLOCK_ROWS, BLOCK_COLUMNS = 18, 32
 """The image is judged in blocks: dirt covers some of them, a covered lens all."""
 
 DARK_LEVEL = 40.0
-"""Grey value that nine pixels in ten stay below in the dark, of 255."""
+"""In the dark nine pixels in ten stay below this grey value, of 255."""
 
 FLAT_GRADIENT = 1.0
 """Mean difference of neighbouring grey values below which a block shows nothing: sensor noise and JPEG leave less."""
 
 COVERED_SHARE = 0.7
-"""Share of flat blocks by which a lens is covered: sky and road leave more than half of an outdoor picture textured."""
+"""A lens is covered if more than this share of the blocks is flat: sky and road leave more than half of an outdoor
+picture textured."""
 
 TEXTURED_GRADIENT = 2.0
 """Blocks with a smaller gradient when the rig was commissioned cannot show dirt."""
 
 DIRTY_RATIO, DIRTY_SHARE = 0.4, 0.012
-"""A block looks dirty when its sharpest exposure has less than this share of the gradient that it had when the rig was
-commissioned; so many of the textured blocks make a dirty lens, if it is the same blocks in `DIRTY_CHECKS` checks
-running. Another street does the same to 6 % of them for 5 s, and to less than 0.6 % for 20 s: dirt stays where it
-is."""
+"""A block looks dirty if its sharpest exposure has less than the first share of the gradient that it had when the rig
+was commissioned. A lens is dirty if more than the second share of the textured blocks look dirty, the same ones in
+`DIRTY_CHECKS` checks running. Another street makes 6 % of them look dirty for 5 s, and less than 0.6 % for 20 s; dirt
+stays where it is."""
 
 DIRTY_CHECKS = 3.5
-"""Independent checks after which a block is dirty, less their usual overlap: 20 s at the usual pace."""
+"""Independent checks after which a block is dirty, overlaps not counted: 20 s at the usual pace."""
 
 SAME_PICTURE = 0.01
-"""Mean absolute difference of two exposures over the standard deviation of their grey values below which they are the
-same picture: noise of a frozen image that was compressed anew."""
+"""Two exposures are the same picture if their mean absolute difference, over the standard deviation of their grey
+values, is below this: a frozen image that was compressed anew has that much noise."""
 
 MOVED_M = 1.0
-"""A vehicle that drove so far must see another picture."""
+"""A vehicle that drove so far, in metres, must see another picture."""
 
 BANDS, BAND_RANGE_RAD = 40, (-0.45, -0.05)
-"""Bands of elevation of 0.57°, of -26° to -3°, in which points are counted: each holds a beam of a 64-beam sensor, and
-each beam finds the ground. Beams above may go astray for want of anything to hit."""
+"""Bands of elevation in which points are counted: 0.57° each, from -26° to -3°. Each holds a beam of a 64-beam sensor,
+and each of these beams hits the ground. Beams above may hit nothing."""
 
 SECTORS = 36
 """Sectors of azimuth of 10°, of the same points."""
 
 LOST_RATIO, LOST_SHARE = 0.2, 0.08
-"""A band or sector is lost when no sweep of a check has this share of the points it had when the rig was commissioned;
-so many of them make a sensor that lost beams: five of 64."""
+"""A band or sector is lost if no sweep of a check has the first share of the points that it had when the rig was
+commissioned. The sensor has lost beams if more than the second share of them is lost: five of 64."""
 
 FEW_POINTS = 30
-"""Bands and sectors with fewer points when commissioned are not counted."""
+"""Bands and sectors that had fewer points when the rig was commissioned are not counted."""
 
 OPEN_FIELD_RATIO, OPEN_FIELD_EDGES = 0.2, 60
-"""Range edges of a sweep, against the commissioned rig and at least: with fewer there is nothing to lay on an image."""
+"""Least range edges of a sweep, as a share of those of the commissioned rig and as a number: with fewer there is
+nothing to lay on an image."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """A machine-readable code, one sentence, and what to do about it, another."""
+    """A machine-readable code, a sentence that says what is wrong, and a sentence that says what to do about it."""
 
     code: str
     text: str
     advice: str
 
     def as_reason(self) -> Reason:
-        """As a reason of a verdict or a state of health."""
+        """The cause as a reason of a verdict or a state of health."""
         return Reason(self.code, self.text)
 
 
@@ -144,7 +146,7 @@ CAUSES = {
         INTRINSICS_WRONG,
     )
 }
-"""By code, those that hide the others first."""
+"""By code, causes that hide others first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,7 +183,7 @@ class SweepFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneFacts:
-    """What one pair shows of the sensors themselves; `speed_mps` is that of the vehicle, None = unknown."""
+    """What one pair shows of the sensors themselves; `speed_mps` is the speed of the vehicle, None if unknown."""
 
     stamp_ns: int
     picture: PictureFacts
@@ -191,7 +193,7 @@ class SceneFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneBaseline:
-    """What the pairs of a commissioned rig show, medians: see `SceneFacts`."""
+    """Medians of what the pairs of a commissioned rig show; see `SceneFacts`."""
 
     gradient: NDArray[np.float64]
     bands: NDArray[np.float64]
@@ -210,8 +212,8 @@ def scene_baseline(scenes: Sequence[SceneFacts]) -> SceneBaseline:
 
 
 def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) -> tuple[Cause, ...]:
-    """Every reason in the frames themselves not to believe a check of them, those that hide others first. Lost beams
-    are seen against a commissioned rig only, dirt only over several checks."""
+    """Every cause in the frames themselves not to believe a check of them, those that hide others first. Lost beams can
+    be seen only with a commissioned rig, dirt only over several checks."""
     gradient = np.array([scene.picture.gradient for scene in scenes])
     causes = []
     dark = float(np.median([scene.picture.bright for scene in scenes])) < DARK_LEVEL
@@ -238,8 +240,7 @@ def data_causes(scenes: Sequence[SceneFacts], baseline: SceneBaseline | None) ->
 
 
 def dirty_blocks(scenes: Sequence[SceneFacts], baseline: SceneBaseline) -> tuple[tuple[int, ...], int]:
-    """Blocks of the image, by their number, that are dirty for all that these pairs show, and of how many that can
-    be."""
+    """The numbers of the blocks of the image that look dirty in all these pairs, and how many blocks could be dirty."""
     textured = baseline.gradient >= TEXTURED_GRADIENT
     sharpest = np.max([scene.picture.gradient for scene in scenes], axis=0)
     dirty = textured & (sharpest < DIRTY_RATIO * baseline.gradient)
@@ -247,7 +248,7 @@ def dirty_blocks(scenes: Sequence[SceneFacts], baseline: SceneBaseline) -> tuple
 
 
 def _lost(counts: NDArray[np.int64], usual: NDArray[np.float64]) -> float:
-    """Share of the usual directions in which no sweep has what it usually has."""
+    """Share of the usual directions in which no sweep has `LOST_RATIO` of its usual points."""
     counted = usual >= FEW_POINTS
     if not counted.any():
         return 0.0
@@ -255,14 +256,15 @@ def _lost(counts: NDArray[np.int64], usual: NDArray[np.float64]) -> float:
 
 
 def _is_frozen(scenes: Sequence[SceneFacts]) -> bool:
-    """Whether most neighbours in time that the vehicle drove between show the same picture."""
+    """Whether most pairs of successive frames between which the vehicle drove show the same picture."""
     pairs = [(a, b) for a, b in pairwise(scenes) if _moved(a, b)]
     same = sum(_same_picture(a, b) for a, b in pairs)
     return len(pairs) > 0 and 2 * same > len(pairs)
 
 
 def _moved(a: SceneFacts, b: SceneFacts) -> bool:
-    """Unknown motion counts as driving: a camera that stands still still has noise."""
+    """Whether the vehicle drove between two frames. Unknown motion counts as driving, because even a standing camera
+    has noise."""
     if a.speed_mps is None or b.speed_mps is None:
         return True
     return min(a.speed_mps, b.speed_mps) * (b.stamp_ns - a.stamp_ns) * 1e-9 > MOVED_M

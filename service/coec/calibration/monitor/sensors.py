@@ -1,10 +1,10 @@
 """What a check needs of each sensor by itself: every sweep and every image is prepared once, however many pairs of a
-rig look at it.
+rig use it.
 
-What reads an image at which resolution: the sharpest edges decide, and are read at the camera's own (halved only above
-`MAX_PIXELS`), so images are decoded in full; bands are two pixels wide and read at the own, half and quarter of it. A
-network of depth reads less, and decodes for itself. Of an image edges are wanted only where range edges can come to
-lie: of 114,000 points of a sweep a thousand, in a strip of a fifth of a fisheye's image.
+Resolutions: the sharpest edges decide and are read at the camera's own resolution (halved only above `MAX_PIXELS`), so
+images are decoded in full. Bands are two pixels wide and read at full, half and quarter resolution. A depth network
+reads fewer pixels and decodes for itself. Edges of an image are needed only where range edges can lie: a thousand of
+the 114,000 points of a sweep, in a strip of a fifth of a fisheye's image.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from coec.geometry.projection import project
 from coec.geometry.thinning import thinned
 
 MAX_PIXELS = 2_500_000
-"""Images are halved until they have no more: bounded time, whatever the camera."""
+"""Images are halved until they have no more pixels than this, which bounds the time for any camera."""
 
 COARSEST_BLUR_RAD = radians(0.6)
-"""Least blur of the coarsest band, an angle about the optical axis; it is below twice that. Its hills are wide enough
-for a cover of some hundred poses within reach."""
+"""Least blur of the coarsest band, an angle about the optical axis; the blur is below twice that. The hills of the band
+are then wide enough for a cover of some hundred poses within reach."""
 
 OUTLINE_RAD = radians(2.0)
-"""Turn of the camera within which the range edges have to stay on the prepared part of its images, all but a few. One
-that turned further has some of them beyond its rim, and the more on it that tell so."""
+"""Within this turn of the camera the range edges have to stay on the prepared part of its images, all but a few. After
+a larger turn some of them lie beyond its rim, but enough lie on it to show the turn."""
 
 OUTLINE_POINTS, OUTLINE_SHARE = 1_500, 0.01
-"""Range edges from which that part is taken, and the share of them that may lie beyond it on each side: a post next to
-the vehicle would double it."""
+"""Range edges from which the prepared part is found, and the share of them that may lie beyond it on each side: without
+that share a post next to the vehicle would double the part."""
 
 MARGIN_PX = MEAN_RADIUS_PX + 8
-"""By how much more is prepared: a local mean, and a blur."""
+"""Margin by which the prepared part is larger: the reach of a local mean, and of a blur."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,8 +53,8 @@ class PreparedSweep:
     """A sweep of one LiDAR.
 
     Attributes:
-        edges: nothing of the sweep but its range edges, as measured.
-        weight: (E,) float32, of each; see `RangeEdges`.
+        edges: the sweep reduced to its range edges, as measured.
+        weight: (E,) float32, weight of each range edge; see `RangeEdges`.
         facts: what the sweep shows of the sensor itself.
     """
 
@@ -80,7 +80,7 @@ class PreparedImages:
     Attributes:
         facts: what each shows of the camera itself.
         sharp, whole: as in `EdgePyramid`.
-        bands: likewise, from fine to coarse; two at least.
+        bands: likewise, from fine to coarse; at least two.
     """
 
     facts: tuple[PictureFacts, ...]
@@ -90,24 +90,24 @@ class PreparedImages:
 
 
 def prepare_sweep(sweep: LidarFrame) -> PreparedSweep:
-    """Range edges of a sweep, and what it shows of the LiDAR. Points are placed later, and only these: when they have
-    to be where, another exposure says in every pair."""
+    """The range edges of a sweep, and what the sweep shows of the LiDAR. Only these points are placed, and only later,
+    because every pair places them at the instant of another exposure."""
     seen = bearings(sweep.xyz_m)
     found = range_edges(sweep.xyz_m, sweep.ring, seen)
     offsets_s = None if sweep.time_offset_s is None else sweep.time_offset_s[found.index]
-    # Motion compensation turns a shift of a tenth of a degree by two degrees at most: it may come first.
+    # The shift may come before motion compensation, which turns this tenth of a degree by two degrees at most.
     xyz_m = sweep.xyz_m[found.index] + found.shift_m
     edges = LidarFrame(sweep.stamp_ns, sweep.frame_id, xyz_m, time_offset_s=offsets_s)
     return PreparedSweep(edges, found.weight, sweep_facts(seen, len(found.index)))
 
 
 def outline(camera: Camera, edges: Sequence[LidarFrame], pose: Matrix4, reach_rad: float) -> Rectangle | None:
-    """The part of the image in which range edges can come to lie within so much of a pose (4, 4); None where there
-    are none."""
+    """The part of the image in which range edges can lie at poses within `reach_rad` of a pose (4, 4); None if none
+    can."""
     xyz_m = np.concatenate([sweep.xyz_m for sweep in edges])
     xyz_m = xyz_m[thinned(len(xyz_m), OUTLINE_POINTS)].astype(np.float64)
     turns_rad = reach_rad * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    # A point within reach of the rim of a strip is at the rim of it from one of these poses.
+    # A point that can reach the rim of the strip is at the rim at one of these poses.
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for turned in moved_by(np.ascontiguousarray(pose), turns_rad, np.zeros_like(turns_rad)):
         uv_px, valid = project(camera, xyz_m @ turned[:3, :3].T + turned[:3, 3])
@@ -132,15 +132,15 @@ def prepare_images(
     counted: Rectangle,
     wanted: Rectangle,
 ) -> PreparedImages:
-    """Edge maps of the images of a camera, and what they show of it. One image at a time: `greys` (height, width) may
-    be decoded as they are asked for.
+    """Edge maps of the images of a camera, and what they show of the camera. Images are read one at a time, so `greys`
+    (height, width) may decode each when it is asked for.
 
     Args:
         frames: how many images there are.
         mask: (height, width), False = ignore this pixel; None: all count.
-        upright: (2,) what the image shows of the axis of the LiDAR, see `EdgeScales`; of several, that of any.
-        counted: the part of the image in which range edges come to lie: its mean and deviation are the maps' units.
-        wanted: the part on which edges are wanted; `counted` lies inside.
+        upright: (2,) direction of the LiDAR's axis in the image, see `EdgeScales`; with several LiDARs, that of any.
+        counted: the part of the image in which range edges lie: its mean and deviation are the units of the maps.
+        wanted: the part on which edges are needed; it contains `counted`.
 
     Raises:
         CalibrationError: an image is not of the camera's size.
@@ -167,7 +167,7 @@ def prepare_images(
     of_part = cropped(camera, part.left, part.top, part.width, part.height)
 
     def level(number: int, blurred: int, maps: NDArray[np.int8]) -> MapLevel:
-        # Halving leaves out a last odd row or column: the scale is a half all the same.
+        # Halving drops a last odd row or column, but the scale is still a half.
         _, height, width = maps.shape
         seen_by = scaled(of_part, 0.5**number, 0.5**number)._replace(width=width, height=height)
         return MapLevel(seen_by, 2.0**blurred * BLUR_SIGMA_PX * pixel_rad(camera), maps)
@@ -182,7 +182,7 @@ def prepare_images(
 
 
 def union(parts: Sequence[Rectangle]) -> Rectangle:
-    """The least part that holds all of some: what several LiDARs ask of one camera."""
+    """The smallest part that contains all of the given parts, for several LiDARs that use one camera."""
     left, top = min(part.left for part in parts), min(part.top for part in parts)
     right = max(part.left + part.width for part in parts)
     bottom = max(part.top + part.height for part in parts)
@@ -190,7 +190,7 @@ def union(parts: Sequence[Rectangle]) -> Rectangle:
 
 
 def _aligned(part: Rectangle, camera: Camera, step_px: int) -> Rectangle:
-    """With a margin, from a pixel that begins one at every level, as far as the image goes."""
+    """The part with a margin, within the image, begun at a pixel at which a pixel of every level begins."""
     left, top = (max(begin - MARGIN_PX, 0) // step_px * step_px for begin in (part.left, part.top))
     right = min(part.left + part.width + MARGIN_PX, camera.width)
     bottom = min(part.top + part.height + MARGIN_PX, camera.height)

@@ -1,8 +1,8 @@
-"""When a window is wanted soon: the monitor suspects, and only a window can tell; or the rig names a sensor, and waits
-for a window of each of its pairs.
+"""Hurries a window that is wanted soon: because the monitor suspects a move that only a window can confirm, or because
+the rig named a sensor and waits for a window of each of its pairs.
 
-An open slice that began before the mount moved mixes two extrinsics and is ended, whatever it holds. One that began
-later is ended as soon as it is enough for a window, or given up for a short dense one if that is sooner.
+An open slice that began before the mount moved mixes two extrinsics, so it is ended, whatever it holds. A slice that
+began later is ended as soon as it is enough for a window, or replaced by a short dense one if that comes sooner.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from coec.calibration.frames.window import SliceEnded, WindowCutter
 from coec.config import MonitorConfig, WindowConfig
 
 TRIES = 3
-"""Urgent windows per suspicion: where these do not help, more of them will not."""
+"""Urgent windows per suspicion: if these do not help, more of them will not either."""
 
 MARGIN = 1.2
-"""By which a slice is longer than its pairs need at the rate at which they come."""
+"""Factor by which a slice is longer than its pairs need at the rate at which they come."""
 
 NS_PER_S = 1_000_000_000
 
 
 class Urgency:
-    """Hurries the `WindowCutter` of one pair while there is an alarm. Sensor time alone decides."""
+    """Hurries the `WindowCutter` of one pair while a window is wanted. Sensor time alone decides."""
 
     def __init__(self, monitor: MonitorConfig) -> None:
         self._monitor = monitor
@@ -36,19 +36,20 @@ class Urgency:
         return self._since_ns is not None
 
     def alarm(self, since_ns: int) -> None:
-        """A window is wanted of pairs since `since_ns`. The pair's own suspicion does not wait its turn."""
+        """The pair suspects a move and wants a window of frames since `since_ns`. Its own suspicion goes before what
+        the rig waits for."""
         if (self._since_ns is None or self._for_rig) and self._tries < TRIES:
             self._want(since_ns, for_rig=False, longer_s=0.0)
             self._tries += 1
 
     def wanted(self, since_ns: int, longer_s: float) -> None:
-        """The rig waits for a window of pairs since `since_ns`, whatever the pair itself suspects. The slice is so much
-        longer than an urgent one: the pairs of a sensor are solved one after the other."""
+        """The rig waits for a window of frames since `since_ns`, whatever the pair itself suspects. The slice is
+        `longer_s` longer than an urgent one, because the pairs of a sensor are solved one after the other."""
         if self._since_ns is None:
             self._want(since_ns, for_rig=True, longer_s=longer_s)
 
     def calm(self) -> None:
-        """The suspicion is over. What the rig waits for is still to come."""
+        """The suspicion is over. A window for which the rig waits is still wanted."""
         self._tries = 0
         if not self._for_rig:
             self._since_ns = None
@@ -63,7 +64,7 @@ class Urgency:
         self._for_rig, self._longer_s = for_rig, longer_s
 
     def heed(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceEnded]:
-        """Before a pair is offered to the cutter: ends its slice if that is called for.
+        """Ends the slice of the cutter if necessary; to be called before a pair is offered to the cutter.
 
         Args:
             rate_hz: at which pairs come; None while unknown.
@@ -85,7 +86,8 @@ class Urgency:
         return [] if waits_s <= self._length_s(cutter.config, rate_hz) else self._hurry(cutter, rate_hz)
 
     def ended(self, event: SliceEnded, cutter: WindowCutter, rate_hz: float | None) -> None:
-        """A slice ended by itself: with enough pairs it is the window that was wanted, else the next one is."""
+        """A slice ended by itself. If it has enough pairs it is the window that was wanted; else the next one is
+        hurried."""
         if self._since_ns is None or not self._hurried:
             return
         if event.complete:
@@ -100,6 +102,6 @@ class Urgency:
         return ended
 
     def _length_s(self, window: WindowConfig, rate_hz: float | None) -> float:
-        """Of an urgent slice: as configured, or longer where pairs come slowly, but no longer than any other."""
+        """Length of an urgent slice: as configured, or longer if pairs come slowly, but no longer than any other."""
         needed_s = MARGIN * window.pairs / rate_hz if rate_hz else 0.0
         return min(max(self._monitor.urgent_slice_s, needed_s) + self._longer_s, window.slice_s)

@@ -141,7 +141,7 @@ def steps_at(history: History, times_ns: Sequence[int]) -> Steps:
     for t, (was, is_now) in enumerate(zip(before.offset, since.offset, strict=True)):
         xi[t] = se3.difference(se3.perturb(history.origin, is_now), se3.perturb(history.origin, was))
     place = np.max(np.array([look.place for look in history.looks]).reshape(-1, 6), axis=0, initial=0.0)
-    covariance = before.covariance + since.covariance + np.diag(2.0 * place**2)  # one for the street before, one for the street since
+    covariance = before.covariance + since.covariance + np.diag(2.0 * place**2)  # one place before, one place since
     good = since.good
     looks = good.sum(axis=1)
     again = np.array([look.log_bad_again for look in history.looks])
