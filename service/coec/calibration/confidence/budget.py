@@ -1,11 +1,11 @@
-"""The errors that all frames of a window share, and that no number of them averages away: one line a term.
+"""The errors that all frames of a window share, so that no number of frames averages them away: one line for each.
 
-Each term is a displacement of the sight lines by its standard deviation; the pose answers it by the least squares of
-that displacement over the points that settled it. What an error does alike to all things in view it does to a rotation
-whole; what it does to near things alone, to a translation. Errors that differ from edge to edge, as the place of an
-edge within a beam or a column does, are in the scatter of the noise and have no line here.
+Each term is a displacement of the sight lines by the standard deviation of an error. The pose moves by the
+least-squares answer to that displacement, over the points that settled it. An error that is the same for all things in
+view acts on a rotation; one that only near things have acts on a translation. Errors that differ from edge to edge,
+such as the place of an edge within a beam or a column, are in the scatter of the noise and have no term here.
 
-A translation that is held is such an error, too: it was measured once, and not to the last millimetre.
+A held translation is such an error, too: it was measured once, and not to the last millimetre.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from coec.geometry.linear import inverted
 from coec.geometry.thinning import thinned
 
 POINTS = 5_000
-"""Sight lines that stand for all: a least squares over six unknowns needs no more."""
+"""Number of sight lines that stand for all: least squares over six unknowns needs no more."""
 
 EDGE_PX = 0.1
-"""How far the edges of near things may lie aside of those of far ones, together: an image edge is drawn to the brighter
-side by blur and gamma by about that much, and which side is near is a matter of the scene."""
+"""How far the edges of near things together may be displaced against those of far ones: blur and gamma move an image
+edge to the brighter side by about that much, and which side is nearer depends on the scene."""
 
 COLUMN_SHARE = 0.05
-"""The same of range edges, in columns: they lie within the near thing by half a column on average, on either side; what
-is left is where more left sides than right ones are in view, and was up to a fifth of the half on simulated drives."""
+"""The same for range edges, in columns. On either side they lie half a column inside the near thing on average. An
+error is left if more left sides than right ones are in view; it was up to a fifth of that half on simulated drives."""
 
 STAMP_S = 1e-3 / sqrt(12.0)
-"""Stamps that are rounded to the millisecond are off by so much, s."""
+"""Standard deviation of stamps that are rounded to the millisecond, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Sight lines (N, 3), unit vectors, with what the terms need of them.
+    """Sight lines, with all that the terms need.
 
     Attributes:
-        towards: the unit vectors.
+        towards: (N, 3) unit vectors.
         p_camera: (N, 3) the points, metres.
-        range_m: (N,).
-        near: (N, 1) 1 for the nearer half, by weight of numbers, else 0.
-        frame: (N,).
-        axis_of_sweep: (3,) about which the LiDAR turns, camera frame.
+        range_m: (N,) ranges of the points.
+        near: (N, 1) 1 for the points nearer than the median range, else 0.
+        frame: (N,) index of the frame of each point.
+        axis_of_sweep: (3,) the axis about which the LiDAR turns, camera frame.
     """
 
     towards: NDArray[np.float64]
@@ -59,7 +59,7 @@ class _Lines:
     axis_of_sweep: NDArray[np.float64]
 
     def beside(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3) what of a direction (3,) or (N, 3) lies across each line of sight."""
+        """(N, 3) the part of a direction (3,) or (N, 3) that lies across each sight line."""
         along = np.sum(self.towards * direction, axis=1, keepdims=True)
         return np.asarray(direction - self.towards * along)
 
@@ -82,20 +82,20 @@ TERMS: MappingProxyType[str, Term] = MappingProxyType(
         "stamps": lambda lines, grain: STAMP_S * _passing(lines, grain),
     }
 )
-"""By name, in a fixed order. The lens is displaced to the right, down and outwards (its principal point and focal
-length); what is finer than that differs from sector to sector of the image and is in the scatter."""
+"""The terms by name, in a fixed order. The lens is displaced to the right, down and outwards (principal point and focal
+length); finer errors of it differ from sector to sector of the image and are in the scatter."""
 
 HELD: MappingProxyType[int, str] = MappingProxyType({3: "held_across", 4: "held_down", 5: "held_forward"})
-"""Further terms, of each translation that was not searched, by its place in ξ."""
+"""Names of further terms, one for each translation that was not searched, by its place in ξ."""
 
 
 def systematic(
     sight: SightLines, grain: Grain, moved: tuple[int, ...], axis_of_sweep: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """What each term does to a pose, by its name: (6,) radians and metres, zero on axes that were not `moved`.
+    """By how much each term moves a pose, by name: (6,) radians and metres, zero on axes that were not `moved`. Empty
+    if the points in view do not determine the pose.
 
-    `axis_of_sweep` (3,) is the axis about which the LiDAR turns, camera frame. Empty where the points in view do not
-    determine the pose.
+    `axis_of_sweep` (3,) is the axis about which the LiDAR turns, camera frame.
     """
     chosen = thinned(len(sight.p_camera), POINTS)
     p_camera, weight = sight.p_camera[chosen], sight.weight[chosen]
@@ -104,7 +104,7 @@ def systematic(
     near = (range_m < np.median(range_m)).astype(np.float64)[:, None] if len(range_m) else np.zeros((0, 1))
     lines = _Lines(towards, p_camera, range_m, near, sight.frame[chosen], axis_of_sweep)
     answers = np.stack([_answer(lines, axis) for axis in moved], axis=2)  # (N, 3, n)
-    # Sums without a BLAS product: to the bit the same in every process.
+    # Sums without a BLAS product are the same to the bit in every process.
     weighted = answers * weight[:, None, None]
     each = range(len(moved))
     normal = [[float(np.sum(weighted[:, :, i] * answers[:, :, j])) for j in each] for i in each]
@@ -134,13 +134,13 @@ def _answer(lines: _Lines, axis: int) -> NDArray[np.float64]:
 
 
 def _of_mean_one(displaced: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scaled to a displacement of one, root mean square."""
+    """The displacement scaled to a root mean square of one."""
     mean = np.sqrt(np.mean(np.sum(displaced * displaced, axis=1)))
     return np.asarray(displaced / max(float(mean), 1e-12))
 
 
 def _passing(lines: _Lines, grain: Grain) -> NDArray[np.float64]:
     """(N, 3) how fast the sight lines move as the vehicle passes, radians per second."""
-    # What stands still moves against the vehicle.
+    # Standing things move against the motion of the vehicle.
     speed = grain.velocity_mps[lines.frame] + np.cross(grain.turn_radps[lines.frame], lines.p_camera)
     return lines.beside(-speed) / lines.range_m[:, None]

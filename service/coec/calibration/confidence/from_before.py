@@ -1,8 +1,8 @@
-"""Where the range edges lead to from the place that the camera had before the search.
+"""Where the range edges lead from the camera's place before the search.
 
-A search of translations, too, may end on a hill of its own far from the one about the place that was known: where few
-things are seen again and again, chance makes several. The hill that is next to what was known is a rival of what was
-found, however the search came by.
+A search that includes translations may end on a hill far from the one about the known place: if few things are seen
+again and again, chance makes several hills. The hill next to the known place is a rival of the pose found, whatever way
+the search took.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from coec.geometry.edges.alignment import EdgeFrames
 
 
 def summit_from_before(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> Matrix4 | None:
-    """The pose (4, 4) of the most significant alignment next to the centre of the window's start, the rotation that of
-    `pose` (4, 4) to begin with: turned first, then shifted as well. None where the edges in view determine no pose.
+    """The pose (4, 4) of the most significant alignment next to the camera's centre at the window's start. The climb
+    begins with the rotation of `pose` (4, 4); it first turns only, then also shifts. None if the edges in view
+    determine no pose.
 
-    `edges` are those of the window, from a level that leads there to the sharpest one.
+    `edges` are those of the window, from coarser levels that lead there to the sharpest one.
     """
     kept = CentreKept(tuple(SHIFTS), window.T_camera_lidar_start)(pose)
     levels = levels_told(edges, window, kept)

@@ -1,4 +1,4 @@
-"""How fine the sensors of a window are: what the budget of systematic errors is counted in."""
+"""How fine the sensors of a window are: the units of the budget of systematic errors."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from coec.geometry.edges.range_edges import NEIGHBOUR_RAD
 from coec.geometry.edges.scan_lines import BAND_RAD, telling
 
 LENS_PX = 0.05
-"""What a target-based calibration of a lens leaves of its principal point, and of its scale at the rim: half of the 0.1
-px to which a corner is found, as near a place of the image its pictures hold a few that are independent. On simulated
-drives, whose lens is exact, twice as much made the claim along the optical axis 3.6 times as wide as the error."""
+"""Error that a target-based calibration of a lens leaves in its principal point, and in its scale at the rim. It is
+half of the 0.1 px to which a corner is found, because its pictures hold a few independent corners near every place of
+the image. On simulated drives, whose lens is exact, twice as much made the claimed σ along the optical axis 3.6 times
+as wide as the error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grain:
-    """Of one window.
+    """The grain of one window.
 
     Attributes:
         pixel_rad: the angle of a pixel on the optical axis.
         lens_px: standard deviation of the camera model, pixels.
         column_rad: the turn between two firings of a beam.
-        velocity_mps, turn_radps: (F, 3) of the LiDAR in each pair, camera frame; zero where it is not known.
-        held_m: standard deviation of the camera's centre, along each axis, where it is held.
+        velocity_mps, turn_radps: (F, 3) of the LiDAR in each pair, camera frame; zero if unknown.
+        held_m: standard deviation of a held camera centre, along each axis.
     """
 
     pixel_rad: float
@@ -41,7 +42,7 @@ class Grain:
 
 
 def grain_of(window: Window, T_camera_lidar: Matrix4, held_m: float) -> Grain:
-    """Of a window, its camera at `T_camera_lidar` (4, 4); a centre that is held is known to `held_m`."""
+    """The grain of a window whose camera is at `T_camera_lidar` (4, 4); a held centre is known to `held_m`."""
     velocity_mps, turn_radps = _rates(window, T_camera_lidar)
     return Grain(
         pixel_rad=pixel_rad(window.rig.camera),
@@ -54,8 +55,8 @@ def grain_of(window: Window, T_camera_lidar: Matrix4, held_m: float) -> Grain:
 
 
 def column_rad(sweep: LidarFrame) -> float:
-    """Median turn between neighbours of a scan line, radians; where no ring tells beams apart, of rows alike high.
-    0 where none has a neighbour."""
+    """Median turn between neighbours of a scan line, radians; without usable rings, of a row of nearly equal elevation.
+    0 if no point has a neighbour."""
     x, y, z = (sweep.xyz_m[:, axis].astype(np.float64) for axis in range(3))
     azimuth, across = np.arctan2(y, x), np.hypot(x, y)
     ring = telling(sweep.ring)
@@ -73,7 +74,7 @@ def _rates(window: Window, T_camera_lidar: Matrix4) -> tuple[NDArray[np.float64]
         if pair.motion is None:
             continue
         omega = T_lidar_ego[:3, :3] @ np.array(pair.motion.angular_radps)
-        # The ego frame's origin lies beside the LiDAR: it is carried around by the turn.
+        # The origin of the ego frame is not at the LiDAR: a turn carries the LiDAR around it.
         turn[index] = R_camera_lidar @ omega
         if pair.motion.linear_mps is None:
             continue

@@ -1,5 +1,5 @@
-"""The cells of an objective about its optimum, along the axes that were searched: what every part of the uncertainty
-looks at."""
+"""The cells of an objective about its optimum, along the axes that were searched: every part of the uncertainty is
+computed from them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Landscape:
 
     @classmethod
     def about(cls, cells: Cells, pose: Matrix4, moved: tuple[int, ...]) -> Landscape:
-        """At a pose (4, 4)."""
+        """The landscape about a pose (4, 4)."""
         return cls(cells, pose, moved, cells.at(pose[None])[0])
 
     @property
@@ -47,17 +47,17 @@ class Landscape:
         return self.cells.at(np.array([se3.perturb(self.pose, one) for one in xi]))
 
     def certainty(self, cells: NDArray[np.float64]) -> float:
-        """How surely the optimum stands above another pose, of which the cells (F, B) are given: what they are lower
-        by, in standard deviations of that difference as frames and sectors scatter.
+        """How surely the optimum stands above another pose whose cells (F, B) are given: the difference in standard
+        deviations, from the scatter of that difference over frames and sectors.
 
-        On a hill that is a paraboloid it is half the distance in standard deviations of the optimum.
+        On a paraboloid it is half the distance from the optimum in standard deviations of the optimum.
         """
         return certainty(self.centre - cells)
 
 
 def certainty(gained: NDArray[np.float64]) -> float:
-    """How surely cells (F, B) of what one pose gains over another are a gain in all: in standard deviations of their
-    sum, as frames and sectors scatter. Nothing gained anywhere is no gain."""
+    """How surely one pose gains over another in all, from the gain in each cell (F, B): the sum in its standard
+    deviations, from the scatter over frames and sectors. It is 0 if no cell gains anything."""
     noise = scatter(gained[None])[0][0]
     total = fsum(gained.ravel().tolist())
     if noise > 0.0:
@@ -66,12 +66,12 @@ def certainty(gained: NDArray[np.float64]) -> float:
 
 
 def scatter(cells: NDArray[np.float64], fitted: int = 0) -> list[list[float]]:
-    """(n, n) covariance of the sums of n figures (n, F, B) over their cells, as frames and as sectors differ.
+    """(n, n) covariance of the sums of n figures (n, F, B) over their cells, from how frames and sectors differ.
 
-    Cluster-robust both ways (Cameron, Gelbach, Miller 2011), `fitted` degrees of freedom having been used up
-    (MacKinnon, White 1985, "HC1"). The term of single cells, which would be subtracted, is left in: so no variance
-    is negative, and where frames and sectors are independent the standard deviation is √2 too wide, which the few
-    sectors need for their tails. One sector alone tells nothing by itself.
+    Cluster-robust both ways (Cameron, Gelbach, Miller 2011), with `fitted` degrees of freedom used up (MacKinnon, White
+    1985, "HC1"). The term of single cells, which would be subtracted, is left in. So no variance is negative, and if
+    frames and sectors are independent the standard deviation is √2 too wide, which the few sectors need for their
+    tails. A single sector contributes nothing.
     """
     figures = len(cells)
     of_frames, of_sectors = cells.sum(axis=2).tolist(), cells.sum(axis=1).tolist()

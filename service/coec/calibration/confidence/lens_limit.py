@@ -1,4 +1,4 @@
-"""Whether a camera model that was fitted to another may stand for it."""
+"""Whether a camera model that was fitted to another one may replace it."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from coec.geometry.cameras.double_sphere_fit import DoubleSphereFit
 
 
 def lens_error_px(residual_max_px: float) -> float:
-    """Standard deviation of a fitted camera where the edges happen to lie, pixels.
+    """Standard deviation of a fitted camera at the edges of a scene, pixels.
 
-    Any miss up to its largest is as likely as another there: edges gather on the horizon and at the rim, and the fit
-    was best for all of the image.
+    There every error up to the largest is equally likely, because edges gather on the horizon and at the rim, while the
+    fit was best for the whole image.
     """
     return residual_max_px / sqrt(3.0)
 
 
 def require_fit(camera: Camera, fit: DoubleSphereFit, max_sigma_deg: float) -> None:
-    """Refuse a fit through which no result could be as sure as it must be to be accepted.
+    """Refuse a fit with which no result could be certain enough to be accepted.
 
-    The error of a lens does not grow less with more frames, as all see it alike: what it is on the optical axis, as an
-    angle, is the least that σ of a rotation may claim. Where that alone is more than `max_sigma_deg`, at which results
-    are refused (`verdict.max_sigma_deg`), there is nothing to search for.
+    More frames do not reduce the error of a lens, because all frames share it. As an angle on the optical axis it is
+    the least σ that a rotation may claim. If that alone exceeds `max_sigma_deg`, above which results are refused
+    (`verdict.max_sigma_deg`), a search is useless.
 
     Raises:
-        LensError: so it is. Its details are those of the fit.
+        LensError: the fit is refused. Its details are those of the fit.
     """
     error_deg = degrees(lens_error_px(fit.residual_max_px) * pixel_rad(camera))
     if error_deg <= max_sigma_deg:

@@ -1,8 +1,9 @@
-"""How many independent looks the frames of a window are worth: what stands still in the vehicle's frame is one look.
+"""How many independent looks the frames of a window are worth. All that stands still in the vehicle's frame is one
+look.
 
-The lane markings, guard rails and the horizon of a straight motorway lie on the same pixels in every image, and the
-range edges of its sweeps among the same beams. Frames that agree on them say it once, however many they are. It shows
-when sweeps and images change partners: what passes fits in its own frame only, what stands still in every one.
+The lane markings, guard rails and horizon of a straight motorway lie on the same pixels in every image, and the range
+edges of its sweeps among the same beams. Frames that agree on such things count as one look, however many they are. To
+find them, sweeps and images change partners: passing things fit only in their own frame, still ones in every frame.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, strengths
 from coec.geometry.thinning import thinned
 
 POINTS = 20_000
-"""Range edges of the window that change partners, at most: with each of F images as much work as F evaluations of a
-search that takes hundreds."""
+"""Most range edges that change partners: with F images that is the work of F evaluations, of which a search takes
+hundreds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """At one pose.
+    """The looks at one pose.
 
     Attributes:
         count: how many independent looks the F frames are worth, 1 to F.
-        significance: of the edges there, what frames have in common counted once: z·√(count / F), as z grows with the
-            root of what is independent; standard deviations.
+        significance: of the edges, with what frames have in common counted once: z·√(count / F), because z grows with
+            the root of the independent part; standard deviations.
     """
 
     count: float
@@ -37,7 +38,7 @@ class Looks:
 
 
 def look(edges: EdgeFrames, T_camera_lidar: Matrix4) -> Looks:
-    """How often the edges say that the camera is at `T_camera_lidar` (4, 4), and how certainly."""
+    """How many independent looks put the camera at `T_camera_lidar` (4, 4), and how significantly."""
     some = edges.of_points(thinned(len(edges.weight), POINTS))
     count = independent_looks(strengths_on_each_map(some, T_camera_lidar))
     whole = frame_alignment(edges, T_camera_lidar).significance
@@ -45,13 +46,13 @@ def look(edges: EdgeFrames, T_camera_lidar: Matrix4) -> Looks:
 
 
 def independent_looks(agreement: NDArray[np.float64]) -> float:
-    """Of F frames, from how well the sweep of each (rows) agrees with the image of each (columns), (F, F): F over the
-    design effect (Kish 1965) of as many repetitions,
+    """The number of independent looks of F frames, from how well each sweep (rows) agrees with each image (columns),
+    (F, F). It is F over the design effect (Kish 1965) of as many repetitions,
 
         F / (1 + (F - 1)·ρ),  ρ = mean agreement with other frames / mean agreement with the own one,
 
-    ρ being their intraclass correlation, from 0 to 1. Neither the order of the frames nor how often all of them are
-    repeated changes it. Frames that do not agree with themselves say nothing, and that once.
+    where ρ is the intraclass correlation, 0 to 1. Neither the order of the frames nor repeating all of them changes it.
+    Frames that do not agree with themselves count as one look.
     """
     frames = len(agreement)
     own = fsum(np.diag(agreement).tolist())

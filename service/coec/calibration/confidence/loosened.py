@@ -1,10 +1,10 @@
-"""A pose once more, with what was taken as known set free: does the window contradict what it was told?
+"""Solves a pose again with its assumptions set free: does the window contradict what it was told?
 
-A camera's centre that was held, clocks that were believed and a lens that was taken from a sheet all leave a pattern in
-the residuals that no pose takes away. Each is set free in turn, after the ones before it: the centre, then the clocks,
-then the lens (a nested likelihood ratio, Wilks 1938, on the sharpest edges). What is gained is counted against how
-frames and sectors of the image scatter; what the pose moves by meanwhile is what it was led astray by, as far as the
-window is believed (`belief`).
+A held camera centre, trusted clocks and a lens taken from a sheet, if wrong, leave a pattern in the residuals that no
+pose removes. They are set free one after the other, the earlier ones staying free: the centre, then the clocks, then
+the lens (a nested likelihood ratio, Wilks 1938, on the sharpest edges). The gain is compared with the scatter of frames
+and sectors of the image. How far the pose moves meanwhile is how far the assumption led it astray, as far as the window
+is believed (`belief`).
 """
 
 from __future__ import annotations
@@ -26,39 +26,40 @@ from coec.geometry import se3
 from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames, alignment_of_parts
 
 HELD_FREE, CLOCKS_FREE, LENS_FREE = "held_free", "clocks_free", "lens_free"
-"""Names of what is set free."""
+"""Names of the assumptions that are set free."""
 
 EVEN = 1.0
 """Certainty (`landscape.certainty`) at which clocks are as likely wrong as right: two standard deviations on a
-paraboloid. Chance reaches it once in ten windows, and then moves the pose by a few hundredths of a degree or
-centimetres. An offset of the clocks that looks like a shift along the way gains little more than that and moves the
-pose by decimetres."""
+paraboloid. Chance reaches it once in ten windows, and then moves the pose by a few hundredths of a degree or a few
+centimetres. An offset of the clocks that looks like a shift along the way gains little more, but moves the pose by
+decimetres."""
 
 LENS_EVEN = 1.5
-"""Likewise of a lens: three standard deviations. Its centre is nearly a turn of the pose, so that what chance gains by
-it moves the pose by half a degree."""
+"""Likewise for a lens: three standard deviations. Its principal point acts nearly like a turn of the pose, so that a
+gain by chance moves the pose by half a degree."""
 
 UNSEEN = COLUMNS * ROWS
-"""Sector of what is outside the image."""
+"""Sector for everything outside the image."""
 
 LEAST_PX = 0.4
-"""Another lens has to move the sharpest edges by so much, root mean square, beside what the pose can do: corners of a
-target are found to a tenth of a pixel, and edges are drawn aside by blur by as much. In 48 windows of twelve simulated
-drives through the lens they were told it was less, or not certain; in all 16 of four through another it was both. It is
-what edges leave to a lens by themselves: one that moves them by as much is half believed (`beside_a_turn`)."""
+"""A different lens matters only if it moves the sharpest edges by so much, root mean square, beyond what the pose can
+do: corners of a target are found to a tenth of a pixel, and blur displaces edges by as much. In 48 windows of twelve
+simulated drives through the assumed lens it was less, or not certain; in all 16 of four drives through another lens it
+was more, and certain. It is also the error that edges by themselves leave in a lens: a lens that moves them by as much
+is half believed (`beside_a_turn`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loosened:
-    """What setting something free came to.
+    """The result of setting one assumption free.
 
     Attributes:
-        name: of what was set free.
+        name: of the assumption.
         certainty: of the gain; see `Landscape.certainty`.
-        moved_px: what it moves the edges by beside what the pose can do, root mean square, pixels of the sharpest map.
-        deviation: (12,) from what was told, with what was set free before it; see `told`.
+        moved_px: how far it moves the edges beyond what the pose can do, root mean square, pixels of the sharpest map.
+        deviation: (12,) from what was assumed, together with what was set free before it; see `told`.
         shift: (6,) by how much the pose turned and shifted meanwhile, rad and m.
-        believed: by what share the shift counts.
+        believed: the share by which the shift counts.
     """
 
     name: str
@@ -70,25 +71,26 @@ class Loosened:
 
     @property
     def matters(self) -> bool:
-        """Whether it moves the edges by more than calibrations leave."""
+        """Whether it moves the edges by more than the error that calibrations leave."""
         return self.moved_px >= LEAST_PX
 
     @property
     def contradicts(self) -> bool:
-        """Whether the window is believed rather than what it was told."""
+        """Whether the window is believed rather than the assumption."""
         return self.believed >= 0.5
 
 
 def loosen(
     edges: Sequence[EdgeFrames], window: Window, pose: Matrix4, held: Sequence[int], known_m: float
 ) -> tuple[Loosened, ...]:
-    """What was taken as known, set free, one after the other; empty where the edges in view do not determine a pose.
+    """Sets the assumptions of a window free, one after the other; empty if the edges in view do not determine a pose.
 
     Args:
-        edges: of the window, from a level that leads there to the sharpest one.
-        window: it was solved to `pose` (4, 4), at the end of its search.
+        edges: of the window, from coarser levels that lead to the sharpest one.
+        window: the window.
+        pose: (4, 4) at which its search ended.
         held: the translations (places in ξ) that were taken as known.
-        known_m: to this standard deviation each.
+        known_m: the standard deviation to which each of them is known.
     """
     levels = levels_told(edges, window, pose)
     free = [(HELD_FREE, tuple(held))] if held else []
@@ -128,10 +130,12 @@ def _judged(
 
 
 def beside_a_turn(moved_px: float) -> float:
-    """By what share a lens is believed that moves the edges by so much beside the pose that answers it. It trades its
-    centre against a turn of the camera, so that what moves the edges by a fifth of a pixel beside the turn turns the
-    camera by half a degree: of what was measured with an error of `LEAST_PX` the part that is not error is believed
-    (Wiener 1949)."""
+    """The share by which a lens is believed that moves the edges by so much beyond the pose that answers it.
+
+    A lens trades its principal point against a turn of the camera: one that moves the edges by a fifth of a pixel
+    beyond the turn turns the camera by half a degree. `moved_px` is measured with an error of `LEAST_PX`, so only the
+    part of it that is not error is believed (Wiener 1949).
+    """
     return moved_px**2 / (moved_px**2 + LEAST_PX**2)
 
 

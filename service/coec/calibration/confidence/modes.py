@@ -1,4 +1,4 @@
-"""Other poses that the search came to, or from, and that the window cannot tell from the best one."""
+"""Other poses, which the search found or started from, that the window cannot distinguish from the best one."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from coec.geometry import se3
 from coec.geometry.linear import solved
 
 SAME_HILL = 3.0
-"""Standard deviations within which a pose belongs to the hill of the optimum, whose width is counted already."""
+"""A pose within so many standard deviations belongs to the hill of the optimum, whose width is counted already."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rivals:
-    """Poses under one objective: the best (4, 4) and `others` (4, 4) that might have been it."""
+    """Poses under one objective: the best (4, 4), and `others` (4, 4) that might be the true one."""
 
     objective: Divisible
     best: Matrix4
@@ -28,10 +28,10 @@ class Rivals:
 
 
 def with_modes(rivals: Rivals, moved: Sequence[int], covariance: list[list[float]]) -> list[list[float]]:
-    """The covariance (n, n) of the axes `moved`, about the best summit of a mixture with the others.
+    """The covariance (n, n) of the axes `moved`, about the best summit, of a mixture with the other summits.
 
-    A summit counts exp(-2·c²) for the certainty c by which the best one stands above it: the likelihood of a pose on a
-    paraboloid, exp(-d²/2), that is as far down. One that stands above the best counts as much as that.
+    A summit has the weight exp(-2·c²), where c is the certainty by which the best one stands above it. That is the
+    likelihood exp(-d²/2) of a pose that is as far down on a paraboloid. A summit above the best has the weight 1.
     """
     axes = tuple(moved)
     aways = [se3.difference(other, rivals.best)[list(axes)].tolist() for other in rivals.others]
@@ -52,5 +52,5 @@ def with_modes(rivals: Rivals, moved: Sequence[int], covariance: list[list[float
 
 
 def _beside(away: list[float], covariance: list[list[float]]) -> bool:
-    """Whether a summit so far away (n,) is another hill than the best one's."""
+    """Whether a summit that lies `away` (n,) from the best one is on another hill."""
     return fsum(a * b for a, b in zip(away, solved(covariance, away), strict=True)) > SAME_HILL**2

@@ -1,8 +1,8 @@
-"""What chance leaves to an optimum: other frames, or other things in them, would have put it elsewhere.
+"""The error of an optimum by chance: other frames, or other things in them, would have put it elsewhere.
 
-The sandwich of maximum-likelihood theory (Huber 1967), J⁻¹·V·J⁻¹, with V from the scatter of the score between frames
-and between sectors of the image. A standing vehicle sees the same in all frames, which then agree on anything; the
-sectors, each with things of its own, still do not. And what a wrong lens does in a sector it does in every frame.
+It is the sandwich of maximum-likelihood theory (Huber 1967), J⁻¹·V·J⁻¹, with V from the scatter of the score between
+frames and between sectors of the image. Both are needed: all frames of a standing vehicle show the same and so agree on
+anything, but its sectors, which show different things, do not; and a wrong lens acts on a sector in every frame alike.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from coec.calibration.steps import of_both
 from coec.geometry.linear import Rows, congruent, eigen, inverted
 
 WIDER = (1.0, 2.0, 4.0)
-"""Difference steps that are tried until the objective has a maximum, in those of the cells: a ripple may dent the top
+"""Difference steps, in steps of the cells, that are tried until the objective has a maximum: a ripple may dent the top
 of a hill."""
 
 SAME = 1e-9
-"""Of the scatter's largest axis, each figure in its own standard deviation, what the smallest has at least where frames
-differ: those that repeat one another leave 1e-16, the rounding."""
+"""If frames differ, the smallest axis of the scatter has at least this share of the largest, with each figure in units
+of its standard deviation. Frames that repeat one another leave 1e-16, the rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,9 +35,9 @@ class Noise:
     Attributes:
         covariance: (n, n) of the axes that were searched, radians and metres.
         information: (n, n) negative Hessian of the objective, likewise.
-        looks: how many independent looks the frames are worth to where the optimum lies: their number, if what one
-            frame says of a sector tells nothing of what the next one says there; one, if it says the same again. How
-            often they say that this is the right hill is another question: see `confidence.looks`.
+        looks: how many independent looks the frames are worth for the place of the optimum: as many as there are, if
+            what a frame says of a sector is independent of the other frames; one, if all say the same. How often they
+            say that this is the right hill is another question: see `confidence.looks`.
     """
 
     covariance: list[list[float]]
@@ -46,8 +46,8 @@ class Noise:
 
 
 def measure_noise(landscape: Landscape) -> Noise | None:
-    """By central differences; None where the objective has no maximum, or the frames that differ are too few to tell:
-    two views in turn, however often, scatter along one line and would settle the other axes without any error."""
+    """The noise, by central differences. None if the objective has no maximum, or if too few frames differ: two views
+    in turn, however often, scatter along one line and would leave the other axes without any error."""
     fitted = len(landscape.moved)
     if landscape.frames <= fitted:
         return None
@@ -93,9 +93,9 @@ def _is_of_full_rank(covariance: Rows) -> bool:
 
 
 def independent_looks(gradients: NDArray[np.float64], inverse: list[list[float]]) -> float:
-    """Of F frames, from the gradients (n, F, B) of their cells and the inverse (n, n) of the information: F over the
-    design effect (Kish 1965), which is how much more the sectors scatter than their cells would, were each frame's
-    independent of the others'."""
+    """The number of independent looks of F frames, from the gradients (n, F, B) of their cells and the inverse (n, n)
+    of the information. It is F over the design effect (Kish 1965): how much more the sectors scatter than they would if
+    the cells of each frame were independent of those of the others."""
     n, frames, _ = gradients.shape
 
     def size(groups: NDArray[np.float64]) -> float:

@@ -1,7 +1,8 @@
 """How far the optimum really reaches along each principal axis of its covariance.
 
-A covariance is the shape of a hill at its top. A ridge is flat where the hill of the same top would have fallen, and on
-it the optimum may lie anywhere: so the hill is walked down until its drop is certain, and as sure as that is it counts.
+A covariance describes a hill only at its top. A ridge stays flat where a paraboloid with the same top has fallen, and
+the optimum may lie anywhere on it. So the hill is walked down until its drop is certain; how wide it counts follows
+from how certain the drop is on the way.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from coec.geometry.linear import congruent, eigen
 
 CERTAIN, BEYOND_DOUBT = 1.5, 3.0
 """Certainty of a drop (`Landscape.certainty`) at three standard deviations of the optimum, on a paraboloid, and at six,
-where the walk ends: a drop that is certain may be a dent in a ridge that goes on behind it."""
+where the walk ends. It goes on beyond the first because a certain drop may be a dent in a ridge that goes on behind
+it."""
 
 ABOUT = 0.25
-"""How well a certainty is known where a drop becomes certain: it is counted in a standard deviation that some twenty
-sectors tell to a sixth, 1 / √(2·19). A place where it is less than that off counts in part."""
+"""How well a certainty is known where a drop becomes certain: its unit is a standard deviation that some twenty sectors
+determine to a sixth, 1 / √(2·19). A place whose certainty is nearer than that to `CERTAIN` counts in part."""
 
 FIRST, DOUBLINGS = 4.0, 5
-"""The walk begins so many standard deviations away and doubles so often, up to 128; on most hills it ends at 8 or
-16."""
+"""The walk begins so many standard deviations away, and the distance doubles so often, up to 128; on most hills the
+walk ends at 8 or 16."""
 
 STRAIGHT = 1e-6
-"""Certainties that differ by less are one."""
+"""Certainties that differ by less count as equal."""
 
 
 def widened(landscape: Landscape, noise: Noise) -> list[list[float]]:
-    """The covariance (n, n) of the noise, each of its principal axes longer by as much as the hill is wider there than
-    a paraboloid: by where its drop becomes certain, in the root mean square of both sides. Never shorter than it
-    was."""
+    """The covariance (n, n) of the noise, with each principal axis lengthened as much as the hill is wider there than a
+    paraboloid. The width is where the drop becomes certain, root mean square of both sides. No axis gets shorter."""
     scale = of_both(1.0)[list(landscape.moved)].tolist()
     n = range(len(scale))
     scaled = [[noise.covariance[i][j] / scale[i] / scale[j] for j in n] for i in n]
@@ -52,8 +53,8 @@ def widened(landscape: Landscape, noise: Noise) -> list[list[float]]:
 
 
 def _expected(noise: Noise, axis: list[float]) -> float:
-    """How many lengths of an axis (n,) away the drop of a paraboloid becomes certain: three where it is a principal
-    axis of the hill, too."""
+    """How many lengths of an axis (n,) away the drop of a paraboloid becomes certain: three if the axis is also a
+    principal axis of the hill."""
     n = range(len(axis))
     pull = [fsum(noise.information[i][j] * axis[j] for j in n) for i in n]
     ((scatter,),) = congruent([pull], noise.covariance)
@@ -61,8 +62,9 @@ def _expected(noise: Noise, axis: list[float]) -> float:
 
 
 def _reaches(landscape: Landscape, one_sigma: NDArray[np.float64]) -> list[float]:
-    """Along each of m ways, over how many standard deviations, an offset of `one_sigma` (m, n) each, the drop is not
-    certain: on a ridge with dents, all that is not one. A drop that is a little surer makes it a little less."""
+    """Along each of m ways, over how many standard deviations the drop is not certain; one standard deviation is an
+    offset of `one_sigma` (m, n). On a ridge with dents all of it counts except the dents. A slightly surer drop makes
+    the reach slightly shorter."""
     reaches, walking = [0.0] * len(one_sigma), list(range(len(one_sigma)))
     before, certainties_before = 0.0, [0.0] * len(one_sigma)
     distance = FIRST
@@ -82,14 +84,14 @@ def _reaches(landscape: Landscape, one_sigma: NDArray[np.float64]) -> list[float
 
 
 def _share_open(begin: float, end: float) -> float:
-    """Of the places between two, with certainties from `begin` to `end` in a straight line, the share where the optimum
-    may lie: those with a drop that is not certain."""
+    """The share of the places between two where the optimum may lie because the drop is not certain. The certainty goes
+    from `begin` to `end` in a straight line."""
     if abs(end - begin) < STRAIGHT:
         return min(max((CERTAIN + ABOUT - 0.5 * (begin + end)) / (2.0 * ABOUT), 0.0), 1.0)
     return (_open_up_to(end) - _open_up_to(begin)) / (end - begin)
 
 
 def _open_up_to(certainty: float) -> float:
-    """The integral of the share over certainties: 1 as long as a drop is uncertain, falling to 0 about `CERTAIN`."""
+    """The integral over certainties of a share that is 1 while a drop is uncertain and falls to 0 about `CERTAIN`."""
     falling = min(max(certainty - (CERTAIN - ABOUT), 0.0), 2.0 * ABOUT)
     return min(certainty, CERTAIN + ABOUT) - falling * falling / (4.0 * ABOUT)

@@ -1,9 +1,9 @@
-"""Where the optimum goes when the camera is shifted aside and everything else may follow.
+"""Where the optimum goes if the camera is shifted aside and everything else may follow.
 
-A shift and a turn make up for each other on all but near things, along a ridge that bends: a straight walk from its top
-leaves it, and finds a drop where the ridge goes on. Many independent looks make it short. One look leaves dents in it,
-any of which may be the top, and a search ends in one of them: so the ridge is followed as far as a translation may be
-off that is still accepted, and where the window cannot tell that end from the optimum, it says so.
+A shift and a turn make up for each other on all but near things, along a ridge that bends. A straight walk from its top
+leaves the ridge, and finds a drop where the ridge goes on. Many independent looks make the ridge short. A single look
+leaves dents in it, any of which may be the top, and a search ends in one of them. So the ridge is followed as far as an
+accepted translation may be off; if the window cannot tell that end from the optimum, the uncertainty shows it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ WAYS = (1.0, -1.0)
 
 def shifted(objective: Divisible, pose: Matrix4, moved: Sequence[int], config: CalibrationConfig) -> Rivals:
     """The best poses with the camera `verdict.max_sigma_m` aside of the optimum at `pose` (4, 4), either way along each
-    translation of the axes `moved`: the profile of the objective there. None where only rotations moved."""
+    translation among the axes `moved`: the profile of the objective there. There are no such poses if only rotations
+    moved."""
     held = tuple(axis for axis in TRANSLATIONS if axis not in moved)
     search = near(config.search, objective)
     ends = []

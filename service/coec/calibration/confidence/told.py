@@ -1,5 +1,5 @@
-"""What a window is told beside its frames: where the camera is, when its exposures were, through which lens they were
-taken. And where its range edges would lie in the images, were it otherwise."""
+"""The assumptions of a window (what it is told beside its frames): where the camera is, when its exposures were, and
+through which lens they were taken; and where its range edges would lie in the images if these were otherwise."""
 
 from __future__ import annotations
 
@@ -24,44 +24,45 @@ from coec.geometry.thinning import thinned
 from coec.geometry.vectors import lengths
 
 TURNS, SHIFTS, CLOCKS, LENS = range(3), range(3, 6), range(6, 9), range(9, 12)
-"""Places in a deviation (12,): the perturbation ξ of the pose, rad and m; by how much the camera was exposed later than
-it was told, by how much more at the end of the window than at its beginning, and by how much more in its last row than
-in its first, s; by how much the principal point lies further right and down, in focal lengths, and the share by which
-the focal length is longer."""
+"""Places in a deviation (12,). Turns and shifts: the perturbation ξ of the pose, rad and m. Clocks, s: by how much the
+camera was exposed later than assumed, by how much more at the end of the window than at its beginning, and by how much
+more in the last row than in the first. Lens: by how much the principal point lies further right and down, in focal
+lengths, and the share by which the focal length is longer."""
 
 SIZE = 12
 
 REACH = np.array([radians(3.0)] * 3 + [0.4] * 3 + [0.08, 0.08, 0.06] + [0.04, 0.04, 0.05])
-"""How far each may be from what was told. Clocks: most of a frame at 10 Hz, and the readout of the slowest rolling
-shutters; a lens: beyond what a focus ring or another unit of the same type does. A mount: as far as the edges of the
-coarsest band lead back."""
+"""How far each place may be from what was assumed. The mount: as far as the edges of the coarsest band lead back.
+Clocks: most of a frame at 10 Hz, and the readout of the slowest rolling shutters. The lens: beyond what a focus ring or
+another unit of the same type does."""
 
 STEP_RAD = 1e-3
-"""Difference step, a shift by so much of the range: about a pixel or less."""
+"""Difference step, as a share of the range by which a point is shifted: about a pixel or less."""
 
 LEADING_POINTS, SETTLING_POINTS = 4_000, 20_000
-"""Range edges that are asked, at most, on a level that leads to the next and on the sharpest: some four hundred
-evaluations of them cost as much as ten of the search's. With half as many, what the sharpest can tell of a principal
-point four pixels beside through a fisheye is a third less certain."""
+"""Most range edges that are used on a level that leads to the next one, and on the sharpest: some four hundred
+evaluations of them cost as much as ten of the search's. With half as many, the sharpest level is a third less certain
+of a principal point that is four pixels off in a fisheye."""
 
 SEEN = SearchBox(radians(15.0), 4.0)
-"""How far from the pose that was told range edges are asked: twice the reach of its turns about three axes at once, and
-what passes at 40 m/s while the clocks are off by theirs. The edge of the coarsest map is known to some degrees."""
+"""How far from the assumed pose range edges are kept: twice the reach of its turns about three axes at once, and what
+passes at 40 m/s within the reach of the clocks. The edge of the coarsest map is known only to some degrees."""
 
 SLOWEST_MPS = 1.0
-"""Below that an offset of a clock of a tenth of a second moves nothing by more than 10 cm, and all is alike."""
+"""Below this speed a clock that is off by a tenth of a second moves nothing by more than 10 cm, and everything
+alike."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """The range edges of a window on the image edges of one level, as it was told, and what it takes to see them
-    otherwise.
+    """The range edges of a window on the image edges of one level, as assumed, and what it takes to move them to where
+    they lie under other assumptions.
 
     Attributes:
-        frames: as told.
+        frames: the edges as assumed.
         pose: (4, 4) from which deviations are counted.
-        passing: (3, E) how fast what stands still passes the LiDAR, m/s, LiDAR frame.
-        share: (3, E) of each clock's error at each range edge, 0 without ego-motion.
+        passing: (3, E) how fast standing things pass the LiDAR, m/s, LiDAR frame.
+        share: (3, E) the share of each clock's error at each range edge; 0 without ego-motion.
     """
 
     frames: EdgeFrames
@@ -70,7 +71,7 @@ class Told:
     share: NDArray[np.float32]
 
     def otherwise(self, deviation: NDArray[np.float64]) -> tuple[EdgeFrames, Matrix4]:
-        """The edges and the pose (4, 4) at a deviation (12,)."""
+        """The edges and the pose (4, 4) after a deviation (12,)."""
         frames, later_s = self._through_lens(deviation), deviation[CLOCKS].astype(np.float32)
         if later_s.any():
             late = later_s[0] * self.share[0] + later_s[1] * self.share[1] + later_s[2] * self.share[2]
@@ -84,7 +85,7 @@ class Told:
         return replace(frames, camera=_through(frames.camera, deviation[LENS]))
 
     def thinned(self, at_most: int) -> Told:
-        """Of about so many of the range edges."""
+        """The same with at most about so many of the range edges."""
         kept = thinned(len(self.frames.weight), at_most)
         return replace(
             self, frames=self.frames.of_points(kept), passing=self.passing[:, kept], share=self.share[:, kept]
@@ -105,7 +106,7 @@ class Told:
         return found
 
     def pixels(self, deviation: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """(E, 2) where the range edges lie at a deviation (12,), and (E,) whether they do."""
+        """(E, 2) the pixels at which the range edges lie at a deviation (12,), and (E,) whether they have one."""
         frames, T = self.otherwise(deviation)
         p_camera = np.einsum("ij,jn->ni", T[:3, :3], frames.xyz_m.astype(np.float64)) + T[:3, 3]
         return project(frames.camera, p_camera)
@@ -113,17 +114,17 @@ class Told:
     def moved(
         self, deviation: NDArray[np.float64], places: tuple[int, ...]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """(n, E, 2) how far each of n places of a deviation moves the range edges about one (12,), pixels per unit; and
-        (E,) which of them.
+        """(n, E, 2) how far each of n places of a deviation moves the range edges, at a deviation (12,), pixels per
+        unit; and (E,) for which of the range edges that is known.
 
-        By how the pixel follows the point, in differences, and how the point follows a place.
+        It multiplies how the pixel follows the point, by differences, with how the point follows a place.
         """
         frames, T = self.otherwise(deviation)
         p_camera = np.einsum("ij,jn->ni", T[:3, :3], frames.xyz_m.astype(np.float64)) + T[:3, 3]
         uv_px, seen = project(frames.camera, p_camera)
         height, width = self.frames.maps.shape[1:]
         seen = seen & (uv_px >= 0.0).all(axis=1) & (uv_px <= [width - 1.0, height - 1.0]).all(axis=1)
-        # A deviation turns about the camera as it was told, and then shifts.
+        # A deviation first turns about the camera as assumed, and then shifts.
         turned_m = p_camera - deviation[SHIFTS]
         step_m = STEP_RAD * lengths(p_camera)
         follows = np.empty((len(uv_px), 2, 3))
@@ -142,8 +143,8 @@ class Told:
         return columns, seen
 
     def _moved_by(self, place: int, turned_m: NDArray[np.float64], T: Matrix4) -> NDArray[np.float64]:
-        """(E, 3) how points move with one place of a deviation, per unit: (E, 3) they are in the camera, turned and not
-        yet shifted, at a pose (4, 4)."""
+        """(E, 3) how points move with one place of a deviation, per unit, at a pose (4, 4). `turned_m` (E, 3) are the
+        points in the camera frame, turned and not yet shifted."""
         if place in TURNS:
             return np.cross(np.eye(3)[place], turned_m)
         if place in SHIFTS:
@@ -153,7 +154,7 @@ class Told:
 
 
 def _of_one_lens(deviations: NDArray[np.float64]) -> list[list[int]]:
-    """Places of those of K deviations (K, 12) that are through the same lens, for each lens."""
+    """For each lens, the indices of those of K deviations (K, 12) that have that lens."""
     places: dict[bytes, list[int]] = {}
     for place, lens in enumerate(deviations[:, LENS]):
         places.setdefault(lens.tobytes(), []).append(place)
@@ -161,8 +162,8 @@ def _of_one_lens(deviations: NDArray[np.float64]) -> list[list[int]]:
 
 
 def levels_told(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> list[Told]:
-    """Of a window, which is at `pose` (4, 4): `edges` from a level that leads there to the sharpest one. Those that no
-    deviation brings into view are left out."""
+    """The levels of a window at `pose` (4, 4), from `edges` of coarser levels that lead there to the sharpest one.
+    Edges that no deviation brings into view are left out."""
     counts = [*([LEADING_POINTS] * (len(edges) - 1)), SETTLING_POINTS]
     half_view_rad = half_field_of_view_rad(edges[0].camera, edges[0].maps[0] != VOID)
     levels = [level.of_points(thinned(len(level.weight), count)) for level, count in zip(edges, counts, strict=True)]
@@ -170,7 +171,7 @@ def levels_told(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> l
 
 
 def _told(frames: EdgeFrames, window: Window, pose: Matrix4) -> Told:
-    """The range edges of a window, which is at `pose` (4, 4)."""
+    """The range edges of one level of a window at `pose` (4, 4)."""
     counts, pairs = np.diff(frames.first_point), window.pairs
     frame = np.repeat(np.arange(len(pairs)), counts)
     velocity, turn, moves = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3)), np.zeros(len(pairs))
@@ -190,12 +191,12 @@ def _told(frames: EdgeFrames, window: Window, pose: Matrix4) -> Told:
 
 
 def moves(window: Window) -> bool:
-    """Whether the vehicle moves enough for a clock to show."""
+    """Whether the vehicle moves enough for the error of a clock to show."""
     return any(pair.motion is not None and pair.motion.reaches(SLOWEST_MPS) for pair in window.pairs)
 
 
 def _moved_by_lens(told: Camera, camera: Camera, uv_px: NDArray[np.float64], place: int) -> NDArray[np.float64]:
-    """(E, 2) how pixels (E, 2) of a camera move with one place of the lens, per unit of what was told of it."""
+    """(E, 2) how pixels (E, 2) of a camera move with one place of the lens, in units of the lens `told`."""
     moved = np.zeros_like(uv_px)
     if place == LENS.start:
         moved[:, 0] = told.fx

@@ -1,5 +1,5 @@
-"""How far an optimum may be off, all in all: chance, the shape of the hill, other summits, what all frames share, and
-what the window itself has against what it was told."""
+"""How far an optimum may be off, all in all: by chance, by the shape of the hill, by other summits, by errors that all
+frames share, and by assumptions that the window itself contradicts."""
 
 from __future__ import annotations
 
@@ -27,9 +27,12 @@ def measure_uncertainty(
     window: Window,
     held_m: float,
 ) -> Uncertainty:
-    """Of the optimum at `pose` (4, 4), searched along the axes `moved` of ξ; `rivals` are summits that the search came
-    to as well, `loosened` is what setting free what was told came to, a translation that is held is known to `held_m`.
-    Unknown where the objective has no maximum there or the frames are too few."""
+    """The uncertainty of the optimum at `pose` (4, 4), searched along the axes `moved` of ξ; unknown if the objective
+    has no maximum there or the frames are too few.
+
+    `rivals` are other summits that the search found. `loosened` is how the pose moves when assumptions are set free. A
+    held translation is known to `held_m`.
+    """
     axes = tuple(moved)
     landscape = Landscape.about(objective.cells(pose), pose, axes)
     noise = measure_noise(landscape)

@@ -1,7 +1,8 @@
-"""Climbs of the alignment of range edges over a pose and over what the window was told.
+"""Climbs of the alignment of range edges over a pose and over the assumptions of a window (clocks, lens).
 
-What is set free moves along with the pose that answers it: a principal point further right is a camera turned to the
-left, on most of the image, and what is left after the turn is what the window can tell of it.
+An assumption that is set free moves together with the pose that answers it. For example, a principal point further
+right looks on most of the image like a camera turned to the left; only what the turn does not explain shows the
+principal point.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, SHARP_SIGMA_PX
 from coec.geometry.linear import inverted
 
 LEADING, SETTLING = 0.1, 0.03
-"""Shares of its first step within which a climb ends, on a level that leads to the next and on the sharpest. An offset
-of the clocks and a shift along the way differ by little: its hill is a ridge."""
+"""A climb ends within this share of its first step, on a level that leads to the next one and on the sharpest. The
+second is small because the hill is a ridge: an offset of the clocks and a shift along the way differ by little."""
 
 POINTS = 5_000
-"""Range edges from which the directions are taken, at most: a least squares over twelve unknowns needs no more."""
+"""Most range edges from which the directions are computed: least squares over twelve unknowns needs no more."""
 
 MAX_EVALUATIONS = 200
 """Bound on one climb; it takes 20 to 80."""
 
 SHARP_STEP_PX = 2.0 * SHARP_SIGMA_PX
-"""First step on the sharpest edges: their hill is as wide."""
+"""First step on the sharpest edges, as wide as their hill."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,10 +39,11 @@ class Ways:
     """The directions of a climb, n of them.
 
     Attributes:
-        directions: (12, n) of a deviation: what moves by itself, and what is set free with its answer.
-        steps: (n,) along each of them that move the edges by one pixel of the sharpest map.
+        directions: (12, n) in the space of deviations: of what moves by itself, and of what is set free together with
+            the answer of the pose.
+        steps: (n,) along each direction that move the edges by one pixel of the sharpest map.
         free: places of what is set free.
-        residual: (f, f) mean products of what the f free ones move the edges by beside their answers, px².
+        residual: (f, f) mean products of how the f free ones still move the edges after their answers, px².
     """
 
     directions: NDArray[np.float64]
@@ -51,10 +53,10 @@ class Ways:
 
     @classmethod
     def of(cls, sharp: Told, at: NDArray[np.float64], base: tuple[int, ...], free: tuple[int, ...]) -> Ways:
-        """About a deviation (12,): `base` moves already, `free` is set free.
+        """The directions about a deviation (12,): the places `base` move already, the places `free` are set free.
 
         Raises:
-            ValueError: the edges in view do not determine what moves already.
+            ValueError: the edges in view do not determine `base`.
         """
         places, count = (*base, *free), len(base)
         some = sharp.thinned(POINTS)
@@ -66,7 +68,7 @@ class Ways:
         for i in n:
             weighted = columns[i] * weight
             for j in range(i + 1):
-                # A sum without a BLAS product: to the bit the same in every process.
+                # A sum without a BLAS product is the same to the bit in every process.
                 normal[i][j] = normal[j][i] = float(np.sum(weighted * columns[j])) / whole
         own = [row[:count] for row in normal[:count]]
         directions = np.zeros((SIZE, len(places)))
@@ -83,7 +85,7 @@ class Ways:
         return cls(directions, np.array([1.0 / sqrt(max(s, LEAST_SQUARE)) for s in squares]), free, np.array(residual))
 
     def moved_px(self, deviation: NDArray[np.float64]) -> float:
-        """What the free ones of a deviation (12,) move the edges by, beside their answers."""
+        """By how many pixels the free places of a deviation (12,) still move the edges after their answers."""
         values = deviation[list(self.free)].tolist()
         rows = self.residual.tolist()
         square = fsum(a * b * rows[i][j] for i, a in enumerate(values) for j, b in enumerate(values))
@@ -91,8 +93,8 @@ class Ways:
 
 
 def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The deviation (12,) of the most significant alignment next to `start` (12,) on the last level, to which the ones
-    before it lead."""
+    """The deviation (12,) of the most significant alignment on the last level next to `start` (12,). The levels before
+    it lead there."""
     sharpest = levels[-1].frames.camera.width
     reach = REACH[:, None] / np.maximum(np.abs(ways.directions), 1e-9)
     widest = 0.5 * reach.min(axis=0)
@@ -105,7 +107,7 @@ def climbed(levels: Sequence[Told], ways: Ways, start: NDArray[np.float64]) -> N
 
         def scores(points: NDArray[np.float64], level: Told = level, begin: NDArray[np.float64] = begin) -> list[float]:
             deviations = begin + np.sum(ways.directions * points[:, None, :], axis=2)
-            # Half a deviation at the end of its reach: what the window does not tell stays as it was told.
+            # Costs half a unit at the end of the reach, so that what the window does not show stays as assumed.
             unlike = deviations[:, SHIFTS.stop :] / REACH[SHIFTS.stop :]
             found: list[float] = (level.significances(deviations) - 0.5 * np.sum(unlike * unlike, axis=1)).tolist()
             return found
