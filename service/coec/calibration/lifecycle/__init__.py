@@ -1,6 +1,7 @@
-"""What is served as the extrinsic of a pair, and how healthy it is: pure functions from state to state.
+"""What a pair serves as its extrinsic, and how healthy it is: pure functions from state to state.
 
-`states` holds the machine and its table, `policy` what may be applied without a person, `pair_state` the flow.
+`states` holds the state machine and its table, `policy` decides what may be applied without a person, and `pair_state`
+holds the steps from state to state.
 docs/health.md shows the table.
 """
 

@@ -1,4 +1,4 @@
-"""How long a pair has been watched, and what became of its alarms: false ones are counted, not claimed."""
+"""How long a pair has been watched, and how its alarms ended: so false alarms are counted rather than estimated."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 from coec.calibration.lifecycle.states import HealthState
 
 GAP_NS = 60_000_000_000
-"""Sensor time, ns. Between two completed checks farther apart nobody watched: twelve periods of the monitor as it is
-shipped, and more than a stretched one waits."""
+"""Sensor time, ns. Between two completed checks that are farther apart the pair counts as not watched. It is twelve
+default periods of the monitor, and longer than a stretched period."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmRecord:
-    """Since the state directory is the pair's.
+    """The record since the pair got its state directory.
 
     Attributes:
         watched_ns: sensor time between completed checks.
-        confirmed: alarms (`miscalibrated`) that ended with another extrinsic.
-        withdrawn: alarms that ended with the extrinsic that they accused, and `healthy`: false ones.
-        accused: whether an alarm has not ended yet.
+        confirmed: number of alarms (`miscalibrated`) that ended with another extrinsic.
+        withdrawn: number of false alarms: they ended `healthy` with the extrinsic that they accused.
+        accused: whether an alarm is going on.
     """
 
     watched_ns: int = 0
@@ -28,13 +28,15 @@ class AlarmRecord:
     accused: bool = False
 
     def watched(self, from_ns: int | None, to_ns: int | None) -> AlarmRecord:
-        """A check was completed at one sensor time, the one before it at another; None where that is not known."""
+        """The record after a check was completed at `to_ns`, and the one before it at `from_ns` (sensor time); None if
+        unknown."""
         if from_ns is None or to_ns is None or not 0 < to_ns - from_ns <= GAP_NS:
             return self
         return replace(self, watched_ns=self.watched_ns + to_ns - from_ns)
 
     def entered(self, health: HealthState, *, replaced: bool) -> AlarmRecord:
-        """The pair is in a state of health now; its extrinsic was or was not replaced on the way there."""
+        """The record after the pair came to a state of health; `replaced`: whether its extrinsic was replaced on the
+        way there."""
         miscalibrated = health is HealthState.MISCALIBRATED
         if self.accused and replaced:
             return replace(self, confirmed=self.confirmed + 1, accused=miscalibrated)

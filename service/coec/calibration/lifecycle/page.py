@@ -1,4 +1,4 @@
-"""The page of the documentation about health, made of the tables that the code runs on."""
+"""The page of the documentation about health, made from the tables that the code runs on."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""The state of a pair and every step it can take: windows, checks of the monitor, age, commands of people.
+"""The state of a pair and every step that it can take: by windows, checks of the monitor, age, commands of people.
 
-An estimate that was not accepted is never served as current; a pair that was not looked at is never healthy; what a
-person froze does not move. Each function returns the next state whole; `PairState` is all that survives a restart.
+An estimate that was not accepted is never served as current. A pair that was not looked at is never healthy. An
+extrinsic that a person holds does not move. Each function returns the whole next state; `PairState` is all that
+survives a restart.
 """
 
 from __future__ import annotations
@@ -35,16 +36,16 @@ from coec.errors import CoecError
 from coec.geometry import se3
 
 BENT_MOUNT = "bent_mount"
-"""The one cause of `diagnose` that is the calibration's; every other is the data's."""
+"""The one cause of `diagnose` that lies in the calibration; every other lies in the data."""
 
 LAST_KNOWN = "last_known"
-"""Code of the reason that says what was known before nobody could look."""
+"""Code of the reason that says what was last known before checks stopped."""
 
 RESTARTED = Reason("restarted", "The service was started again; nothing has been looked at since.")
 
 SETTLING_NS = 60_000_000_000
-"""Sensor time, a minute, that a pair stays degraded, at least, once its data could not be judged: one poor stretch
-after another is one, and who reads health is told of no change twice a minute."""
+"""Sensor time, a minute, for which a pair stays degraded at least once its data could not be judged. Poor stretches
+that follow each other then count as one, and readers of health do not see two changes a minute."""
 
 SETTLING = Reason("settling", "The data can be judged again, after a stretch where they could not.")
 
@@ -84,8 +85,8 @@ class CommandRefusedError(CoecError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A pose (4, 4) that an accepted estimate asks for and that waits for `apply`; why it waits, and whether it is too
-    far from what is served for both to be right."""
+    """A pose (4, 4) from an accepted estimate that waits for `apply`; why it waits, and whether it contradicts the
+    served pose, being too far from it for both to be right."""
 
     T_camera_lidar: Matrix4
     estimate: Estimate
@@ -96,7 +97,7 @@ class Candidate:
 @dataclass(frozen=True, slots=True)
 class Hold:
     """A person holds the extrinsic: since when (wall clock, ns since 1970), who, and why, in their words; None and
-    empty where that is not known."""
+    empty if unknown."""
 
     since_ns: int | None = None
     sender: str = ""
@@ -113,7 +114,7 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What the owner of the vehicle has laid down."""
+    """The configuration that the owner of the vehicle has set."""
 
     policy: PolicyConfig
     tracker: TrackerConfig
@@ -121,7 +122,7 @@ class Rules:
 
     @property
     def alarm(self) -> AlarmLevels:
-        """What the evidence of checks has to come to."""
+        """The levels that the evidence of checks has to reach."""
         return alarm_levels(self.monitor)
 
 
@@ -130,24 +131,24 @@ class PairState:
     """Everything that survives a restart.
 
     Attributes:
-        T_camera_lidar: (4, 4) the extrinsic that is served.
+        T_camera_lidar: (4, 4) the served extrinsic.
         valid_from_ns: sensor time of the data it rests on; 0 for the nominal one.
         latest: the last estimate, accepted or not.
         accepted: the accepted estimate on which the served extrinsic rests; None for a nominal one.
-        failures: why the last attempt produced no estimate; empty when it produced one.
-        health, reasons: the state of the machine, and why it is in it.
-        unseen_from: the health out of which time without a check took it; None while it has not. What the data decide
-            goes on from there: how long a machine took for a check is none of their business.
-        pending: what waits for `apply`.
-        hold: who holds the extrinsic as it is; None while nobody does.
-        proven: whether a window, or commissioning, has confirmed what is served.
+        failures: why the last attempt produced no estimate; empty if it produced one.
+        health, reasons: the state of health, and why the pair is in it.
+        unseen_from: the health before time without a check changed it; None if time did not. Events in the data go on
+            from there, because they do not depend on how long the machine took for a check.
+        pending: the candidate that waits for `apply`.
+        hold: who holds the extrinsic as it is; None if nobody does.
+        proven: whether a window, or commissioning, has confirmed the served extrinsic.
         track: the combination of accepted windows since the extrinsic last jumped; None before the first.
-        monitor: what the checks since then add up to.
-        flagged_since_ns: sensor time since which the monitor has something against the pairs, None while it has not. A
+        monitor: what the checks since the last confirmation or replacement add up to.
+        flagged_since_ns: sensor time since which the monitor has something against the pairs; None if it has nothing. A
             window that began earlier mixes two mounts: it neither corrects nor acquits.
-        poor_since_ns: sensor time at which the data began not to tell, None once health has left that behind.
-        changes: steps of the last day that nobody ordered.
-        record: how long it was watched, and what became of its alarms.
+        poor_since_ns: sensor time since which the data could not be judged; None once health has recovered.
+        changes: steps of the last day that no person ordered.
+        record: how long the pair was watched, and how its alarms ended.
     """
 
     T_camera_lidar: Matrix4
@@ -172,25 +173,25 @@ class PairState:
 
     @property
     def seen(self) -> HealthState:
-        """Health by what was looked at, however long ago."""
+        """Health according to the last look, however long ago it was."""
         return self.health if self.unseen_from is None else self.unseen_from.state
 
 
 def initial_state(rig: Rig) -> PairState:
-    """Nominal, not accepted, nothing looked at."""
+    """The first state: nominal extrinsic, not accepted, nothing looked at."""
     return PairState(rig.T_camera_lidar_nominal, Provenance.NOMINAL, Status.NOT_ACCEPTED, 0)
 
 
 def restored(state: PairState) -> PairState:
-    """The state after a restart: an estimate that was read back from disk says so, and whatever the clock claims,
-    nothing has been looked at since. A suspicion, and an alarm, outlive the restart."""
+    """The state after a restart. An estimate read back from disk is marked as restored, and nothing counts as looked at
+    since, whatever the clock says. A suspicion or an alarm outlives the restart."""
     if state.provenance is Provenance.ESTIMATED:
         state = replace(state, provenance=Provenance.RESTORED)
     return _unseen(state, Event.RESTARTED, RESTARTED)
 
 
 def moved(estimate: Estimate, pose: Matrix4, rig: Rig) -> Estimate:
-    """An estimate that says another pose (4, 4): the estimator's known bias was taken out of it."""
+    """The estimate with another pose (4, 4), from which the known bias of the estimator was removed."""
     optimum = replace(estimate.optimum, T_camera_lidar=pose)
     return replace(estimate, optimum=optimum, correction=se3.difference(pose, rig.T_camera_lidar_nominal))
 
@@ -201,7 +202,7 @@ def agrees(T_one: Matrix4, T_other: Matrix4, rules: PolicyConfig) -> bool:
 
 
 def happened(state: PairState, event: Event, *reasons: Reason) -> PairState:
-    """The state after an event: the table decides, and the reasons are the newest ones for being there."""
+    """The state after an event: the table decides on health, and the given reasons replace the old ones."""
     return replace(state, health=TRANSITIONS[state.seen, event], reasons=reasons, unseen_from=None)
 
 
@@ -209,8 +210,9 @@ def happened(state: PairState, event: Event, *reasons: Reason) -> PairState:
 
 
 def before_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules) -> PairState:
-    """A window was solved, and `after_estimate` will follow: an accepted one that is elsewhere than an extrinsic which
-    the monitor suspects makes two witnesses. The mount has moved, even if the next step puts it right."""
+    """The state when a window was solved, before `after_estimate`. If the window is accepted and its pose is elsewhere
+    than an extrinsic that the monitor suspects, there are two witnesses: the mount has moved, even if the next step
+    corrects it at once."""
     mixed = state.flagged_since_ns is not None and window_start_ns < state.flagged_since_ns
     if estimate.verdict.decision is Decision.FAILED or mixed or not _accused_elsewhere(state, estimate, rules):
         return state
@@ -218,18 +220,18 @@ def before_estimate(state: PairState, estimate: Estimate, window_start_ns: int, 
 
 
 def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: Rules) -> PairState:
-    """A window was solved. `window_start_ns` is the stamp of its first pair."""
+    """The state after a window was solved. `window_start_ns` is the stamp of its first pair."""
     state = replace(state, latest=estimate, failures=())
     if estimate.verdict.decision is Decision.FAILED:
         state = replace(state, status=Status.FAILED)
         moved = _well_told_move(estimate)
         if estimate.verdict.tells_another_lens:
             return _poor(state, Event.DATA_CAUSE, estimate.data_stamp_ns, CAUSES[INTRINSICS_OFF].as_reason())
-        # Along a tunnel two poses fit as well as in front of and behind a knock: without a check that has something
-        # against the pairs that is no witness.
+        # In a tunnel two poses fit as well as before and after a knock. Without a check that has something against the
+        # pairs, such a window is no witness.
         if (moved is None and estimate.verdict.cannot_tell) or (moved is not None and not _objected(state)):
             return state
-        # Where the camera moved within the window, its end tells where it is now.
+        # If the camera moved within the window, the end of the window shows where it is now.
         latest = estimate.optimum.T_camera_lidar if moved is None else moved.T_after
         if agrees(state.T_camera_lidar, latest, rules.policy):
             return state
@@ -244,7 +246,7 @@ def after_estimate(state: PairState, estimate: Estimate, window_start_ns: int, r
         why = Reason("step_suspected", f"The latest window differs by {_told(step)}; the next one decides.")
         pending = Candidate(track.candidate.T_camera_lidar, estimate, why, contradicts=True)
         return _unless_red(replace(state, pending=pending), Event.STEP_SUSPECTED, why)
-    # A track of one window is that window, to the last bit.
+    # A track of one window has that window's pose to the last bit.
     pose = estimate.optimum.T_camera_lidar if track.windows <= 1 else track.T_camera_lidar
     return _applied_or_waiting(state, pose, estimate, rules.policy)
 
@@ -255,19 +257,19 @@ def _objected(state: PairState) -> bool:
 
 
 def _data_cause(monitor: MonitorState) -> Cause | None:
-    """What is wrong with the data, if anything is certain enough."""
+    """The cause in the data, if one is certain enough."""
     cause = diagnose(monitor)
     return None if cause is None or cause.code == BENT_MOUNT else cause
 
 
 def _well_told_move(estimate: Estimate) -> MovedWithin | None:
-    """What a window says of a move within it; nothing where it may not be believed for another reason, too."""
+    """The move within a window; None if there is none or if another reason also makes the window doubtful."""
     return estimate.moved if estimate.verdict.tells_two_poses else None
 
 
 def window_wanted_since(state: PairState) -> int | None:
-    """Since when (sensor time) pairs are wanted for a window that has to come soon; None where none has to: what is
-    served is suspected by the monitor, or by the latest window, within which the camera moved."""
+    """The sensor time since which pairs are wanted for an urgent window; None if none is urgent. It is urgent if the
+    monitor accuses the served extrinsic, or if the camera moved within the latest window and health is not good."""
     if state.monitor.outcome in ACCUSING and state.flagged_since_ns is not None:
         return state.flagged_since_ns
     moved = None if state.latest is None else _well_told_move(state.latest)
@@ -276,7 +278,8 @@ def window_wanted_since(state: PairState) -> int | None:
 
 
 def kept_for_next(estimate: Estimate) -> KeptPairs | None:
-    """The pairs of a window after the camera moved within it: they are as good as those of the next one."""
+    """The pairs of a window that come after the camera moved within it: the next window may use them as its own. None
+    if there are none."""
     moved = estimate.moved
     if moved is None or not moved.pairs_after:
         return None
@@ -284,14 +287,14 @@ def kept_for_next(estimate: Estimate) -> KeptPairs | None:
 
 
 def told_by_rig(estimate: Estimate, covariance: NDArray[np.float64]) -> Estimate:
-    """An estimate as sure as all pairs of the rig together are: with a covariance (6, 6) of theirs, NaN on axes that
-    it does not tell."""
+    """The estimate with the uncertainty of all pairs of the rig together: their covariance (6, 6), NaN on axes that it
+    does not determine."""
     return replace(estimate, uncertainty=replace(estimate.uncertainty, noise=covariance, systematic={}))
 
 
 def after_joint(state: PairState, joint: Estimate, stamp_ns: int, rules: Rules) -> PairState:
-    """A sensor of the pair has moved, and the windows of all of its pairs together say where it is: the track starts
-    again from that. Decided at a sensor time. The policy, and a person who holds the extrinsic, are heard."""
+    """The state after a sensor of the pair moved and the windows of all its pairs together said where it is, decided at
+    the sensor time `stamp_ns`. The track starts again from that pose. The policy applies, and so does a hold."""
     pose = joint.optimum.T_camera_lidar
     track = Track.initial(pose, prior_sigma(rules.tracker), stamp_ns)
     track = absorb(track, replace(Measurement.of(joint), stamp_ns=stamp_ns), rules.tracker)
@@ -299,14 +302,15 @@ def after_joint(state: PairState, joint: Estimate, stamp_ns: int, rules: Rules) 
 
 
 def after_failure(state: PairState, reason: Reason) -> PairState:
-    """A window from which no estimate could be made: the served extrinsic stays, and so does its health, of which that
-    says nothing."""
+    """The state after a window from which no estimate could be made. The served extrinsic and its health stay, because
+    this says nothing about them."""
     return replace(state, status=Status.FAILED, failures=(reason,))
 
 
 def _tracked(state: PairState, estimate: Estimate, rules: Rules) -> Track:
-    """The track with the estimate in it. It starts again from the estimate when there is none yet, and when the monitor
-    already speaks against what is served: then two witnesses agree that the mount has moved."""
+    """The track with the estimate in it. It starts anew from the estimate if there is no track yet, or if the monitor
+    already accuses the served extrinsic and the estimate is elsewhere: then two witnesses agree that the mount
+    moved."""
     measurement = Measurement.of(estimate)
     pose = estimate.optimum.T_camera_lidar
     track = state.track
@@ -316,7 +320,7 @@ def _tracked(state: PairState, estimate: Estimate, rules: Rules) -> Track:
 
 
 def _accused_elsewhere(state: PairState, estimate: Estimate, rules: Rules) -> bool:
-    """Whether the monitor speaks against what is served, and the estimate is too far from it for both to be right."""
+    """Whether the monitor accuses the served extrinsic, and the estimate is too far from it for both to be right."""
     accused = state.monitor.outcome in ACCUSING
     return accused and not agrees(state.T_camera_lidar, estimate.optimum.T_camera_lidar, rules.policy)
 
@@ -353,8 +357,8 @@ def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
 
 
 def _confirmed(state: PairState, stamp_ns: int) -> PairState:
-    """A window vouches for what is served: whatever the monitor had against it is settled. What is wrong with the data
-    is not."""
+    """The state after a window vouches for the served extrinsic. All that the monitor had against it is dropped; causes
+    in the data stay."""
     fresh = MonitorState(blind=state.monitor.blind, dirt=state.monitor.dirt, vouched=True)
     cause = _data_cause(fresh)
     state = replace(state, proven=True, monitor=fresh, flagged_since_ns=None)
@@ -368,18 +372,19 @@ def _confirmed(state: PairState, stamp_ns: int) -> PairState:
 
 
 def after_observation(state: PairState, observation: Observation, rules: Rules) -> PairState:
-    """The monitor checked the served extrinsic. One check decides nothing: `MonitorState` adds them up."""
+    """The state after the monitor checked the served extrinsic. One check decides nothing: `MonitorState` adds them
+    up."""
     monitor = check_taken(state.monitor, observation, rules.alarm)
     since_ns = state.flagged_since_ns
     if (observation.flagged or observation.undecided) and not observation.causes:
         if since_ns is None:
-            # Without a clear check before, nothing says that earlier pairs were any better.
+            # Without a clear check before, nothing shows that earlier pairs were better.
             was_clear = state.monitor.outcome is Finding.CLEAR
             since_ns = observation.pair_stamps_ns[0] if was_clear else state.valid_from_ns
     elif monitor.outcome in (Finding.CLEAR, Finding.UNKNOWN):
         since_ns = None
     elif since_ns is None and monitor.outcome in ACCUSING:
-        # All checks together accuse it, and none by itself: all pairs say the same.
+        # All checks together accuse the extrinsic, but none by itself: then all pairs count as flagged.
         since_ns = state.valid_from_ns
     state = replace(state, monitor=monitor, flagged_since_ns=since_ns)
     cause = _data_cause(monitor)
@@ -393,7 +398,7 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
     if monitor.outcome is Finding.AT_ODDS:
         text = "The latest checks accuse the mount, but do not add up to a move; a window is being taken to tell."
         return _poor(state, Event.AT_ODDS, observation.stamp_ns, Reason("checks_at_odds", text))
-    # Against an accepted window that contradicts what is served the word of the monitor is not enough.
+    # A clear monitor does not outweigh an accepted window that contradicts the served extrinsic.
     if monitor.outcome is Finding.CLEAR and (state.pending is None or not state.pending.contradicts):
         if state.proven:
             return _well_again(state, Event.CLEAR, observation.stamp_ns)
@@ -403,14 +408,14 @@ def after_observation(state: PairState, observation: Observation, rules: Rules) 
 
 
 def _poor(state: PairState, event: Event, stamp_ns: int, why: Reason) -> PairState:
-    """The data do not tell, at this sensor time."""
+    """The state after an event because of which the data cannot be judged at this sensor time."""
     after = _unless_red(state, event, why)
     goes_on = state.seen is HealthState.DEGRADED and state.poor_since_ns is not None
     return after if goes_on else replace(after, poor_since_ns=stamp_ns)
 
 
 def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason) -> PairState:
-    """The event, at this sensor time, which makes a pair healthy, unless its data began not to tell less than
+    """The state after an event at this sensor time that makes a pair healthy, unless its poor stretch began less than
     `SETTLING_NS` before."""
     since_ns = state.poor_since_ns
     if state.seen is HealthState.DEGRADED and since_ns is not None and stamp_ns - since_ns < SETTLING_NS:
@@ -419,12 +424,12 @@ def _well_again(state: PairState, event: Event, stamp_ns: int, *reasons: Reason)
 
 
 def overdue(state: PairState, why: Reason) -> PairState:
-    """No check has been completed in time, for this reason; what was last known is said with it."""
+    """The state after no check was completed in time, for this reason; the last known state is added to the reasons."""
     return _by_the_clock(state, Event.OVERDUE, why)
 
 
 def aged(state: PairState, age_s: float, stale_after_s: float) -> PairState:
-    """Time has passed since a check was last completed."""
+    """The state after `age_s` without a completed check."""
     if age_s <= stale_after_s:
         return state
     text = f"No check has been completed for {age_s:.0f} s, more than {stale_after_s:.0f} s."
@@ -432,7 +437,7 @@ def aged(state: PairState, age_s: float, stale_after_s: float) -> PairState:
 
 
 def _by_the_clock(state: PairState, event: Event, why: Reason) -> PairState:
-    """Nothing was looked at in time: told, until something is, and then forgotten."""
+    """The state after an event of the clock: it is reported until something is looked at, and then forgotten."""
     after = _unseen(state, event, why)
     return (
         state
@@ -442,7 +447,7 @@ def _by_the_clock(state: PairState, event: Event, why: Reason) -> PairState:
 
 
 def _seen_again(state: PairState) -> PairState:
-    """A check was completed that changes nothing: health is what it was before nobody looked."""
+    """The state after a check that changes nothing: health returns to what it was before checks stopped."""
     seen = state.unseen_from
     return state if seen is None else replace(state, health=seen.state, reasons=seen.reasons, unseen_from=None)
 
@@ -457,8 +462,8 @@ def _unseen(state: PairState, event: Event, why: Reason) -> PairState:
 
 
 def time_stepped_back(state: PairState, stamp_ns: int) -> PairState:
-    """The clock of the sensors stepped back, to this time. What was suspected of pairs since some time of the old clock
-    is suspected of every pair of the new one."""
+    """The state after the clock of the sensors stepped back to `stamp_ns`. If pairs since some time of the old clock
+    were suspected, every pair of the new clock is."""
     since_ns = None if state.flagged_since_ns is None else stamp_ns
     state = replace(
         state, flagged_since_ns=since_ns, poor_since_ns=None, monitor=replace(state.monitor, last_stamps_ns=())
@@ -471,7 +476,7 @@ def time_stepped_back(state: PairState, stamp_ns: int) -> PairState:
 
 
 def apply_pending(state: PairState, rules: Rules) -> PairState:
-    """A person accepts the candidate; limits of policy do not bind people.
+    """The state after a person accepts the candidate; the limits of the policy do not bind people.
 
     Raises:
         CommandRefusedError: nothing waits, or the extrinsic is held.
@@ -486,7 +491,8 @@ def apply_pending(state: PairState, rules: Rules) -> PairState:
 
 
 def rolled_back(state: PairState, pose: Matrix4, estimate: Estimate, rules: Rules) -> PairState:
-    """A person returns to an earlier accepted calibration; it has to be looked at again before it is called healthy.
+    """The state after a person returns to an earlier accepted calibration. It has to be looked at again before it
+    counts as healthy.
 
     Raises:
         CommandRefusedError: the extrinsic is held.
@@ -504,7 +510,7 @@ def rolled_back(state: PairState, pose: Matrix4, estimate: Estimate, rules: Rule
 
 
 def reset(state: PairState, rig: Rig) -> PairState:
-    """A person returns to the workshop calibration.
+    """The state after a person returns to the workshop calibration.
 
     Raises:
         CommandRefusedError: the extrinsic is held.
@@ -515,17 +521,19 @@ def reset(state: PairState, rig: Rig) -> PairState:
 
 
 def held(state: PairState, hold: Hold) -> PairState:
-    """A person freezes the extrinsic: estimates go on, nothing is applied."""
+    """The state after a person freezes the extrinsic: estimates go on, but none is applied."""
     return replace(state, hold=hold)
 
 
 def released(state: PairState) -> PairState:
-    """The extrinsic may move again; what waits goes on waiting for `apply` or for the next window."""
+    """The state after a hold ends: the extrinsic may move again. A candidate still waits for `apply` or for the next
+    window."""
     return replace(state, hold=None)
 
 
 def after_commissioning(state: PairState, T_commissioned: Matrix4) -> PairState:
-    """The rig was commissioned: if that is what is served, it is the baseline of this rig, and confirmed."""
+    """The state after the rig was commissioned: if the commissioned pose is the served one, it is the baseline of this
+    rig and counts as confirmed."""
     if not np.array_equal(T_commissioned, state.T_camera_lidar):
         return state
     state = replace(state, provenance=Provenance.COMMISSIONED, proven=True, monitor=MonitorState(vouched=True))
@@ -544,7 +552,7 @@ def _refuse_if_held(state: PairState) -> None:
 
 
 def _unless_red(state: PairState, event: Event, *reasons: Reason) -> PairState:
-    """The event; where the state stays red, the reasons for the red stay, too, in front of the new ones."""
+    """The state after an event. If the pair stays miscalibrated, the reasons for that stay too, before the new ones."""
     after = happened(state, event, *reasons)
     if state.health is after.health is HealthState.MISCALIBRATED:
         red = tuple(reason for reason in state.reasons if reason.code in _RED)

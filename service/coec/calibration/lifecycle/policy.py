@@ -1,4 +1,4 @@
-"""Whether an accepted estimate may become current by itself: estimating is one thing, applying another."""
+"""Decides whether an accepted estimate may become current without a person."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ AXES = ("pitch", "yaw", "roll", "x", "y", "z")
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A step of the served extrinsic that nobody ordered: sensor time, and |rx ry rz tx ty tz| (rad, m)."""
+    """A step of the served extrinsic that no person ordered: sensor time, and |rx ry rz tx ty tz| (rad, m)."""
 
     stamp_ns: int
     step: tuple[float, ...]
@@ -35,7 +35,7 @@ def objection(step: NDArray[np.float64], past: Iterable[Change], stamp_ns: int, 
     """Why a step (6,) must wait for a person; None when it may be applied.
 
     Args:
-        past: earlier steps; those within 24 h of sensor time of `stamp_ns` count against the limits of a day.
+        past: earlier steps; those within 24 h of sensor time of `stamp_ns` count towards the limits of a day.
     """
     if policy.apply == "always":
         return None

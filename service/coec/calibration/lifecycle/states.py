@@ -1,6 +1,7 @@
-"""Health as an explicit state machine: six states (CONTRACT), what can happen, and one table that says what follows.
+"""Health as an explicit state machine: six states (CONTRACT), the events, and one table that says what follows.
 
-The table is total and the only place where a state changes. `markdown()` renders it for the documentation.
+The table covers every state and event, and nothing else decides a change of state. `markdown()` renders it for the
+documentation.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from types import MappingProxyType
 
 
 class HealthState(StrEnum):
-    """States of `health` (CONTRACT). `unknown` is the state of not having looked."""
+    """States of `health` (CONTRACT). `unknown` means that nothing has been looked at."""
 
     UNKNOWN = "unknown"
     HEALTHY = "healthy"
@@ -75,10 +76,10 @@ MEANING: Mapping[Event, str] = MappingProxyType(
 
 _U, _H, _S, _M, _D, _A = HealthState
 
-# Rows: what happens. Columns: the state it happens in, in the order of `HealthState`.
-#   Green is only ever reached by looking (CONFIRMED_BY_WINDOW, CLEAR), and kept by looking. Red is left only by a
-#   window that agrees, by a person, or step by step by a monitor that stays clear; neither silence nor bad data hides
-#   it. A window that cannot tell, or came to nothing, is no event: it says nothing of the mount.
+# Rows: what happens. Columns: the state in which it happens, in the order of `HealthState`.
+#   Green (healthy) is reached and kept only by looking (CONFIRMED_BY_WINDOW, CLEAR). Red (miscalibrated) ends only by
+#   a window that agrees, by a person, or step by step by a monitor that stays clear; neither silence nor bad data hides
+#   it. A window that cannot tell or failed is no event, because it says nothing of the mount.
 _ROWS: Mapping[Event, tuple[HealthState, ...]] = {
     #                            unknown healthy suspect miscal. degraded stale
     Event.CONFIRMED_BY_WINDOW: (_H, _H, _H, _H, _H, _H),
