@@ -1,8 +1,8 @@
-"""Pairs between the chosen ones of a window, thinned: where the camera moved between two pairs that lie seconds apart,
-these tell when.
+"""Thinned pairs between the chosen ones of a window. If the camera moved between two chosen pairs, which lie seconds
+apart, these show when.
 
-They are no part of an estimate, so nobody asks whether they are good, and a part of each sweep is enough: whole scan
-lines, so that the jumps in range along those are found as in the whole sweep.
+They enter no estimate, so they are not selected for quality, and a part of each sweep is enough. The part consists of
+whole scan lines, so that the jumps in range along them are found as in the whole sweep.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ NS_PER_S = 1_000_000_000
 MIB = 2**20
 
 POINTS = 12_000
-"""Of a sweep that are kept, about: as many range edges are among them as a frame of a window of 25 is asked for when a
-change is looked for (`search.change_point.POINTS`)."""
+"""About how many points of a sweep are kept. Among them are as many range edges as the search for a change uses of each
+frame in a window of 25 (`search.change_point.POINTS`)."""
 
 BEYOND_RAD = radians(6.0)
-"""Beyond the border of the view, points are kept so far: a knock brings them into view."""
+"""Points are kept so far beyond the border of the view, because a knock may bring them into view."""
 
 
 @dataclass(slots=True)
 class _Slice:
-    """The open one. `next_ns` is the stamp from which a pair lies far enough from those before it, None before the
-    first; `afforded_ns` that from which there are bytes for it."""
+    """The open slice. From the stamp `next_ns` on a pair lies far enough from those before it; None before the first
+    pair. From the stamp `afforded_ns` on there are bytes for another pair."""
 
     start_ns: int
     length_ns: int
@@ -45,7 +45,7 @@ class _Slice:
 
 
 class BetweenPairs:
-    """Picks and thins them, slice by slice: so many seconds apart, in so many bytes."""
+    """Picks and thins the pairs between, slice by slice: at a given distance in seconds, within a given size."""
 
     def __init__(self, images: ImageReducer, half_view_rad: float) -> None:
         """`half_view_rad` is the largest angle from the optical axis at which there is a pixel."""
@@ -54,19 +54,19 @@ class BetweenPairs:
         self._open: _Slice | None = None
 
     def begin(self, config: WindowConfig, start_ns: int, length_ns: int) -> None:
-        """A slice begins, that is cut by `config`. Where its pairs are to be so near to each other that they tell the
-        time as well, there are none between."""
+        """Begins a slice that is cut by `config`. If its chosen pairs will be so near to each other that they show the
+        time as well, it has no pairs between."""
         spacing_ns = round(config.between_s * NS_PER_S)
         wanted = config.between_mib > 0 and length_ns >= 2 * spacing_ns * config.pairs
         self._open = _Slice(start_ns, length_ns, spacing_ns, config.between_mib * MIB, start_ns) if wanted else None
 
     def chosen(self, stamp_ns: int) -> None:
-        """The window has a pair of this stamp: the next one between has its distance from that."""
+        """The window has chosen a pair of this stamp; the next pair between has to keep its distance from it."""
         if self._open is not None:
             self._open.next_ns = stamp_ns + self._open.spacing_ns
 
     def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> FramePair | None:
-        """The pair, thinned, if it is one to record; `T_camera_lidar` (4, 4) is the current extrinsic."""
+        """The pair, thinned, if it is to be recorded; `T_camera_lidar` (4, 4) is the current extrinsic."""
         current = self._open
         if current is None or current.next_ns is None or pair.stamp_ns < max(current.next_ns, current.afforded_ns):
             return None
@@ -81,13 +81,13 @@ class BetweenPairs:
             self._open = None
             return None
         current.bytes = spent
-        # No more than its share of the bytes by any time, so that those suffice to the end of the slice.
+        # At any time no more than that time's share of the bytes is spent, so that they last to the end of the slice.
         current.afforded_ns = current.start_ns + current.length_ns * spent // current.max_bytes
         return replace(pair, camera=camera, lidar=lidar)
 
 
 def thinned_sweep(lidar: LidarFrame, T_camera_lidar: Matrix4, half_view_rad: float) -> LidarFrame:
-    """Every so manieth row of the points that are in view, or nearly, at `T_camera_lidar` (4, 4): `POINTS`, about.
+    """The sweep with about `POINTS` points: every n-th row of those in view, or nearly, at `T_camera_lidar` (4, 4).
     Without intensities."""
     seen = np.flatnonzero(_near_the_view(lidar.xyz_m, T_camera_lidar, half_view_rad + BEYOND_RAD))
     every = ceil(len(seen) / POINTS)
@@ -103,8 +103,8 @@ def thinned_sweep(lidar: LidarFrame, T_camera_lidar: Matrix4, half_view_rad: flo
 
 
 def _near_the_view(xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4, angle_rad: float) -> NDArray[np.bool_]:
-    """(N,) whether points lie within an angle of the optical axis. Without a kernel and without BLAS: see
-    `frames.window`."""
+    """(N,) whether points lie within an angle of the optical axis. It uses no compiled kernel and no BLAS, see
+    `WindowCutter._points_in_view`."""
     if angle_rad >= pi:
         return np.ones(len(xyz_m), np.bool_)
     x_m, y_m, z_m = xyz_m.T
@@ -114,7 +114,7 @@ def _near_the_view(xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4, angle_ra
 
 
 def _rows(lidar: LidarFrame, of: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The row of each point: its ring, or without one the band of its elevation."""
+    """The row of each point: its ring, or, without rings, its band of elevation."""
     ring = telling(lidar.ring)
     if ring is not None:
         return ring[of].astype(np.int64)

@@ -1,7 +1,7 @@
-"""Clouds of several LiDARs in one: told by their rings, where no field tells the source of a point.
+"""Recognises clouds of several LiDARs joined into one, by their rings, if no field names the source of a point.
 
-Who joins clouds appends one to the other (`pcl::concatenatePointCloud`, Autoware's `concatenate_data`): each LiDAR's
-points are a block of the message. A block lies on cones of its own, and looks all around again from another place.
+Programs that join clouds append one to the other (`pcl::concatenatePointCloud`, Autoware's `concatenate_data`), so each
+LiDAR's points are a block of the message. Each block lies on cones of its own, and looks all around from its own place.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from coec.calibration.frames.cones import Rings, elevation_rad
 Doubles = NDArray[np.float64]
 
 APART_M = 0.3
-"""Origins nearer to each other than that are one: a sensor's height."""
+"""Origins nearer to each other than this count as one: the height of a sensor."""
 
 THIN_RAD = math.radians(0.25)
-"""Spread of the elevations within a ring that one LiDAR leaves: a beam, and a metre of driving during the sweep."""
+"""Most spread of the elevations within a ring of one LiDAR: a beam, and a metre of driving during the sweep."""
 
 BELONGS_RAD = 2 * THIN_RAD
-"""A point farther than that from the beam of its ring is another's."""
+"""A point farther than this from the beam of its ring belongs to another LiDAR."""
 
 BEGINNINGS = (1.0, 0.5, 0.25, 0.125)
-"""Shares of the points, from the first on, that are tried as one LiDAR's."""
+"""Shares of the points, from the first on, that are tried as the points of one LiDAR."""
 
 BLOCK = 0.1
-"""Share of the points that the next LiDAR has at least; fewer may be anything."""
+"""Least share of the points that a further LiDAR must have; fewer may be anything."""
 
 WITHIN, BEYOND = 0.6, 0.6
-"""Share of the points that fit the first LiDAR's beams in its block at least, and behind it at most: a passer-by stands
-beside the beams, and some of another's points lie on them by chance."""
+"""Least share of the points in the first LiDAR's block that fit its beams, and most of the points behind the block that
+do. Neither is all or none: a passer-by does not fit the beams, and some points of another LiDAR fit by chance."""
 
 SECTORS, COMMON = 36, 0.5
-"""Of 10° around a LiDAR; and the share of those into which one LiDAR looks that the other sees too, at least. One that
-drives on while it turns looks into each direction once."""
+"""Number of sectors around a LiDAR, 10° each; and the least share of the sectors of one LiDAR that the other must see,
+too. That rules out a single LiDAR that drives on while it turns, because it looks into each direction once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,8 +46,8 @@ class SeveralOrigins:
     """Two places from which blocks of a cloud's points were measured; a third may be there.
 
     Attributes:
-        cones: of each (see `cones`), in the frame of the points.
-        cause, setting: as of `ApparentOrigin`.
+        cones: those of each LiDAR (see `cones`), in the frame of the points.
+        cause, setting: as in `ApparentOrigin`.
     """
 
     cones: tuple[Doubles, Doubles]
@@ -57,7 +57,7 @@ class SeveralOrigins:
 
     @property
     def origins_m(self) -> tuple[tuple[float, ...], ...]:
-        """(3,) each."""
+        """The place (3,) of each LiDAR."""
         return tuple(tuple(cones[:3].tolist()) for cones in self.cones)
 
     @property
@@ -68,8 +68,8 @@ class SeveralOrigins:
 
 
 def several_origins(rings: Rings, before: SeveralOrigins | None = None) -> SeveralOrigins | None:
-    """Two LiDARs, the points of one behind those of the other; None where the points are not seen to be of several.
-    `before` is what explained the sweep before."""
+    """Two LiDARs, if the points of one follow those of the other; None if several LiDARs cannot be recognised. `before`
+    is what explained the last sweep."""
     guesses = (np.zeros(5), *(before.cones if before else ()))
     first = _beginning(rings, guesses)
     if first is None:
@@ -90,7 +90,7 @@ def several_origins(rings: Rings, before: SeveralOrigins | None = None) -> Sever
 
 
 def _beginning(rings: Rings, guesses: tuple[Doubles, ...]) -> tuple[Rings, Doubles] | None:
-    """The longest beginning of the points that lies on cones, and these; None where none does."""
+    """The longest block at the beginning of the points that lies on cones, and those cones; None if none does."""
     for share in BEGINNINGS:
         block = rings.part(0, int(share * len(rings.xyz_m)))
         if block is None:
@@ -104,7 +104,8 @@ def _beginning(rings: Rings, guesses: tuple[Doubles, ...]) -> tuple[Rings, Doubl
 
 
 def _fits(rings: Rings, block: Rings, cones: Doubles) -> NDArray[np.bool_]:
-    """(N,) whether a point lies on the beam that its ring has in the block; rings that are not in it have none."""
+    """(N,) whether each point lies on the beam of its ring in the block; rings that are not in the block have no
+    beam."""
     beams_rad = np.full(int(rings.names.max()) + 1, np.nan)
     beams_rad[block.names] = block.beams_rad(cones)
     beside_rad = elevation_rad(rings.xyz_m, cones) - beams_rad[rings.names[rings.number]]
@@ -112,12 +113,12 @@ def _fits(rings: Rings, block: Rings, cones: Doubles) -> NDArray[np.bool_]:
 
 
 def _ends(fits: NDArray[np.bool_], end: int) -> bool:
-    """Whether a LiDAR's points end there."""
+    """Whether the points of the first LiDAR end there."""
     return bool(fits[:end].mean() >= WITHIN and fits[end:].mean() <= BEYOND)
 
 
 def _sectors(xyz_m: Doubles, cones: Doubles) -> NDArray[np.bool_]:
-    """(SECTORS,) whether there are points, seen from the tip of the cones."""
+    """(SECTORS,) whether each sector holds points, seen from the tip of the cones."""
     ray_m = xyz_m - cones[:3]
     sector = ((np.arctan2(ray_m[:, 1], ray_m[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
     return np.bincount(sector, minlength=SECTORS) > 0

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 Doubles = NDArray[np.float64]
 
 MIN_RINGS, MIN_POINTS = 4, 12
-"""Fewer rings, or points of a ring, say nothing."""
+"""Fewer rings, or fewer points of a ring, say nothing."""
 
 STEPS, STEP = 16, 1e-3
-"""Of the search, and of its differences: metres, and slopes of the axis."""
+"""Most steps of the search, and its difference step: metres, and slopes of the axis."""
 
 LONGEST = np.array([1.0, 1.0, 1.0, 0.2, 0.2])
-"""Step of the search: metres, and slopes of the axis."""
+"""Longest step of the search: metres, and slopes of the axis."""
 
 NORMAL = 1.4826
 """Standard deviation of a normal distribution, in medians of its absolute deviations."""
@@ -43,7 +43,7 @@ class Rings:
 
     @classmethod
     def of(cls, xyz_m: Doubles, ring: NDArray[np.integer]) -> Rings | None:
-        """Those among points (N, 3) with the sensor's names (N,); None where there are too few rings."""
+        """The rings among points (N, 3) with the ring names of the sensor (N,); None if there are too few rings."""
         names, number, count = np.unique(ring, return_inverse=True, return_counts=True)
         full = count >= MIN_POINTS
         if full.sum() < MIN_RINGS:
@@ -53,7 +53,7 @@ class Rings:
         return cls(xyz_m[keep], renumbered[number[keep]], names[full].astype(np.int64))
 
     def part(self, begin: int, end: int) -> Rings | None:
-        """Those among the points from `begin` on, before `end`."""
+        """The rings among the points from `begin` to before `end`."""
         return Rings.of(self.xyz_m[begin:end], self.names[self.number[begin:end]])
 
     def beams_rad(self, cones: Doubles) -> Doubles:
@@ -70,8 +70,8 @@ class Rings:
         return NORMAL * float(np.median(np.abs(self.deviations_rad(cones))))
 
     def sharpest(self) -> Doubles:
-        """The cones (5,) that are thinnest: Gauss-Newton on the deviations, those beyond three times the typical one
-        left out (people beside a ring, reflections)."""
+        """The cones (5,) from which the points deviate least: Gauss-Newton on the deviations, without those beyond
+        three times the typical one (people beside a ring, reflections)."""
         cones = np.zeros(5)
         for _ in range(STEPS):
             deviation = self.deviations_rad(cones)
@@ -94,7 +94,7 @@ class Rings:
 
 
 def elevation_rad(xyz_m: Doubles, cones: Doubles) -> Doubles:
-    """(N,) of points (N, 3) above the plane through the tip of the cones, across their axis."""
+    """(N,) elevation of points (N, 3) above the plane through the tip of the cones and across their axis."""
     axis = np.array([cones[3], cones[4], 1.0]) / math.sqrt(1.0 + float(cones[3] ** 2 + cones[4] ** 2))
     ray_m = xyz_m - cones[:3]
     along_m = ray_m @ axis

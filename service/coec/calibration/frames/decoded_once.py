@@ -1,4 +1,4 @@
-"""Images that are looked at twice, once for the mask and once for what they show, and decoded once."""
+"""Images that are used twice, once for the mask and once for what they show, but decoded once."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from coec.calibration.ports import ImageReader
 from coec.calibration.types import CameraFrame
 
 MOST_KEPT_BYTES = 64_000_000
-"""Of decoded images in all: twenty-five of 2.5 megapixels. It is what the edge maps that they become take, and an image
-goes as its maps come; those beyond are decoded again."""
+"""Most bytes of decoded images that are kept: twenty-five of 2.5 megapixels. Their edge maps take as much, and each
+image is dropped when its maps are made. Images beyond this are decoded again."""
 
 
 class DecodedOnce:
-    """An image reader that remembers images from their first look to their second."""
+    """An image reader that keeps images from their first use to their second."""
 
     def __init__(self, images: ImageReader) -> None:
         self._images = images
@@ -22,7 +22,7 @@ class DecodedOnce:
         self._bytes = 0
 
     def first(self, frame: CameraFrame) -> NDArray[np.uint8]:
-        """(height, width) grey values of a frame that `grey` is asked for later.
+        """(height, width) grey values of a frame; `grey` will be called for it later.
 
         Raises:
             DecodeError: the image cannot be decoded within the limits.
@@ -34,7 +34,7 @@ class DecodedOnce:
         return grey
 
     def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
-        """(height, width) grey values; forgotten here.
+        """(height, width) grey values; the reader then drops the image.
 
         Raises:
             DecodeError: the image cannot be decoded within the limits.

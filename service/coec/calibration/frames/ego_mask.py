@@ -1,10 +1,10 @@
-"""Regions of the image that show nothing of the world: the vehicle's own body, the black ring around a fisheye's image
-circle, dirt. Found from frames in motion: the world's edges come and go, theirs stay.
+"""Finds regions of the image that show nothing of the world: the vehicle's own body, the black ring around a fisheye's
+image circle, dirt. In frames taken in motion the edges of the world come and go, while those of such regions stay.
 
 Statistics are kept on a coarse grid, as sums over the frames, so that memory does not grow with their number. An edge
 is tested by its signed gradient (as for watermarks in image collections: Dekel, Rubinstein, Liu, Freeman 2017, "On the
-effectiveness of visible watermarks"): over a moving scene it averages out, on a fixed structure it has one direction.
-An outline against the world changes its sign with what is behind it, but not its axis.
+effectiveness of visible watermarks"): over a moving scene the gradient averages out, on a fixed structure it has one
+direction. The gradient of an outline against the world changes sign with the background, but keeps its axis.
 """
 
 from __future__ import annotations
@@ -24,39 +24,42 @@ Cells = NDArray[np.bool_]
 Value = TypeVar("Value", np.bool_, np.int64)
 
 GRID_WIDTH = 200
-"""Cells across the image, about: 7 px of a 1400 px image, wider than shake and rounding move an edge of the body."""
+"""About how many cells the grid has across the image. A cell is 7 px of a 1400 px image, wider than shake and rounding
+move an edge of the body."""
 
 MIN_FRAMES = 5
-"""Fewer frames in motion tell nothing: chance repeats itself."""
+"""Fewer frames in motion say nothing, because chance may repeat itself."""
 
 MIN_SPEED_MPS = 0.5
-"""Frames of a vehicle that is known to be slower do not count: what stands before it would pass for its body."""
+"""Frames of a vehicle known to be slower do not count, because things that stand before it would pass for its body."""
 
 MIN_CHANGE_LEVELS = 8.0
-"""Mean absolute difference, grey levels, from the last frame that counted: below, the vehicle hardly moved. Measured:
-4 between consecutive frames of slow traffic and in a room, 18 and more between frames a second apart."""
+"""Least mean absolute difference, grey levels, from the last frame that counted; below it the vehicle hardly moved.
+Measured: 4 between consecutive frames of slow traffic and in a room, 18 and more between frames a second apart."""
 
 MOVED_LEVELS, MIN_MOVED_SHARE = 10.0, 0.4
-"""Standard deviation of a cell that saw the world move, and the share of such cells, black ones apart, without which
-the scene itself stood still. Measured: 1.0 on a drive, 0.65 with a third of the image sky, 0.31 in slow traffic."""
+"""Standard deviation from which a cell saw the world move, and the least share of such cells, of those that are not
+black; with fewer the scene itself stood still. Measured shares: 1.0 on a drive, 0.65 with a third of the image sky,
+0.31 in slow traffic."""
 
 CHANCE = 1e-4
-"""Probability that a cell of a moving scene passes for a fixed edge, were its gradients normally distributed."""
+"""Probability that a cell of a moving scene passes for a fixed edge if its gradients are normally distributed."""
 
 MIN_STEADINESS = 2.0
-"""Mean gradient over its standard deviation: roofs and kerbs of a straight road pass the test of chance with many
-frames, being alike and not the same; below 1.2 on recorded drives, above 3 on a body."""
+"""Least mean gradient of a fixed edge over its standard deviation. It is needed because with many frames roofs and
+kerbs of a straight road, which are alike but not the same, pass the test of chance; they are below 1.2 on recorded
+drives, a body is above 3."""
 
 MIN_GRADIENT_LEVELS = 3.0
-"""Grey levels per cell: less is shading, on which nothing could be aligned anyway."""
+"""Least gradient of an edge, grey levels per cell. Less is shading, on which nothing could be aligned anyway."""
 
 MIN_PRESENCE, MIN_AXIS_AGREEMENT = 0.8, 0.9
-"""An outline shows in so many of the frames, and the mean of its axes (unit vectors of twice the angle) is so long.
-Measured on ten frames of a drive: the world has 0.2 % of such cells, scattered."""
+"""An outline shows in at least this share of the frames, and the mean of its axes (unit vectors of twice the angle) is
+at least so long. Measured on ten frames of a drive: 0.2 % of the world's cells are such, scattered."""
 
 MIN_BOUND_AGREEMENT = 0.8
-"""Least length of the mean of the axes around still cells: whole groups are judged there, which the 2 to 8 % of such
-cells in the world never bound."""
+"""Least length of the mean of the axes around still cells. It may be lower because whole groups are judged there, and
+the 2 to 8 % of such cells in the world never bound a group."""
 
 STILL_SHARE = 0.2
 """A cell whose standard deviation is below this share of the median of those that moved is still."""
@@ -65,12 +68,12 @@ BLACK_LEVELS = 24.0
 """Mean grey value outside the image circle, glow of the lens included (measured on a 180° fisheye: 2 to 22)."""
 
 ENCLOSED_SHARE = 0.35
-"""Still cells show no world when so much of their outline is fixed. The outline of a dark spot is lost before dark
-trees; that of a sky moves with the roofs. Measured with painted dirt: 70 % of it found, 45 % at 0.6; of clean drives at
-most 0.7 % taken with five frames, nothing with ten."""
+"""Still cells show no world if at least this share of their outline is fixed. It is a share because the outline of a
+dark spot is lost before dark trees; the outline of a sky moves with the roofs. Measured with painted dirt: 70 % of it
+is found, 45 % at 0.6; on clean drives at most 0.7 % of the image is taken with five frames, nothing with ten."""
 
 MIN_CELLS = 6
-"""Smaller groups of fixed edges are left alone: two cells across are chance, or not worth a hole in the mask."""
+"""Smaller groups of fixed edges are ignored: two cells across are chance, or not worth a hole in the mask."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,12 +82,12 @@ class DeadRegions:
 
     Attributes:
         cell_px: side of a cell.
-        frames: those that counted.
+        frames: number of frames that counted.
         last: the last of them, grey levels; the other grids are sums over all of them.
-        grey, grey_squared: of the levels.
-        gradient_x, gradient_y, gradient_squared: of the gradient, levels per cell.
-        axis_x, axis_y: cosine and sine of twice the gradient's angle, where it is an edge.
-        edges: how often it was one.
+        grey, grey_squared: sums of the levels and of their squares.
+        gradient_x, gradient_y, gradient_squared: sums of the gradient, levels per cell, and of its square.
+        axis_x, axis_y: sums of the cosine and sine of twice the gradient's angle, over frames with an edge there.
+        edges: number of frames with an edge there.
     """
 
     cell_px: int
@@ -101,19 +104,19 @@ class DeadRegions:
 
     @classmethod
     def begin(cls, grey: NDArray[np.uint8]) -> DeadRegions:
-        """From the first frame, (height, width) uint8."""
+        """The sums after the first frame, (height, width) uint8."""
         cell_px = max(1, round(grey.shape[1] / GRID_WIDTH))
         none = np.zeros_like(cell_means(grey, cell_px))
         return cls(cell_px, 0, none, none, none, none, none, none, none, none, none)._with(cell_means(grey, cell_px))
 
     def after(self, grey: NDArray[np.uint8]) -> DeadRegions:
-        """With one more frame of the same size; unchanged when the vehicle hardly moved since the last one."""
+        """The sums after one more frame of the same size; unchanged if the vehicle hardly moved since the last one."""
         reduced = cell_means(grey, self.cell_px)
         return self._with(reduced) if np.abs(reduced - self.last).mean() >= MIN_CHANGE_LEVELS else self
 
     def mask(self, width: int, height: int) -> Cells | None:
-        """(height, width) bool, False = shows nothing of the world; None when nothing is dead, or nothing can be told
-        yet: too few frames, or the scene stood still."""
+        """(height, width) bool, False = shows nothing of the world. None if no region is dead, or if that cannot be
+        told yet because of too few frames or a scene that stood still."""
         if self.frames < MIN_FRAMES:
             return None
         mean, deviation = self._grey()
@@ -162,7 +165,7 @@ class DeadRegions:
         """Cells whose gradient is the same in every frame.
 
         F = N·|ḡ|²/s² of two components and 2·(N - 1) degrees of freedom (Hotelling 1931, with one variance for both)
-        exceeds f with probability (1 + f/(N - 1))^-(N - 1), the closed form of two numerator degrees of freedom.
+        exceeds f with probability (1 + f/(N - 1))^-(N - 1), the closed form for two numerator degrees of freedom.
         """
         n = self.frames
         squared = (self.gradient_x / n) ** 2 + (self.gradient_y / n) ** 2
@@ -172,14 +175,14 @@ class DeadRegions:
         return np.asarray((squared >= MIN_GRADIENT_LEVELS**2) & (squared >= least * variance))
 
     def _axes(self) -> tuple[Cells, Grid]:
-        """Where an edge shows in nearly every frame, and the squared length R² of the mean of its axes there: random
-        axes of n frames exceed it with probability exp(-n·R²) (Rayleigh 1880)."""
+        """Cells in which an edge shows in nearly every frame, and the squared length R² of the mean of its axes. Random
+        axes of n frames exceed R² with probability exp(-n·R²) (Rayleigh 1880)."""
         shown = self.edges >= MIN_PRESENCE * self.frames
         return shown, (self.axis_x**2 + self.axis_y**2) / np.maximum(self.edges, 1.0) ** 2
 
 
 def lit_pixels(greys: Iterable[NDArray[np.uint8]]) -> Cells | None:
-    """`DeadRegions.mask` of the frames of one window, (height, width) uint8 each; None also when their sizes differ."""
+    """`DeadRegions.mask` of the frames of one window, (height, width) uint8 each; None also if their sizes differ."""
     regions: DeadRegions | None = None
     shape: tuple[int, ...] | None = None
     for grey in greys:
@@ -202,21 +205,21 @@ def _at_pixels(cells: Cells, cell_px: int, width: int, height: int) -> Cells:
 
 
 def _grown(cells: Cells) -> Cells:
-    """With the eight neighbours of every cell."""
+    """The cells and the eight neighbours of each."""
     return ~_least_around(~cells, outside=True)
 
 
 def _least_around(values: NDArray[Value], outside: int | bool) -> NDArray[Value]:
-    """The least of every cell and its eight neighbours; beyond the border the value is `outside`. Along one axis after
-    the other."""
+    """The least value of each cell and its eight neighbours, along one axis after the other; beyond the border the
+    value is `outside`."""
     padded = np.pad(values, 1, constant_values=outside)
     columns = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
     return np.asarray(np.minimum(np.minimum(columns[:-2], columns[1:-1]), columns[2:]))
 
 
 def _ring(black: Cells) -> Cells:
-    """The black cells that are connected to the corners, when at least three of the four are black: an image circle,
-    not a night sky."""
+    """The black cells that are connected to the corners, if at least three of the four corners are black: then it is an
+    image circle, not a night sky."""
     rows, columns = black.shape
     corners = [(0, 0), (0, columns - 1), (rows - 1, 0), (rows - 1, columns - 1)]
     labels = _labels(black)
@@ -230,8 +233,8 @@ def _without_specks(cells: Cells) -> Cells:
 
 
 def _enclosed(still: Cells, body: Cells, dead: Cells) -> Cells:
-    """Groups of still cells whose outline is the body's; where other dead cells or the border of the image bound them,
-    it does not count."""
+    """Groups of still cells whose outline belongs to the body. Parts of the outline at other dead cells or at the
+    border of the image do not count."""
     labels = _labels(still)
     bounding = np.pad(np.where(body, 1, np.where(dead | still, 0, 2)), 1)
     by_body, by_world = np.zeros((2, int(labels.max()) + 1))

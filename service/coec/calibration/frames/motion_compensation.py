@@ -10,7 +10,7 @@ from coec.calibration.types import Compensation, EgoMotion, FramePair, LidarFram
 from coec.geometry.deskew import deskew
 
 Choice = NDArray[np.int64] | slice
-"""Of the points of a sweep."""
+"""Which points of a sweep: indices, or a slice."""
 
 EVERY = slice(None)
 """All points, without a copy."""
@@ -19,9 +19,9 @@ EVERY = slice(None)
 def compensate(pair: FramePair, rig: Rig, *, enabled: bool, chosen: Choice = EVERY) -> NDArray[np.float32]:
     """(N, 3) float32: the chosen points of the sweep in the LiDAR frame at the camera stamp.
 
-    Per-point time comes with the cloud, or follows from azimuth (`rig.sweep`). Without either, the sweep is moved as a
-    whole from its stamp to the camera's. Without ego-motion nothing is moved; where only its rotation is known, points
-    are turned and not shifted.
+    Per-point time comes with the cloud, or follows from azimuth (`rig.sweep`). Without either, the whole sweep is moved
+    from its stamp to the camera's. Without ego-motion nothing is moved. If only the rotation is known, points are
+    turned and not shifted.
     """
     xyz_m = np.ascontiguousarray(pair.lidar.xyz_m[chosen])
     if not enabled or pair.motion is None:
@@ -44,13 +44,13 @@ def compensation(pair: FramePair, rig: Rig, *, enabled: bool) -> Compensation:
 
 
 def sensor_twist(motion: EgoMotion, T_lidar_ego: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Angular (3,) rad/s and linear velocity (3,) m/s of the LiDAR in its own frame; the lever arm turns rotation into
-    velocity. Where the linear velocity of the vehicle is not known, none is assumed of the LiDAR."""
+    """Angular (3,) rad/s and linear velocity (3,) m/s of the LiDAR in its own frame, with the velocity that its lever
+    arm adds in a turn. If the linear velocity of the vehicle is unknown, that of the LiDAR is zero."""
     rotation = T_lidar_ego[:3, :3]
     angular = np.asarray(motion.angular_radps)
     if motion.linear_mps is None:
         return rotation @ angular, np.zeros(3)
-    # The lever is where the LiDAR is in the vehicle's frame. Number by number: arrays of three are mostly overhead.
+    # The lever is the place of the LiDAR in the vehicle's frame. Plain numbers, because arrays of three are slow.
     (a, b, c), (x, y, z) = motion.angular_radps, (-rotation.T @ T_lidar_ego[:3, 3]).tolist()
     linear = np.asarray(motion.linear_mps) + np.array([b * z - c * y, c * x - a * z, a * y - b * x])
     return rotation @ angular, rotation @ linear

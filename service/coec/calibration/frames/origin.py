@@ -1,8 +1,8 @@
 """Where a cloud's points were measured from.
 
-Drivers often hand out clouds in the vehicle's frame. Directions and ranges, and with them every range edge, then start
-from a place where no sensor is. `from_origin` undoes that with the LiDAR's stated pose in the cloud's frame;
-`apparent_origin` tells a statement that the points contradict.
+Drivers often give clouds in the vehicle's frame. Directions and ranges, and with them every range edge, then start from
+a place where no sensor is. `from_origin` undoes that with the stated pose of the LiDAR in the cloud's frame;
+`apparent_origin` finds out whether the points contradict the stated origin.
 """
 
 from __future__ import annotations
@@ -21,31 +21,33 @@ from coec.calibration.types import LidarFrame, Matrix4
 Doubles = NDArray[np.float64]
 
 POINTS = 6000
-"""Looked at, evenly chosen: some hundred a ring of a 64-beam sensor."""
+"""How many evenly chosen points are used: some hundred per ring of a 64-beam sensor."""
 
 NEAR_M, FAR_M = 2.0, 40.0
-"""Ranges looked at. Nearer, the lasers' own places in the sensor tell; farther, half a metre turns a ray by less than a
-beam's width."""
+"""Ranges of the points used. Nearer points show where each laser sits in the sensor; for farther ones half a metre
+turns a ray by less than a beam's width."""
 
 CONTRADICTED_RAD, EXPLAINED = math.radians(0.5), 0.25
-"""Spread of a ring's elevations at the stated origin above which it cannot be that: twice what a beam and an
-uncompensated metre of driving leave. And the share of it that may remain where the points come from."""
+"""The stated origin is contradicted if the elevations of a ring, seen from it, spread more than this: twice what a beam
+and an uncompensated metre of driving cause. Another origin explains the points if at most this share of the spread
+remains there."""
 
 GIVE_UP = 5
-"""Sweeps in a row that no cones explain, after which the LiDAR is taken for one without."""
+"""After so many sweeps in a row that no cones explain, the LiDAR counts as one whose points lie on none."""
 
 STRAYS = 0.1
-"""Share of the points beyond `CONTRADICTED_RAD`, above which the rings are no single LiDAR's or much else is there."""
+"""If more than this share of the points is beyond `CONTRADICTED_RAD`, the rings are not those of one LiDAR, or much
+else is in view."""
 
 
 @dataclass(frozen=True, slots=True)
 class ApparentOrigin:
-    """A place from which the points of a cloud look measured, and the stated one does not.
+    """The place from which the points of a cloud look measured, if that is not the stated origin.
 
     Attributes:
-        origin_m: (3,) of the LiDAR, in the frame in which the points were taken to be.
-        spread_rad, stated_rad: of the elevations within a ring seen from there, and from the stated origin.
-        cause, setting: under which a loss is counted, and what of a LiDAR's configuration would help.
+        origin_m: (3,) place of the LiDAR in the assumed frame of the points.
+        spread_rad, stated_rad: spread of the elevations within a ring, seen from there and from the stated origin.
+        cause, setting: the cause under which a loss is counted, and the setting of the LiDAR that would help.
     """
 
     cause: ClassVar[str] = "cloud_origin"
@@ -63,8 +65,8 @@ class ApparentOrigin:
 
 
 def from_origin(sweep: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str) -> LidarFrame:
-    """A sweep in the LiDAR's own frame, of that name: its points were given in a frame in which the LiDAR has the pose
-    T_cloud_lidar (4, 4), metres. The identity leaves the points as they are, to the bit."""
+    """The sweep in the LiDAR's own frame, named `frame_id`. Its points were given in a frame in which the LiDAR has the
+    pose T_cloud_lidar (4, 4), metres. The identity leaves the points as they are, to the bit."""
     if np.array_equal(T_cloud_lidar, np.eye(4)):
         return replace(sweep, frame_id=frame_id)
     R, t = T_cloud_lidar[:3, :3], T_cloud_lidar[:3, 3]
@@ -73,18 +75,18 @@ def from_origin(sweep: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str) -> Lid
 
 
 def apparent_origin(sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
-    """Where the points contradict that they were measured from the origin of their frame, from where they look
-    measured; None where they do not, or where nothing is known. See `OriginCheck`."""
+    """From where the points look measured, if they contradict the origin of their frame; None if they do not, or if
+    that is unknown. See `OriginCheck`."""
     return OriginCheck().look(sweep)
 
 
 class OriginCheck:
-    """Looks at the sweeps of one LiDAR, one after the other.
+    """Checks the origin of the sweeps of one LiDAR, one after the other.
 
     A laser of a turning LiDAR has one elevation, seen from the sensor: its points lie on a cone about the sensor's
-    axis. From elsewhere they do not, and those of several LiDARs lie on the cones of each. So rings are needed; and
-    where no cones explain them (another scanning pattern, a `ring` that numbers something else), nothing is known, and
-    after a few such sweeps nothing more is tried.
+    axis. Seen from elsewhere they do not, and the points of several LiDARs lie on the cones of each. So the check needs
+    rings. If no cones explain them (another scanning pattern, a `ring` that numbers something else), nothing is known,
+    and after a few such sweeps the check gives up.
     """
 
     def __init__(self) -> None:
@@ -93,7 +95,7 @@ class OriginCheck:
         self._unexplained = 0
 
     def look(self, sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
-        """From where the points of a sweep look measured, if they contradict their origin."""
+        """From where the points of a sweep look measured, if they contradict the origin of their frame."""
         rings = None if self._unexplained >= GIVE_UP else _rings(sweep)
         if rings is None:
             return None
@@ -101,7 +103,7 @@ class OriginCheck:
         if stated_rad <= CONTRADICTED_RAD:
             strays = float(np.mean(np.abs(rings.deviations_rad(np.zeros(5))) > CONTRADICTED_RAD))
             return self._several_of(rings) if strays > STRAYS else None
-        # What explained the sweep before usually explains this one.
+        # The cones that explained the last sweep usually explain this one.
         several = None if self._several is None else self._several_of(rings)
         cones = None if several else self._one_of(rings, stated_rad)
         if several is None and cones is None:
@@ -131,13 +133,13 @@ class OriginCheck:
 
 
 def _rings(sweep: LidarFrame) -> Rings | None:
-    """Those at middle ranges; None where there are too few of them, or points."""
+    """The rings of a sweep at middle ranges; None if there are too few rings or points."""
     if sweep.ring is None:
         return None
     stride = max(1, len(sweep.xyz_m) // POINTS)
     xyz_m, ring = sweep.xyz_m[::stride].astype(np.float64), sweep.ring[::stride]
     range_m = np.sqrt((xyz_m**2).sum(axis=1))
-    # Measured from the stated origin, which may be the wrong one: generous on both sides.
+    # The limits are generous because ranges are from the stated origin, which may be wrong.
     inside = (range_m > NEAR_M) & (range_m < FAR_M)
     xyz_m, ring = xyz_m[inside], ring[inside]
     return Rings.of(xyz_m, ring)

@@ -1,7 +1,7 @@
-"""Which camera frame belongs to which sweep, and how the vehicle moved then: decided by sensor stamps alone.
+"""Decides by sensor stamps alone which camera frame belongs to which sweep, and how the vehicle moved then.
 
-Nothing here depends on when or in which interleaving messages arrive, as long as each stream arrives in its own order:
-a pair is formed only when later messages can no longer change it. So a replay at any rate forms the same pairs.
+Nothing here depends on when or in which interleaving messages arrive, as long as each stream arrives in its own order,
+because a pair is formed only when later messages can no longer change it. So a replay at any rate forms the same pairs.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from coec.config import PairingConfig
 
 NS_PER_S = 1_000_000_000
 AGREEING_STAMPS = 5
-"""Consecutive frames that must agree on a new time line before it is believed: half a second at 10 Hz."""
+"""So many consecutive frames must agree on a new time line before it is believed: half a second at 10 Hz."""
 
 MOTION_SAMPLES = 512
-"""Ego-motion samples kept: more than two seconds at 200 Hz, against pairs that wait at most a few frames."""
+"""Ego-motion samples kept: more than two seconds at 200 Hz, while pairs wait at most a few frames."""
 
 MOTION_LATE_NS = NS_PER_S
-"""How far pictures may be ahead of ego-motion, in sensor time, before a pair goes without it: filters and bridges hold
-motion back by some tenths of a second, and a pair that is not compensated is worth less than one that comes later."""
+"""How far images may be ahead of ego-motion, in sensor time, before a pair is released without it. Filters and bridges
+hold motion back by some tenths of a second, and a pair without compensation is worth less than one that comes later."""
 
 PAIRS_WAITING = 32
-"""Pairs that may wait for ego-motion, whatever their stamps say: those of a second, of a LiDAR at 30 Hz."""
+"""Most pairs that wait for ego-motion, whatever their stamps say: those of a second of a LiDAR at 30 Hz."""
 
 Frame = TypeVar("Frame", CameraFrame, LidarFrame, EgoMotion)
 
 
 class TimeLine:
-    """Refuses single stamps that leave the order of their stream; follows a step that lasts.
+    """Refuses single stamps that are out of order in their stream, but follows a step of the clock that lasts.
 
     Attributes:
         latest_ns: stamp that was accepted last; None before the first.
@@ -92,7 +92,7 @@ class Pairer:
                 self._enqueue(frame, self._lidar_time, self._sweeps, "lidar")
             case EgoMotion():
                 if self._unmoved_ns is not None and frame.stamp_ns <= self._unmoved_ns + self._motion_tolerance_ns:
-                    # A pair went without it, and is another than if it had come in time.
+                    # A pair was released without this motion and differs from the pair that it would have been.
                     self.losses["motion_late"] += 1
                 self._enqueue(frame, self._motion_time, self._motions, "motion")
         self._match(final=False)
@@ -108,7 +108,7 @@ class Pairer:
         if reason is not None:
             self.losses[f"{stream}_{reason}"] += 1
             return
-        if queue and queue[-1].stamp_ns >= frame.stamp_ns:  # the time line stepped back: what waits is of the old one
+        if queue and queue[-1].stamp_ns >= frame.stamp_ns:  # the clock stepped back: waiting frames are of the old time
             self._lose(stream, len(queue))
             queue.clear()
         queue.append(frame)
@@ -139,7 +139,7 @@ class Pairer:
                 self._lose("lidar", 1)
                 continue
             while self._cameras and self._cameras[0].stamp_ns <= camera.stamp_ns:
-                # A camera that is faster than the LiDAR has frames between two sweeps: not one frame goes uncounted.
+                # A camera that is faster than the LiDAR has frames between two sweeps; each is counted as a loss.
                 if self._cameras.popleft() is not camera:
                     self.losses["camera_surplus"] += 1
             self._waiting.append(FramePair(camera, sweep))
@@ -170,8 +170,8 @@ class Pairer:
 
 
 def motion_at(samples: Sequence[EgoMotion], stamp_ns: int, tolerance_ns: int) -> EgoMotion | None:
-    """Ego-motion at a stamp, of samples in the order of theirs: one with exactly this stamp as it is, else interpolated
-    between its neighbours, else the nearest within the tolerance."""
+    """Ego-motion at a stamp, from samples in the order of their stamps: the sample with exactly this stamp, else one
+    interpolated between its neighbours, else the nearest within the tolerance; None if none is."""
     after = bisect_left(samples, stamp_ns, key=lambda sample: sample.stamp_ns)
     near = [s for s in samples[max(after - 1, 0) : after + 1] if abs(s.stamp_ns - stamp_ns) <= tolerance_ns]
     if not near:

@@ -1,8 +1,8 @@
-"""Choosing the pairs of a check of the monitor while the stream passes: evenly over each period of sensor time.
+"""Chooses the pairs of a check of the monitor while the stream passes, evenly over each period of sensor time.
 
-Periods are counted from the zero of sensor time, not from the first pair: a service that was restarted, and a replay at
-any rate, cut the same checks. Unlike the pairs of a window these are not asked whether they are good: a dirty lens, a
-frozen camera and a mount that is hit while the vehicle stands are what the monitor has to see.
+Periods are counted from the zero of sensor time, not from the first pair, so that a restarted service and a replay at
+any rate cut the same checks. Unlike the pairs of a window these are not selected for quality, because the monitor has
+to see a dirty lens, a frozen camera, and a mount that is hit while the vehicle stands.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from coec.config import MonitorConfig, WindowConfig
 NS_PER_S = 1_000_000_000
 
 SPAN_PERIODS = 6
-"""Periods that the pairs of one check may span. The slowest stream that the monitor is of use with, a pair a period,
-fills the four pairs of a check in four; two more allow for losses. Pairs further apart are not one inspection."""
+"""Periods that the pairs of one check may span. The slowest useful stream, with a pair per period, fills the four pairs
+of a check in four periods; two more allow for losses. Pairs further apart do not belong to one check."""
 
 
 MOVING_MPS = 1.0
-"""Faster, a vehicle passes what it sees."""
+"""Above this speed a vehicle passes the things that it sees."""
 
 
 def drives(pairs: Sequence[FramePair]) -> bool:
@@ -29,7 +29,7 @@ def drives(pairs: Sequence[FramePair]) -> bool:
 
 
 def stands(pair: FramePair, window: WindowConfig) -> bool:
-    """Whether the vehicle is known to stand: then nothing is seen that was not seen before."""
+    """Whether the vehicle is known to stand, so that it sees nothing new."""
     return pair.motion is not None and pair.motion.stays_below(window.min_speed_mps)
 
 
@@ -44,7 +44,7 @@ class CheckSampler:
         self._last_ns = -1
 
     def offer(self, pair: FramePair) -> tuple[FramePair, ...] | None:
-        """Takes the next pair; the pairs of a check when the period before it was full enough, newest last."""
+        """Takes the next pair. Returns the pairs of a check, newest last, if a period has ended with enough of them."""
         stamp_ns = pair.stamp_ns
         if stamp_ns < self._last_ns:  # sensor time stepped back
             self._pairs.clear()

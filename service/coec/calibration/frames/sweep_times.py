@@ -1,4 +1,4 @@
-"""When each point of a sweep was measured, where its driver does not say: by the turning of the sensor."""
+"""When each point of a sweep was measured, from the turning of the sensor, if its driver does not say."""
 
 from __future__ import annotations
 

@@ -1,13 +1,14 @@
-"""The offset between the clocks of camera and LiDAR, from the data: observable while the vehicle turns.
+"""Estimates the offset between the clocks of camera and LiDAR from the data; it is observable while the vehicle turns.
 
-An offset dt moves every sweep by the ego-motion of dt: in a turn at the rate w it looks like a yaw of w·dt. One frame
-cannot tell that from a bent mount, but frames of different turn rates can: the mount is the part that stays
-(cf. Rehder, Siegwart, Furgale, "A general approach to spatiotemporal calibration in multisensor systems", 2016: the
-offset is one more parameter of the estimate). So rotation and offset are fitted together, to the edge witness.
+An offset dt moves every sweep by the ego-motion during dt: in a turn at the rate w it looks like a yaw of w·dt. One
+frame cannot tell that from a bent mount, but frames of different turn rates can, because the mount is the part that
+stays the same (cf. Rehder, Siegwart, Furgale, "A general approach to spatiotemporal calibration in multisensor
+systems", 2016: the offset is one more parameter of the estimate). So rotation and offset are fitted together, to the
+edge witness.
 
-Driving on at a steady speed, dt looks like a shift of the mount along the road, which other frames do not contradict.
-What the position of the mount is not known to is therefore carried into the uncertainty, and a straight drive does not
-count as an observation at all.
+In straight driving at a steady speed, dt looks like a shift of the mount along the road, which no other frame
+contradicts. Therefore the uncertainty of the mount's position is carried into that of the offset, and a straight drive
+does not count as an observation at all.
 """
 
 from __future__ import annotations
@@ -34,22 +35,22 @@ from coec.geometry.edges.charts import climb
 from coec.geometry.linear import solved
 
 OFFSET = 6
-"""Place of the offset behind the six axes of the perturbation."""
+"""Place of the offset, after the six axes of the perturbation."""
 
 FITTED = (0, 1, 2, OFFSET)
-"""Places of what is fitted: the rotation and the offset."""
+"""Places of the unknowns that are fitted: the rotation and the offset."""
 
 SHIFTS = (3, 4, 5)
-"""Places of the camera's position, which is taken as it is."""
+"""Places of the camera's position, which is not fitted."""
 
 STEPS = np.array([*of_both(radians(0.3)), 0.01])
 """Difference steps, radians, metres and seconds: each moves edges by about the blur of the sharpest edges."""
 
 PROFILE_STEP_S = 0.02
-"""Grid on which the offset is looked for on the coarse chart, a fifth of its hill: some 0.1 s wide in a turn."""
+"""Step of the grid of offsets on the coarse chart: a fifth of the hill, which is some 0.1 s wide in a turn."""
 
 TURN_RAD = radians(4.0)
-"""Reach of the rotation about the given pose: what an offset of 0.1 s in a sharp turn puts into it."""
+"""Reach of the rotation about the given pose: an offset of 0.1 s in a sharp turn changes it by so much."""
 
 TOLERANCE = 1e-3
 """Last trust region of the fit, as a share of the difference steps."""
@@ -63,11 +64,11 @@ AT_BOUND = 0.95
 
 @dataclass(frozen=True, slots=True)
 class TimeOffset:
-    """How much later than its stamp says the camera was exposed, by the clock of the LiDAR.
+    """How much later than its stamp the camera was exposed, by the clock of the LiDAR.
 
     Attributes:
-        offset_s: seconds, to be added to the stamps of the camera; NaN where it could not be fitted.
-        sigma_s: its standard deviation, seconds; NaN likewise.
+        offset_s: seconds, to be added to the stamps of the camera; NaN if it could not be fitted.
+        sigma_s: standard deviation of the offset, seconds; NaN likewise.
         turn_spread_radps: standard deviation of the turn rate over the frames.
         observable: whether the offset may be believed.
         reason: one sentence.
@@ -86,7 +87,7 @@ def estimate_time_offset(window: Window, images: ImageReader, pose: Matrix4, con
     Args:
         window: pairs with ego-motion.
         images: decodes them.
-        pose: (4, 4) T_camera_lidar that was found for the window; the camera's centre is taken as it is.
+        pose: (4, 4) T_camera_lidar that was found for the window; its camera centre is kept.
         config: `time_offset` and whether sweeps are motion-compensated.
 
     Raises:
@@ -147,7 +148,7 @@ Twist = tuple[NDArray[np.float64], NDArray[np.float64]]
 def _moved(
     xyz_m: NDArray[np.float32], frame: NDArray[np.int64], twists: list[Twist], offset_s: float
 ) -> NDArray[np.float32]:
-    """The edges (3, E) of the frames (E,) as the LiDAR would have seen them `offset_s` later:
+    """The edges (3, E), in the frames (E,), as the LiDAR would have seen them `offset_s` later:
     exp(ξ·(t - dt)) = exp(-ξ·dt)·exp(ξ·t)."""
     moved = np.empty_like(xyz_m)
     # Points come frame by frame.
@@ -160,7 +161,7 @@ def _moved(
 
 
 def _coarse(edges: EdgeWitness, twists: list[Twist], pose: Matrix4, limits: TimeOffsetConfig) -> tuple[Matrix4, float]:
-    """The pose, turned only, and the offset of the highest significance on a grid of offsets."""
+    """The pose, only turned, and the offset with the highest significance on a grid of offsets."""
     turns = np.array([radians(0.5)] * 3 + [0.0] * 3)
     steps = round(limits.reach_s / PROFILE_STEP_S)
     offsets_s = PROFILE_STEP_S * np.arange(-steps, steps + 1)
@@ -203,11 +204,11 @@ def _maximum(
 
 
 def _sigma(scores: FrameScores, found: NDArray[np.float64], limits: TimeOffsetConfig) -> float:
-    """Standard deviation of the offset, seconds; infinite where the score has no maximum or rests on a single frame.
+    """Standard deviation of the offset, seconds; infinite if the score has no maximum or rests on a single frame.
 
-    From leaving out one frame at a time (Efron 1982), each by its Newton step: a frame in a sharp turn has so much
-    leverage on the offset that the residual which it leaves says nothing about its error. Beside it stands what the
-    position of the mount, taken as known, puts into the offset: ∂dt/∂t = -(H⁻¹·H_t).
+    It comes from leaving out one frame at a time (Efron 1982), each by its Newton step, because a frame in a sharp turn
+    has so much leverage on the offset that its residual says nothing about its error. Added to it is the error that the
+    position of the mount, taken as known, causes in the offset: ∂dt/∂t = -(H⁻¹·H_t).
     """
     of_frames, of_shifts, gradients = _derivatives(scores, found)
     count = len(of_frames)
@@ -227,8 +228,8 @@ def _sigma(scores: FrameScores, found: NDArray[np.float64], limits: TimeOffsetCo
 def _derivatives(
     scores: FrameScores, found: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Central differences of each frame's score: negative Hessians over the fitted axes (F, 4, 4), those of the fitted
-    axes with the translation (F, 4, 3), gradients (F, 4)."""
+    """Central differences of each frame's score: negative Hessians over the fitted axes (F, 4, 4) and of the fitted
+    axes with the translation (F, 4, 3), and gradients (F, 4)."""
 
     def at(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
         return scores(found + shifts)

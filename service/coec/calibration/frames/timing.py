@@ -1,9 +1,9 @@
 """Whether another clock or another ego-motion explains what looks like a bent mount.
 
-A bent mount moves every point the same way in every frame; a clock that is off moves each sweep along the motion of
-the vehicle at that instant, and a wrong ego-motion tears each sweep apart in proportion to it. So the sweeps are
-compensated anew under each hypothesis, the extrinsic left as it was: one that fits the images as well with a single
-number as a moved extrinsic does with six is the simpler explanation.
+A bent mount moves every point the same way in every frame. A clock that is off moves each sweep along the motion of the
+vehicle at that instant, and a wrong ego-motion tears each sweep apart in proportion to the motion. So the sweeps are
+compensated anew under each hypothesis, with the extrinsic unchanged. A hypothesis that fits the images with a single
+number as well as a moved extrinsic does with six is the simpler explanation.
 """
 
 from __future__ import annotations
@@ -29,29 +29,31 @@ SCALES = (-1.0, 0.0, 0.33, 0.5, 2.0, 3.0)
 """Factors on the ego-motion that are tried: a wrong sign, a missing signal, wrong units and gains."""
 
 AS_GOOD, BETTER = 0.97, 1.08
-"""Of a flagged check: the share of the significance of the moved extrinsic that a hypothesis must reach without moving
-it (its grid is coarser than the peak), and by which it must exceed that of the extrinsic as it was."""
+"""For a flagged check: a hypothesis must reach this share of the significance of the moved extrinsic without moving the
+extrinsic (a share, because its grid is coarser than the peak), and exceed the significance of the unmoved extrinsic by
+this factor."""
 
 GAIN, FRAMES_AGREE = 0.01, 0.6
-"""Of any check: what a hypothesis must gain at the local optimum, and the share of pairs that must gain. On real drives
-a right clock and ego-motion lose 2 % by each of them; a wrong sign or a factor of three leaves 2 to 7 % to gain."""
+"""For any check: the share that a hypothesis must gain at the local optimum, and the share of pairs that must gain. On
+real drives with the right clock and ego-motion every hypothesis loses 2 %; with a wrong sign or a factor of three 2 to
+7 % can be gained."""
 
 FINE_PIXEL_RAD = radians(0.15)
-"""Pixel up to which these gains hold; with coarser ones the edges sway by more between one pose and the next."""
+"""Size of pixel up to which these gains hold; with coarser pixels the edges vary more from one pose to the next."""
 
 MIN_SPEED_MPS = 1.0
-"""Slower, neither a clock nor an ego-motion moves anything."""
+"""Below this speed neither a clock nor an ego-motion moves anything."""
 
 
 def explained_by_motion(
     edges: Sequence[FramePair], rig: Rig, level: EdgeFrames, expected: Matrix4, found: Matrix4, min_significance: float
 ) -> Cause | None:
-    """The clock or ego-motion that explains the images better than the extrinsic alone; None if none does, or none can
-    be tried for want of motion.
+    """The clock or ego-motion that explains the images better than the extrinsic alone; None if none does, or if there
+    is too little motion to try.
 
     Args:
-        edges: the pairs of a check with nothing of their sweeps but the range edges of `level`, as measured.
-        level: these, placed, and edge maps, on one level.
+        edges: the pairs of a check, their sweeps reduced to the range edges of `level`, as measured.
+        level: the same range edges, placed, and the edge maps of one level.
         expected: (4, 4) where the local optimum should be.
         found: (4, 4) where it is.
         min_significance: below this nothing is explained.
@@ -78,11 +80,12 @@ def explained_by_motion(
 def _hypotheses(
     edges: Sequence[FramePair], rig: Rig, level: EdgeFrames
 ) -> Iterator[tuple[EdgeFrames, NDArray[np.float64], Cause]]:
-    """The range edges as each hypothesis places them, and by what those of each pair are moved after that (F, 4, 4)."""
+    """For each hypothesis the range edges as it places them, the motions (F, 4, 4) that then move the edges of each
+    pair, and the cause that it stands for."""
     xi = np.array([_twist(pair, rig) for pair in edges])
     placed = _placed(edges, rig, level)
     for seconds in OFFSETS_S:
-        # Under a constant twist, later means a motion more, the same for all points of a sweep.
+        # Under a constant twist, a later time is one more motion, the same for all points of a sweep.
         yield placed, np.array([se3.exp(seconds * of_pair) for of_pair in xi]), TIME_OFFSET
     still = np.tile(np.eye(4), (len(edges), 1, 1))
     for factor in SCALES:
@@ -90,7 +93,7 @@ def _hypotheses(
 
 
 def _twist(pair: FramePair, rig: Rig) -> NDArray[np.float64]:
-    """(6,) of the LiDAR, by which `compensate` moves a sweep of the pair: rad/s and m/s."""
+    """(6,) twist of the LiDAR by which `compensate` moves a sweep of the pair: rad/s and m/s."""
     return np.zeros(6) if pair.motion is None else np.concatenate(sensor_twist(pair.motion, rig.T_lidar_ego))
 
 
@@ -100,7 +103,7 @@ def _placed(edges: Sequence[FramePair], rig: Rig, level: EdgeFrames) -> EdgeFram
 
 
 def _scaled(pair: FramePair, factor: float) -> FramePair:
-    """As if the vehicle had moved so many times as fast."""
+    """The pair as if the vehicle had moved so many times as fast."""
     motion = pair.motion
     if motion is None or motion.linear_mps is None:
         return pair

@@ -1,10 +1,10 @@
-"""Choosing the pairs of a window while the stream passes: evenly over the slice, each sharp, in view, taken in motion.
+"""Chooses the pairs of a window while the stream passes: evenly over the slice, each sharp, in view, taken in motion.
 
-The slice is divided into as many bins as pairs are wanted; the first good pair of a bin is taken, and the rest of the
+The slice is divided into as many bins as pairs are wanted. The first good pair of a bin is taken, and the rest of the
 bin is not even decoded. Bins and slices are cut by sensor time, so a replay at any rate chooses the same pairs.
 
-Pairs of an earlier window that was refused because the camera moved within it are as good as any if they were taken
-after that: they are kept, and count for the next window.
+If a window was refused because the camera moved within it, its pairs from after the move are as good as any: they are
+kept and count for the next window.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from coec.geometry.cameras import Camera, in_image, project_point
 NS_PER_S = 1_000_000_000
 
 CELLS = 180
-"""Of the table of directions that are in view, from the optical axis to its opposite and all around it: 1° and 2°."""
+"""Cells of the table of directions in view, from the optical axis to its opposite (1° each) and all around it (2°)."""
 
 LOOKS_PER_BIN = 16
-"""Pairs of a bin that are looked at before it stays empty: looking decodes an image, and a camera that is dirty, dark
-or standing for an hour must not cost a decode of every frame."""
+"""Pairs of a bin that are inspected before it stays empty. Each inspection decodes an image, and a camera that is
+dirty, dark or standing for an hour must not cost a decode of every frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class PairSelected:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairBetween:
-    """A pair, thinned, that is recorded beside those of the window."""
+    """A thinned pair that is recorded beside those of the window."""
 
     window_id: str
     pair: FramePair
@@ -53,13 +53,13 @@ class PairBetween:
 
 @dataclass(frozen=True, slots=True)
 class KeptPairs:
-    """Pairs of a recorded window that the next one is to hold, too.
+    """Pairs of a recorded window that also count for the next one.
 
     Attributes:
-        window_id: of the window that holds them.
-        since_ns: stamp of the first of them; all later ones of that window belong to them.
+        window_id: the recorded window.
+        since_ns: stamp of the first of them; all later pairs of that window are kept, too.
         last_ns: stamp of the last.
-        pairs: how many they are.
+        pairs: how many there are.
     """
 
     window_id: str
@@ -70,8 +70,8 @@ class KeptPairs:
 
 @dataclass(frozen=True, slots=True)
 class SliceEnded:
-    """The end of a slice of which at least one pair was chosen. `pairs` counts those that were `kept` for it, and it is
-    `complete` when there are enough of them for a window."""
+    """The end of a slice in which at least one pair was chosen. `pairs` includes those that were `kept` for it; the
+    slice is `complete` if they are enough for a window."""
 
     window_id: str
     pairs: int
@@ -81,7 +81,7 @@ class SliceEnded:
 
 @dataclass(frozen=True, slots=True)
 class KeptForgotten:
-    """The kept pairs are of another time than the slice that begins: they will be in no other window."""
+    """The kept pairs are too far in time from the slice that begins, and will be in no other window."""
 
     kept: KeptPairs
 
@@ -102,8 +102,8 @@ class WindowCutter:
     """Cuts the stream of one camera-LiDAR pair into slices and picks the pairs of each.
 
     Attributes:
-        rejections: pairs that were looked at and refused, by reason.
-        last_quality: what the last look at an image told.
+        rejections: number of pairs that were inspected and refused, by reason.
+        last_quality: result of the last inspection of an image.
     """
 
     def __init__(self, config: WindowConfig, rig: Rig, inspector: ImageInspector, reducer: ImageReducer) -> None:
@@ -121,16 +121,16 @@ class WindowCutter:
 
     @property
     def config(self) -> WindowConfig:
-        """By which the open slice is cut, or the next one when none is open."""
+        """The configuration of the open slice, or of the next one if none is open."""
         return self._config if self._open else self._next_config
 
     def use(self, config: WindowConfig) -> None:
-        """The next slice is to be cut by this; the open one ends as it began."""
+        """Sets the configuration for the next slice; the open one keeps its own."""
         self._next_config = config
 
     @property
     def selected(self) -> int:
-        """Pairs that the open slice has so far: those chosen, and those kept for it."""
+        """Number of pairs of the open slice so far: those chosen, and those kept for it."""
         return len(self._open.filled) + self._kept_pairs if self._open else 0
 
     @property
@@ -144,8 +144,8 @@ class WindowCutter:
         return self._open.start_ns if self._open else None
 
     def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[Event]:
-        """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, by which it must be in view. With kept
-        pairs a slice ends as soon as it is as large as any."""
+        """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, at which its points must be in view. A
+        slice with kept pairs ends as soon as it has as many pairs as any slice."""
         events: list[Event] = [*self._end_before(pair.stamp_ns)]
         if self._open is None:
             events += self._forget_before(pair.stamp_ns)
@@ -165,20 +165,21 @@ class WindowCutter:
         return events
 
     def keep(self, kept: KeptPairs) -> None:
-        """The window that is open, or else the next one, is to hold these pairs, too. Earlier ones that wait for the
-        same are a part of them, or of another time."""
+        """Adds kept pairs to the open window, or else to the next one. They replace earlier kept pairs, which are a
+        part of them or from another time."""
         self._kept = kept
 
     def advance(self, stamp_ns: int) -> list[SliceEnded]:
-        """Sensor time has passed `stamp_ns` though no pair came."""
+        """Ends the open slice if sensor time has passed its end although no pair came."""
         return self._end_before(stamp_ns) if self.slice_end_ns and stamp_ns >= self.slice_end_ns else []
 
     def hurry(self, slice_s: float) -> None:
-        """The next slice is to be `slice_s` long: a window is wanted soon. The one after it is an ordinary one."""
+        """Makes the next slice `slice_s` long, because a window is wanted soon. The one after it has its usual
+        length."""
         self._hurried_ns = round(slice_s * NS_PER_S)
 
     def finish(self) -> list[SliceEnded]:
-        """Ends the open slice here and now. One that is no window leaves what was kept to the next one."""
+        """Ends the open slice now. If it has too few pairs for a window, the kept pairs stay for the next one."""
         ended, pairs, kept = self._open, self.selected, self._kept
         self._open = None
         if ended is None or not ended.filled:
@@ -193,8 +194,8 @@ class WindowCutter:
         return self._kept.pairs if self._kept is not None else 0
 
     def _forget_before(self, start_ns: int) -> list[KeptForgotten]:
-        """What is kept is of the time before a slice that begins, by a slice at most: what is older, or younger since
-        sensor time stepped back, is not of one window with it."""
+        """Drops kept pairs that do not lie within one slice length before the slice that begins: they are older, or
+        newer because sensor time stepped back."""
         kept = self._kept
         if kept is None or 0 <= start_ns - kept.last_ns <= round(self._config.slice_s * NS_PER_S):
             return []
@@ -202,7 +203,7 @@ class WindowCutter:
         return [KeptForgotten(kept)]
 
     def _end_before(self, stamp_ns: int) -> list[SliceEnded]:
-        """Ends the open slice if the stamp lies outside it; sensor time that stepped back is outside, too."""
+        """Ends the open slice if the stamp lies outside it, also because sensor time stepped back."""
         if self._open is None or 0 <= stamp_ns - self._open.start_ns < self._open.length_ns:
             return []
         return self.finish()
@@ -222,7 +223,7 @@ class WindowCutter:
         return True
 
     def _objection(self, pair: FramePair, T_camera_lidar: Matrix4) -> str | None:
-        """Why the pair is not fit for a window, cheapest question first; None when it is fit."""
+        """Why the pair is not fit for a window, cheapest test first; None if it is fit."""
         config = self._config
         standing = stands(pair, config)
         if config.require_motion and standing:
@@ -246,8 +247,9 @@ class WindowCutter:
         return None
 
     def _points_in_view(self, pair: FramePair, T_camera_lidar: Matrix4) -> int:
-        """By direction: the border of the view is a degree wide, which matters little to a limit for the whole. Without
-        a kernel, as the process that cuts windows loads no compiler, and without BLAS, whose threads spin."""
+        """Number of points in view, by the table of directions. Its border is a degree wide, which matters little for a
+        limit on the whole number. It uses no compiled kernel, because the process that cuts windows loads no compiler,
+        and no BLAS, whose threads spin."""
         x_m, y_m, z_m = pair.lidar.xyz_m.T
         T = T_camera_lidar.astype(np.float32)
         x, y, z = (T[i, 0] * x_m + T[i, 1] * y_m + T[i, 2] * z_m + T[i, 3] for i in range(3))
@@ -259,9 +261,9 @@ class WindowCutter:
 
 @lru_cache(maxsize=32, typed=True)
 def _directions_in_view(camera: Camera) -> NDArray[np.bool_]:
-    """(`CELLS`, `CELLS`), read-only: whether the middle of a cell of directions, camera frame, has a pixel in the
-    image. Every model is central, so the distance does not matter. Kept, as a camera is of several pairs, and one takes
-    0.2 s without a kernel."""
+    """(`CELLS`, `CELLS`), read-only: whether the middle of each cell of directions, camera frame, has a pixel in the
+    image. Every camera model is central, so the distance does not matter. The result is cached, because a camera
+    belongs to several pairs and the table takes 0.2 s without a kernel."""
     across = (np.arange(CELLS) + 0.5) * (np.pi / CELLS)
     around = (np.arange(CELLS) + 0.5) * (2.0 * np.pi / CELLS) - np.pi
     angle, turn = (grid.ravel() for grid in np.meshgrid(across, around, indexing="ij"))
@@ -274,5 +276,5 @@ def _directions_in_view(camera: Camera) -> NDArray[np.bool_]:
 
 
 def _half_view_rad(in_view: NDArray[np.bool_]) -> float:
-    """The end of the last ring of such cells that has a pixel."""
+    """The angle at the end of the last ring of cells that has a pixel."""
     return float(np.flatnonzero(in_view.any(axis=1)).max(initial=-1) + 1) * (np.pi / CELLS)
