@@ -1,8 +1,8 @@
-"""An objective taken apart into cells: what every frame says in every sector of the image.
+"""An objective divided into cells: what every frame says in every sector of the image.
 
-Frames differ by what the vehicle passed, sectors by what stands where. What both have in common cannot be told from the
-sum alone: a standing vehicle sees the same corner of a wall in every frame, and a lens that is wrong at its rim is so
-in every frame, too. Cells show it.
+Frames differ by what the vehicle passed, sectors by what stands where. The sum alone does not show what they have in
+common: a standing vehicle sees the same corner of a wall in every frame, and a lens that is wrong at its rim is wrong
+in every frame. Cells show it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 COLUMNS, ROWS = 8, 2
-"""Sectors of the image, across and down. More than there are degrees of freedom, so that their scatter can be told from
-the pose; each several degrees wide, so that an object lies in one. 4 x 4, 4 x 2 and near from far apart, and 16 x 1
-give the same standard deviations within a tenth (two simulated drives of 32 beams, 16 windows)."""
+"""Sectors of the image, across and down. There are more than degrees of freedom, so that their scatter can be
+distinguished from the pose; each is several degrees wide, so that an object lies in one. 4 x 4, 4 x 2 with near and far
+apart, and 16 x 1 give the same standard deviations within a tenth (two simulated drives of 32 beams, 16 windows)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,8 +25,8 @@ class SightLines:
 
     Attributes:
         p_camera: (N, 3) metres, camera frame.
-        weight: (N,) in the objective.
-        frame: (N,) which frame of the window.
+        weight: (N,) weight of each point in the objective.
+        frame: (N,) index of the frame of each point.
     """
 
     p_camera: NDArray[np.float64]
@@ -36,13 +36,14 @@ class SightLines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """An objective near one pose, taken apart.
+    """An objective near one pose, divided.
 
     Attributes:
-        at: (K, F, B) what each of F frames adds in each of B sectors at each of K poses (K, 4, 4): the mean over the
-            frames of the sums over the sectors is the objective, but for a constant.
-        step_rad: difference step at which its hill is still a hill: not wider than its top, not finer than its ripples.
-        sight: what is in view at that pose.
+        at: (K, F, B) what each of F frames adds in each of B sectors at each of K poses (K, 4, 4). The mean over the
+            frames of the sums over the sectors is the objective, up to a constant.
+        step_rad: difference step at which the hill still looks like a hill: no wider than its top, no finer than its
+            ripples.
+        sight: the points in view at the pose.
     """
 
     at: Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -51,7 +52,8 @@ class Cells:
 
 
 def sectors(uv_px: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(N,) the sector of pixels (N, 2): as many of them in each of `COLUMNS`, and of those in each of `ROWS`."""
+    """(N,) the sector of each of N pixels (N, 2): `COLUMNS` columns of equal numbers of pixels, each divided into
+    `ROWS` rows of equal numbers."""
     sector = np.empty(len(uv_px), np.int64)
     across = np.argsort(uv_px[:, 0], kind="stable")
     for column, of_column in enumerate(np.array_split(across, COLUMNS)):

@@ -1,4 +1,4 @@
-"""How peaked and how flat the objective is at an optimum: the numerical first and second derivative of the paper
+"""How steep and how peaked the objective is at an optimum: the numerical first and second derivative of the paper
 (METHOD, section 1)."""
 
 from __future__ import annotations
@@ -29,16 +29,15 @@ class Curvature:
     second_derivative: NDArray[np.float64]
 
     def peakedness(self, score: float) -> NDArray[np.float64]:
-        """(3,) -f''/f of the rotations, per radian², where the objective is `score`.
+        """(3,) -f''/f of the rotations, per radian², for an objective of `score`.
 
-        NaN where the score is not above zero: a share of nothing, or of what is worse than nothing, tells no peak. A
-        figure that is not a number passes no limit.
+        NaN if the score is not above zero, because a share of it then says nothing about a peak. NaN passes no limit.
         """
         return np.asarray(self.second_derivative[:3] / (score if score > 0.0 else np.nan))
 
 
 def measure_curvature(objective: Objective, pose: Matrix4, dof: int, kept: Collection[int] = ()) -> Curvature:
-    """Central differences about `pose` (4, 4) on the first `dof` axes, less those in `kept`."""
+    """The curvature by central differences about `pose` (4, 4), on the first `dof` axes except those in `kept`."""
     axes = [axis for axis in range(dof) if axis not in kept]
     first, second = _derivatives(objective, pose, axes)
     return Curvature(_padded(first, axes), _padded(second, axes))

@@ -1,4 +1,4 @@
-"""Central differences: the first and second derivatives of what several frames say, each frame by itself."""
+"""Central differences: first and second derivatives of the scores of several frames, each frame by itself."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ FrameScores = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 def along(
     at: FrameScores, steps: NDArray[np.float64], axes: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gradients and second derivatives, (len(axes), F) each, along some of n axes; `steps` (n,) are the differences."""
+    """Gradients and second derivatives, each (len(axes), F), along some of n axes; `steps` (n,) are the difference
+    steps."""
     shifts = np.diag(steps)[list(axes)]
     centre, *beside = at(np.concatenate([np.zeros((1, len(steps))), shifts, -shifts]))
     plus, minus = np.array(beside[: len(axes)]), np.array(beside[len(axes) :])

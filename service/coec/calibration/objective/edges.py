@@ -1,4 +1,4 @@
-"""The second witness: range edges of the sweeps on edges of the images, at several scales."""
+"""The second witness: range edges of the sweeps laid on edges of the images, at several scales."""
 
 from __future__ import annotations
 
@@ -27,18 +27,20 @@ BANDS = 3
 tell a true basin from a layout that happens to fit."""
 
 MAX_PIXELS = 2_500_000
-"""Images are halved until they have no more before the last search on them: bounded time, whatever the camera."""
+"""Before the last search images are halved until they have no more pixels than this, which bounds the time for any
+camera."""
 
 COARSEST_BLUR_RAD = radians(0.6)
-"""Least blur of the coarsest level, an angle about the optical axis and so the same for any lens; the levels double, so
-it is below twice that. Wider, the layout of a scene hides the true pose (measured: in a garage the true pose comes 80th
-of the cover at 1.9° and first to tenth at 0.9°); narrower, the cover of the global stage has to be finer."""
+"""Least blur of the coarsest level, an angle about the optical axis and so the same for any lens. Levels double, so the
+blur is below twice that. With a wider blur the layout of a scene hides the true pose (measured: in a garage the true
+pose comes 80th of the cover at 1.9° and first to tenth at 0.9°); with a narrower one the cover of the global stage has
+to be finer."""
 
 RANKED_POINTS = 60_000
-"""Range edges of the window that rank basins, at most: bounded time for a window of many frames."""
+"""Most range edges of the window that rank basins: bounds the time for a window of many frames."""
 
 THINNED_POINTS = 3_000
-"""Range edges of the window that the cover visits; significance falls with the square root of their number only."""
+"""Range edges of the window that score the cover; significance falls only with the square root of their number."""
 
 
 Edges = TypeVar("Edges", EdgeFrames, EdgeCharts)
@@ -46,16 +48,17 @@ Edges = TypeVar("Edges", EdgeFrames, EdgeCharts)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeWitness:
-    """One witness in four forms.
+    """One witness in four forms: exact and sharp, exact and blurred, bands, and charts.
 
     Attributes:
-        sharp: every range edge on the sharpest image edges, through the model of the lens: settles a pose.
-        whole: the same on blurred edges, layout and all: leads there. It is drawn to where edges are dense, but its
-            hills are wide; those of a band as fine are not. Half as many pixels a side: the blur is a pixel wide.
+        sharp: every range edge on the sharpest image edges, through the lens model: settles a pose.
+        whole: the same on blurred edges that keep the layout of the scene: leads to `sharp`. It is biased to where
+            edges are dense, but its hills are wide; those of an equally fine band are not. It has half as many pixels a
+            side, because the blur is a pixel wide.
         blur_rad: the blur of `whole`, an angle about the optical axis.
-        bands: from fine to coarse, `RANKED_POINTS` of the range edges on one band each, through the model of the
-            lens: ranks basins.
-        band_blur_rad: the blur of each, an angle likewise.
+        bands: from fine to coarse, `RANKED_POINTS` of the range edges on one band each, through the lens model: rank
+            basins.
+        band_blur_rad: the blur of each band, an angle likewise.
         half_view_rad: largest angle from the optical axis at which the images have a pixel that counts.
         charts: the coarsest and the next finer band with the same range edges: fast.
         thinned: the charts with `THINNED_POINTS` of those range edges: faster.
@@ -72,17 +75,17 @@ class EdgeWitness:
 
     @property
     def to_the_sharpest(self) -> tuple[EdgeFrames, EdgeFrames, EdgeFrames]:
-        """Levels by which a climb from some pixels beside gets to the sharpest edges: two bands, and these."""
+        """Levels that lead a climb from a few pixels away to the sharpest edges: two bands, and the sharpest edges."""
         return self.bands[1], self.bands[0], self.sharp
 
 
 ROUNDING_RAD = radians(0.1)
-"""Added to an angle within which edges may come into view: many times what single precision loses."""
+"""Added to the angle within which edges may come into view: many times the error of single precision."""
 
 
 def in_reach(edges: Edges, half_view_rad: float, pose: Matrix4, reach: SearchBox) -> Edges:
-    """With the range edges only that may come into view at some pose within a reach of `pose` (4, 4): to the
-    significance at any of those poses the others are nothing, to the last bit."""
+    """The edges with only those range edges that may come into view at some pose within a reach of `pose` (4, 4). The
+    others do not change the significance at any of these poses, not even in the last bit."""
     angle_rad = half_view_rad + reach.rotation_rad + ROUNDING_RAD
     return edges.of_points(np.flatnonzero(within_cone(edges.xyz_m, pose, angle_rad, reach.translation_m)))
 
@@ -101,7 +104,7 @@ class EdgesAlone:
         return self._blur_rad
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
-        """Significance at `T_camera_lidar` (4, 4), 0 where nothing is in view; depth and overlap are not looked at."""
+        """Significance at `T_camera_lidar` (4, 4), 0 if nothing is in view; depth and overlap are not computed."""
         return self._evaluation(frame_alignment(self._frames, T_camera_lidar))
 
     def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
@@ -124,7 +127,7 @@ def build_edges(
     """Range edges of the sweeps (found as measured, placed motion-compensated) and edge maps of the images.
 
     Args:
-        pairs: the window's.
+        pairs: those of the window.
         points: places the chosen points of the sweep of a pair: motion-compensated, (N, 3) float32.
         greys: (height, width) uint8, the images of the pairs.
 
@@ -135,7 +138,7 @@ def build_edges(
     first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in found])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError("no sweep has a jump in range: there is nothing to lay onto the edges of the images")
-    # Motion compensation turns a shift of a tenth of a degree by two degrees at most: no need to.
+    # The shift is not compensated: motion compensation turns this tenth of a degree by two degrees at most.
     xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(found)])
     weight = np.concatenate([edges.weight for edges in found])
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
@@ -144,7 +147,7 @@ def build_edges(
     points_m = np.ascontiguousarray(xyz_m.T)
 
     def frames(level: int, maps: NDArray[np.int8], chosen: NDArray[np.int64]) -> EdgeFrames:
-        # Halving leaves out a last odd row or column: the scale is a half all the same.
+        # Halving drops a last odd row or column, but the scale is still a half.
         _, height, width = maps.shape
         camera = scaled(rig.camera, 0.5**level, 0.5**level)._replace(width=width, height=height)
         first_chosen = np.searchsorted(chosen, first_point)
@@ -177,8 +180,8 @@ def _maps(
 ) -> list[NDArray[np.int8]]:
     """The sharpest map, the whole one and the last `BANDS` bands of all images, each (F, h, w).
 
-    An image at a time: none is in memory twice, nor longer than its turn where `greys` are decoded as they are asked
-    for. What a pyramid is made in, as much as five maps, is gone before the charts are made.
+    Images are read one at a time, so none is in memory twice, nor longer than its turn if `greys` decodes them one by
+    one. The buffers of a pyramid, as large as five maps, are freed before the charts are made.
     """
     # The third column of a rotation is where it takes the third axis.
     scales = EdgeScales(_lit(rig), finest, coarsest, upright=rig.T_camera_lidar_nominal[:2, 2])

@@ -1,7 +1,7 @@
 """Two independent witnesses in one objective: edges, sharp and unbiased, and depth, broad and blind to texture.
 
-Each is counted in standard deviations of its own score over other poses within reach, so that neither needs a weight: a
-network that tells nothing adds noise of one unit, a scene without edges likewise (METHOD, section 3, "complement").
+Each is counted in standard deviations of its own score over other poses within reach, so neither needs a weight: a
+useless network adds only noise of one unit, and so does a scene without edges (METHOD, section 3, "complement").
 """
 
 from __future__ import annotations
@@ -34,24 +34,25 @@ from coec.geometry.edges.image_edges import VOID
 from coec.geometry.projection import project
 
 OTHER_POSES = 64
-"""Poses within reach from which the mean and the standard deviation of a score are taken: known to an eighth."""
+"""Poses within reach from which the mean and the standard deviation of a score are taken; they are then known to an
+eighth."""
 
 OTHER_POSES_RAD = radians(28.0)
-"""The reach from which those of the edges are taken at least, whatever the search may reach: nearer to the truth, poses
-share too much of the layout of the scene with it to stand for wrong ones."""
+"""For the edges these poses come from at least this reach, however small that of the search: nearer to the truth, poses
+share too much of the scene's layout with it to stand for wrong ones."""
 
 NEARBY = SearchBox(radians(10.0), 1.0)
-"""How far from the pose at which they are cut cells are asked: where the hill drops for certain, and other summits of
-the basin. Edges that come into view only farther off are in none of them."""
+"""How far from the pose of their division cells are evaluated: to where the hill certainly drops, and to other summits
+of the basin. Edges that come into view only farther off are in no cell."""
 
 BEYOND = SearchBox(radians(8.0), 0.5)
-"""How far a polish may end outside of the reach: its box, of four blurs, and that of the next level."""
+"""How far outside of the reach a polish may end: by its box of four blurs, and by the box of the next level."""
 
 
 CELL_STEP = 0.25
-"""Difference step of the cells, in blurs of the edges: half a pixel on the sharpest. At a whole blur the differences
-reach over the rim of the hill: the standard deviations of rotations were a third smaller than that, and the errors of
-16 windows of two simulated drives 2.2 of them (pitch) instead of 1.4."""
+"""Difference step of the cells, in blurs of the edges: half a pixel on the sharpest. With a step of a whole blur the
+differences reach over the rim of the hill: the standard deviations of rotations were a third smaller, and the errors of
+16 windows of two simulated drives were 2.2 of them (pitch) instead of 1.4."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class Scale:
 
     @classmethod
     def of(cls, scores: NDArray[np.float64]) -> Scale:
-        # A score that does not vary at all tells nothing; it must not divide by zero either.
+        # A score that does not vary at all says nothing, but must not cause a division by zero.
         return cls(float(scores.mean()), max(float(scores.std()), 1e-9))
 
     def standard(self, score: float) -> float:
@@ -71,7 +72,8 @@ class Scale:
 
 
 class FusedObjective:
-    """Standardised edge significance at one blur plus standardised mutual information, per frame and in sum."""
+    """Standardised edge significance at one blur plus standardised mutual information, for each frame and on
+    average."""
 
     def __init__(self, edges: EdgeFrames, step_rad: float, depth: MutualInformation, of_edges: Scale, of_depth: Scale):
         self._edges, self._depth = edges, depth
@@ -80,11 +82,11 @@ class FusedObjective:
 
     @property
     def step_rad(self) -> float:
-        """The blur of the edges, or more: the hill of the sharpest has ripples a pixel wide."""
+        """The blur of the edges, or more, because the hill of the sharpest edges has ripples a pixel wide."""
         return self._step_rad
 
     def with_depth(self, depth: MutualInformation) -> FusedObjective:
-        """The same edges with another depth witness, counted on the same scale."""
+        """The same edges with another depth witness, on the same scale."""
         return FusedObjective(self._edges, self._step_rad, depth, self._of_edges, self._of_depth)
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
@@ -108,7 +110,7 @@ class FusedObjective:
         )
 
     def cells(self, T_camera_lidar: Matrix4) -> Cells:
-        """The edges by sectors of the image, and depth, which has no parts, as one more."""
+        """The edges by sectors of the image, and depth, which cannot be divided, as one more sector."""
         every = self._edges
         half_view_rad = half_field_of_view_rad(every.camera, every.maps[0] != VOID)
         edges = in_reach(every, half_view_rad, T_camera_lidar, NEARBY)
@@ -118,7 +120,7 @@ class FusedObjective:
         uv_px, valid = project(edges.camera, p_camera)
         seen = valid & in_image(edges.camera, uv_px)
         frame = np.repeat(np.arange(len(edges.maps)), np.diff(edges.first_point))
-        # What lies outside counts with the first sector, should a step bring it into view.
+        # Edges outside the image count with the first sector if a step brings them into view.
         sector = np.zeros(len(p_camera), np.uint8)
         sector[seen] = sectors(uv_px[seen])
 
@@ -137,13 +139,13 @@ class FusedObjective:
 
 
 class Fusion:
-    """Both witnesses of a window, with their scales frozen from poses within reach. Edges that come into view at none
-    of them, nor a little outside, are left out.
+    """Both witnesses of a window, with their scales frozen from poses within reach. Edges that come into view neither
+    within the reach nor a little outside are left out.
 
     Attributes:
-        ranking: what a basin is polished on before it is ranked, one after the other; the coarsest band the charts have
-            settled.
-        settling: what the best basin is polished on in the end, one after the other.
+        ranking: the objectives on which a basin is polished in turn before it is ranked. The coarsest band is not among
+            them, because the charts have settled it.
+        settling: the objectives on which the best basin is polished in turn at the end.
     """
 
     ranking: tuple[FusedObjective, ...]
@@ -192,10 +194,10 @@ class Fusion:
         return self.depth_contrasts(T_camera_lidar[None])[0]
 
     def ranks(self, poses: Sequence[Matrix4]) -> list[float]:
-        """How outstanding each of some poses (4, 4) is to both witnesses, standard deviations.
+        """How far each of some poses (4, 4) stands out to both witnesses, standard deviations.
 
-        The root of the sum of squares, as improbabilities combine (Fisher 1925: the logarithm of a normal tail falls
-        with the square). A plain sum would let two poor showings outdo one that cannot be chance.
+        It is the root of the sum of squares, because that is how improbabilities combine (Fisher 1925: the logarithm of
+        a normal tail falls with the square). With a plain sum, two weak results could outdo one that cannot be chance.
         """
         stacked = np.array(poses).reshape(-1, 4, 4)
         return [
@@ -204,5 +206,5 @@ class Fusion:
         ]
 
     def rank(self, T_camera_lidar: Matrix4) -> float:
-        """The same of one pose (4, 4)."""
+        """The same for one pose (4, 4)."""
         return self.ranks([T_camera_lidar])[0]

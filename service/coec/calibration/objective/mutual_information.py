@@ -1,8 +1,7 @@
-"""The objective of a window: equation (1) under a guard against looking away, with everything frozen that may be
-frozen.
+"""The objective of a window: equation (1) with a guard against poses that look away, and with all frozen that may be.
 
-Frozen for a whole search: the bins of range and depth, the set of points, and the number of points that a frame is
-expected to have in view. What is left to the pose is the projection alone.
+Frozen for a whole search are the bins of range and depth, the set of points, and the number of points that a frame is
+expected to have in view. Only the projection depends on the pose.
 """
 
 from __future__ import annotations
@@ -36,17 +35,17 @@ from coec.geometry.thinning import thinned
 from coec.geometry.vectors import lengths
 
 GUARD_OVERLAP = 0.5
-"""Share of a frame's best-seen number of points below which its MI counts for less, in proportion. Plain MI grows when
-points leave the view (METHOD, section 3); a pose that sees less than half of what it could has to earn it. At the true
-pose of every recording tried the share is above 0.7, so the guard does not touch the neighbourhood of the optimum."""
+"""If a frame sees less than this share of the most points that it could see, its MI is reduced in proportion. Plain MI
+grows when points leave the view (METHOD, section 3), so a pose that sees less than half of what it could is penalised.
+At the true pose of every recording tried the share is above 0.7, so the guard does not act near the optimum."""
 
 QUANTILE_SAMPLES = 65_536
-"""Values of a frame from which its bin edges are computed: the rank of an edge is then known to 0.2 % (the binomial
-deviation of the median), far inside a bin of 1/32."""
+"""Number of values of a frame from which its bin edges are computed. The rank of an edge is then known to 0.2 % (the
+binomial deviation of the median), far inside a bin of 1/32."""
 
 
 SIGHT_POINTS = 20_000
-"""Points that stand for the geometry of a window where every point weighs the same."""
+"""Number of points that stand for the geometry of a window if every point has the same weight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +61,9 @@ class Evaluation:
     """The objective at one pose.
 
     Attributes:
-        score: what the search maximises: nats, for the fused objective standard deviations.
+        score: what the search maximises: nats; for the fused objective standard deviations.
         frame_scores: (F,) the same per frame.
-        mi: mean over the frames of equation (1), nats.
+        mi: mean of equation (1) over the frames, nats.
         overlap: points in view over the most that any pose of the box sees.
         points_in_view: number of points that entered the histograms, over all frames.
     """
@@ -89,15 +88,15 @@ class Objective(Protocol):
         ...
 
     def evaluate_each(self, poses: NDArray[np.float64]) -> list[Evaluation]:
-        """The same at each of many poses (K, 4, 4) that do not depend on each other's."""
+        """The same at each of many poses (K, 4, 4), none of which depends on another's result."""
         ...
 
 
 class Divisible(Objective, Protocol):
-    """An objective that can be taken apart."""
+    """An objective that can be divided into cells."""
 
     def cells(self, T_camera_lidar: Matrix4) -> Cells:
-        """Its cells, cut at `T_camera_lidar` (4, 4)."""
+        """Its cells, divided at `T_camera_lidar` (4, 4)."""
         ...
 
 
@@ -112,7 +111,7 @@ class MutualInformation:
         Args:
             frames: the window, binned.
             half_view_rad: largest angle from the optical axis at which the depth maps have a pixel that counts.
-            reference: (F,) of the guard: the most points each frame has in view anywhere in the search.
+            reference: (F,) for the guard: the most points that each frame has in view anywhere in the search.
         """
         self._frames = frames
         self._half_view_rad = half_view_rad
@@ -125,7 +124,7 @@ class MutualInformation:
 
     @property
     def binned(self) -> BinnedFrames:
-        """What an evaluation visits."""
+        """The binned window that an evaluation uses."""
         return self._frames
 
     def evaluate(self, T_camera_lidar: Matrix4) -> Evaluation:
@@ -148,7 +147,8 @@ class MutualInformation:
         )
 
     def may_see(self, xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4, box: SearchBox) -> NDArray[np.int64]:
-        """Indices (n,) of the points (N, 3) that may be in view at some pose within a box of one (4, 4)."""
+        """Indices (n,) of the points (N, 3) that may be in view at some pose within a box about `T_camera_lidar`
+        (4, 4)."""
         return np.flatnonzero(_Reach(self._half_view_rad, T_camera_lidar, box)(xyz_m))
 
     def with_points(
@@ -159,12 +159,12 @@ class MutualInformation:
         box: SearchBox,
         config: ObjectiveConfig,
     ) -> MutualInformation:
-        """The same depth maps under other points of the same sweeps, for poses within a box of `near` (4, 4).
+        """The same depth maps with other points of the same sweeps, for poses within a box about `near` (4, 4).
 
         Args:
-            points: of each frame, in order; what comes into view nowhere in the box may be missing.
-            times: (F,) as many times as many points of a frame as this objective has, had none been left out: so much
-                more is expected in view.
+            points: of each frame, in order; points that come into view nowhere in the box may be left out.
+            times: (F,) factor by which each frame has more points than in this objective, those left out included; so
+                many more are expected in view.
 
         Raises:
             CalibrationError: no point is left between the range limits.
@@ -175,7 +175,7 @@ class MutualInformation:
         return MutualInformation(binned, self._half_view_rad, self._reference * times)
 
     def cells(self, T_camera_lidar: Matrix4) -> Cells:
-        """Frames alone: a histogram has no parts."""
+        """Cells by frames alone, with one sector: a histogram cannot be divided into parts."""
         frames = self._frames
         chosen = thinned(frames.xyz_m.shape[1], SIGHT_POINTS)
         xyz_m = frames.xyz_m[:, chosen].astype(np.float64)
@@ -190,10 +190,10 @@ class MutualInformation:
         )
 
     def mi_of_unrelated(self, T_camera_lidar: Matrix4) -> float:
-        """Mean MI of every cloud with the depth map of another frame, nats: what the layout of a road scene alone
-        gives.
+        """Mean MI of every cloud with the depth map of another frame, nats: the MI that the layout of a road scene
+        alone gives.
 
-        A single frame has no other; its own map, turned upside down and left to right, takes the place.
+        For a single frame, its own map turned upside down and left to right is used instead.
         """
         depth = self._frames.depth_bin
         others = np.roll(depth, 1, axis=0) if self.frames > 1 else np.hstack([depth[:, -2::-1], depth[:, -1:]])
@@ -203,11 +203,11 @@ class MutualInformation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Of one frame: a value of every point.
+    """The points of one frame with a value for each.
 
     Attributes:
         xyz_m: (N, 3) float32 points in the LiDAR frame, motion-compensated.
-        of_points: (N,) float32, does not depend on the pose.
+        of_points: (N,) float32 the values, which do not depend on the pose.
     """
 
     xyz_m: NDArray[np.float32]
@@ -216,7 +216,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features(Points):
-    """What is compared in one frame: a value of every point and a map of the image.
+    """What is compared in one frame: a value for every point and a map of the image.
 
     Attributes:
         of_pixels: (h, w) float32 over the whole field of view of the image; NaN = no value.
@@ -228,17 +228,17 @@ class Features(Points):
 def distances(xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4) -> Points:
     """The points (N, 3) with their distance from the camera at `T_camera_lidar` (4, 4).
 
-    The paper counts the range from the LiDAR: both are the same to every rotation of the camera, so either is frozen
-    for a search. But depth counts from the camera. Where the camera sits a metre ahead of the LiDAR, the range of the
-    ground before the vehicle is a different function of depth than that of the walls beside it, and the optimum moves
-    to make up for it: by 0.12° in pitch on a simulated drive with exact depth.
+    The paper uses the range from the LiDAR. Neither distance changes with a rotation of the camera, so either can be
+    frozen for a search. But depth is measured from the camera. If the camera sits a metre ahead of the LiDAR, the range
+    of the ground before the vehicle is another function of depth than the range of the walls beside it, and the optimum
+    moves to make up for that: by 0.12° in pitch on a simulated drive with exact depth.
     """
     camera_m = se3.inverse(T_camera_lidar)[:3, 3].astype(np.float32)
     return Points(xyz_m, lengths(xyz_m - camera_m).astype(np.float32))
 
 
 def distance_and_depth(xyz_m: NDArray[np.float32], depth: DepthMap, T_camera_lidar: Matrix4) -> Features:
-    """`distances` of the points (N, 3), and the network's output as it comes."""
+    """The `distances` of the points (N, 3), and the output of the network as it comes."""
     points = distances(xyz_m, T_camera_lidar)
     return Features(points.xyz_m, points.of_points, depth.values)
 
@@ -248,8 +248,8 @@ def build_mutual_information(
 ) -> MutualInformation:
     """Bins the features of a window.
 
-    Bins hold equal shares of the values of their frame: MI is then blind to any monotonic code, so inverse depth as it
-    comes, metric depth and disparity are the same to it.
+    Bins hold equal shares of the values of their frame. MI then does not depend on a monotonic code, so inverse depth
+    as it comes, metric depth and disparity give the same.
 
     Raises:
         CalibrationError: no point is left between the range limits, or none can come into view.
@@ -304,14 +304,15 @@ def _binned(
 
 
 def _poses_of_box(start: Matrix4, box: SearchBox) -> NDArray[np.float64]:
-    """(n, 4, 4) the start, and the rotations at the centres of the faces and at the corners of the box."""
+    """(n, 4, 4) the start, and the poses turned to the centres of the faces and to the corners of the box."""
     steps = [s for s in product((-1.0, 0.0, 1.0), repeat=3) if sum(map(abs, s)) != 2]
     rotations = [np.array([*step, 0.0, 0.0, 0.0]) * box.rotation_rad for step in steps]
     return np.array([se3.perturb(start, rotation) for rotation in rotations])
 
 
 class _Reach:
-    """Which points can come into view of any pose of the box: an angle about the optical axis, widened by the box."""
+    """Which points can come into view at any pose of the box: those within an angle about the optical axis, widened by
+    the box."""
 
     def __init__(self, half_view_rad: float, start: Matrix4, box: SearchBox) -> None:
         self.start = start
@@ -333,7 +334,7 @@ def _visible(xyz_m: NDArray[np.float32], reach: _Reach, config: ObjectiveConfig)
 def _point_bins(values: NDArray[np.float32], bins: int) -> NDArray[np.unsignedinteger]:
     """f^P as a bin index."""
     share = np.searchsorted(_equal_shares(values, bins), values, side="right")
-    # In the narrowest type that holds 0 to `bins`: the kernel lives on cache.
+    # The narrowest type that holds 0 to `bins`, because the kernel depends on cache.
     narrow: NDArray[np.unsignedinteger] = share.astype(np.uint8 if bins < 256 else np.uint16)
     return narrow
 
