@@ -1,4 +1,4 @@
-"""A maximum in a box with BOBYQA (Powell 2009, NLopt): bounded, derivative-free, deterministic."""
+"""Finds a maximum in a box with BOBYQA (Powell 2009, NLopt): bounded, derivative-free, deterministic."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ class Box:
 
 
 Scores = Callable[[NDArray[np.float64]], Sequence[float]]
-"""What K points (K, n) score, each by itself."""
+"""The scores of K points (K, n), each by itself."""
 
 
 def maximum_in(
     box: Box, scores: Scores, start: NDArray[np.float64], max_evaluations: int
 ) -> tuple[NDArray[np.float64], bool]:
-    """The best coordinates (n,) of the box that a search from `start` (n,) comes to, and whether its evaluations ran
-    out before it came to an end.
+    """The best coordinates (n,) in the box that a search from `start` (n,) finds, and whether its evaluations ran out
+    before it ended.
 
-    The first points do not depend on what they score: they are asked for together, the others one by one.
+    The first points do not depend on their scores, so they are scored together; the others are scored one by one.
     """
     # The first quadratic model needs two steps of room between the bounds.
     step = np.minimum(box.step, (box.upper - box.lower) / 2.0)
@@ -59,6 +59,6 @@ def maximum_in(
 
 
 def _first_points(start: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2·n + 1, n) those of BOBYQA's first model: the start, and a step either way along each axis where the box has
-    room for both. Elsewhere it begins aside of them."""
+    """(2·n + 1, n) the points of BOBYQA's first model: the start, and a step either way along each axis. Where the box
+    has no room for both steps, BOBYQA begins at other points."""
     return np.concatenate([start[None], start + np.diag(step), start - np.diag(step)])

@@ -1,19 +1,19 @@
-"""Whether the camera moved while a window was taken: two poses, one after the other, instead of one.
+"""Whether the camera moved while a window was taken: it then has two poses, one after the other, instead of one.
 
 A generalised likelihood ratio over the time of the change (Willsky, Jones 1976; Basseville, Nikiforov, "Detection of
 abrupt changes", 1993, section 2.4). For every split of the frames in time
 
     gain = max over T of the early frames' score + max over T of the late frames' score - max over T of all frames'
 
-where a frame scores z(T) = Σ w·e / √Σ w² of its own range edges: about unit variance at a wrong pose, whatever
-the frame. The largest gain tells whether there was a change, its split when. A frame in the middle that is bad by
-itself raises neither side: no split has it alone.
+where the score of a frame is z(T) = Σ w·e / √Σ w² over its own range edges, with about unit variance at a wrong pose
+for every frame. The largest gain shows whether there was a change, and its split shows when. A single bad frame in the
+middle raises neither side, because no split has it alone.
 
-Two poses of one scene score alike within the blur of the edges, and a step may lie far outside of that: the fine band
-of the edge witness is asked next to the solved pose, a chart as far as a mount is knocked, and both about what the
-chart found there. What they find is settled on the sharpest edges: they tell half a degree two to three times as well
-as the band, and a scene that fits many a pose fits none of them sharply. Where to split and the pose of either side are
-found in turns, each from the other, until neither changes.
+Within the blur of the edges two poses of one scene score alike, but a step may be far larger. So the fine band of the
+edge witness is searched next to the solved pose, a chart as far as a mount is knocked, and both around the best poses
+of the chart. The result is settled on the sharpest edges: they resolve half a degree two to three times as well as the
+band, and a scene that fits many poses fits none of them sharply. The split and the poses of its sides are found in
+turns, each from the other, until neither changes.
 """
 
 from __future__ import annotations
@@ -36,65 +36,68 @@ from coec.geometry.edges.climbs import Climb, Summit, climbed
 from coec.geometry.thinning import thinned
 
 REACH_RAD = radians(4.0)
-"""How far from the solved pose the other one is looked for: a knock of 3°, and the solved pose beside the one it
-belongs to."""
+"""How far from the solved pose the other pose is searched: a knock of 3°, and how far the solved pose is off its own
+side."""
 
 POINTS = 30_000
-"""Range edges of the window that are asked, at most: half of those that rank basins. Every other costs gain by the root
-of two, and all of them would cost a tenth of a solve."""
+"""Most range edges of the window that are used: half of those that rank basins. Using every other one lowers the gain
+by the root of two; using all would take a tenth of a solve."""
 
 FAR_REACH_RAD = radians(12.0)
-"""How far it is looked for where frames at an end of the window do not fit the solved pose: a mount that is bent, or
-hangs by one screw. It takes 27 times the poses of the reach, for a few frames in few windows."""
+"""How far the other pose is searched if frames at an end of the window do not fit the solved pose: a mount that is
+bent, or hangs by one screw. It takes 27 times the poses of the reach, but only for a few frames in few windows."""
 
 SEEN = SearchBox(FAR_REACH_RAD + radians(2.0), 0.0)
-"""From the solved pose to the farthest that a climb comes to: edges that none of them brings into view are left out."""
+"""From the solved pose to the farthest end of a climb: edges that come into view nowhere within it are left out."""
 
 CHART_POSES = 2_000
 """Of the cover of the reach: half a degree apart, the blur of a chart or less."""
 
 END, END_CHARTED, END_POSES = 2, 64, 8
-"""Frames at either end of a window that are asked for a pose of their own; poses of the cover that are as good as any
-to so few on a chart, about which the fine band is asked; and those that are put forward then."""
+"""Number of frames at either end of a window whose own pose is searched; number of poses of the cover, best for these
+few frames on a chart, around which the fine band is searched; and number of poses proposed from that."""
 
 MISFIT = 0.4
-"""Share of the median score of a frame at the solved pose below which frames at an end do not fit it: four degrees
-beside, as far as the reach, those of a simulated street keep a seventh."""
+"""Frames at an end do not fit the solved pose if they score less than this share of the median frame there. Four
+degrees off, as far as the reach, frames of a simulated street keep a seventh."""
 
 NEAR_BLURS, NEAR_POSES = 2.5, 300
-"""Radius about the solved pose that the fine band covers, in its blurs, and the poses of the cover, 0.6 blurs apart:
-further off, the chart tells two poses apart."""
+"""Radius about the solved pose that the fine band covers, in its blurs, and number of poses of that cover, 0.6 blurs
+apart. Farther off, the chart can distinguish two poses."""
 
 FAR_POSES, AROUND_POSES = 6, 8
-"""Poses that the chart puts forward, by what they gain over the solved one, and poses about each that the fine band is
-asked: the chart's are half a degree apart."""
+"""Number of poses that the chart proposes, by their gain over the solved one, and number of poses around each that are
+tried on the fine band, because those of the chart are half a degree apart."""
 
 CLIMB_BLURS, HALVINGS = 0.3, 2
-"""First step of a climb, in blurs of what is climbed on, and its halvings: to a tenth of a blur, where a score is
-within a percent of its maximum."""
+"""First step of a climb, in blurs of its level, and its halvings: down to a tenth of a blur, where a score is within a
+percent of its maximum."""
 
 TURNS = 4
-"""Of splitting and climbing on the sharpest edges, at most: two changed nothing any more in nine of ten windows."""
+"""Most turns of splitting and climbing on the sharpest edges: in nine of ten windows nothing changed any more after
+two."""
 
 FEW = 3
-"""One or two frames fit some pose of hundreds well by chance, better than many fit the right one on the blurred band:
-the best split with at least so many on either side is settled, too."""
+"""The best split with at least so many frames on either side is settled, too. One or two frames fit some pose of
+hundreds by chance, better than many frames fit the right one on the blurred band."""
 
 STARTS = 6
-"""Poses from which a side of so few is climbed: the one that fits the blurred band best may lie a degree beside."""
+"""Number of poses from which a side of so few frames is climbed: the best one on the blurred band may be a degree
+off."""
 
 MIN_FRAMES = 4
-"""With fewer there is no early and late."""
+"""With fewer frames there is no early and late."""
 
 MIN_SUPPORT = 5.0
-"""Mean score of a frame that tells anything on either side, at the pose of its side: at a right pose it is 6 to 20 on
-every recording tried by day; on an open road and at night 1 to 4 at the best of all poses. Over all frames of a drive
-a third of which was in a tunnel or at night it would be 3 to 5, and knocks of 1 to 3 degrees would pass."""
+"""Least mean score, on either side at the pose of that side, of the frames that say anything. At a right pose it is 6
+to 20 on every recording tried by day; on an open road and at night it is 1 to 4 at the best of all poses. Over all
+frames of a drive that was in a tunnel or at night for a third of the time it would be 3 to 5, and knocks of 1 to 3
+degrees would be missed."""
 
 MIN_LIKENESS = 0.6
-"""A camera that moved from T₁ to T₂ costs the early frames at T₂ as large a share of their score as late ones at T₁;
-a change of the scene does not: in a tunnel the lines along the way fit many a pose. Of simulated knocks of 0.5 to 3° in
-17 windows 98 % are more alike than this."""
+"""Least likeness of the losses of both sides. If the camera moved from T₁ to T₂, early frames lose as large a share of
+their score at T₂ as late frames lose at T₁. A change of the scene does not have that property: in a tunnel the lines
+along the way fit many poses. Of simulated knocks of 0.5 to 3° in 17 windows 98 % are above this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,13 +105,13 @@ class ChangePoint:
     """The likeliest change of the pose within a window.
 
     Attributes:
-        first_late: index of the first pair after it.
-        T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after it best.
-        gain: what two poses score more than one, in standard deviations of a frame's score.
-        support: mean score of the frames on the side that scores less, at the pose of its side, each counted by its
-            score: frames that tell nothing speak neither for nor against.
-        likeness: what a side loses of its score at the pose of the other, frames counted likewise: the lesser share
-            over the larger one.
+        first_late: index of the first pair after the change.
+        T_before, T_after: (4, 4) T_camera_lidar that fit the pairs before and after the change best.
+        gain: how much more two poses score than one, in standard deviations of a frame's score.
+        support: mean score of the frames on the side that scores less, at the pose of that side. Each frame is weighted
+            by its score, so that frames which say nothing do not count.
+        likeness: the share of its score that a side loses at the pose of the other, frames weighted likewise: the
+            smaller of both shares over the larger.
     """
 
     first_late: int
@@ -120,18 +123,18 @@ class ChangePoint:
 
     @property
     def turn_rad(self) -> float:
-        """Angle between both poses."""
+        """Angle between the two poses."""
         return se3.rotation_angle_rad(self.T_after @ se3.inverse(self.T_before))
 
     @property
     def of_camera(self) -> bool:
-        """Whether it is a change of the camera, rather than of the scene."""
+        """Whether the camera changed, rather than the scene."""
         return self.support >= MIN_SUPPORT and self.likeness >= MIN_LIKENESS
 
 
 def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
-    """The likeliest change of a window that was solved to `pose` (4, 4), however unlikely it is; None with fewer than
-    `MIN_FRAMES` pairs. The camera turns about its centre."""
+    """The likeliest change within a window that was solved to `pose` (4, 4), however unlikely it is; None with fewer
+    than `MIN_FRAMES` pairs. The camera turns about its centre."""
     if len(edges.whole.first_point) - 1 < MIN_FRAMES:
         return None
     band = _asked(edges.bands[0], edges.half_view_rad, pose)
@@ -156,7 +159,7 @@ def change_point(edges: EdgeWitness, pose: Matrix4) -> ChangePoint | None:
             begun += [Climb(poses[k], first, last) for k in best]
     on_band = [end.pose for end in _climbed(band, begun, blur_rad)]
     again = [replace(climb, pose=pose) for climb, pose in zip(begun, on_band, strict=True)]
-    # What fits all frames is climbed on the sharpest edges later, beside the poses of the settled sides.
+    # The pose for all frames is climbed on the sharpest edges later, beside the poses of the settled sides.
     on_sharp = _climbed(sharp, again[1:], edges.blur_rad)
     of_sides = [max((on_sharp[k - 1] for k in side), key=lambda end: end.score).pose for side in sides]
     splits = [
@@ -177,15 +180,15 @@ class _Split:
 
 
 def _promising(gains: NDArray[np.float64]) -> list[int]:
-    """Splits (the last early frame of each) to settle, of gains (F - 1,): the best, and the best that leaves some
-    frames on either side."""
+    """The splits to settle (the last early frame of each), from gains (F - 1,): the best one, and the best that leaves
+    at least `FEW` frames on either side."""
     best, inner = int(np.argmax(gains)), gains[FEW - 1 : len(gains) - FEW + 1]
     return [best] if len(inner) == 0 else list(dict.fromkeys((best, FEW - 1 + int(np.argmax(inner)))))
 
 
 def _settled(sharp: EdgeFrames, begun: Sequence[_Split], T_whole: Matrix4, blur_rad: float) -> list[ChangePoint]:
-    """The likeliest change next to each split, from poses that fit what is before and after it and one (4, 4) that fits
-    the whole. They take their turns together: so several climbs are under way at once."""
+    """The likeliest change next to each split, from the poses that fit its two sides and one (4, 4) that fits all
+    frames. All splits take their turns together, so that several climbs run at once."""
     frames, turning = len(sharp.first_point) - 1, dict(enumerate(begun))
     best, most = dict(turning), dict.fromkeys(turning, -inf)
     for _ in range(TURNS):
@@ -203,7 +206,7 @@ def _settled(sharp: EdgeFrames, begun: Sequence[_Split], T_whole: Matrix4, blur_
         if not again:
             break
         turning = again
-    # One pose for all of them is no worse than that of either side.
+    # The one pose for all frames is also sought from the poses of the sides, so that it is no worse than theirs.
     chosen = list(best.values())
     whole = [T_whole, *(T for split in chosen for T in (split.T_before, split.T_after))]
     of_whole, *of_sides = _climbed(sharp, [Climb(T, 0, frames) for T in whole], blur_rad)
@@ -222,7 +225,8 @@ def _sides(split: _Split, frames: int) -> tuple[Climb, Climb]:
 def _change(
     split: _Split, at_before: NDArray[np.float64], at_after: NDArray[np.float64], together: float
 ) -> ChangePoint:
-    """Of a settled split, with the scores (F,) of its frames at both poses, and what they score at one for all."""
+    """The change of a settled split, from the scores (F,) of the frames at both poses, and their score `together` at
+    one pose for all."""
     first_late = split.first_late
     before, after = float(at_before[:first_late].sum()), float(at_after[first_late:].sum())
     losses = (
@@ -240,7 +244,8 @@ def _change(
 
 
 def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[np.float64]]:
-    """Poses (n, 4, 4) about those at which the frames of one side of a split score most on the chart."""
+    """Proposes poses (n, 4, 4): those at which the frames of one side of a split score most on the chart, and others
+    around them."""
     cover = sample_reach(pose, SearchBox(REACH_RAD, 0.0), CHART_POSES)
     cover = np.concatenate([pose[None], cover])
     of_frames = chart.frame
@@ -250,7 +255,7 @@ def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[
     early = np.cumsum(charted, axis=0)
     sides = np.concatenate([early[:-1], early[-1] - early[:-1]])
     best = np.argmax(sides, axis=1)
-    # What a side gains over the solved pose; a pose may be the best of many sides.
+    # How much a side gains over the solved pose; a pose may be the best for many sides.
     gained = {int(k): 0.0 for k in best if k != 0}
     for side, k in zip(sides, best.tolist(), strict=True):
         if k != 0:
@@ -260,8 +265,8 @@ def _put_forward(chart: EdgeCharts, pose: Matrix4, frames: int) -> list[NDArray[
 
 
 def _put_forward_by_ends(chart: EdgeCharts, band: EdgeFrames, pose: Matrix4) -> list[NDArray[np.float64]]:
-    """Poses (n, 4, 4) that the first and the last frames fit best, by the chart and then by the band; further away
-    where they do not fit the solved one."""
+    """Proposes poses (n, 4, 4) that the first and the last frames fit best, by the chart and then by the band. They are
+    searched farther off if these frames do not fit the solved pose."""
     at_pose, chosen = scores(band, pose), []
     for begin in (0, len(at_pose) - END):
         end = begin + END
@@ -277,7 +282,7 @@ def _put_forward_by_ends(chart: EdgeCharts, band: EdgeFrames, pose: Matrix4) -> 
 
 
 def _about(pose: Matrix4) -> NDArray[np.float64]:
-    """Poses (n, 4, 4) between one of a cover and the next ones."""
+    """Poses (n, 4, 4) between a pose of the cover and its neighbours."""
     apart_rad = REACH_RAD * (4.0 / 3.0 * pi / CHART_POSES) ** (1.0 / 3.0)
     return sample_reach(pose, SearchBox(apart_rad, 0.0), AROUND_POSES)
 
@@ -288,25 +293,26 @@ def scores(band: EdgeFrames, pose: Matrix4) -> NDArray[np.float64]:
 
 
 def _scores(band: EdgeFrames, poses: Sequence[Matrix4]) -> NDArray[np.float64]:
-    """(K, F) the same at each of K poses (4, 4)."""
+    """(K, F) z of each frame by itself at each of K poses (4, 4)."""
     return alignments(band, np.stack(poses)).of_single_frames
 
 
 def _support(of_frames: NDArray[np.float64]) -> float:
-    """Mean of scores (F,), each counted by itself; 0 of none above that."""
+    """Mean of scores (F,), each weighted by itself; 0 if none is above 0."""
     told = np.maximum(of_frames, 0.0)
     return float(np.square(told).sum() / max(told.sum(), LEAST_SQUARE))
 
 
 def _loss(own: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """The share of scores (F,) that is lost where they become others (F,), each counted by itself; 0 of none above
-    that."""
+    """The share of the scores `own` (F,) that is lost if they become `other` (F,), each weighted by itself; 0 if none
+    is above 0."""
     told = np.maximum(own, 0.0)
     return float((told * (own - other)).sum() / max(np.square(told).sum(), LEAST_SQUARE))
 
 
 def _climbed(band: EdgeFrames, begun: Sequence[Climb], blur_rad: float) -> list[Summit]:
-    """The poses next to those where climbs begin at which their frames score most, the axes in turn."""
+    """The ends of climbs: the poses next to their beginnings at which their frames score most, one axis after the
+    other."""
     nowhere, turns = np.eye(4), (*np.eye(6)[:3], *-np.eye(6)[:3])
     steps_rad = [CLIMB_BLURS * blur_rad * 0.5**halved for halved in range(HALVINGS + 1)]
     moves = np.array([[se3.perturb(nowhere, step_rad * turn) for turn in turns] for step_rad in steps_rad])
@@ -314,12 +320,12 @@ def _climbed(band: EdgeFrames, begun: Sequence[Climb], blur_rad: float) -> list[
 
 
 def _asked(edges: Edges, half_view_rad: float, pose: Matrix4) -> Edges:
-    """Of range edges `POINTS` at most, and of those the ones that any pose brings into view."""
+    """The edges with at most `POINTS` range edges, and of those only the ones that some pose brings into view."""
     return in_reach(edges.of_points(thinned(len(edges.weight), POINTS)), half_view_rad, pose, SEEN)
 
 
 def _part(frames: EdgeFrames, begin: int, end: int) -> EdgeFrames:
-    """Those from `begin` to before `end`."""
+    """The frames from `begin` to before `end`."""
     first, last = frames.first_point[begin], frames.first_point[end]
     return replace(
         frames,

@@ -1,8 +1,9 @@
-"""The global stage: every basin of the edge witness within reach of the start, from coarse to fine, in bounded time.
+"""The global stage: finds every basin of the edge witness within reach of the start, from coarse to fine, in bounded
+time.
 
-A low-discrepancy cover of the reach is scored on the coarsest level with few edges, the better part of it with more;
-the best, kept apart, climb on ever finer levels with ever more edges. Range edges that no pose of the reach brings into
-view are left out of it all. Nothing is drawn at random: same input, same basins.
+A low-discrepancy cover of the reach is scored on the coarsest level with few edges, and the better part of it with
+more. The best poses that lie apart climb on ever finer levels with ever more edges. Range edges that no pose of the
+reach brings into view are left out. Nothing is random: the same input gives the same basins.
 """
 
 from __future__ import annotations
@@ -26,24 +27,30 @@ COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
 
 MIN_COVER, MAX_COVER = 10_000, 150_000
-"""Poses of the cover, whatever the reach: enough for the translations of a small one, bounded time for a large one."""
+"""Least and most poses of the cover: enough for the translations of a small reach, bounded time for a large one."""
 
 BLOCK = 10_000
-"""Poses that are made at once: what is needed between is many times as large as they are."""
+"""Poses that are made at once: intermediate arrays are many times as large as the poses."""
 
 SCREENING_POINTS = 400
-"""Range edges by which the whole cover is looked through, at most."""
+"""Most range edges that score the whole cover."""
 
 CANDIDATES = 12_000
-"""Poses of the cover, the best by those, that all thinned edges score, and among which those that begin are looked for:
-most neighbours of a good pose are good, too."""
+"""How many of the best poses of the cover by that score are scored with all thinned edges. The beginnings are chosen
+among them; it takes many, because most neighbours of a good pose are good, too."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Round:
-    """One round of climbing: how many poses begin it, the best on its chart, how far apart (rad); on the coarse or the
-    fine chart, thinned or not, and with how many of its edges they climb, at most; first step (rad) and halvings of
-    it."""
+    """One round of climbing.
+
+    Attributes:
+        poses: how many poses begin it, the best on its chart.
+        apart_rad: how far these lie apart at least.
+        chart: the coarse or the fine chart, `thinned` or not.
+        points: with how many of its edges they climb at most.
+        step_rad, halvings: first step, and how often it is halved.
+    """
 
     poses: int
     apart_rad: float
@@ -62,17 +69,19 @@ ROUNDS = (
     _Round(150, radians(0.7), FINE, thinned=True, points=3_000, step_rad=radians(0.3), halvings=1),
     _Round(24, radians(0.4), FINE, thinned=False, points=10_000, step_rad=radians(0.15), halvings=1),
 )
-"""Each round's steps begin at the width of its blur and end at the next one's. That each chooses by its own chart is
-what finds the true pose: on a coarse one, hundreds of layouts that happen to fit may stand above it (the 855th of the
-first round in a simulated street, six degrees of freedom; by the fine chart, the first to eleventh)."""
+"""The steps of each round begin at the width of its blur and end at that of the next. Each round chooses its poses by
+its
+own chart, which is how the true pose is found: on a coarse chart hundreds of layouts that happen to fit may rank above
+it (in a simulated street with six degrees of freedom it was the 855th of the first round, and first to eleventh by the
+fine chart)."""
 
 SHIFTED_POSES, SHIFT_M = 4, 0.25
-"""Where translation is searched, six more poses climb once more for so many of the best, shifted by so much along each
-axis: poses of one rotation do not lie apart, so that the translation was chosen on the coarse chart, which hardly tells
-it (one start of 24, half a metre away, had ended 36 cm aside)."""
+"""If translation is searched, so many of the best poses are shifted by so much either way along each axis, and the six
+shifted poses climb again. This is needed because poses of one rotation do not count as apart, so their translation was
+chosen on the coarse chart, which hardly shows it (one start of 24, half a metre away, had ended 36 cm off)."""
 
 SHIFTED = _Round(6 * SHIFTED_POSES, 0.0, FINE, thinned=False, points=4_000, step_rad=radians(0.15), halvings=1)
-"""How these climb: as in the last round, with as many edges as tell a quarter of a metre."""
+"""How the shifted poses climb: as in the last round, with as many edges as it takes to see a quarter of a metre."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +93,7 @@ class Basin:
 
 
 AT_RIM = 0.98
-"""Share of the reach beyond which a pose counts as lying on its rim: the maximum may lie outside."""
+"""Share of the reach beyond which a pose counts as lying on its rim, because the maximum may lie outside."""
 
 
 def at_rim(pose: Matrix4, start: Matrix4, reach: SearchBox) -> bool:
@@ -99,7 +108,7 @@ def at_rim(pose: Matrix4, start: Matrix4, reach: SearchBox) -> bool:
 def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Basin]:
     """The most significant basins whose poses lie within `reach` of `start` (4, 4), best first.
 
-    The reach is a ball: so many radians about any axis, and so many metres in any direction (0: rotation only).
+    The reach is a ball: a rotation (rad) about any axis, and a shift (m) in any direction (0: rotation only).
     """
     thinned_to = [in_reach(charts, edges.half_view_rad, start, reach) for charts in edges.thinned]
     finest = in_reach(edges.charts[FINE], edges.half_view_rad, start, reach)
@@ -117,8 +126,8 @@ def find_basins(edges: EdgeWitness, start: Matrix4, reach: SearchBox) -> list[Ba
 
 
 def basin_next_to(edges: EdgeWitness, pose: Matrix4, reach: SearchBox) -> Matrix4:
-    """The pose (4, 4) to which the rounds lead from `pose` (4, 4), whatever stands above it elsewhere; within `reach`
-    of it."""
+    """The pose (4, 4) to which the rounds lead from `pose` (4, 4), within `reach` of it, even if other poses rank
+    higher."""
     end = pose[None]
     for number in ROUNDS:
         charts = (edges.thinned if number.thinned else edges.charts)[number.chart]
@@ -132,21 +141,21 @@ def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.flo
 
 
 class _Cover:
-    """So many poses that cover the reach evenly, made as they are asked for: all at once they would take more memory
-    than the edges of a window."""
+    """A number of poses that cover the reach evenly. They are made when needed, because all at once would take more
+    memory than the edges of a window."""
 
     def __init__(self, start: Matrix4, reach: SearchBox, count: int) -> None:
         self._start, self._reach, self._ball = np.ascontiguousarray(start), reach, unit_ball(count)
 
     def poses(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(n, 4, 4) those with the given numbers."""
-        # Translations in another order, so that they do not go along with the rotations.
+        """(n, 4, 4) the poses with the given numbers."""
+        # Translations come in another order, so that they are not correlated with the rotations.
         turn_rad, shift_m = self._ball[index], self._ball[(index * 7919) % len(self._ball)]
         return moved_by(self._start, turn_rad * self._reach.rotation_rad, shift_m * self._reach.translation_m)
 
 
 def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
-    """The poses of the cover, and the start, that begin the first round."""
+    """The poses that begin the first round, out of the cover and the start."""
     volume = 4.0 / 3.0 * pi * (reach.rotation_rad / COVER_RAD) ** 3
     count = int(min(max(volume, MIN_COVER), MAX_COVER))
     cover = _Cover(start, reach, count)
@@ -154,7 +163,7 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     screen = _at_most(charts, SCREENING_POINTS)
     z = np.concatenate([charted_significances(screen, cover.poses(block)) for block in blocks])
     best = np.flatnonzero(z >= np.partition(z, -min(CANDIDATES, count))[-min(CANDIDATES, count)])
-    # In place: twice all of them is the most that a solve holds.
+    # Filled in place, because a second copy of all poses would be the peak of memory of a solve.
     poses = np.empty((1 + len(best), 4, 4))
     poses[0] = start
     for begin in range(0, len(best), BLOCK):
@@ -164,7 +173,7 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
 
 
 def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6·K, 4, 4) poses (K, 4, 4) shifted either way along each camera axis."""
+    """(6·K, 4, 4) the poses (K, 4, 4), each shifted either way along each camera axis."""
     shifts = SHIFT_M * np.concatenate([np.eye(3), -np.eye(3)])
     shifted = np.repeat(poses, len(shifts), axis=0)
     shifted[:, :3, 3] += np.tile(shifts, (len(poses), 1))

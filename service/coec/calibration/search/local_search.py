@@ -1,7 +1,8 @@
-"""Maximising an objective over a box of perturbations: bounded, derivative-free.
+"""Maximises an objective over a box of perturbations: bounded, derivative-free.
 
-Two stages on one objective: the first finds the basin with a trust region of degrees, the second starts again in it
-with a fresh quadratic model of its size. Deterministic: same objective, same evaluations, same optimum.
+There are two stages on one objective. The first finds the basin with a trust region of degrees; the second starts again
+there with a fresh quadratic model of the basin's size. Deterministic: the same objective gives the same evaluations and
+the same optimum.
 """
 
 from __future__ import annotations
@@ -23,16 +24,17 @@ from coec.config import SearchConfig
 from coec.geometry import se3
 
 REFINE_BOX_RAD, REFINE_STEP_RAD = radians(1.5), radians(0.6)
-"""Second stage. The box holds the widest ripple of pixels and scan lines around the end of the first stage;
-the step spans several of those ripples (cells of a depth map, rings of a sweep: 0.1 to 0.4 degrees), so that the first
-quadratic model sees the hill and not the ripple."""
+"""Box and first step of the second stage. The box holds the widest ripple of pixels and scan lines around the end of
+the first stage. The step spans several of those ripples (cells of a depth map, rings of a sweep: 0.1 to 0.4 degrees),
+so that the first quadratic model sees the hill and not the ripple."""
 
 POLISH_STEPS = 4.0
-"""Half-width of the box of a polish, in steps: what leads to a basin ends within a few of them."""
+"""Half-width of the box of a polish, in steps: the search that leads to a basin ends within a few steps of its
+maximum."""
 
 NEAR = 0.1
-"""Share of an objective's difference step within which a maximum is found that only ranks a basin, or leads to a finer
-level: the score there is half a percent of the hill below its maximum, and takes half as many evaluations."""
+"""Tolerance, as a share of the difference step, of a maximum that only ranks a basin or leads to a finer level. The
+score there is half a percent of the hill below its maximum, and takes half as many evaluations."""
 
 AT_BOUND = 0.995
 """Share of the half-width of the box beyond which an optimum counts as lying on the bound."""
@@ -40,7 +42,7 @@ AT_BOUND = 0.995
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
-    """Where the search ended: pose (4, 4), its effort, and why it ended."""
+    """Where a search ended: its pose (4, 4), its number of evaluations, and why it ended."""
 
     T_camera_lidar: Matrix4
     evaluations: int
@@ -53,7 +55,7 @@ def box_of(config: SearchConfig) -> SearchBox:
 
 
 def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progress: Progress) -> SearchResult:
-    """The pose of the highest score in the box about `start` (4, 4).
+    """The pose with the highest score in the box about `start` (4, 4).
 
     Coordinates are the perturbation ξ = [rx ry rz tx ty tz] on the left of the start, about the camera axes; with three
     degrees of freedom the camera turns about its centre, which stays that of the start.
@@ -81,7 +83,7 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
 
 
 class Constraint(Protocol):
-    """What a search leaves as it is."""
+    """What a search keeps as it is."""
 
     @property
     def axes(self) -> tuple[int, ...]:
@@ -89,7 +91,7 @@ class Constraint(Protocol):
         ...
 
     def __call__(self, T_camera_lidar: Matrix4) -> Matrix4:
-        """The nearest pose (4, 4) that keeps them."""
+        """The nearest pose (4, 4) that obeys the constraint."""
         ...
 
 
@@ -101,8 +103,8 @@ def polish(
     evaluations: int = 0,
     kept: Constraint | None = None,
 ) -> SearchResult:
-    """The maximum next to `basin` (4, 4), which lies within a few of the objective's difference steps of it;
-    `evaluations` were made before. Every pose that is tried obeys `kept`."""
+    """The maximum next to `basin` (4, 4), within a few difference steps of the objective. `evaluations` were made
+    before and are included in the result. Every pose that is tried obeys `kept`."""
     moved = [axis for axis in range(config.dof) if kept is None or axis not in kept.axes]
 
     def pose(coordinates: NDArray[np.float64]) -> Matrix4:
@@ -125,7 +127,7 @@ def polish(
 
 
 def near(config: SearchConfig, objective: Objective) -> SearchConfig:
-    """The configuration of a search that may end as soon as it is `NEAR` the maximum of `objective`."""
+    """The configuration for a search that may end as soon as it is `NEAR` the maximum of `objective`."""
     near_deg = NEAR * degrees(objective.step_rad)
     return config.model_copy(update={"tolerance_deg": max(near_deg, config.tolerance_deg)})
 
@@ -133,7 +135,7 @@ def near(config: SearchConfig, objective: Objective) -> SearchConfig:
 def polish_in_turn(
     objectives: Sequence[Objective], basin: Matrix4, config: SearchConfig, progress: Progress
 ) -> SearchResult:
-    """The maximum of the last objective next to `basin` (4, 4), to which the ones before it lead, one after the
+    """The maximum of the last objective next to `basin` (4, 4); the objectives before it lead there, one after the
     other."""
     *leading, last = objectives
     evaluations = 0
@@ -150,8 +152,8 @@ def _box(
     step: NDArray[np.float64],
     config: SearchConfig,
 ) -> Box:
-    """What lies within `reach` of `centre` and inside the box of `half_width`, all (n,); the tolerance of the
-    rotations is the configuration's, that of the translations has the proportion of the steps."""
+    """The box within `reach` of `centre` and inside the box of `half_width`, all (n,). The tolerance of rotations is
+    that of the configuration; tolerances are in proportion to the steps."""
     tolerance = step * radians(config.tolerance_deg) / step[0]
     return Box(np.maximum(centre - reach, -half_width), np.minimum(centre + reach, half_width), step, tolerance)
 

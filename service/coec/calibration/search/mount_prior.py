@@ -1,13 +1,13 @@
-"""What is known of a pose before a window is looked at: a mount that has a calibration seldom moves, and seldom far.
+"""What is known of a pose before its window is used: a calibrated mount seldom moves, and seldom far.
 
-Of the angle θ by which the pose differs from the start, a density per volume of rotations that falls like Cauchy's in
+The prior is a density of the angle θ between the pose and the start, per volume of rotations. It falls like Cauchy's in
 three dimensions (Student's with one degree of freedom, the longest tails of the family):
 
     p(θ) ∝ (1 + θ² / s²)⁻²
 
-Its scale s is what creep, temperature and a workshop leave. A knock has no scale, so the tails are long: 3° are 7 nats
-less likely than 0°, 25° are 16. A street outweighs that several times over; a tunnel, where some pose among a hundred
-thousand always fits by chance, does not.
+Its scale s is the error that creep, temperature and a workshop leave. A knock has no typical size, so the tails are
+long: 3° are 7 nats less likely than 0°, 25° are 16. The evidence of a street outweighs that several times over; that of
+a tunnel, where some pose among a hundred thousand always fits by chance, does not.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from coec.calibration.types import Matrix4
 from coec.geometry import se3
 
 MOUNT_RAD = radians(0.5)
-"""Scale of a calibration that is in use: bolted brackets creep and breathe by some tenths of a degree between windows,
-and a workshop leaves about as much."""
+"""Scale for a calibration in use: bolted brackets creep and breathe by some tenths of a degree between windows, and a
+workshop leaves about as much error."""
 
 
 def log_prior(T_camera_lidar: Matrix4, start: Matrix4, known_to_rad: float) -> float:
-    """How likely a pose (4, 4) is before anything was seen, against the start's (4, 4), which is known to
-    `known_to_rad`: nats, 0 at the start and below it elsewhere."""
+    """Log prior of a pose (4, 4) relative to that of the start (4, 4), which is known to `known_to_rad`: nats, 0 at the
+    start and negative elsewhere."""
     turned = se3.rotation_angle_rad(T_camera_lidar @ se3.inverse(start)) / known_to_rad
     return -2.0 * log1p(turned * turned)

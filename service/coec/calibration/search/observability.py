@@ -1,16 +1,16 @@
-"""Translations that a window does not tell: there the camera's centre keeps the place that it had before the search.
+"""Translations that a window cannot determine: along these the camera's centre keeps its place from before the search.
 
-Rotations move every point of an image alike, translations only near ones. Where nothing near has an edge, the optimum
-slides along a translation, and takes a rotation with it: better to leave the camera where it was, and say so.
+Rotations move every point of an image alike, translations only near ones. If nothing near has an edge, the optimum
+slides along a translation and takes a rotation with it. It is better to leave the camera where it was, and to say so.
 
-What is left is the camera's *centre*, c = -Rᵀ·t in LiDAR coordinates for T_camera_lidar = [R | t], and not an entry of
-t. The column t is where the LiDAR lies as seen from the camera. It swings with every rotation that is found: by 35 cm
-for a start that was turned by 20° and a camera 1 m from the LiDAR, though nobody moved the camera.
+What stays is the camera's *centre*, c = -Rᵀ·t in LiDAR coordinates for T_camera_lidar = [R | t], not an entry of t. The
+column t is the place of the LiDAR as seen from the camera. It changes with every rotation that is found: by 35 cm for a
+start that was turned by 20° and a camera 1 m from the LiDAR, although nobody moved the camera.
 
 In the terms of METHOD, section 4: the perturbation T(ξ) = exp(ξ)·T on the left turns the camera about its own centre,
-and its translation shifts that centre along the axes of the turned camera, by -R·(c - c₀). An axis is kept where this
-component, counted from the start, is zero. With three degrees of freedom all three are: a search of rotations alone
-leaves the centre of the start where it is.
+and its translation shifts that centre along the axes of the turned camera, by -R·(c - c₀). An axis is kept if this
+component, counted from the start, is zero. With three degrees of freedom all three are kept: a search of rotations
+alone leaves the centre of the start where it is.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ TRANSLATIONS = range(3, 6)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CentreKept:
-    """Along some axes of the camera, its centre stays where it was.
+    """Keeps the camera's centre where it was along some axes of the camera.
 
     Attributes:
-        axes: of `TRANSLATIONS`.
-        prior: (4, 4) T_camera_lidar whose centre that is.
+        axes: the kept axes, out of `TRANSLATIONS`.
+        prior: (4, 4) T_camera_lidar whose centre is kept.
     """
 
     axes: tuple[int, ...]
@@ -54,10 +54,10 @@ class CentreKept:
 
 
 def unobservable(curvature: Curvature, sigma: NDArray[np.float64], dof: int, limits: VerdictConfig) -> tuple[int, ...]:
-    """The translation axes, of those searched, whose maximum is no maximum or wider than `max_sigma_m`; `sigma` (6,)
-    says how wide.
+    """The searched translation axes that have no maximum, or one whose standard deviation in `sigma` (6,) exceeds
+    `max_sigma_m`.
 
-    Without a covariance at all (too few frames, or no maximum on a rotation) nothing can be said, and nothing is.
+    If there is no covariance at all (too few frames, or no maximum on a rotation) nothing can be said: empty.
     """
     if dof <= TRANSLATIONS.start or not np.isfinite(curvature.second_derivative[: TRANSLATIONS.start]).all():
         return ()
@@ -74,7 +74,7 @@ def without(
     config: SearchConfig,
     progress: Progress,
 ) -> SearchResult:
-    """The search ended anew with the camera's centre put back to that of `prior` (4, 4) along the axes `blind`."""
+    """The search finished again with the camera's centre put back to that of `prior` (4, 4) along the axes `blind`."""
     kept = CentreKept(blind, prior)
     again = polish(objective, kept(search.T_camera_lidar), config, progress, search.evaluations, kept)
     return replace(again, stop_reason=search.stop_reason)

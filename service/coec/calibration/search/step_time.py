@@ -1,12 +1,12 @@
-"""When the camera moved within a window whose pairs lie seconds apart: asked of the thinned pairs between them.
+"""Finds when the camera moved within a window whose pairs lie seconds apart, from the thinned pairs between them.
 
-The window tells a pose before and a pose after (`search.change_point`). A pair i that was taken before the change
-scores higher at the one than at the other, by d_i = z_i(T_before) - z_i(T_after); one that was taken after it scores
+The window gives a pose before and a pose after the change (`search.change_point`). A pair i from before the change
+scores higher at the former than at the latter, by d_i = z_i(T_before) - z_i(T_after); a pair from after it scores
 lower. The likeliest time is where the sum of d over the pairs until then is highest (a change of known size: Page
-1954), and every time at which that sum is nearly as high may be it, too.
+1954). Every time at which the sum is nearly as high is possible, too.
 
-Where a single pair of the window lies before the change, or after it, it tells its pose badly. So the pairs about the
-change are searched for one, too, and of the poses that both tell those count that explain all pairs best.
+If a single pair of the window lies before or after the change, that pair determines its pose badly. So the pairs around
+the change are also searched for a change, and of all poses found those are taken that explain all pairs best.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from coec.calibration.search.change_point import ChangePoint, change_point, scor
 from coec.calibration.types import FramePair, Matrix4
 
 MAY_BE = 4.0
-"""By how much the sum may stay below the highest where the change may be: of 58 knocks of 0.5 to 3 degrees in five
-simulated drives, one interval does not hold the knock then, and they are 1.7 s long in the mean (at 0 four do not)."""
+"""The change may be wherever the sum is at most this far below its highest value. Of 58 knocks of 0.5 to 3 degrees in
+five simulated drives one lies outside the interval, and intervals are 1.7 s long on average (at 0 four lie outside)."""
 
 AT_ONCE = 36
-"""Pairs whose edges are found at a time: 120 MB of edge maps of 2 megapixels."""
+"""Most pairs whose edges are found at a time: 120 MB of edge maps of 2 megapixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,7 @@ class StepTime:
     T_after: Matrix4
 
     def holds(self, stamp_ns: int) -> bool:
-        """Whether a pair of this stamp may narrow it."""
+        """Whether a pair of this stamp may narrow the interval."""
         return self.last_before_ns < stamp_ns < self.first_after_ns
 
 
@@ -58,16 +58,16 @@ def step_time(
     between: Sequence[FramePair],
     edges_of: Callable[[Sequence[FramePair]], DatedEdges | None],
 ) -> StepTime:
-    """The stamps between which it moved, and the poses.
+    """The stamps between which the camera moved, and the poses before and after.
 
     Args:
-        change: of the window.
-        window: its pairs.
+        change: the change of the window.
+        window: the pairs of the window.
         between: the thinned pairs between them, ascending.
         edges_of: finds the edges of those of some pairs that have any; None if none has.
     """
     stamps_ns, seen, changes = window.stamps_ns, [window], [change]
-    # One pair of the window further on either side: the poses were fitted to where the change was thought to be.
+    # One more pair of the window on either side, because the poses were fitted to the supposed time of the change.
     first, last = max(0, change.first_late - 2), min(len(stamps_ns) - 1, change.first_late + 1)
     about, waiting = StepTime(stamps_ns[first], stamps_ns[last], change.T_before, change.T_after), list(between)
     while True:
@@ -86,7 +86,7 @@ def step_time(
 
 
 def _bunches(pairs: Sequence[FramePair]) -> Iterator[Sequence[FramePair]]:
-    """`AT_ONCE` at most, all over the time that they take: any of them tells of a change anywhere."""
+    """Bunches of at most `AT_ONCE` pairs, each spread over the whole time, so that each shows a change anywhere."""
     count = -(-len(pairs) // AT_ONCE)
     return (pairs[begin::count] for begin in range(count))
 
@@ -97,7 +97,8 @@ def _better_known(change: ChangePoint, frames: int) -> Matrix4:
 
 
 def _told(seen: Sequence[DatedEdges], changes: Sequence[ChangePoint]) -> StepTime:
-    """Of all pairs, at the poses of those that explain them best. One pair at least lies on either side."""
+    """The time of the change by all pairs, at the two poses that explain them best. At least one pair lies on either
+    side."""
     stamps_ns = np.concatenate([np.array(some.stamps_ns, np.int64) for some in seen])
     order = np.argsort(stamps_ns)
     stamps_ns = stamps_ns[order]
@@ -109,7 +110,7 @@ def _told(seen: Sequence[DatedEdges], changes: Sequence[ChangePoint]) -> StepTim
     after = [(one.T_after, at(one.T_after)) for one in changes]
     told, most = None, -np.inf
     for (T_before, early), (T_after, late) in product(before, after):
-        # With the change at a split, what is before it scores at the one pose and the rest at the other.
+        # For each split: the pairs before it score at one pose and the rest at the other.
         summed = late.sum() + np.cumsum(early - late)[:-1]
         highest = float(summed.max())
         if told is None or highest > most:
