@@ -1,4 +1,4 @@
-"""What commissioning leaves behind: how the estimator and the sensors behave on one rig, and the limits that follow."""
+"""The result of commissioning: how the estimator and the sensors behave on one rig, and the limits that follow."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from coec.geometry import se3
 from coec.geometry.cameras import Camera, pixel_rad
 
 FLOOR = np.array([radians(0.02)] * 3 + [0.004] * 3)
-"""Standard deviation that no check is trusted to be below: what the interpolation of the edge maps leaves (rad, m)."""
+"""Least standard deviation of any check: the error that the interpolation of the edge maps leaves (rad, m)."""
 
 PRIOR_SPREAD_ROTATION = np.array([radians(0.08), radians(0.07), radians(0.15), np.nan, np.nan, np.nan])
 PRIOR_SPREAD_POSE = np.array([radians(0.20), radians(0.10), radians(0.25), 0.02, 0.04, 0.04])
-"""Spread of a check at one pair over three and six degrees of freedom, on the widest of the 64-beam recordings tried
-(rad, m)."""
+"""Spread of a check of a single pair over three and over six degrees of freedom, on the worst of the 64-beam recordings
+tried (rad, m)."""
 
 UNCOMMISSIONED_BIAS = np.array([radians(0.12)] * 3 + [0.03] * 3)
-"""Standard deviation of the estimator's unknown bias on a rig (rad, m): on the recordings tried up to 0.28° and 2 cm
-lie between the vendor's calibration and the edges."""
+"""Standard deviation of the estimator's unknown bias on a rig (rad, m): on the recordings tried the edges differ from
+the vendor's calibration by up to 0.28° and 2 cm."""
 
 STREET = np.array([radians(0.04)] * 3 + [0.01] * 3)
-"""Standard deviation by which streets differ in where they put the camera (rad, m): disjoint halves of the recordings
-tried agree within 0.05° over rotations."""
+"""Standard deviation of the pose from street to street (rad, m): disjoint halves of the recordings tried agree within
+0.05° over rotations."""
 
 PIXEL_SHARE = 0.3
-"""Share of a pixel that the local optimum may be off for the pixels alone, whatever the scenes of a commissioning say:
+"""Share of a pixel by which pixels alone may displace the local optimum, whatever the scenes of a commissioning show:
 edges of an image of 0.8° per pixel put a right pose 0.2 to 0.35° off."""
 
 FIGURES = "edges-insist"
-"""Names the figures that limits are learned for, in the hash of what a baseline holds for. It changes when a check at
-the same pairs gives other figures: limits of the old ones would not fit."""
+"""Names the figures for which limits are learned; part of the hash that says what a baseline is valid for. It changes
+when a check of the same pairs gives other figures, because limits learned before would not fit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:
-    """How far the local optimum of a check lies from a right pose: `bias` (6,), known to `bias_sigma` (6,), and
-    `spread` (6,) of a check at one pair (rad, m). NaN on axes that the check does not search."""
+    """How far the local optimum of a check lies from a right pose: the `bias` (6,), known to `bias_sigma` (6,), and the
+    `spread` (6,) of a check of one pair (rad, m). NaN on axes that the check does not search."""
 
     bias: NDArray[np.float64]
     bias_sigma: NDArray[np.float64]
@@ -56,12 +56,12 @@ class Accuracy:
         return np.nan_to_num(self.bias)
 
     def sigma(self, pairs: int) -> NDArray[np.float64]:
-        """(6,) standard deviation of the offset of a check at so many pairs, less the bias."""
+        """(6,) standard deviation of the offset of a check of so many pairs, after the bias is subtracted."""
         variance = self.spread**2 / max(pairs, 1) + self.bias_sigma**2 + FLOOR**2
         return np.asarray(np.sqrt(variance))
 
     def noise(self, pairs: int) -> NDArray[np.float64]:
-        """(6,) the part of that which is new at every check."""
+        """(6,) the part of that standard deviation which is new at every check."""
         return np.asarray(np.sqrt(self.spread**2 / max(pairs, 1) + FLOOR**2))
 
     def distance2(self, offset: NDArray[np.float64], pairs: int) -> float:
@@ -69,9 +69,8 @@ class Accuracy:
         return fsum(self._squares(offset, pairs))
 
     def farthest2(self, offset: NDArray[np.float64], pairs: int) -> float:
-        """Squared distance of an offset (6,) from the bias along the one axis on which it is farthest, in standard
-        deviations: one axis that is off is not hidden by five that are
-        not."""
+        """Squared distance of an offset (6,) from the bias on the axis where it is farthest, in standard deviations, so
+        that five axes that are right do not hide one that is off."""
         return max(self._squares(offset, pairs))
 
     def _squares(self, offset: NDArray[np.float64], pairs: int) -> list[float]:
@@ -81,15 +80,15 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True)
 class MonitorLimits:
-    """Where a check turns bad. The paper's three refuse nothing until they were learned.
+    """The limits of a check. The paper's three refuse nothing until they are learned.
 
     Attributes:
-        max_distance2_rotation: of the local optimum over rotations, in standard deviations, squared.
-        max_farthest2_pose: of the local optimum over six degrees of freedom, along the axis that is farthest off,
-            likewise squared.
+        max_distance2_rotation: squared distance of the local optimum over rotations, in standard deviations.
+        max_farthest2_pose: squared distance of the local optimum over six degrees of freedom, on the axis that is
+            farthest off, likewise.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
-        insisted_share: of these two limits, beyond which it is too far where the edges insist on it.
-        max_agreement_rad: between the local optima of the two witnesses.
+        insisted_share: share of these two distance limits beyond which an optimum is too far off if the edges insist.
+        max_agreement_rad: angle between the local optima of the two witnesses.
         min_overlap: points in view over the most that any pose within reach sees.
         min_mi, max_f1, min_f2: equation (2) of Borer et al. 2023: nats, per radian, per radian².
     """
@@ -106,23 +105,23 @@ class MonitorLimits:
 
     @property
     def of_paper(self) -> PaperLimits:
-        """Those of equation (2)."""
+        """The limits of equation (2)."""
         return PaperLimits(self.min_mi, self.max_f1, self.min_f2)
 
 
 def pixel_floor(camera: Camera) -> NDArray[np.float64]:
-    """(6,) standard deviation that the pixels of a camera leave to any check, however many pairs it has (rad, m)."""
+    """(6,) standard deviation that the pixels of a camera cause in any check, however many pairs it has (rad, m)."""
     off_rad = PIXEL_SHARE * pixel_rad(camera)
     return of_both(off_rad)
 
 
 def street_sigma(camera: Camera) -> NDArray[np.float64]:
-    """(6,) standard deviation of what the local optima of all checks of one street have in common (rad, m)."""
+    """(6,) standard deviation of the error that all checks of one street have in common (rad, m)."""
     return np.asarray(np.hypot(STREET, pixel_floor(camera)))
 
 
 def uncommissioned(camera: Camera) -> tuple[Accuracy, Accuracy]:
-    """What to expect of checks over three and six degrees of freedom on a rig of which only its camera is known."""
+    """The accuracy of checks over three and over six degrees of freedom on a rig of which only the camera is known."""
     bias_sigma = np.sqrt(UNCOMMISSIONED_BIAS**2 + pixel_floor(camera) ** 2)
     rotation = Accuracy(np.array([0.0] * 3 + [np.nan] * 3), bias_sigma, PRIOR_SPREAD_ROTATION)
     return rotation, Accuracy(np.zeros(6), bias_sigma, PRIOR_SPREAD_POSE)
@@ -133,16 +132,16 @@ class Baseline:
     """A commissioned rig.
 
     Attributes:
-        T_camera_lidar: (4, 4) the reference: workshop calibration, or what was current when it was commissioned.
-        rotation, pose: how checks over three and six degrees of freedom lie about the reference.
-        dof: of the calibrations of this rig; decides which of the two is `bias`.
+        T_camera_lidar: (4, 4) the reference: the workshop calibration, or the current one when it was commissioned.
+        rotation, pose: how checks over three and over six degrees of freedom lie about the reference.
+        dof: degrees of freedom of the calibrations of this rig; decides which of the two gives `bias`.
         limits: learned limits, by the names of `VerdictConfig`.
         monitor: learned limits of a check.
-        false_alarm_rate: share of checks at a right pose that the limits were chosen to flag at most.
-        windows, pairs: from how many it was learned.
-        detected: share of checks that were flagged after the reference had been moved, by amount, as `0.5 deg`.
+        false_alarm_rate: largest share of checks at a right pose that the limits are meant to flag.
+        windows, pairs: from how many of each it was learned.
+        detected: share of checks that were flagged after the reference was moved, by the amount, such as `0.5 deg`.
         sensors: what identifies the sensors, by stream: serial numbers where known, else frame ids.
-        depth_identity, config_hash: of the calibrations that it holds for.
+        depth_identity, config_hash: of the calibrations for which it is valid.
     """
 
     pair: str
@@ -163,7 +162,7 @@ class Baseline:
 
     @property
     def accuracy(self) -> Accuracy:
-        """Of the degrees of freedom that calibrations of this rig search."""
+        """The accuracy for the degrees of freedom that calibrations of this rig search."""
         return self.rotation if self.dof == 3 else self.pose
 
     @property
@@ -173,7 +172,7 @@ class Baseline:
 
     @property
     def bias_sigma(self) -> NDArray[np.float64]:
-        """(6,) how well it is known; NaN on axes that are not searched."""
+        """(6,) standard deviation of the bias; NaN on axes that are not searched."""
         return self.accuracy.bias_sigma
 
     def verdict(self, config: VerdictConfig) -> VerdictConfig:
@@ -181,28 +180,29 @@ class Baseline:
         return config.model_copy(update=self.limits)
 
     def unbiased(self, T_camera_lidar: Matrix4) -> Matrix4:
-        """An estimate (4, 4) without the bias of the estimator on this rig: what may be compared with the workshop
-        calibration, and served."""
+        """An estimate (4, 4) without the bias of the estimator on this rig. Only that may be served, or compared with
+        the workshop calibration."""
         return np.asarray(se3.inverse(se3.perturb(np.eye(4), self.bias)) @ T_camera_lidar)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """From the commissioned calibration: ξ (6,) and its standard deviation (6,), rad and m; NaN where not estimated."""
+    """Distance from the commissioned calibration: ξ (6,) and its standard deviation (6,), rad and m; NaN where not
+    estimated."""
 
     value: NDArray[np.float64]
     sigma: NDArray[np.float64]
 
 
 def drift(T_camera_lidar: Matrix4, sigma: NDArray[np.float64], baseline: Baseline) -> Drift:
-    """How far an estimate (4, 4) with its standard deviations (6,) lies from the commissioned calibration. The
-    estimator's bias on the rig is removed, and its uncertainty counted."""
+    """How far an estimate (4, 4) with standard deviations (6,) lies from the commissioned calibration. The estimator's
+    bias on the rig is removed, and the uncertainty of the bias is included."""
     value = se3.difference(T_camera_lidar, baseline.T_camera_lidar) - baseline.bias
     return Drift(value, np.asarray(np.sqrt(sigma**2 + np.nan_to_num(baseline.bias_sigma) ** 2)))
 
 
 def mismatch(baseline: Baseline, rig: Rig, depth_identity: str, config_hash: str) -> str | None:
-    """Why a baseline does not hold for a rig and its configuration, in one sentence; None if it does."""
+    """Why a baseline is not valid for a rig and its configuration, in one sentence; None if it is valid."""
     if baseline.pair != rig.pair:
         return f"It was made for the pair {baseline.pair}."
     for stream, frame in (("camera", rig.camera_frame), ("lidar", rig.lidar_frame)):
@@ -218,5 +218,6 @@ def mismatch(baseline: Baseline, rig: Rig, depth_identity: str, config_hash: str
 
 
 def learned_hash(config: CalibrationConfig) -> str:
-    """Of the configuration that a baseline holds for: all that moves an optimum; the limits are what it replaces."""
+    """Hash of the configuration for which a baseline is valid: all that moves an optimum. Limits are not part of it,
+    because the baseline replaces them."""
     return config_hash(config.objective, config.search, str(config.motion_compensation), FIGURES)

@@ -36,7 +36,7 @@ class PaperFigures(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PaperLimits:
-    """Of the three figures, in their units; those of nothing learned refuse nothing."""
+    """Limits of the three figures, in their units; the defaults refuse nothing."""
 
     min_mi: float = -inf
     max_f1: float = inf
@@ -48,8 +48,8 @@ class PaperLimits:
 
     @classmethod
     def learned(cls, right: Sequence[PaperFigures], false_alarm_rate: float) -> PaperLimits:
-        """Limits that refuse so small a share of right poses, were the figures of these (two and more) a sample of a
-        normal distribution: a third of it each."""
+        """Limits that refuse this share of right poses, a third of it by each figure, if the figures of `right` (at
+        least two) are samples of a normal distribution."""
         z = normal_quantile(1.0 - false_alarm_rate / 3.0)
         return cls(
             min_mi=beyond([figures.mi for figures in right], -z),
@@ -59,5 +59,5 @@ class PaperLimits:
 
 
 def beyond(values: Sequence[float], z: float) -> float:
-    """So many standard deviations from the mean."""
+    """The value that lies z standard deviations from the mean."""
     return float(np.mean(values) + z * np.std(values, ddof=1))

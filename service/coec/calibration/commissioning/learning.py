@@ -1,11 +1,11 @@
-"""From good windows to the baseline of a rig: the estimator's bias and spread on it, and every limit.
+"""Learns the baseline of a rig from good windows: the estimator's bias and spread on the rig, and every limit.
 
-Nothing is set by hand: the same windows are checked where they are right and after they were moved by known amounts,
-and each limit is put where it flags no more right checks of other pairs than the stated rate (a spread that few pairs
-tell is itself uncertain, so the limit is that of a prediction), and as many of the moved ones as that leaves. What the
-rig does where it is right is tried on blocks of time that were left out when its bias was learned: a limit of frames
-that were learned from would be that of a rig at places it has been to. Moves are seeded: the same windows give the same
-baseline.
+Nothing is set by hand. The same windows are checked at the right pose and at poses moved by known amounts. Each limit
+is set so that it flags at most the stated rate of right checks of other pairs, and as many moved checks as that allows.
+(A spread learned from few pairs is itself uncertain, so the limit is that of a prediction.) Right checks are made on
+blocks
+of time that were left out when the bias was learned: a limit from the same frames would hold only for places where the
+rig has been. Moves are seeded, so the same windows give the same baseline.
 """
 
 from __future__ import annotations
@@ -44,35 +44,35 @@ from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 
 MAX_PAIRS = 48
-"""Pairs that are checked, evenly chosen from all windows: two windows of the default size."""
+"""Most pairs that are checked, evenly chosen from all windows: two windows of the default size."""
 
 BLOCKS = 10
-"""Blocks of neighbouring pairs, of which half are left out at a time: neighbours are not independent."""
+"""Blocks of neighbouring pairs, half of which are left out at a time, because neighbours are not independent."""
 
 HALVES = 10
-"""Draws of the half that is kept."""
+"""Number of draws of the half that is kept."""
 
 PRIOR_BLOCKS = 6
-"""Blocks that the spread known from other rigs counts for."""
+"""Number of blocks for which the spread known from other rigs counts."""
 
 OUTLIER = 4.0
-"""Times the median deviation beyond which the check at a half counts for no more (2.7 standard deviations)."""
+"""Deviations of a half are capped at this multiple of their median (2.7 standard deviations)."""
 
 CHECK_PAIRS = 6
-"""Pairs of a check from which limits are learned: about as many as the monitor takes."""
+"""Pairs of each check from which limits are learned: about as many as the monitor uses."""
 
 CHECKS, FAR_CHECKS = 12, 5
-"""Checks at the right pose and after every move, and far off."""
+"""Number of checks at the right pose and after every move, and number far off."""
 
 FOLDS = 4
-"""Blocks of time, each checked where the others put the rig: of the 25 to 48 pairs of one or two windows each is as
-long as a check, and the others are three quarters of what is known."""
+"""Number of blocks of time; each is checked against the pose that the others find. With the 25 to 48 pairs of one or
+two windows a block is as long as a check, and the others are three quarters of the data."""
 
 SMALL_RAD, SMALL_M = radians(0.5), 0.10
-"""The smallest moves that have to be seen."""
+"""The smallest moves that have to be detected."""
 
 FAR_RAD = radians(12.0)
-"""A move beyond the reach of a check: what is found there is no optimum."""
+"""A move beyond the reach of a check: what a check finds there is no true optimum."""
 
 MOVES = (
     ("0.5 deg", SMALL_RAD, 0.0),
@@ -80,33 +80,32 @@ MOVES = (
     ("3 deg", radians(3.0), 0.0),
     ("10 cm", 0.0, SMALL_M),
 )
-"""By name: rotations about random axes (rad) and translations in random directions (m)."""
+"""Moves by name: rotations about random axes (rad) and translations in random directions (m)."""
 
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
 
 MAX_BIAS_RAD = radians(1.0)
-"""More than this about an axis is no bias of the estimator, but a wrong reference: on the recordings tried it was up to
-0.28°."""
+"""A larger bias about an axis means a wrong reference: on the recordings tried the bias was up to 0.28°."""
 
 LAYOUT_SHARE = 0.25
-"""Of the edges of right checks, what a lost pose counts as keeping at least: the layout of a street fits anywhere, and
-five checks far off may all have missed it."""
+"""A lost pose counts as keeping at least this share of the edges of right checks: the layout of a street fits anywhere,
+and five checks far off may all have missed that."""
 
 INSISTED_SHARE = 0.25
-"""Of the limits of the squared distances, which is too far where the edges insist on it: half the distance. Standard
-deviations are those of a rig's checks at large; how sharply a scene tells the pose, its edges know. Not so where the
-estimator's bias is unknown: edges insist on that as well."""
+"""Share of the limits of the squared distances beyond which an optimum is too far off if the edges insist on it: half
+the distance. The standard deviations are those of all checks of a rig, while the edges show how sharply this scene
+determines the pose. This does not hold if the estimator's bias is unknown, because edges insist on the bias as well."""
 
 POOREST_SHARE = 0.8
-"""Of the least that right checks showed, what a limit may ask for at most: a dozen checks are not the poorest stretch
-of a drive."""
+"""A limit may require at most this share of the least that right checks showed, because a dozen checks do not include
+the poorest stretch of a drive."""
 
 NEAREST_SHARE = 0.25
-"""Of the squared distance of the least of the moved checks, what a limit may be at most: half its distance."""
+"""A limit may be at most this share of the squared distance of the nearest moved check, which is half its distance."""
 
 AGREEMENT_RAD = radians(0.5)
-"""Least limit of the witnesses' disagreement: a quarter of the hill of the depth witness."""
+"""Least limit of the angle between the witnesses: a quarter of the hill of the depth witness."""
 
 
 def commission(
@@ -123,14 +122,14 @@ def commission(
     """The baseline of the rig of `windows`.
 
     Args:
-        windows: of one rig, in which the extrinsic is right.
+        windows: windows of one rig, taken while its extrinsic was right.
         sensors: what identifies the sensors, by stream; the frame ids are added.
         reference: (4, 4) the right extrinsic; None = the workshop calibration of the rig.
         false_alarm_rate: share of checks at a right pose that may be flagged.
 
     Raises:
-        CalibrationError: too few pairs, or the windows do not show the reference: nothing is learned from a rig that is
-            not right.
+        CalibrationError: too few pairs, or the windows contradict the reference: nothing is learned from a rig whose
+            extrinsic is wrong.
     """
     heard = progress or Silence()
     whole = _merged(windows)
@@ -178,7 +177,7 @@ def learn_accuracy(evidence: CheckInput, right: Matrix4) -> tuple[Accuracy, Accu
 def learn_limits(
     evidence: CheckInput, right: Matrix4, config: CalibrationConfig, accuracies: tuple[Accuracy, Accuracy], rate: float
 ) -> MonitorLimits:
-    """The limits of checks, at a false-alarm rate."""
+    """The limits of checks for a false-alarm rate."""
     rotation, pose = accuracies
     checks = _Checks(evidence, right, config, Expected(rotation.expected, pose.expected), Silence())
     moved = {name: checks.moved(turn_rad, shift_m, name, CHECKS) for name, turn_rad, shift_m in MOVES[::3]}
@@ -207,7 +206,8 @@ def _merged(windows: Sequence[Window]) -> Window:
 
 
 def _accuracies(evidence: CheckInput, right: Matrix4, heard: Progress) -> tuple[Accuracy, Accuracy]:
-    """The bias from all pairs, the spread of one pair from checks of halves of them."""
+    """The accuracies over three and six degrees of freedom: the bias from all pairs, the spread of one pair from checks
+    of halves of them."""
     count = len(evidence.pairs)
     whole = check_at(evidence, right)
     halves = _halves(count)
@@ -217,10 +217,10 @@ def _accuracies(evidence: CheckInput, right: Matrix4, heard: Progress) -> tuple[
         heard.step("spread", number, len(halves))
     at_rotation = np.array([seen.offset_rotation for seen in of_halves])
     at_pose = np.array([seen.offset_pose for seen in of_halves])
-    # The mean of k of n pairs varies about that of all by 1/k - 1/n of the variance of one.
+    # The mean of k of n pairs varies about the mean of all by 1/k - 1/n of the variance of one pair.
     share = np.array([1.0 / len(half) - 1.0 / count for half in halves])
     not_searched = np.array([0.0] * 3 + [np.nan] * 3)
-    # Translations are told by near edges, where a pixel is little: their floor is that of every rig.
+    # Near edges determine translations, and a pixel matters little there: their floor is the same on every rig.
     pixels = np.where(np.arange(6) < ROTATION_DOF, pixel_floor(evidence.rig.camera), 0.0)
     return (
         _accuracy(whole.offset_rotation + not_searched, at_rotation, share, PRIOR_SPREAD_ROTATION, count, pixels),
@@ -231,8 +231,9 @@ def _accuracies(evidence: CheckInput, right: Matrix4, heard: Progress) -> tuple[
 def _halves(count: int) -> list[list[int]]:
     """Indices of the pairs that each draw keeps: half of the blocks, seeded.
 
-    Half of them at a time instead of one (Shao and Wu 1989, the delete-d jackknife): a local optimum jumps when a pair
-    is left out, and the jackknife of one block takes every jump for a spread of the whole.
+    Half of the blocks are left out at a time instead of one (Shao and Wu 1989, the delete-d jackknife), because a local
+    optimum jumps when a pair is left out, and the jackknife of single blocks takes every jump for a spread of the
+    whole.
     """
     blocks = np.array_split(np.arange(count), min(count, BLOCKS))
     rng = np.random.default_rng([SEED, count])
@@ -241,7 +242,8 @@ def _halves(count: int) -> list[list[int]]:
 
 
 def _known_by(count: int) -> int:
-    """Degrees of freedom of the spread that so many pairs tell: what was known of other rigs, and their blocks."""
+    """Degrees of freedom of the spread that so many pairs determine: those known from other rigs, and those of their
+    blocks."""
     return PRIOR_BLOCKS + min(count, BLOCKS) - 1
 
 
@@ -253,13 +255,16 @@ def _accuracy(
     count: int,
     pixels: NDArray[np.float64],
 ) -> Accuracy:
-    """From a check at all pairs (6,) and at halves of them (H, 6), which vary about it by `share` (H,) of the variance
-    of one pair, and what is known of other rigs: the variance of few blocks is uncertain itself (the posterior mean
-    under an inverse gamma prior of `PRIOR_BLOCKS` degrees of freedom). The bias is that of the streets that were
-    driven; on others it is another share of a pixel (`pixels`, (6,))."""
+    """The accuracy from a check of all pairs (6,), checks of halves of them (H, 6), and the spread on other rigs
+    `prior`.
+
+    The halves vary about the whole by `share` (H,) of the variance of one pair. That variance is itself uncertain with
+    few blocks, so it is the posterior mean under an inverse gamma prior of `PRIOR_BLOCKS` degrees of freedom. The bias
+    is that of the streets that were driven; on other streets it differs by a share of a pixel (`pixels`, (6,)).
+    """
     known_by = _known_by(count)
     apart = np.abs(of_halves - whole)
-    # One check that ended in another basin must not make the rig look blind.
+    # A single check that ended in another basin must not make the spread of the rig look huge.
     apart = np.minimum(apart, OUTLIER * np.median(apart, axis=0) + FLOOR)
     variance = (apart**2 / share[:, None]).mean(axis=0)
     spread = np.sqrt((PRIOR_BLOCKS * prior**2 + (known_by - PRIOR_BLOCKS) * variance) / known_by)
@@ -277,8 +282,8 @@ def _check(rotation: Accuracy) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LeftOut:
-    """A check at the right pose, what depth says there, and how it lies about where pairs of other times put the rig:
-    squared distance over rotations, and the farthest axis of the pose, as in `Accuracy`."""
+    """A check at the right pose, what depth says there, and its distance from where pairs of other times put the rig:
+    squared, over rotations and on the farthest axis of the pose, as in `Accuracy`."""
 
     seen: Check
     depth: DepthWitness
@@ -287,7 +292,8 @@ class _LeftOut:
 
 
 class _Checks:
-    """Checks at seeded subsets of the pairs, near the right pose moved by a known amount in seeded directions."""
+    """Makes checks of seeded subsets of the pairs, at the right pose or moved from it by a known amount in seeded
+    directions."""
 
     def __init__(
         self,
@@ -313,7 +319,7 @@ class _Checks:
         size = min(CHECK_PAIRS, pairs - 1)
         seen = []
         for number in range(1, count + 1):
-            # Neighbours, as the monitor sees them.
+            # Neighbouring pairs, as the monitor uses them.
             first = int(rng.integers(0, pairs))
             indices = sorted((first + step) % pairs for step in range(size))
             xi = np.concatenate([turn_rad * random_direction(rng), shift_m * random_direction(rng)])
@@ -324,8 +330,8 @@ class _Checks:
         return seen
 
     def left_out(self, rotation: Accuracy, pose: Accuracy, name: str, count: int) -> list[_LeftOut]:
-        """`count` checks at the right pose, in every block of time as many, against the bias that the other blocks
-        tell. Of too few pairs for that, they are checks of pairs that the bias was learned from, too."""
+        """`count` checks at the right pose, equally many in every block of time, compared with the bias that the other
+        blocks show. With too few pairs for that, the checks include pairs from which the bias was learned."""
         pairs = len(self._evidence.pairs)
         blocks = [block.tolist() for block in np.array_split(np.arange(pairs), FOLDS)]
         if min(len(block) for block in blocks) < MIN_PAIRS:
@@ -391,12 +397,13 @@ def _monitor_limits(
 
 
 def _times(distances2: Sequence[float], median: float) -> float:
-    """By how much the squared distances of checks that were left out exceed what the spread of the rig leads to expect,
-    whose `median` is known; no less than 1. A median: one check that ended in another basin is none of the spread."""
+    """Factor by which the squared distances of left-out checks exceed those that the spread of the rig implies, whose
+    `median` is known; at least 1. It compares medians, because a check that ended in another basin is not part of the
+    spread."""
     return max(1.0, float(np.median(distances2)) / median)
 
 
 def _between(right: float, wrong: float) -> float:
-    """Half-way, in ratio, from what right checks do not exceed to the least of the moved ones, and no nearer to these
-    than at a quarter of it; where the two come close the false-alarm rate decides."""
+    """A limit half-way, in ratio, between what right checks do not exceed and the least of the moved ones, and at most
+    a quarter of the latter. If the two come close, the false-alarm rate decides: the limit is `right`."""
     return max(right, min(sqrt(right * wrong), NEAREST_SHARE * wrong))

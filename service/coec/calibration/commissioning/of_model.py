@@ -1,4 +1,4 @@
-"""What commissioned vehicles of one model tell of another that is not commissioned yet."""
+"""What commissioned vehicles of one model say about another one that is not commissioned yet."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from coec.errors import CalibrationError
 from coec.geometry import se3
 
 MIN_VEHICLES = 3
-"""Fewer do not tell how vehicles of the model differ."""
+"""Fewer vehicles do not show how vehicles of the model differ."""
 
 
 def of_model(baselines: Sequence[Baseline]) -> Baseline:
     """One baseline for all vehicles of a model. Their order does not matter.
 
-    The estimator's bias is the mean over the vehicles, and a further vehicle's lies about it as theirs do. A check
-    spreads as on average, and a limit is that of the vehicle with the widest: none of the vehicles that taught it would
-    be flagged by it at its right pose more often than by its own.
+    The estimator's bias is the mean over the vehicles; the bias of a further vehicle scatters about it as theirs do.
+    The spread of a check is the average. Each limit is the widest of all vehicles, so that at its right pose no vehicle
+    of these is flagged more often than by its own limit.
 
     Args:
-        baselines: of one pair, a vehicle each, commissioned with one configuration and one depth network.
+        baselines: of one pair, one for each vehicle, commissioned with the same configuration and depth network.
 
     Returns:
-        A baseline whose `T_camera_lidar` is the mean of theirs; `for_rig` puts a vehicle's own in its place.
+        A baseline whose `T_camera_lidar` is the mean of theirs; `for_rig` replaces it by a vehicle's own.
 
     Raises:
         CalibrationError: fewer than `MIN_VEHICLES`, or baselines that do not belong together.
@@ -45,7 +45,7 @@ def of_model(baselines: Sequence[Baseline]) -> Baseline:
     ):
         if len(found) > 1:
             raise CalibrationError(f"baselines of more than one {what}: {', '.join(sorted(found))}")
-    # Rounding follows an order that is theirs, and not the one in which they were named.
+    # Sorted by content, so that rounding does not depend on the order in which they were given.
     several = sorted(baselines, key=lambda one: one.T_camera_lidar.tobytes() + one.rotation.bias.tobytes())
     first = several[0]
     apart = [se3.difference(one.T_camera_lidar, first.T_camera_lidar) for one in several]
@@ -86,9 +86,9 @@ def of_model(baselines: Sequence[Baseline]) -> Baseline:
 
 
 def for_rig(model: Baseline, rig: Rig) -> Baseline:
-    """The baseline of a model, about the workshop calibration of one of its vehicles. Its bias is known no better than
-    that of a rig of which only the camera is known: how far its own workshop calibration is off, no other vehicle
-    tells."""
+    """The baseline of a model, about the workshop calibration of one of its vehicles. The bias is known no better than
+    on a rig of which only the camera is known, because no other vehicle shows how far this workshop calibration is
+    off."""
     rotation, pose = uncommissioned(rig.camera)
     return replace(
         model,
@@ -102,7 +102,7 @@ def _accuracy(several: Sequence[Accuracy]) -> Accuracy:
     count = len(several)
     bias = _mean([one.bias for one in several])
     variance = _mean([(one.bias - bias) ** 2 for one in several]) * count / (count - 1)
-    # The mean of so few is itself uncertain by its share of how they differ.
+    # The mean of so few vehicles is itself uncertain, by 1 / count of their variance.
     return Accuracy(
         bias=bias,
         bias_sigma=np.sqrt(variance * (1.0 + 1.0 / count)),
@@ -115,10 +115,10 @@ def _mean(values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
 
 
 def _shared(several: Sequence[Baseline]) -> list[str]:
-    """Limits of calibrations that all of them learned; the others stay as configured."""
+    """Names of the limits that all of them learned; the others stay as configured."""
     return sorted(set.intersection(*(set(one.limits) for one in several)))
 
 
 def _widest(limit: str) -> Callable[[Iterable[float]], float]:
-    """Of several values of a limit the one that refuses least; its name begins with what it bounds."""
+    """The function that picks, of several values of a limit, the one that refuses least; `limit` is its name."""
     return min if limit.startswith("min_") else max

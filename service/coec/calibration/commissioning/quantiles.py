@@ -1,4 +1,4 @@
-"""Quantiles of the distributions that limits are taken from."""
+"""Quantiles of the distributions from which limits are taken."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from statistics import NormalDist
 
 
 def chi2_quantile(probability: float, dof: int) -> float:
-    """Of the χ² distribution, by the cube-root approximation of Wilson and Hilferty (1931): within 3 % from one degree
-    of freedom and 0.9 on.
+    """Quantile of the χ² distribution, by the cube-root approximation of Wilson and Hilferty (1931): within 3 % from
+    one degree of freedom and a probability of 0.9 on.
 
     Raises:
         ValueError: the probability is not between 0 and 1.
@@ -18,8 +18,8 @@ def chi2_quantile(probability: float, dof: int) -> float:
 
 
 def poisson_most(confidence: float, events: int) -> float:
-    """The mean of a Poisson variable that is `events` or fewer in one draw of 1 / (1 - confidence): the upper end of
-    what so many events leave likely (Garwood 1936).
+    """The mean of a Poisson variable that is `events` or fewer in one of 1 / (1 - confidence) draws: the upper
+    confidence limit for a mean when so many events were seen (Garwood 1936).
 
     Raises:
         ValueError: the confidence is not between 0 and 1.
@@ -28,12 +28,12 @@ def poisson_most(confidence: float, events: int) -> float:
 
 
 def distance2_quantile(probability: float, dof: int, known_by: int) -> float:
-    """Of the squared distance of one more draw in `dof` axes from a mean, in standard deviations that were estimated
-    themselves, with so many degrees of freedom: `dof` times the F distribution, by the approximation of Paulson (1942).
-    Where the estimate is of few draws, one more lies farther out than χ² has it.
+    """Quantile of the squared distance of one more draw in `dof` axes from a mean, in standard deviations that were
+    estimated with `known_by` degrees of freedom: `dof` times the F distribution, by the approximation of Paulson
+    (1942). If the estimate is from few draws, one more draw lies farther out than χ² says.
 
     Raises:
-        ValueError: the probability is not between 0 and 1, or the estimate is of too few for so rare a quantile.
+        ValueError: the probability is not between 0 and 1, or `known_by` is too small for so rare a quantile.
     """
     z = normal_quantile(probability)
     g, h = 2.0 / (9.0 * dof), 2.0 / (9.0 * known_by)
@@ -46,7 +46,7 @@ def distance2_quantile(probability: float, dof: int, known_by: int) -> float:
 
 
 def normal_quantile(probability: float) -> float:
-    """Of the standard normal distribution.
+    """Quantile of the standard normal distribution.
 
     Raises:
         ValueError: the probability is not between 0 and 1.

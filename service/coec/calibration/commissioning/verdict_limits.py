@@ -1,4 +1,4 @@
-"""The limits of equation (2) for full calibrations of one rig, learned from calibrations that find the right pose and
+"""Learns the limits of equation (2) for full calibrations of one rig, from calibrations that find the right pose and
 calibrations that cannot."""
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from coec.geometry import se3
 from coec.geometry.vectors import random_direction
 
 SOLVES = 6
-"""Calibrations of each kind, each on a random half of the pairs; limits lie between the worst right and the best wrong
-one."""
+"""Number of calibrations of each kind, each on a random half of the pairs. Limits lie between the worst right and the
+best wrong one."""
 
 MIN_HALF = 5
-"""Pairs of such a half at least: fewer than axes and one more have no uncertainty (three degrees of freedom)."""
+"""Least pairs of such a half: it takes more pairs than axes to have an uncertainty (three degrees of freedom)."""
 
 NEAR_RAD, LOST_RAD, LOST_REACH_RAD = radians(5.0), radians(20.0), radians(8.0)
-"""Where they start from the right pose, well inside of any search and twice as far as a lost one may search: that one
-cannot come to it."""
+"""Distance of the start from the right pose, for calibrations that find it (well inside any search) and for lost ones,
+and the reach of a lost one. The last is less than half the second, so that a lost one cannot find the right pose."""
 
 RIGHT_RAD = radians(0.5)
-"""A calibration that ends nearer than this to where the estimator puts this rig is right."""
+"""A calibration is right if it ends nearer than this to where the estimator puts the rig."""
 
 OF_NOISE = ("sigma", "newton_step")
-"""Figures that tell how precise a result is, and not whether it is the right one: their limits are a matter of what the
-result is for, and stay as configured."""
+"""Figures that show how precise a result is, not whether it is the right one. Their limits depend on the use of the
+result, and stay as configured."""
 
 SEED = 20_230_617
 """Any number; the first day of CVPR 2023, where the method appeared."""
@@ -49,11 +49,11 @@ def verdict_limits(
     config: CalibrationConfig,
     heard: Progress,
 ) -> dict[str, float]:
-    """Learned limits, by the names of `VerdictConfig`; those that nothing was learned about are absent.
+    """Learned limits, by the names of `VerdictConfig`; those about which nothing was learned are absent.
 
     Args:
         window: all pairs.
-        right: (4, 4) the right extrinsic, about which the starts lie.
+        right: (4, 4) the right extrinsic, around which the starts lie.
         expected: (4, 4) where the estimator puts it.
     """
     rng = np.random.default_rng(SEED)
@@ -79,15 +79,15 @@ def verdict_limits(
 
 
 def learned(near: Sequence[Estimate], lost: Sequence[Estimate]) -> dict[str, float]:
-    """Half-way, in ratio, between the right and the wrong calibrations, of every figure that tells all of them
-    apart."""
+    """Limits half-way, in ratio, between the right and the wrong calibrations, for every figure that separates all of
+    them."""
     limits = {}
     for metric in near[0].verdict.metrics:
         name = f"{'min' if metric.at_least else 'max'}_{metric.name}"
         if name not in VerdictConfig.model_fields or metric.name.startswith(OF_NOISE):
             continue
         sign = 1.0 if metric.at_least else -1.0
-        # Logarithms, the good side upwards.
+        # Logarithms, signed so that more is better.
         worst = float((sign * _log(near, metric.name)).min(initial=inf))
         best = float((sign * _log(lost, metric.name)).max(initial=-inf))
         if np.isfinite(worst) and np.isfinite(best) and worst > best:
@@ -96,13 +96,13 @@ def learned(near: Sequence[Estimate], lost: Sequence[Estimate]) -> dict[str, flo
 
 
 def _astray(config: CalibrationConfig) -> CalibrationConfig:
-    """A search that cannot reach the right pose."""
+    """The configuration of a search that cannot reach the right pose."""
     reach_deg = degrees(LOST_REACH_RAD)
     reach = {"reach_deg": reach_deg, "rotation_deg": min(reach_deg, config.search.rotation_deg)}
     return config.model_copy(update={"search": config.search.model_copy(update=reach)})
 
 
 def _log(estimates: Sequence[Estimate], name: str) -> NDArray[np.float64]:
-    """Of one metric over the estimates, where it is positive."""
+    """Logarithms of one metric over the estimates, where it is positive."""
     values = [m.value for estimate in estimates for m in estimate.verdict.metrics if m.name == name and m.value > 0.0]
     return np.log(np.array(values, dtype=np.float64))

@@ -1,1 +1,1 @@
-"""Where a LiDAR sits from another one, of what both see: an edge of a rig that no camera has a part in."""
+"""The pose of one LiDAR in another, from surfaces that both see: an edge of a rig without a camera."""

@@ -1,8 +1,9 @@
-"""Point to plane: the points of one LiDAR on the surfaces of another (Chen, Medioni 1992; weights of Geman, McClure
-1985), over several pairs of sweeps at once, with the range bias of either as a nuisance.
+"""Point-to-plane registration: lays the points of one LiDAR on the surfaces of another (Chen, Medioni 1992; weights of
+Geman, McClure 1985), over several pairs of sweeps at once, with the range bias of each as a nuisance.
 
-A step solves for eight unknowns: ξ (6,) about the axes of a, and what a and b measure too long. Their priors are no
-stronger than what a workshop and a data sheet know: an axis that nothing tells stays where it was, and says so.
+A step solves for eight unknowns: ξ (6,) about the axes of a, and the range biases of a and b (how much they measure too
+long). The priors are no stronger than the knowledge of a workshop and of a data sheet, so an axis that nothing
+determines stays where it was, with a wide covariance.
 """
 
 from __future__ import annotations
@@ -26,36 +27,37 @@ from coec.geometry.vectors import lengths
 Doubles = NDArray[np.float64]
 
 REACHES_M = (2.0, 1.0, 0.6, 0.4, 0.3)
-"""How far a point may lie from the surface it is brought to, step by step: 5° at 20 m is 1.7 m. The last one is
-repeated until the pose rests."""
+"""How far a point may lie from its surface, step by step: 5° at 20 m is 1.7 m. The last reach is repeated until the
+pose rests."""
 STEPS = 30
-"""At most; most rest after ten."""
+"""Most steps; most registrations rest after ten."""
 HOPELESS = 0.5
-"""Share of the least that has to be in common, below which further steps bring nothing together."""
+"""If less than this share of `LEAST_SHARE` meets a surface, further steps are useless."""
 RESTS_RAD, RESTS_M = 1e-5, 1e-4
-"""A step shorter than this is none: a thousandth of a degree and a tenth of a millimetre are far below what chance
-does."""
+"""The pose rests if a step is shorter than this: a thousandth of a degree and a tenth of a millimetre are far below the
+error by chance."""
 SCALE_SHARE = 0.25
-"""Of the reach: where the weight of a residual has fallen to a quarter."""
+"""Share of the reach at which the weight of a residual has fallen to a quarter."""
 LEAST_SCALE_M = 0.05
-"""The same at the end: a little over two standard deviations of the range noise of either."""
+"""Least residual at which the weight is a quarter: a little over two standard deviations of the range noise of either
+LiDAR."""
 NEIGHBOURS = 16
-"""Points of a surface: at 10 m and 0.2° two to three rings of a LiDAR of 64 beams."""
+"""Number of points that make a surface: at 10 m and 0.2° two to three rings of a LiDAR of 64 beams."""
 SURFACE_REACH_M = 0.6
-"""Neighbours further away are of something else, or of a road so far that its rings are lines."""
+"""Neighbours further away belong to something else, or to a road so far that its rings are lines."""
 LEAST_NEIGHBOURS = 8
 THICKEST_M = 0.04
-"""Two standard deviations of range noise: what is thicker is no plane."""
+"""Two standard deviations of range noise: a thicker surface is no plane."""
 NARROWEST, NARROWEST_M = 0.15, 0.04
-"""A surface is a strip, of one ring, where the narrower of its two extents is less than this share of the wider one,
-or no wider than it is thick."""
+"""A surface is only a strip, from one ring, if the narrower of its two extents is less than this share of the wider
+one, less than this many metres, or no wider than the surface is thick."""
 PRIOR = np.concatenate([KNOWN_BEFORE, [0.03] * 2])
-"""Standard deviations of what is known before, of the mount and of ranges, which have data sheets (m)."""
+"""Prior standard deviations of the mount (rad, m), and of the range biases, from data sheets (m)."""
 NOISE_M = 0.02
-"""Of a residual, against which the priors are weighed; what the covariance claims is taken from the residuals
+"""Standard deviation of a residual for weighing it against the priors; the covariance is computed from the residuals
 themselves."""
 LEAST_POINTS = 500
-"""Fewer, and less than `LEAST_SHARE` of those that were tried, do not make an edge."""
+"""An edge needs at least so many points on surfaces, and at least `LEAST_SHARE` of those tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,11 +66,11 @@ class Met:
 
     Attributes:
         residual: (N,) distance from the surface along its normal, metres.
-        jacobian: (N, 8) of it by the unknowns.
-        tilt: (N, 2, 6) the same of what the normal may be off by: its two standard deviations, as derivatives by ξ.
+        jacobian: (N, 8) its derivative by the unknowns.
+        tilt: (N, 2, 6) the same for the error of the normal: its two standard deviations, as derivatives by ξ.
         pair: (N,) number of the pair of sweeps.
-        place: (N, 3) in a.
-        tried: points that were tried.
+        place: (N, 3) the points in the frame of a.
+        tried: number of points that were tried.
     """
 
     residual: Doubles
@@ -138,16 +140,16 @@ def _weights(residual: Doubles, scale_m: float) -> Doubles:
 
 
 def _step(met: Met, weight: Doubles, known: Doubles) -> Doubles:
-    """The change (8,) of the unknowns; `known` (8,) is how far they are from what was known before."""
+    """The change (8,) of the unknowns; `known` (8,) is their distance from their priors."""
     weighted = met.jacobian * weight[:, None]
-    # einsum without BLAS: the same bits whatever its threads.
+    # einsum without BLAS gives the same bits whatever the number of threads.
     information = np.einsum("ni,nj->ij", weighted, met.jacobian) / NOISE_M**2 + np.diag(PRIOR**-2.0)
     score = -np.einsum("ni,n->i", weighted, met.residual) / NOISE_M**2 - known / PRIOR**2
     return np.array(solved(information.tolist(), score.tolist()))
 
 
 def _meet(indexed: Sequence[tuple[Cloud, Neighbourhood]], T_a_b: Matrix4, bias: Doubles, reach_m: float) -> Met:
-    """The points of b that lie within reach of a surface of a, at a pose and at what a and b measure too long."""
+    """The points of b that lie within reach of a surface of a, at a pose and at the range biases of a and b."""
     parts = []
     tried = 0
     for number, (cloud, a) in enumerate(indexed):

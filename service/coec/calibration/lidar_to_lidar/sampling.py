@@ -1,8 +1,8 @@
-"""Which sweeps of two LiDARs make a look at where the one sits in the other: decided by sensor stamps alone.
+"""Decides by sensor stamps alone which sweeps of two LiDARs make a look at the pose of one in the other.
 
-A look is of sweeps a few seconds apart, once in each period of sensor time, counted from its zero: a service that was
-restarted, and a replay at any rate, take the same ones. A sweep of a is taken with the one of b that is nearest to it,
-once later ones cannot be nearer. Sweeps are large, so only those are kept that may still be taken.
+A look uses sweeps a few seconds apart, once in each period of sensor time. Periods are counted from the zero of sensor
+time, so that a restarted service and a replay at any rate take the same sweeps. A sweep of a is taken with the nearest
+sweep of b, once later ones cannot be nearer. Sweeps are large, so only those are kept that may still be taken.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ from coec.calibration.lidar_to_lidar.types import SweepPair
 from coec.calibration.types import EgoMotion, LidarFrame
 
 PAIRS = 2
-"""Pairs of sweeps of one look: on simulated streets one has too few points in common now and then, and five tell no
-more than two, as what the first two leave open the surroundings do not tell."""
+"""Pairs of sweeps of one look. On simulated streets a single pair sometimes has too few points in common, and five say
+no more than two, because what two leave open the surroundings do not show."""
 
 SPACING_NS = 2 * NS_PER_S
-"""Between them: some ten metres further other surfaces are in view, and hardly ever is a mount hit in between."""
+"""Time between these pairs: some ten metres further on other surfaces are in view, and a mount is hardly ever hit in
+between."""
 
 APART_NS = 60_000_000
-"""By which their stamps may differ: half a turn at 10 Hz, and a little."""
+"""Most difference between the stamps of a pair: half a turn at 10 Hz, and a little."""
 
 LATEST_NS = 400_000_000
-"""After its instant a sweep of a is looked for: two turns at 5 Hz."""
+"""How long after an instant a sweep of a may come: two turns at 5 Hz."""
 
 SWEEPS_HELD = 12
-"""Sweeps of b that may wait for those of a: those of the instants above at 20 Hz, and one more."""
+"""Most sweeps of b that wait for those of a: those of the times above at 20 Hz, and one more."""
 
 CANDIDATES_HELD = 2
-"""Sweeps of a that may wait for those of b."""
+"""Most sweeps of a that wait for those of b."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +54,8 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Missed:
-    """A sweep of a that was to be taken and was not: `no_sweep` of b is near it, `no_ego_motion` with a velocity is
-    known, the vehicle is `standing`, or points have no time (`no_point_time`)."""
+    """A sweep of a that was due but not taken, with the cause: no sweep of b is near (`no_sweep`), no ego-motion with a
+    velocity is known (`no_ego_motion`), the vehicle stands (`standing`), or points have no time (`no_point_time`)."""
 
     stamp_ns: int
     cause: str
@@ -64,11 +65,12 @@ Found = list[Look | Missed]
 
 
 class SweepSampler:
-    """Of two LiDARs a and b. Holds at most `CANDIDATES_HELD` and `PAIRS` sweeps of a, and `SWEEPS_HELD` and `PAIRS` of
-    b.
+    """Picks the sweeps of looks at two LiDARs a and b. It holds at most `CANDIDATES_HELD` + `PAIRS` sweeps of a, and
+    `SWEEPS_HELD` + `PAIRS` of b.
 
     Attributes:
-        losses: sweeps of a that were to be taken and were not, by cause; `incomplete`: whose look came to nothing.
+        losses: number of sweeps of a that were due but not taken, by cause; `incomplete`: taken, but their look was
+            never complete.
     """
 
     def __init__(
@@ -81,8 +83,8 @@ class SweepSampler:
         timed_a: bool = False,
         timed_b: bool = False,
     ) -> None:
-        """Of a vehicle that is slower than `min_speed_mps`, which sees again what it saw, no look is taken. `timed_a`,
-        `timed_b`: whether it is known when points were measured of sweeps that do not tell it."""
+        """No look is taken while the vehicle is slower than `min_speed_mps`, because it sees nothing new. `timed_a`,
+        `timed_b`: whether point times are known for sweeps that do not carry them."""
         self._period_ns = max(round(period_s * NS_PER_S), PAIRS * SPACING_NS)
         self._motion_tolerance_ns = round(motion_tolerance_s * NS_PER_S)
         self._min_speed_mps = min_speed_mps
@@ -103,11 +105,11 @@ class SweepSampler:
 
     @property
     def held(self) -> int:
-        """Sweeps that are kept."""
+        """Number of sweeps that are kept."""
         return len(self._candidates) + len(self._sweeps) + 2 * len(self._taken)
 
     def push_a(self, sweep: LidarFrame) -> Found:
-        """The next sweep of a; what became certain by it."""
+        """Takes the next sweep of a; returns the looks and misses that became certain."""
         before_ns = self._time_a.latest_ns
         if self._time_a.refusal(sweep.stamp_ns) is not None:
             return []
@@ -123,7 +125,7 @@ class SweepSampler:
         return self._decided()
 
     def push_b(self, sweep: LidarFrame) -> Found:
-        """The same of b."""
+        """Takes the next sweep of b, likewise."""
         before_ns = self._time_b.latest_ns
         if self._time_b.refusal(sweep.stamp_ns) is not None:
             return []
@@ -137,7 +139,7 @@ class SweepSampler:
         return self._decided()
 
     def push_motion(self, motion: EgoMotion) -> Found:
-        """The next ego-motion."""
+        """Takes the next ego-motion, likewise."""
         before_ns = self._time_motion.latest_ns
         if self._time_motion.refusal(motion.stamp_ns) is not None:
             return []
@@ -147,13 +149,13 @@ class SweepSampler:
         return self._decided()
 
     def _begin_new_time(self) -> None:
-        """Sensor time has stepped back: what was kept is of the old one."""
+        """Drops all that is kept, because sensor time stepped back."""
         self._candidates.clear()
         self._taken.clear()
         self._instant = None
 
     def _instant_before(self, stamp_ns: int) -> tuple[tuple[int, int], int]:
-        """The instant, by its period and its number there, at or after which a stamp lies, and by how much."""
+        """The last instant at or before a stamp, as its period and its number in the period, and how long before."""
         period, within_ns = divmod(stamp_ns, self._period_ns)
         number = min(within_ns // SPACING_NS, PAIRS - 1)
         return (period, number), within_ns - number * SPACING_NS
@@ -168,7 +170,7 @@ class SweepSampler:
         return found
 
     def _is_certain(self, stamp_ns: int) -> bool:
-        """Whether later frames cannot change what belongs to a sweep of a; or they are overdue."""
+        """Whether later frames can no longer change what belongs to a sweep of a, or are overdue."""
         latest_ns = self._time_a.latest_ns
         if latest_ns is not None and latest_ns - stamp_ns > MOTION_LATE_NS:
             return True
@@ -176,7 +178,7 @@ class SweepSampler:
         return all(other_ns is not None and other_ns >= stamp_ns for other_ns in others)
 
     def _take(self, a: LidarFrame) -> Look | Missed | None:
-        """What becomes of a sweep of a; None where it is one of a look that is not complete."""
+        """What becomes of a sweep of a; None if its look is not complete yet."""
         (period, number), _ = self._instant_before(a.stamp_ns)
         if self._taken and (number == 0 or self._taken[0].a.stamp_ns // self._period_ns != period):
             self.losses["incomplete"] += len(self._taken)
@@ -206,7 +208,7 @@ class SweepSampler:
         return SweepPair(a, b, motion)
 
     def _forget(self) -> None:
-        """Sweeps of b that no sweep of a can be taken with any more."""
+        """Drops sweeps of b that can no longer be taken with any sweep of a."""
         latest_ns = self._time_a.latest_ns
         if latest_ns is None:
             return

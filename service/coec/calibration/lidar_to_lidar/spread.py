@@ -1,10 +1,9 @@
 """How far the pose of one LiDAR in another may be off.
 
-The sandwich of maximum-likelihood theory (Huber 1967), with the scatter of the score between pairs of sweeps and
-between sectors of the surroundings, as of a window of a camera (`confidence.noise`): a standing vehicle sees the same
-again, and what leans on one wall agrees with itself. Two things are taken off what the points seem to tell: that
-normals are measured (a long wall whose normals scatter seems to hold what lies along it), and that clocks are not
-exact.
+It is the sandwich of maximum-likelihood theory (Huber 1967), with the scatter of the score between pairs of sweeps and
+between sectors of the surroundings, as for a window of a camera (`confidence.noise`): a standing vehicle sees the same
+again, and points of one wall agree with each other. Two errors reduce what the points seem to determine: normals are
+measured (a long wall whose normals scatter seems to hold the direction along it), and clocks are not exact.
 """
 
 from __future__ import annotations
@@ -28,23 +27,24 @@ Doubles = NDArray[np.float64]
 AZIMUTHS, ELEVATIONS = 8, 2
 """Sectors of the surroundings of a: by azimuth, and above or below its horizon."""
 CLOCK_S = 0.001
-"""By how much the clocks of two LiDARs that are synchronised (PTP, or a pulse per second) may differ."""
+"""By how much the clocks of two synchronised LiDARs (PTP, or a pulse per second) may differ, s."""
 GRAIN_RAD, GRAIN_M = radians(0.01), 0.002
-"""What all points of a LiDAR may have in common of their angles and places: the steps in which packets of common
-sensors tell azimuth and range (VLP-16, HDL-64E: 0.01° and 2 mm)."""
+"""Error of angle and place that all points of a LiDAR may have in common: the steps of azimuth and range in the packets
+of common sensors (VLP-16, HDL-64E: 0.01° and 2 mm)."""
 LEANING = 2.0
-"""So much of what leaning normals pretend to tell is taken off: their own estimate is as uncertain as that of a
-variance of a dozen neighbours."""
+"""Factor on the information that leaning normals only pretend to give, before it is subtracted: it is itself estimated
+no better than a variance of a dozen neighbours."""
 
 
 def covariance_of(met: Met, weight: Doubles, prior: Doubles, noise_m: float, clouds: Sequence[Cloud]) -> Doubles:
-    """(8, 8) of ξ and of what a and b measure too long.
+    """The covariance (8, 8) of ξ and of the range biases of a and b.
 
     Args:
-        weight: (N,) of the points that met a surface.
-        prior: (8,) standard deviations of what is known before.
-        noise_m: of a residual, by which it was weighed against the priors.
-        clouds: whose mean motion turns an error of the clocks into one of the pose.
+        met: the points that met a surface.
+        weight: (N,) their weights.
+        prior: (8,) prior standard deviations.
+        noise_m: standard deviation of a residual by which it was weighed against the priors.
+        clouds: their mean motion turns an error of the clocks into one of the pose.
     """
     known = np.diag(prior**-2.0)
     weighted = met.jacobian * weight[:, None]
@@ -54,7 +54,7 @@ def covariance_of(met: Met, weight: Doubles, prior: Doubles, noise_m: float, clo
     information = _held(told - LEANING * pretended, prior) + known
     scattered = np.array(scatter(_cells(met, weighted * met.residual[:, None]))) / noise_m**4 + known
     covariance = np.array(congruent(inverted(information.tolist()), scattered.tolist()))
-    # What the clocks do is a shift and a turn along the way, alike in all pairs.
+    # An error of the clocks is a shift and a turn along the way, alike in all pairs.
     moved = np.zeros(8)
     moved[:6] = CLOCK_S * np.mean([cloud.twist for cloud in clouds], axis=0)
     grain = np.diag(2.0 * np.array([GRAIN_RAD] * 3 + [GRAIN_M] * 3 + [0.0] * 2) ** 2)  # of either LiDAR
@@ -62,19 +62,19 @@ def covariance_of(met: Met, weight: Doubles, prior: Doubles, noise_m: float, clo
 
 
 def _held(information: Doubles, prior: Doubles) -> Doubles:
-    """The matrix without its negative part, each unknown in the unit of what is known of it before."""
+    """The matrix without its negative eigenvalues, with each unknown in units of its prior."""
     unit = prior[:, None] * prior
     return _reshaped(information * unit, lambda value: max(value, 0.0)) / unit
 
 
 def _no_wider(covariance: Doubles, prior: Doubles) -> Doubles:
-    """A scatter without points to hold it may claim more than was known before: both together."""
+    """The covariance combined with the prior, because a scatter that few points hold may be wider than the prior."""
     unit = prior[:, None] * prior
     return _reshaped(covariance / unit, lambda value: max(value, 0.0) / (1.0 + max(value, 0.0))) * unit
 
 
 def _reshaped(symmetric: Doubles, of: Callable[[float], float]) -> Doubles:
-    """The matrix (8, 8) with a function of its eigenvalues for them."""
+    """The matrix (8, 8) with its eigenvalues replaced by a function of them."""
     result = np.zeros((8, 8))
     for value, vector in eigen(symmetric.tolist()):
         result += of(value) * np.outer(vector, vector)
@@ -82,7 +82,7 @@ def _reshaped(symmetric: Doubles, of: Callable[[float], float]) -> Doubles:
 
 
 def _cells(met: Met, score: Doubles) -> Doubles:
-    """(8, pairs, sectors) sums of the score (N, 8)."""
+    """(8, pairs, sectors) sums of the score (N, 8) over each pair and sector."""
     azimuth = np.arctan2(met.place[:, 1], met.place[:, 0])
     around = np.minimum(((azimuth / (2 * np.pi) + 0.5) * AZIMUTHS).astype(np.int64), AZIMUTHS - 1)
     sector = around * ELEVATIONS + (met.place[:, 2] > 0.0)

@@ -1,4 +1,4 @@
-"""Two sweeps as they would have been measured at one instant, that of the first one's stamp."""
+"""Two sweeps as they would have been measured at one instant: the stamp of the sweep of a."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from coec.geometry.vectors import lengths
 Doubles = NDArray[np.float64]
 
 THINNED_M = 0.3
-"""One point of b in every cube of this size: what is near would else count for everything."""
+"""One point of b is kept in every cube of this size; otherwise near things would count for everything."""
 NEAREST_M, FURTHEST_M = 0.5, 60.0
-"""Points of b that are used; further ones have no surfaces of a about them."""
+"""Ranges of the points of b that are used; further ones have no surfaces of a around them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """Points of both.
+    """The points of both sweeps.
 
     Attributes:
-        a_m: (N, 3) in the frame of a, at the instant.
-        raw_b_m: (M, 3) float32 in the frame of b, each at its own instant; thinned.
-        after_s: (M,) by how much that is later.
-        motion: of the vehicle at the instant; None where it is not known.
-        T_a_ego: (4, 4).
+        a_m: (N, 3) points of a in the frame of a, at the instant.
+        raw_b_m: (M, 3) float32 points of b in the frame of b, each at its own instant; thinned.
+        after_s: (M,) how much later than the instant each point of b was measured.
+        motion: ego-motion at the instant; None if unknown.
+        T_a_ego: (4, 4) maps ego coordinates to those of a.
     """
 
     a_m: Doubles
@@ -42,20 +42,21 @@ class Cloud:
     T_a_ego: Matrix4
 
     def b_m(self, T_a_b: Matrix4) -> Doubles:
-        """(M, 3) in the frame of b at the instant, if b sits there: a LiDAR that is turned goes another way through
-        its own frame, 1.4 cm aside in 90 ms at 8 m/s and 1°."""
+        """(M, 3) the points of b in the frame of b at the instant, if b has the pose T_a_b (4, 4) in a. They depend on
+        that pose, because a turned LiDAR moves another way in its own frame: 1.4 cm aside in 90 ms at 8 m/s and 1°."""
         return _at(self.raw_b_m, self.after_s, self.motion, se3.inverse(T_a_b) @ self.T_a_ego)
 
     @property
     def twist(self) -> Doubles:
-        """(6,) of a in its own frame, rad/s and m/s; zero where it is not known."""
+        """(6,) twist of a in its own frame, rad/s and m/s; zero if unknown."""
         if self.motion is None:
             return np.zeros(6)
         return np.concatenate(sensor_twist(self.motion, self.T_a_ego))
 
 
 def clouds_of(rig: LidarRig, pair: SweepPair) -> Cloud:
-    """Motion-compensated by the time of each point; a sweep without such times, or without ego-motion, as it is."""
+    """The points of a pair of sweeps, motion-compensated by the time of each point. Without such times all points of a
+    sweep have its stamp; without ego-motion nothing is moved."""
     a, b = pair.a, pair.b
     a_m = _at(np.ascontiguousarray(a.xyz_m), _offsets_s(a, rig.sweep_a), pair.motion, rig.T_a_ego)
     range_m = lengths(b.xyz_m)
@@ -79,7 +80,7 @@ def _at(xyz_m: NDArray[np.float32], after_s: Doubles, motion: EgoMotion | None, 
 
 
 def _first_of_each_cube(points_m: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Indices, ascending."""
+    """Indices of the first point in each cube, ascending."""
     cubes = np.floor(points_m / THINNED_M).astype(np.int64)
     _, first = np.unique(cubes, axis=0, return_index=True)
     return np.sort(first)

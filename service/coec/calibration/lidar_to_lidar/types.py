@@ -1,4 +1,4 @@
-"""What the registration of two LiDARs is given, and what it tells."""
+"""The input and the result of the registration of two LiDARs."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, SweepTiming
 
 KNOWN_BEFORE = np.array([radians(10.0)] * 3 + [1.0] * 3)
-"""(6,) standard deviation of what is known of a mount before any look (rad, m): they are built to that at the worst."""
+"""(6,) standard deviation of a mount before any look (rad, m): at worst, mounts are built to that."""
 
 LEAST_SHARE = 0.05
-"""Of the points of b, that must meet a surface of a: with fewer the fields of view hardly overlap."""
+"""Least share of the points of b that must meet a surface of a: with fewer the fields of view hardly overlap."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class LidarRig:
         a, b: names; b is brought to a. The denser one should be a: its points make the surfaces.
         T_a_b_nominal: (4, 4) maps coordinates of b to those of a.
         T_a_ego: (4, 4) maps ego coordinates to those of a; carries ego-motion to both.
-        sweep_a, sweep_b: how points are timed that do not tell it themselves; None where nothing does.
+        sweep_a, sweep_b: how the time of points follows from azimuth if the sweep carries no times; None if unknown.
     """
 
     a: str
@@ -38,7 +38,7 @@ class LidarRig:
 
 @dataclass(frozen=True, slots=True)
 class SweepPair:
-    """A sweep of each, near each other in time, and the ego-motion then; None where none is known."""
+    """A sweep of each LiDAR, near each other in time, and the ego-motion then; None if unknown."""
 
     a: LidarFrame
     b: LidarFrame
@@ -58,16 +58,16 @@ class LidarEdge:
     """The pose of b in a.
 
     Attributes:
-        rig: whose.
-        T_a_b: (4, 4).
+        rig: the two LiDARs.
+        T_a_b: (4, 4) the pose found.
         correction: (6,) ξ with T_a_b = perturb(T_a_b_nominal, ξ): about the axes of a, rad and m.
-        covariance: (6, 6) of ξ; axes that the surroundings do not tell have the width of what is known before.
-        range_bias: a nuisance that is estimated along.
-        rms_m: distance of the points of b from the surfaces of a, of those that met one.
-        points: of b that met a surface of a, over all pairs.
-        share: of the points of b that were tried.
-        pairs: of sweeps.
-        reasons: why the result is not to be used; empty if it is.
+        covariance: (6, 6) of ξ; as wide as the prior on axes that the surroundings do not determine.
+        range_bias: a nuisance that is estimated along with the pose.
+        rms_m: root mean square distance of the points of b from the surfaces of a that they met.
+        points: number of points of b that met a surface of a, over all pairs.
+        share: their share of the points of b that were tried.
+        pairs: number of pairs of sweeps.
+        reasons: why the result is not to be used; empty if it may be.
     """
 
     rig: LidarRig
@@ -88,8 +88,8 @@ class LidarEdge:
 
     @property
     def chi2(self) -> float:
-        """Squared length of the correction in its standard deviations, 6 degrees of freedom: whether one of the two
-        has moved. NaN where the covariance is none."""
+        """Squared length of the correction in its standard deviations, 6 degrees of freedom: shows whether one of the
+        two has moved. NaN if the covariance is singular."""
         try:
             return float(self.correction @ np.linalg.solve(self.covariance, self.correction))
         except np.linalg.LinAlgError:

@@ -269,8 +269,8 @@ def _well_told_move(estimate: Estimate) -> MovedWithin | None:
 
 def window_wanted_since(state: PairState) -> int | None:
     """The sensor time since which pairs are wanted for an urgent window; None if none is urgent. It is urgent if the
-    monitor accuses the served extrinsic, or if the camera moved within the latest window and the pair is suspect or
-    miscalibrated."""
+    monitor accuses the served extrinsic, or if the camera moved within the latest window and health is `suspect` or
+    `miscalibrated`."""
     if state.monitor.outcome in ACCUSING and state.flagged_since_ns is not None:
         return state.flagged_since_ns
     moved = None if state.latest is None else _well_told_move(state.latest)

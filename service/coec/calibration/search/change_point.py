@@ -51,7 +51,7 @@ SEEN = SearchBox(FAR_REACH_RAD + radians(2.0), 0.0)
 """From the solved pose to the farthest end of a climb: edges that come into view nowhere within it are left out."""
 
 CHART_POSES = 2_000
-"""Of the cover of the reach: half a degree apart, the blur of a chart or less."""
+"""Number of poses in the cover of the reach: half a degree apart, the blur of a chart or less."""
 
 END, END_CHARTED, END_POSES = 2, 64, 8
 """Number of frames at either end of a window whose own pose is searched; number of poses of the cover, best for these
