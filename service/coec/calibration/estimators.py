@@ -44,7 +44,7 @@ POLISHED_BASINS = 5
 second place."""
 
 POLISHED_ALIKE = 3
-"""At most so many polishes, that of the start included, may end in one basin: further ones come to the same end. On
+"""At most this many polishes, that of the start included, may end in one basin: further ones come to the same end. On
 eight windows of nine, half of them simulated, the score of the settled pose differs by 0.1 % at most; with two, another
 basin won on the ninth."""
 
@@ -71,8 +71,8 @@ freedom and starts 20° and 0.3 m away: root mean square 0.08° and 1.0 cm on th
 cm."""
 
 TELLING = 2.0
-"""More points are spent on the depth witness only where it stands out by at least so many standard deviations. Below
-that its peak may be chance, and more points would not make it tell more."""
+"""More points are spent on the depth witness only if it stands out by at least this many standard deviations. Below
+that its peak may be chance, and more points would not change that."""
 
 SETTLING = SearchBox(radians(8.0), 0.5)
 """How far from a settled pose these points are used at most: for its summits, and to measure how wide its hill is."""

@@ -3,8 +3,7 @@
 The slow track is an information filter on SE(3). Its state is a pose and the covariance of the perturbation on its left
 (Barfoot, Furgale, "Associating uncertainty with three-dimensional poses", 2014); its update is the Kalman update of
 that perturbation. Between windows the covariance grows with time, so that the track follows a mount that creeps. Errors
-that
-windows have in common do not average away: they are carried beside the noise and reported with it.
+that windows have in common do not average away: they are carried beside the noise and reported with it.
 
 Each window is first tested for whether it can come from the same mount: the squared Mahalanobis distance of its
 innovation is chi-square distributed if it does (Bar-Shalom, Li, Kirubarajan 2001, section 5.4). A window that fails the

@@ -3,9 +3,8 @@
 Nothing is set by hand. The same windows are checked at the right pose and at poses moved by known amounts. Each limit
 is set so that it flags at most the stated rate of right checks of other pairs, and as many moved checks as that allows.
 (A spread learned from few pairs is itself uncertain, so the limit is that of a prediction.) Right checks are made on
-blocks
-of time that were left out when the bias was learned: a limit from the same frames would hold only for places where the
-rig has been. Moves are seeded, so the same windows give the same baseline.
+blocks of time that were left out when the bias was learned: a limit from the same frames would hold only for places
+where the rig has been. Moves are seeded, so the same windows give the same baseline.
 """
 
 from __future__ import annotations

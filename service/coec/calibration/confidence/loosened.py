@@ -42,7 +42,7 @@ UNSEEN = COLUMNS * ROWS
 """Sector for everything outside the image."""
 
 LEAST_PX = 0.4
-"""A different lens matters only if it moves the sharpest edges by so much, root mean square, beyond what the pose can
+"""A different lens matters only if it moves the sharpest edges by this much, root mean square, beyond what the pose can
 do: corners of a target are found to a tenth of a pixel, and blur displaces edges by as much. In 48 windows of twelve
 simulated drives through the assumed lens it was less, or not certain; in all 16 of four drives through another lens it
 was more, and certain. It is also the error that edges by themselves leave in a lens: a lens that moves them by as much

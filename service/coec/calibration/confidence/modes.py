@@ -15,7 +15,7 @@ from coec.geometry import se3
 from coec.geometry.linear import solved
 
 SAME_HILL = 3.0
-"""A pose within so many standard deviations belongs to the hill of the optimum, whose width is counted already."""
+"""A pose within this many standard deviations belongs to the hill of the optimum, whose width is counted already."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

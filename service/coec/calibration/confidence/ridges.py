@@ -27,7 +27,7 @@ ABOUT = 0.25
 determine to a sixth, 1 / √(2·19). A place whose certainty is nearer than that to `CERTAIN` counts in part."""
 
 FIRST, DOUBLINGS = 4.0, 5
-"""The walk begins so many standard deviations away, and the distance doubles so often, up to 128; on most hills the
+"""The walk begins this many standard deviations away, and the distance doubles this often, up to 128; on most hills the
 walk ends at 8 or 16."""
 
 STRAIGHT = 1e-6

@@ -85,7 +85,7 @@ class Told:
         return replace(frames, camera=_through(frames.camera, deviation[LENS]))
 
     def thinned(self, at_most: int) -> Told:
-        """The same with at most about so many of the range edges."""
+        """The same with at most about this many range edges."""
         kept = thinned(len(self.frames.weight), at_most)
         return replace(
             self, frames=self.frames.of_points(kept), passing=self.passing[:, kept], share=self.share[:, kept]

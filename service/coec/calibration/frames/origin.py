@@ -33,7 +33,7 @@ and an uncompensated metre of driving cause. Another origin explains the points 
 remains there."""
 
 GIVE_UP = 5
-"""After so many sweeps in a row that no cones explain, the LiDAR counts as one whose points lie on none."""
+"""After this many sweeps in a row that no cones explain, the LiDAR counts as one whose points lie on none."""
 
 STRAYS = 0.1
 """If more than this share of the points is beyond `CONTRADICTED_RAD`, the rings are not those of one LiDAR, or much

@@ -16,7 +16,7 @@ from coec.config import PairingConfig
 
 NS_PER_S = 1_000_000_000
 AGREEING_STAMPS = 5
-"""So many consecutive frames must agree on a new time line before it is believed: half a second at 10 Hz."""
+"""This many consecutive frames must agree on a new time line before it is believed: half a second at 10 Hz."""
 
 MOTION_SAMPLES = 512
 """Ego-motion samples kept: more than two seconds at 200 Hz, while pairs wait at most a few frames."""

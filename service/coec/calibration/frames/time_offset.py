@@ -50,7 +50,7 @@ PROFILE_STEP_S = 0.02
 """Step of the grid of offsets on the coarse chart: a fifth of the hill, which is some 0.1 s wide in a turn."""
 
 TURN_RAD = radians(4.0)
-"""Reach of the rotation about the given pose: an offset of 0.1 s in a sharp turn changes it by so much."""
+"""Reach of the rotation about the given pose: an offset of 0.1 s in a sharp turn changes it by that much."""
 
 TOLERANCE = 1e-3
 """Last trust region of the fit, as a share of the difference steps."""

@@ -57,7 +57,7 @@ NOISE_M = 0.02
 """Standard deviation of a residual for weighing it against the priors; the covariance is computed from the residuals
 themselves."""
 LEAST_POINTS = 500
-"""An edge needs at least so many points on surfaces, and at least `LEAST_SHARE` of those tried."""
+"""An edge needs at least this many points on surfaces, and at least `LEAST_SHARE` of those tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,11 +34,11 @@ CLEARS_AT = 0.4
 """A suspect mount clears again below this share of the evidence that makes it suspect."""
 
 ABOVE = 4.0
-"""Evidence is capped so many nats above the level that confirms, so that a repaired mount clears within three
+"""Evidence is capped this many nats above the level that confirms, so that a repaired mount clears within three
 checks."""
 
 DOUBTFUL_CHECKS = 2.0
-"""So many clear checks after a faint one count as faint too, because what made it faint, such as a guard rail along a
+"""This many clear checks after a faint one count as faint too, because what made it faint, such as a guard rail along a
 highway, did not end with it. Of 25 checks of simulated highways with 64 beams six were clear; four of these stood alone
 between faint ones and were as far off as they. By day in streets, garages and rooms one check in thirty is faint."""
 
@@ -46,8 +46,8 @@ WEAK_SHARE = 0.5
 """A flagged check with faint edges counts half as much as another towards checks being at odds with each other."""
 
 AT_ODDS_AT, MOST_AT_ODDS = 1.5, 3.0
-"""Flagged checks in a row from which they are at odds if they do not add up to a move (which takes two), and the most
-that are counted."""
+"""From so many flagged checks in a row that do not add up to a move (that is, from two on) checks are at odds; and the
+most of them that are counted."""
 
 ASTRAY2 = chi2_quantile(0.95, AXES)
 """Squared distance between the rotations that the checks have found and those served. Above it, no move but the served

@@ -83,7 +83,7 @@ class Belief:
         return Belief(three(mean), three(variance), 1.0 - scored.good)
 
     def wider(self, variance: Three) -> Belief:
-        """The belief with its variance increased by so much."""
+        """The belief with `variance` added to its own."""
         return Belief(self.mean, plus(self.variance, variance), self.astray)
 
     def distance2(self, told: Told) -> float:

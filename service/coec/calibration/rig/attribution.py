@@ -47,8 +47,8 @@ CALM_AT = 0.5
 """Probability that nobody moved, from which looks that grow old count as looks at a right rig."""
 
 NEWEST = 6
-"""A step is looked for after each of the so many newest last looks of the edges: just after a LiDAR is knocked, some of
-its edges show it already and others were last looked at before."""
+"""Of the last looks of all edges so many, the newest, are tried as the last look before a step: just after a LiDAR is
+knocked, some of its edges show it already, and others were last looked at before."""
 
 AGES_S = (10.0, 16.0, 26.0, 42.0, 68.0, 110.0)
 """How long ago a step is looked for otherwise, at intervals that a robust mean bridges; and beyond these, before all
@@ -110,7 +110,7 @@ class RigState:
     Attributes:
         histories: of every edge, by name.
         posterior: the last answer to who moved; None before the first look.
-        asked_ns: stamp of the look after which who moved was last asked; windows leave it.
+        asked_ns: stamp of the look after which who moved was last asked; a window does not change it.
         stepped_ns: the step in question lies before the looks from this stamp on.
         claimed: the sensors that are probable enough to be named, each with the number of answers in a row that said so
             and knew of a new look at it, `ANSWERS` at most.

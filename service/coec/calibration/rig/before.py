@@ -3,9 +3,8 @@
 A knocked LiDAR leaves the cameras where they were to one another, so all that was known about that still holds.
 Therefore a sensor that moved is two nodes of the graph: where it was, and where it is. What was known of its pairs
 joins the first node to the sensors that stood still; windows from after the move join the second. Nothing joins the two
-nodes.
-So all pairs of the sensor determine the move together, and loops close that did not before: every pair has to show the
-same move.
+nodes. So all pairs of the sensor determine the move together, and loops close that did not before: every pair has to
+show the same move.
 
 What was known is less certain than it was, because mounts creep with time and a knock shakes the other mounts too.
 Errors that the scenes of that time had in common are noise beside the scenes of now; a displaced lens stays displaced.

@@ -23,7 +23,7 @@ from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
 
 BIAS_TIMES = 2.0
-"""The first looks of a rig, and a window beside them, are trusted only to so many times the usual bias of looks: the
+"""The first looks of a rig, and a window beside them, are trusted only to this multiple of the usual bias of looks: the
 next rig may have a larger bias than the few that are known, and a bias must not pass for a move."""
 
 LEAST_SIGMA, MOST_SIGMA = 1e-6, 10.0
@@ -46,7 +46,8 @@ class Look:
         share: how much it counts, 0 to 1: the part of its frames that no earlier look held.
         weak: whether it has little evidence, and may lie anywhere.
         stepped_ns: stamp of the first frame since which the pair by itself suspects a step; None if it suspects none.
-            It only says at which times to look for a step.
+            It adds a time at which a step is looked for, and a sensor with one pair is named by looks only if it is
+            set.
     """
 
     edge: str

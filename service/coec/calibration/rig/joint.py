@@ -2,9 +2,8 @@
 
 If the pairs fit each other, the squared residuals are χ² distributed with six degrees of freedom for each loop to
 close. If they are not, the edge without which they are is left out, provided that it is the only such edge (Baarda's
-test). If
-several would do, nothing is left out: all loops that do not close are reported, and all standard deviations widen by
-what the loops miss (Birge 1932).
+test). If several would do, nothing is left out: all loops that do not close are reported, and all standard deviations
+widen by what the loops miss (Birge 1932).
 
 After a move of a sensor, the graph also holds what was known before the move (`before`). That closes loops which are
 not there otherwise, such as those between the cameras of a single LiDAR.
@@ -33,8 +32,8 @@ INCONSISTENT_AT = 1e-3
 windows, which is fifty hours."""
 
 ALONE_BY = 12.0
-"""An edge alone is at fault if leaving it out lowers the sum of squares by so much more than leaving out any other
-does: odds of 400 to 1."""
+"""An edge alone is at fault if leaving it out lowers the sum of squares by this much more than leaving out any other:
+odds of 400 to 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,7 +28,7 @@ MOST_LOOKS = 24
 together."""
 
 MEMORY_LOOKS = 360.0
-"""The older looks together count as so many at most: half an hour, so that the mean follows a mount that creeps."""
+"""The older looks together count as this many at most: half an hour, so that the mean follows a mount that creeps."""
 
 REACH = np.array([*ROTATIONS.reach, *TRANSLATIONS.reach])
 """(6,) standard deviation of the offsets of bad looks (rad, m)."""
@@ -236,8 +236,8 @@ class _Stack:
         return np.concatenate([self.offset[some], known[None]])
 
     def _sums(self, weight: Array, information: Array, moment: Array) -> tuple[Array, Array]:
-        """Summed information (..., 6, 6) and moments (..., 6) of what is known and of the looks weighted by (...,
-        N)."""
+        """Sums of the information (..., 6, 6) and moments (..., 6) of what is known and of the looks, with weights
+        (..., N)."""
         pulled = dense.applied(self.information, self.offset)
         precision = np.broadcast_to(information, (*weight.shape[:-1], 6, 6)).copy()
         moments = np.broadcast_to(moment, (*weight.shape[:-1], 6)).copy()

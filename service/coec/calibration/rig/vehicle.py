@@ -1,10 +1,9 @@
 """The rig of one vehicle, step by step: combines checks, accepted windows and what the pairs serve.
 
 A move of a sensor is one event. It begins when the sensor is named (`attribution`). It is put right when every live
-pair
-of the sensor has an accepted window from after the move: the joint estimate (`joint`), with what was known before the
-move (`before`), then corrects all pairs of the sensor at once, with one move for all of them. The event is over when
-all these pairs serve the correction or a pose that they found since; their looks are counted from that pose on.
+pair of the sensor has an accepted window from after the move: the joint estimate (`joint`), with what was known before
+the move (`before`), then corrects all pairs of the sensor at once, with one move for all of them. The event is over
+when all these pairs serve the correction or a pose that they found since; their looks are counted from that pose on.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ from coec.calibration.types import Matrix4
 from coec.geometry import dense, se3
 
 ALIVE_NS = 60 * NS_PER_S
-"""An event does not wait for a pair without a look for so long: 12 periods of the monitor."""
+"""An event does not wait for a pair that had no look for this time: 12 periods of the monitor."""
 
 OVER_NS = 900 * NS_PER_S
-"""After so long an event is over, whatever its pairs serve, if no sensor is named any more: five slices."""
+"""After this time an event is over, whatever its pairs serve, if no sensor is named any more: five slices."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,8 +58,7 @@ class Told:
     """What the joint estimate says of a pair: a pose (4, 4) and the covariance (6, 6) of its perturbation.
 
     Axes that the pair's own window does not determine are as in that window, and NaN in the covariance. A pair without
-    a
-    window from after the move has no such axes: the other pairs and what was known of it before determine its pose.
+    a window from after the move has no such axes: the other pairs and what was known of it before determine its pose.
     """
 
     T_a_b: Matrix4

@@ -78,7 +78,7 @@ TURNS = 4
 two."""
 
 FEW = 3
-"""The best split with at least so many frames on either side is settled, too. One or two frames fit some pose of
+"""The best split with at least this many frames on either side is settled, too. One or two frames fit some pose of
 hundreds by chance, better than many frames fit the right one on the blurred band."""
 
 STARTS = 6
