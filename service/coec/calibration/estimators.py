@@ -267,7 +267,7 @@ def by_fusion(sight: Sight, config: CalibrationConfig) -> Found:
         found = replace(found, stop_reason=StopReason.AT_BOUND)
     others = [end.T_camera_lidar for end in settled if end is not best]
     if not _differ(start, best.T_camera_lidar):
-        # A window that cannot tell the start from the pose found has told nothing.
+        # A window that cannot tell the start from the pose found says nothing.
         others.append(start)
     summits = (
         Rivals(finest, best.T_camera_lidar, tuple(others)),
@@ -341,7 +341,7 @@ def _number(count: int, share: float) -> int:
 
 def _denser(sight: Sight, depth: MutualInformation, pose: Matrix4, config: CalibrationConfig) -> MutualInformation:
     """The depth witness with about `SEEN_DEPTH_POINTS` in view at `pose` (4, 4); unchanged if at least half as many are
-    in view there already. Some must be."""
+    in view there already. At least one point must be in view there."""
     seen = depth.evaluate(pose).points_in_view
     if 2 * seen >= SEEN_DEPTH_POINTS:
         return depth

@@ -48,7 +48,7 @@ class BetweenPairs:
     """Picks and thins the pairs between, slice by slice: at a given distance in seconds, within a given size."""
 
     def __init__(self, images: ImageReducer, half_view_rad: float) -> None:
-        """`half_view_rad` is the largest angle from the optical axis at which there is a pixel."""
+        """`half_view_rad` is the largest angle from the optical axis at which the image has a pixel."""
         self._images = images
         self._half_view_rad = half_view_rad
         self._open: _Slice | None = None

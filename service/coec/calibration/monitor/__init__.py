@@ -1,1 +1,1 @@
-"""Is what is served still right? One check, its verdict, the change detector, sensor faults."""
+"""Is the served extrinsic still right? One check, its verdict, the change detector, sensor faults."""

@@ -46,8 +46,8 @@ WEAK_SHARE = 0.5
 """A flagged check with faint edges counts half as much as another towards checks being at odds with each other."""
 
 AT_ODDS_AT, MOST_AT_ODDS = 1.5, 3.0
-"""From so many flagged checks in a row that do not add up to a move (that is, from two on) checks are at odds; and the
-most of them that are counted."""
+"""Number of flagged checks in a row from which checks that do not add up to a move are at odds (reached with two), and
+the most that are counted."""
 
 ASTRAY2 = chi2_quantile(0.95, AXES)
 """Squared distance between the rotations that the checks have found and those served. Above it, no move but the served

@@ -36,8 +36,8 @@ class Urgency:
         return self._since_ns is not None
 
     def alarm(self, since_ns: int) -> None:
-        """The pair suspects a move and wants a window of frames since `since_ns`. Its own suspicion goes before what
-        the rig waits for."""
+        """The pair suspects a move and wants a window of frames since `since_ns`. It does not wait for its turn, as
+        pairs do that the rig waits for."""
         if (self._since_ns is None or self._for_rig) and self._tries < TRIES:
             self._want(since_ns, for_rig=False, longer_s=0.0)
             self._tries += 1

@@ -47,8 +47,8 @@ CALM_AT = 0.5
 """Probability that nobody moved, from which looks that grow old count as looks at a right rig."""
 
 NEWEST = 6
-"""Of the last looks of all edges so many, the newest, are tried as the last look before a step: just after a LiDAR is
-knocked, some of its edges show it already, and others were last looked at before."""
+"""How many of the edges' last looks are used, newest first: a step is tried right after each of them, because just
+after a LiDAR is knocked some of its edges show it already, and others were last looked at before."""
 
 AGES_S = (10.0, 16.0, 26.0, 42.0, 68.0, 110.0)
 """How long ago a step is looked for otherwise, at intervals that a robust mean bridges; and beyond these, before all

@@ -339,7 +339,7 @@ def _evidence(sets: Sets, rows: _Rows, pulls: _Pulls) -> tuple[Array, Array]:
 
 
 class _Case(NamedTuple):
-    """Which of the edges of a set are disturbed, and the log evidence (T,) of that."""
+    """Which of the edges that a set touches are disturbed, and the log evidence (T,) of that."""
 
     out: tuple[int, ...]
     log_evidence: Array

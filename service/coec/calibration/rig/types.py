@@ -1,4 +1,4 @@
-"""The rig of a vehicle as a graph: sensors are its nodes, what can be measured between two of them its edges.
+"""The rig of a vehicle as a graph: its nodes are sensors, its edges are what can be measured between two sensors.
 
 An edge `a <- b` measures T_a_b, which maps coordinates of b to those of a; a camera-LiDAR pair is the edge camera <-
 LiDAR. Every sensor has a pose in the rig, T_sensor_rig. A sensor that moves by x (6,) about its own axes has

@@ -1,1 +1,1 @@
-"""How it is maximised: near a start, within tens of degrees, and what cannot be told."""
+"""How the objective is maximised: near a start, within tens of degrees; and what a window cannot determine."""
