@@ -87,8 +87,8 @@ def loosen(
 
     Args:
         edges: of the window, from coarser levels that lead to the sharpest one.
-        window: the window.
-        pose: (4, 4) at which its search ended.
+        window: the window whose assumptions are set free.
+        pose: (4, 4) where its search ended.
         held: the translations (places in ξ) that were taken as known.
         known_m: the standard deviation to which each of them is known.
     """
