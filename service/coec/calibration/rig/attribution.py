@@ -265,8 +265,8 @@ def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, History], 
 
     If it has several pairs, two of them must have been looked at: a single one may have a fault of its own, such as the
     clock of one driver, which another pair would deny. If it has one pair, nothing else tells a small move from a
-    street that bends all looks a little. That pair must then suspect a move by itself, or have stepped farther than such a
-    street bends looks.
+    street that bends all looks a little. That pair must then suspect a move by itself, or have stepped farther than
+    such a street bends looks.
     """
     of_pairs = [histories[edge.name] for edge in graph.edges if name in (edge.a, edge.b)]
     if len(of_pairs) > 1:
