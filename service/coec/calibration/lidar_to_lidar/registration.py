@@ -9,14 +9,21 @@ determines stays where it was, with a wide covariance.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.lidar_to_lidar.spread import covariance_of
 from coec.calibration.lidar_to_lidar.sweeps import Cloud, clouds_of
-from coec.calibration.lidar_to_lidar.types import KNOWN_BEFORE, LEAST_SHARE, LidarEdge, LidarRig, RangeBias, SweepPair
+from coec.calibration.lidar_to_lidar.types import (
+    KNOWN_BEFORE,
+    LEAST_SHARE,
+    LidarEdge,
+    LidarRig,
+    Met,
+    RangeBias,
+    SweepPair,
+)
 from coec.calibration.ports import Neighbourhood, NeighbourSearch
 from coec.calibration.types import Matrix4, Reason
 from coec.geometry import se3
@@ -58,27 +65,6 @@ NOISE_M = 0.02
 themselves."""
 LEAST_POINTS = 500
 """An edge needs at least this many points on surfaces, and at least `LEAST_SHARE` of those tried."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Met:
-    """Points of b on surfaces of a, over all pairs.
-
-    Attributes:
-        residual: (N,) distance from the surface along its normal, metres.
-        jacobian: (N, 8) its derivative by the unknowns.
-        tilt: (N, 2, 6) the same for the error of the normal: its two standard deviations, as derivatives by ξ.
-        pair: (N,) number of the pair of sweeps.
-        place: (N, 3) the points in the frame of a.
-        tried: number of points that were tried.
-    """
-
-    residual: Doubles
-    jacobian: Doubles
-    tilt: Doubles
-    pair: NDArray[np.int64]
-    place: Doubles
-    tried: int
 
 
 def register(rig: LidarRig, pairs: Sequence[SweepPair], search: NeighbourSearch) -> LidarEdge:

@@ -10,17 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import radians
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.confidence.landscape import scatter
+from coec.calibration.lidar_to_lidar.sweeps import Cloud
+from coec.calibration.lidar_to_lidar.types import Met
 from coec.geometry.linear import congruent, eigen, inverted
-
-if TYPE_CHECKING:
-    from coec.calibration.lidar_to_lidar.registration import Met
-    from coec.calibration.lidar_to_lidar.sweeps import Cloud
 
 Doubles = NDArray[np.float64]
 

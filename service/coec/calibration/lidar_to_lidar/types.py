@@ -46,6 +46,27 @@ class SweepPair:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Met:
+    """Points of b on surfaces of a, over all pairs.
+
+    Attributes:
+        residual: (N,) distance from the surface along its normal, metres.
+        jacobian: (N, 8) its derivative by the unknowns.
+        tilt: (N, 2, 6) the same for the error of the normal: its two standard deviations, as derivatives by ξ.
+        pair: (N,) number of the pair of sweeps.
+        place: (N, 3) the points in the frame of a.
+        tried: number of points that were tried.
+    """
+
+    residual: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    tilt: NDArray[np.float64]
+    pair: NDArray[np.int64]
+    place: NDArray[np.float64]
+    tried: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RangeBias:
     """By how much b measures longer than a, metres, with its standard deviation."""
 
