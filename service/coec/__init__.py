@@ -7,22 +7,22 @@
     if result.accepted:
         result.export("calibration.urdf", format="urdf", parent="lidar", child="camera")
 
-`coec.open` gives a `Recording`, its windows are calibrated by `coec.calibrate`, and a `Result` says where the camera
-is, how sure that is, and whether to use it. `coec.client.Vehicle` asks a service that runs. Everything raised on
-purpose is a `CoecError`.
+`coec.open` gives a `Recording`, `coec.calibrate` calibrates its windows, and a `Result` says where the camera is, how
+certain that is, and whether to use it. `coec.client.Vehicle` asks a running service. Every exception that coec raises
+on purpose is a `CoecError`.
 
 Conventions: `T_camera_lidar` (4, 4) maps LiDAR coordinates (x forward, y left, z up) to camera coordinates (x right, y
 down, z forward), metres. Corrections and standard deviations are about and along the camera axes, rotations first.
-Stamps are integer nanoseconds. Radians inside, degrees where a name or a docstring says so.
+Stamps are integer nanoseconds. Angles are in radians, and in degrees where a name or a docstring says so.
 
-Stability: public is what `coec.__all__` and `coec.client.__all__` name, with its attributes that have no underscore
-and are not said to be none of it, and the models of `coec.schemas` that it returns. Within a minor version (0.1.x)
-nothing of that goes away or changes its meaning; arguments and attributes may be added, arguments by name. What is to
-go warns (`DeprecationWarning`, which says what to use instead) for at least one minor version before. Not promised are
-other modules, texts of messages, and the last digits of a result: another version of coec, numba or the network may
-calculate another way, and says so in `config_hash` or its version.
+Stability: the public interface is what `coec.__all__` and `coec.client.__all__` name, with all attributes that have no
+underscore and whose docstring does not exclude them, and the models of `coec.schemas` that they return. Within a minor
+version (0.1.x) none of it is removed or changes its meaning; attributes and keyword arguments may be added. Before
+something is removed, it warns for at least one minor version (a `DeprecationWarning` that says what to use instead).
+There is no promise about other modules, texts of messages, and the last digits of a result: another version of coec,
+numba or the network may calculate differently, and `config_hash` or the version shows it.
 
-To import this costs milliseconds: what calculates is imported when it is first used.
+`import coec` costs milliseconds: the modules that calculate are imported when they are first used.
 """
 
 import os
@@ -79,8 +79,8 @@ __all__ = [
     "open",
 ]
 
-# onnxruntime reports to its vendor over the internet unless it is told not to before it is imported. A vehicle's
-# service speaks to nobody it was not told to.
+# onnxruntime reports to its vendor over the internet unless this is set before it is imported. A vehicle's service
+# connects to nobody but those that it is configured for.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
 _LATER = {
@@ -93,7 +93,7 @@ _LATER = {
     "evaluate": "coec.library.calls",
     "open": "coec.library.recordings",
 }
-"""Where the names are that are imported when they are first used."""
+"""Public names that are imported when they are first used, and the module of each."""
 
 TYPE_CHECKING = False  # as `typing` has it, which takes longer to import than everything here
 if TYPE_CHECKING:
@@ -103,10 +103,10 @@ if TYPE_CHECKING:
     from coec.library.recordings import Description, Recording, open
     from coec.library.results import Result
     from coec.library.windows import Window
-else:  # a checker that saw this would take every misspelt name for one that is there
+else:  # hidden from type checkers: with this function in sight they would accept every misspelt name
 
     def __getattr__(name: str) -> object:
-        """The public names that take long to import, and `client` (PEP 562)."""
+        """Imports `client`, or one of the public names that take long to import (PEP 562)."""
         from importlib import import_module
 
         if name == "client":

@@ -1,4 +1,4 @@
-"""A service that runs, for a program with an event loop.
+"""Asks and commands a running service, from a program with an event loop.
 
     import asyncio
     from coec.client import Vehicle
@@ -11,7 +11,7 @@
 
     asyncio.run(main())
 
-Replies are the pydantic models of `coec.schemas.replies`, as CONTRACT and `schemas/v1` have them.
+Replies are the pydantic models of `coec.schemas.replies`, which CONTRACT and `schemas/v1` describe.
 """
 
 from __future__ import annotations
@@ -61,16 +61,16 @@ from coec.schemas.replies import Acknowledgement, ExtrinsicReply, HealthReply, H
 __all__ = ["Change", "Vehicle"]
 
 WAITING = 1024
-"""Changes that may wait to be taken, some 10 MB; of more the oldest go, and are counted."""
+"""Changes that may wait until the program takes them, some 10 MB. Beyond that the oldest are dropped and counted."""
 
 MAX_MESSAGE_BYTES = 2 * MAX_LENGTH
-"""Of one that is taken in."""
+"""Largest message that the session accepts, bytes."""
 
 MAX_REPLIES = 16
-"""To a question that is put to one service."""
+"""Replies that are kept for one question to one service; further ones are ignored."""
 
 GRACE_S = 1.0
-"""Beyond the time of a question: Zenoh ends it itself, unless its session hangs."""
+"""Waited beyond the timeout of a question, s. Zenoh ends the question at the timeout, unless its session hangs."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -78,9 +78,9 @@ M = TypeVar("M", bound=BaseModel)
 class Vehicle:
     """A running service of one vehicle: questions, commands and changes.
 
-    It is an asynchronous context manager, and what is asked is asked within it. Any number of questions may be under
-    way at once, of one event loop. A task that is cancelled gives its question up at once; a command that was
-    cancelled may have been carried out.
+    It is an asynchronous context manager: ask within its block. Any number of questions may be under way at once, all
+    from one event loop. A task that is cancelled gives up its question at once; the service may have carried out a
+    command all the same.
     """
 
     def __init__(
@@ -92,19 +92,19 @@ class Vehicle:
         settings: str | PathLike[str] | None = None,
         timeout_s: float = 5.0,
     ) -> None:
-        """Nothing is connected yet.
+        """Does not connect yet: entering the `async with` block does.
 
         Args:
-            name: of the vehicle, as its configuration has it.
-            connect: Zenoh endpoints of the router, of which the first that answers is taken; None: those of the file,
-                else `tcp/127.0.0.1:7447`.
-            prefix: of all keys; None: `coec`.
-            settings: file with the Zenoh configuration of the session (JSON5). With a certificate in it, commands are
-                proven with it.
-            timeout_s: for the router to answer, and for each question, unless told otherwise there.
+            name: name of the vehicle in the configuration of its service.
+            connect: Zenoh endpoints of the router; the first that answers is used. None: those of the file, else
+                `tcp/127.0.0.1:7447`.
+            prefix: first part of all keys; None: `coec`.
+            settings: file with the Zenoh configuration of the session (JSON5). If it names a certificate, that
+                certificate proves the commands.
+            timeout_s: how long to wait for the router, and for each answer unless the call says otherwise.
 
         Raises:
-            UsageError: the name or the prefix makes no key, or `timeout_s` is no time.
+            UsageError: the name or the prefix cannot be part of a key, or `timeout_s` is not positive and finite.
             ConfigError: the file cannot be used.
         """
         fields = Config.model_fields
@@ -128,7 +128,7 @@ class Vehicle:
         """Connects.
 
         Raises:
-            ConnectionFailedError: no router answered within `timeout_s`.
+            ConnectionFailedError: no router has answered within `timeout_s`.
             UsageError: an endpoint is malformed.
         """
         if self._connection is not None:
@@ -149,7 +149,7 @@ class Vehicle:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Disconnects: whoever iterates over `changes` comes to the end."""
+        """Disconnects: every loop over `changes` ends."""
         connection, self._connection, self._open = self._connection, None, None
         for waiting in tuple(self._listeners):
             waiting.end()
@@ -158,7 +158,7 @@ class Vehicle:
             await asyncio.shield(closing)
 
     async def pairs(self) -> tuple[str, ...]:
-        """Names of the pairs that are served.
+        """Names of the pairs that the vehicle serves.
 
         Raises:
             NotFoundError, RemoteError: as `extrinsic`.
@@ -166,7 +166,7 @@ class Vehicle:
         return tuple(pair.name for pair in (await self.status()).pairs)
 
     async def status(self, *, timeout_s: float | None = None) -> StatusReply:
-        """Of the service: its worker, storage, and the counters of each pair.
+        """State of the service: its worker, its storage, and the counters of each pair.
 
         Raises:
             NotFoundError, RemoteError: as `extrinsic`.
@@ -174,22 +174,23 @@ class Vehicle:
         return await self._reply(StatusReply, self._keys.status, timeout_s)
 
     async def extrinsic(self, pair: str | None = None, *, timeout_s: float | None = None) -> ExtrinsicReply:
-        """The calibration to use now. There is one before the first result: the nominal one.
+        """The calibration to use now. Before the first result this is the nominal one.
 
         Args:
-            pair: which; None: the vehicle's only one.
-            timeout_s: for the answer; None: as the vehicle was made.
+            pair: name of the pair; None: the only pair of the vehicle.
+            timeout_s: how long to wait for the answer; None: as given to `Vehicle`.
 
         Raises:
-            UsageError: no such name, or there are several pairs to choose from; or the vehicle is not connected.
-            NotFoundError: nobody answered: the vehicle is not there, or the router's rules do not allow it.
-            RemoteError: the service refuses; `reply_code` is its code, `timeout` where it did not answer in time.
-            DecodeError: what came is no such reply.
+            UsageError: the name cannot be part of a key, `pair` is None and the vehicle does not serve exactly one
+                pair, or the vehicle is not connected.
+            NotFoundError: nobody answered: the vehicle is not there, or the router's rules do not allow the question.
+            RemoteError: the service refuses; `reply_code` is its code, or `timeout` if it did not answer in time.
+            DecodeError: the reply is not one of the expected kind.
         """
         return await self._reply(ExtrinsicReply, self._keys.extrinsic(await self._pair(pair)), timeout_s)
 
     async def health(self, pair: str | None = None, *, timeout_s: float | None = None) -> HealthReply:
-        """Whether the calibration is right, and how that is known. Arguments and errors as `extrinsic`."""
+        """Whether the calibration is still right, and on which evidence. Arguments and errors as `extrinsic`."""
         return await self._reply(HealthReply, self._keys.health(await self._pair(pair)), timeout_s)
 
     async def windows(self, pair: str | None = None, *, timeout_s: float | None = None) -> WindowsReply:
@@ -199,7 +200,7 @@ class Vehicle:
     async def history(
         self, pair: str | None = None, *, limit: int = 100, timeout_s: float | None = None
     ) -> HistoryReply:
-        """Past results and what else happened, oldest first: the newest `limit` of them. Arguments and errors as
+        """Past results and other events: the newest `limit` of them, oldest first. Arguments and errors as
         `extrinsic`."""
         key = self._keys.history(await self._pair(pair))
         return await self._reply(HistoryReply, f"{key}?limit={limit}", timeout_s)
@@ -212,17 +213,18 @@ class Vehicle:
         *,
         timeout_s: float | None = None,
     ) -> Acknowledgement:
-        """Gives a command, and waits for its acknowledgement, which says whether it is carried out, and why not.
+        """Gives a command and waits for the acknowledgement, which says whether the service carries it out, or why not.
 
         Args:
             name: `calibrate`, `apply`, `rollback`, `reset`, `commission` or `hold`.
-            pair: which; None: the vehicle's only one.
-            payload: arguments of the command, as JSON takes them.
-            timeout_s: for the acknowledgement; what the service could not begin by then is not done.
+            pair: name of the pair; None: the only pair of the vehicle.
+            payload: arguments of the command; JSON must be able to hold them.
+            timeout_s: how long to wait for the acknowledgement. The service does not carry out a command that it could
+                not begin by then.
 
         Raises:
-            UsageError: no such command, or a payload that is no JSON; else as `extrinsic`.
-            NotProvenError: whoever answered is not the service (with a certificate).
+            UsageError: no such command, or a payload that JSON cannot hold; else as `extrinsic`.
+            NotProvenError: with a certificate: the one who answered is not the service.
             NotFoundError, RemoteError, DecodeError: as `extrinsic`.
         """
         if name not in NAMES:
@@ -244,17 +246,17 @@ class Vehicle:
         return from_msgpack(Acknowledgement, reply.payload)
 
     async def changes(self, pair: str | None = None) -> AsyncGenerator[Change]:
-        """What is so now (`extrinsic`, `health`, `alive` of each pair), then every change as it comes, until the loop
-        over it ends or the vehicle is disconnected. A vehicle that is not there says nothing until it comes; one that
-        goes says `alive` False, and is heard again when it is back.
+        """Yields the present state (`extrinsic`, `health`, `alive` of each pair), then every change as it comes, until
+        the loop over it ends or the vehicle is disconnected. From an absent vehicle nothing comes until it appears. For
+        one that goes away, `alive` False comes, and its changes come again when it is back.
 
-        At most 1024 changes wait; of more the oldest are left out, and `Change.lost` of the next one counts them.
+        At most 1024 changes wait. Beyond that the oldest are dropped, and `Change.lost` of the next one counts them.
 
         Args:
-            pair: which; None: all of them.
+            pair: name of the pair; None: all pairs.
 
         Raises:
-            UsageError: no such name, or the vehicle is not connected.
+            UsageError: the name cannot be part of a key, or the vehicle is not connected.
         """
         if pair is not None:
             single_key(pair)
@@ -329,7 +331,7 @@ class Vehicle:
 
 
 class _Waiting:
-    """Changes between Zenoh's threads and one loop."""
+    """Queue of changes from Zenoh's threads to one event loop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
@@ -341,29 +343,29 @@ class _Waiting:
         self._ended = False
 
     def take(self, change: Change) -> None:
-        """On any thread."""
+        """Queues a change; called on any thread."""
         with self._lock:
             if len(self._changes) >= WAITING:
                 self._changes.popleft()
                 self._lost += 1
             self._changes.append(change)
             wakes, self._wakes = self._wakes, True
-        if not wakes:  # one call waits for a loop that is busy, not one for each change
+        if not wakes:  # while the loop is busy a single wake-up waits for it, not one for each change
             with suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._wake)
 
     def refuse(self) -> None:
-        """On any thread."""
+        """Counts a message that was no valid change; called on any thread."""
         with self._lock:
             self._lost += 1
 
     def end(self) -> None:
-        """On the loop: nothing comes any more."""
+        """No more changes come; called on the loop."""
         self._ended = True
         self._woken.set()
 
     async def next(self) -> Change | None:
-        """The next one; None: there is none any more."""
+        """The next change; None: no more come."""
         while True:
             self._woken.clear()
             with self._lock:
@@ -381,7 +383,7 @@ class _Waiting:
 
 
 def _abandon(opening: asyncio.Future[zenoh.Session], connection: AbstractContextManager[zenoh.Session]) -> None:
-    """What was opened when nobody waited for it any more is closed again."""
+    """Closes a connection that came up after its caller had been cancelled."""
     if not opening.cancelled() and opening.exception() is None:
         threading.Thread(target=connection.__exit__, args=(None, None, None), daemon=True).start()
 

@@ -1,4 +1,4 @@
-"""The flow of a calibration for whoever calls it: a program that imports coec, and the command line.
+"""The flow of a calibration for its two callers: a program that imports coec, and the command line.
 
-What others may rely on is what `coec` itself names (`coec.__all__`); the modules here may change.
+Programs may rely on what `coec` itself names (`coec.__all__`); the modules here may change.
 """

@@ -1,4 +1,4 @@
-"""From a window that was loaded to its result: the flow on one page."""
+"""From a loaded window to its result: the whole flow on one page."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Calibrated:
     """A result, and what it rests on.
 
     Attributes:
-        window: as it was solved: its start moved, its camera fitted, where that was asked for.
+        window: the window as it was solved: with its start moved and its camera fitted where that was asked for.
         estimate: see `calibration.types`.
-        result: the same on the wire.
-        configuration: that decided it.
-        fit: of the camera model; None where the recording's own was used.
-        offset: of the camera's clock; None where it was not asked for.
+        result: the estimate as a document of the wire contract.
+        configuration: the settings that decided the result.
+        fit: how well the fitted camera model fits; None where the recording's own model was used.
+        offset: offset of the camera's clock; None where it was not asked for.
     """
 
     window: Window
@@ -51,15 +51,16 @@ def calibrated(
     camera_model: str | None = None,
     time_offset: bool = False,
 ) -> Calibrated:
-    """The result of a window.
+    """Calibrates a window.
 
     Args:
-        loaded: the window, with the configuration that it was recorded with.
-        choices: what differs from that.
-        progress: hears of the stages `prepare`, those of the calibration, and `time offset`.
-        perturbation: ξ (6,), radians and metres about the camera axes, by which the start is moved; None: it is not.
-        camera_model: fitted to the recording's camera, and used instead; None: the recording's own.
-        time_offset: estimate the offset of the camera's clock, too.
+        loaded: the window, with the configuration that was recorded with it.
+        choices: what the caller chose otherwise.
+        progress: is called for the stages `prepare`, those of the calibration, and `time offset`.
+        perturbation: ξ (6,), radians and metres about the camera axes, by which the start is moved; None: it is not
+            moved.
+        camera_model: a model that is fitted to the recording's camera and used in its place; None: the recording's own.
+        time_offset: also estimate the offset of the camera's clock.
 
     Raises:
         UsageError: a value that does not exist.

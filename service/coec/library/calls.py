@@ -1,4 +1,4 @@
-"""What a program that imports coec asks for."""
+"""The functions that a program calls which imports coec."""
 
 from __future__ import annotations
 
@@ -29,31 +29,32 @@ def calibrate(
     configuration: CalibrationConfig | None = None,
     progress: Progress | None = None,
 ) -> Result:
-    """Finds where the camera is to the LiDAR, and judges what it found. The same window, network and configuration give
-    the same result, to the byte, and the one that `coec calibrate` prints. Whether to use it, `Result.accepted` says:
-    a negative verdict is a result, and no error.
+    """Finds the pose of the camera against the LiDAR, and judges the result. The same window, network and configuration
+    give the same result, to the byte; `coec calibrate` prints the same one. `Result.accepted` says whether to use it:
+    a negative verdict is a result, not an error.
 
     Args:
-        window: what is calibrated from; of a recording, its window of 25 frames.
-        depth: an ONNX file, the name of a built-in network, or `stereo`: the maps of the recording. None: what a
+        window: the frames to calibrate from; a recording stands for its window of 25 frames.
+        depth: an ONNX file, the name of a built-in network, or `stereo`: the depth maps of the recording. None: what a
             recorded window names, else the network that comes with coec.
-        objective: what is maximised: `fused` (edges and depth), `mi` (the paper's), `intensity`. None: as recorded,
-            else `fused`.
+        objective: what the search maximises: `fused` (edges and depth), `mi` (the paper's), `intensity`. None: as
+            recorded, else `fused`.
         dof: 3, rotation only, or 6, translation too. None: as recorded, else 3.
-        perturb: (3,) degrees about, or (6,) degrees about and metres along the camera axes, by which the start is moved
-            from the recording's calibration: exp(perturb)·T.
-        motion_compensation: False takes the sweeps as they were recorded.
-        camera_model: `double_sphere` is fitted to the recording's camera, and used instead. None: the recording's own.
-        time_offset: also estimate how far the camera's clock is off, if turns show it.
-        configuration: all that decides a result, instead of what was recorded and the defaults; what is given besides
-            comes first.
-        progress: is called with (stage, parts done, parts of all) while it goes on; 0 where that is not known.
+        perturb: moves the start away from the recording's calibration: exp(perturb)·T. (3,) degrees about the camera
+            axes, or (6,) degrees about and metres along them.
+        motion_compensation: False: the sweeps are used as they were recorded.
+        camera_model: `double_sphere`: this model is fitted to the recording's camera and used in its place. None: the
+            recording's own.
+        time_offset: also estimate how far the camera's clock is off, if the vehicle's turns show it.
+        configuration: all settings that decide a result, in place of the recorded ones and the defaults. The other
+            arguments override it.
+        progress: is called with (stage, parts done, number of parts) on the way; the number is 0 while it is unknown.
 
     Raises:
         UsageError: a value that does not exist.
         SourceError, WindowError: the recording cannot be read.
         ModelError: the depth network is missing, corrupt, or does not match its card.
-        CalibrationError: there is no result at all: no pairs, no depth, or no point that can come into view.
+        CalibrationError: there is no result at all: no pairs, no depth, or no point that any pose brings into view.
 
     Example:
         >>> import coec
@@ -93,16 +94,19 @@ def evaluate(
     camera_model: str | None = None,
     progress: Progress | None = None,
 ) -> EvaluationReport:
-    """Solves from many starts all around the recording's own calibration: how often it is found again, how exactly, and
-    how good the verdicts are. `coec evaluate` prints the same report, and knows further experiments.
+    """Solves from many starts all around the recording's own calibration. The report says how often that calibration is
+    found again, how exactly, and how good the verdicts are. `coec evaluate` prints the same report and has further
+    experiments.
 
     Args:
-        window: what is solved; of a recording, its window of 25 frames.
+        window: the frames to solve with; a recording stands for its window of 25 frames.
         rotation_deg: radius of the sphere of starts, degrees.
-        translation_m: the same, metres; above 0 six degrees of freedom are searched unless `dof` says otherwise.
+        translation_m: the same for the translation, metres. Above 0, six degrees of freedom are searched unless `dof`
+            says otherwise.
         directions: number of starts, spread evenly (a Fibonacci sphere).
-        halves: also split the frames so often at random into disjoint halves, and compare their results.
-        detection: also say how well moved extrinsics are seen, over so many splits of the frames.
+        halves: also compare the results of disjoint halves of the frames, over this many random splits; 0: do not.
+        detection: also measure how well checks detect a moved extrinsic, over this many splits of the frames; 0: do
+            not.
         depth: as `calibrate`.
         objective: as `calibrate`.
         dof: as `calibrate`.
@@ -115,8 +119,8 @@ def evaluate(
         `classified_correctly` and more, each explained in `schemas/v1/EvaluationReport.json`.
 
     Raises:
-        UsageError: a value that does not exist, or starts too far for any search box.
-        CalibrationError: there is no result even from the recording's calibration.
+        UsageError: a value that does not exist, or starts farther away than any search box reaches.
+        CalibrationError: there is no result even when the search starts from the recording's calibration.
         SourceError, WindowError, ModelError: as `calibrate`.
         KeyboardInterrupt: on Ctrl-C.
     """

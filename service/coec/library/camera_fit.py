@@ -1,4 +1,4 @@
-"""Another camera model in place of the one that a recording came with."""
+"""Replaces the camera model of a recording by one that is fitted to it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from coec.geometry.cameras import name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 
 FITTED = "double_sphere"
-"""The one model that can be fitted to the others."""
+"""The only model that can be fitted to another one."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFit:
-    """What a fitted camera model misses of the one it stands for, pixels. `coverage`: share of the source's pixels."""
+    """How far the fitted camera model `model` is off the original `of`, pixels. `coverage`: share of the original's
+    pixels that the fit covers."""
 
     model: str
     of: str
@@ -27,11 +28,11 @@ class CameraFit:
 
 
 def refitted(window: Window, model: str) -> tuple[Window, CameraFit]:
-    """The window seen through another camera model that was fitted to its own.
+    """The window with another camera model, which is fitted to the window's own.
 
     Raises:
-        UsageError: no model that can be fitted.
-        LensError: it does not fit the lens.
+        UsageError: `model` cannot be fitted.
+        LensError: the model does not fit the lens.
     """
     if model != FITTED:
         raise UsageError(f"camera model {model}: only {FITTED} can be fitted")

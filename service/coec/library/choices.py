@@ -1,4 +1,4 @@
-"""What a caller may choose of how a recording is calibrated."""
+"""The settings of a calibration that a caller may choose."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Options(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """None leaves a value as it was recorded, else at its default.
+    """What the caller chose. None: the recorded value, else the default.
 
     Attributes:
-        depth: an ONNX file, the name of a built-in network, or `stereo`: the maps of the source.
-        objective: what is maximised: `fused`, `mi` or `intensity`.
-        dof: degrees of freedom that are searched: 3, rotation only, or 6, translation too.
+        depth: an ONNX file, the name of a built-in network, or `stereo`: the depth maps of the source.
+        objective: what the search maximises: `fused`, `mi` or `intensity`.
+        dof: degrees of freedom of the search: 3, rotation only, or 6, translation too.
         motion_compensation: whether sweeps are compensated for the motion of the vehicle.
     """
 
@@ -57,7 +57,7 @@ class Choices:
 
 
 def configuration_of(choices: Choices, recorded: CalibrationConfig | None) -> CalibrationConfig:
-    """The recorded configuration, or the defaults, with what was chosen.
+    """The recorded configuration, else the defaults, overridden by the choices.
 
     Raises:
         UsageError: a value that does not exist.

@@ -44,26 +44,26 @@ from coec.sources.recording import KnowsTruth
 
 MARGIN_DEG, MARGIN_M = 5.0, 0.2
 REACH_MARGIN_DEG, REACH_MARGIN_M = 3.0, 0.15
-"""How far the search box reaches beyond the starts at least, so that the reference never lies on its bound and a search
-may overshoot."""
+"""How far the search box (`MARGIN`) and the reach of the global search (`REACH_MARGIN`) extend beyond the starts at
+least, so that the reference never lies on a bound and a search may overshoot."""
 
 SIMULATED_TRUTH, OWN_CALIBRATION = "the simulated truth", "the source's own calibration"
 OTHER_HALF = "the other half of the frames"
-"""What normalised errors are counted from."""
+"""The references from which normalised errors are counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is tried. 0 and False: not.
+    """Which experiments run. 0 and False leave one out.
 
     Attributes:
         rotation_deg, translation_m: radii of the spheres of starts.
         directions: number of starts.
-        against_frames, against_slice: windows of fewer frames, and slices of the recording, too.
-        halves: random splits of the frames into disjoint halves.
-        nees: windows whose errors are held against what they claim, one after the other.
-        detection: splits over which moved extrinsics are to be seen.
-        steps: knocks of each kind.
+        against_frames, against_slice: also solve windows of fewer frames, and slices of the recording.
+        halves: number of random splits of the frames into disjoint halves.
+        nees: number of consecutive windows whose errors are compared with the uncertainty that they claim.
+        detection: number of splits over which it is measured how well moved extrinsics are detected.
+        steps: number of knocks of each kind.
     """
 
     rotation_deg: float
@@ -79,8 +79,8 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """What is evaluated: the window and its depth (`model` infers that of other frames, `depth` remembers), of so many
-    camera frames of a source (None: as many as usual)."""
+    """What is evaluated: a window of at most `frames` camera frames of a source (None: the usual number) and its depth.
+    `depth` returns the maps that were inferred for the window; `model` infers those of other frames."""
 
     source: str
     frames: int | None
@@ -94,7 +94,7 @@ class Subject:
 
 @dataclass(slots=True, eq=False)
 class Experiments:
-    """What has come of the experiments that were asked for. `interrupted`: not of all of them."""
+    """Outcomes of the experiments that were asked for. `interrupted`: some are missing."""
 
     from_reference: Outcome
     outcomes: list[Outcome] = field(default_factory=list)
@@ -108,11 +108,11 @@ class Experiments:
 
 
 def configuration_of(plan: Plan, chosen: Choices, recorded: CalibrationConfig | None) -> CalibrationConfig:
-    """As for `coec calibrate`, with a search box that holds the starts; a translated start is searched in six degrees
-    of freedom unless told otherwise.
+    """The configuration as for `coec calibrate`, with a search box that contains the starts. If the starts are moved in
+    translation, six degrees of freedom are searched unless `chosen` says otherwise.
 
     Raises:
-        UsageError: a value that does not exist, or starts too far for any search box.
+        UsageError: a value that does not exist, or starts farther away than any search box reaches.
     """
     dof = 6 if chosen.dof is None and plan.translation_m > 0 else chosen.dof
     configuration = choices.configuration_of(replace(chosen, dof=dof), recorded)
@@ -120,7 +120,7 @@ def configuration_of(plan: Plan, chosen: Choices, recorded: CalibrationConfig | 
     search = values["search"]
     search["rotation_deg"] = max(search["rotation_deg"], plan.rotation_deg + MARGIN_DEG)
     search["translation_m"] = max(search["translation_m"], plan.translation_m + MARGIN_M)
-    # The protocol tells how far away the starts are; the global stage looks no further.
+    # The experiment knows how far away its starts are, so the global search looks no farther.
     search["reach_deg"] = plan.rotation_deg + REACH_MARGIN_DEG
     search["reach_m"] = plan.translation_m + REACH_MARGIN_M
     try:
@@ -140,18 +140,18 @@ def subject_of(
     camera_model: str | None,
     stages: Stages,
 ) -> Subject:
-    """A window that was loaded, with its depth. What it is too short for is refused before anything is inferred.
+    """A loaded window with its depth. A plan for which the window is too short is refused before any depth is inferred.
 
     Raises:
         UsageError: a value that does not exist.
-        CalibrationError: detection is asked for and the pairs are too few, or a frame has no depth.
+        CalibrationError: there are too few pairs for the detection that the plan asks for, or a frame has no depth.
     """
     window = loaded.window
     if plan.detection:
         require_enough(len(window.pairs))
     if camera_model is not None:
         window, _ = refitted(window, camera_model)
-    if plan.steps and loaded.configuration is None:  # a recorded window has what was recorded
+    if plan.steps and loaded.configuration is None:  # a recorded window brings the pairs between its own
         window = with_between(window, open_source(source), WindowConfig())
     model = open_depth(configuration_of(plan, chosen, loaded.configuration).depth, LimitsConfig())
     depth = experiments.inferred(window, model, stages.begin("depth", len(window.pairs)))
@@ -169,10 +169,12 @@ def bench_of(subject: Subject, plan: Plan, chosen: Choices) -> Bench:
 
 
 def tried(subject: Subject, plan: Plan, bench: Bench, stages: Stages) -> Experiments:
-    """Every experiment that was asked for; or after Ctrl-C those that were finished, if at least one start was.
+    """Runs every experiment of the plan. After Ctrl-C it returns those that were finished, unless not even one start
+    was.
 
     Raises:
-        CalibrationError: there is no result even from the source's calibration.
+        CalibrationError: there is no result even when the search starts from the source's calibration.
+        KeyboardInterrupt: on Ctrl-C before the first start was finished.
     """
     poses = experiments.poses_of(bench, plan.directions, plan.rotation_deg, plan.translation_m)
     done = Experiments(experiments.from_reference(bench, stages))
@@ -193,7 +195,7 @@ def _try_further(
     def cut(begin_s: float, end_s: float) -> Window:
         between_s = (begin_s, end_s)
         loaded = windows.load(subject.source, subject.frames, WindowConfig().pairs, lambda *_: None, between_s)
-        # With the rig of the whole: it may have another camera model.
+        # The rig of the whole window stays, because its camera model may have been replaced.
         return replace(loaded.window, rig=subject.window.rig)
 
     if plan.against_frames:
@@ -222,8 +224,8 @@ def _try_further(
 
 
 def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
-    """What the errors of windows are counted from, and its name: the truth where the source knows it, else its own
-    calibration."""
+    """The reference for the errors of windows, as a name and a pose by stamp: the truth where the source knows it, else
+    its own calibration."""
     recording = open_source(source)
     if isinstance(recording, KnowsTruth):
         return SIMULATED_TRUTH, recording.truth
@@ -236,7 +238,7 @@ def report_of(
     """The document of an evaluation.
 
     Raises:
-        CalibrationError: there is no estimate from the source's calibration.
+        CalibrationError: there is no estimate even when the search starts from the source's calibration.
     """
     summary = statistics.summarise(done.outcomes)
     search = bench.configuration.search

@@ -1,4 +1,4 @@
-"""A calibration in the files of other programs: what may be written, and what is to stand in them."""
+"""Export of a calibration into the files of other programs: whether it may be written, and the new text of the file."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from coec.errors import NotAcceptedError, SourceError, UsageError
 from coec.sources.reading import read_bytes
 
 MAX_BYTES = 64 * 2**20
-"""Of a file that is read, or of another program's that is changed: a robot's URDF has below one million."""
+"""Largest file that is read or changed, bytes. A robot's URDF has less than one million."""
 
 
 def accepted(extrinsic: Extrinsic, name: str, way: str, *, force: bool) -> None:
-    """Nothing, where the extrinsic may be written; `name` is what people call it, `way` how they insist.
+    """Returns if the extrinsic may be written. `name` (of the calibration) and `way` (the option that forces the
+    export) appear in the error message.
 
     Raises:
-        NotAcceptedError: its verdict speaks against it, and nobody insists.
+        NotAcceptedError: its verdict is negative, and `force` is False.
     """
     if extrinsic.origin.objections and not force:
         raise NotAcceptedError(
@@ -27,29 +28,30 @@ def accepted(extrinsic: Extrinsic, name: str, way: str, *, force: bool) -> None:
 
 
 def text_of(extrinsic: Extrinsic, form: str, path: Path | None) -> str:
-    """What the file shall hold; what it holds already stays where the format has room for it. None: there is no file.
+    """The new text of the file `path` (None: there is none). Its present content stays where the format has room for
+    it.
 
     Raises:
         UsageError: no such format.
-        SourceError: the file that is there cannot be read, or is no text.
-        OutputError: what it holds cannot be changed.
+        SourceError: the present file cannot be read, or is not text.
+        OutputError: the present content cannot be changed.
     """
     known(form)
     return FORMATS[form].text(extrinsic, None if path is None else _held(path))
 
 
 def known(form: str) -> None:
-    """Nothing, where there is such a format.
+    """Returns if the format exists.
 
     Raises:
-        UsageError: there is none; says which there are.
+        UsageError: there is no such format; the message lists those that exist.
     """
     if form not in FORMATS:
         raise UsageError(f"format {form}: known are {', '.join(FORMATS)}")
 
 
 def _held(path: Path) -> str | None:
-    """What is in the file that is to be changed; None where there is none."""
+    """Text of the file that is to be changed; None where there is no file."""
     if not path.exists():
         return None
     try:

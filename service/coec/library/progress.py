@@ -1,4 +1,4 @@
-"""How a caller hears how far a long call has come."""
+"""How a long call reports its progress to the caller."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rich.progress import Progress as Bars
 from coec.evaluation.experiments import Stages
 
 Progress = Callable[[str, int, int], None]
-"""Is told the name of a stage, how many of its parts are done, and of how many; 0 where that is not known."""
+"""Called with the name of a stage, how many of its parts are done, and how many it has (0: unknown)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A function, where the flow expects a listener."""
+    """Adapts the caller's function to `calibration.ports.Progress`, which the flow calls. None: nobody listens."""
 
     progress: Progress | None
 
@@ -26,7 +26,7 @@ class Told:
 
 
 class ToldStages(Stages):
-    """The stages of an evaluation, told to a function instead of drawn."""
+    """The stages of an evaluation, reported to a function instead of drawn."""
 
     def __init__(self, progress: Progress | None) -> None:
         super().__init__(Bars(disable=True))

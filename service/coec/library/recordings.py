@@ -36,8 +36,8 @@ def open(source: str | PathLike[str]) -> Recording:
             `dataset.yaml`, `kitti360:ROOT?camera=image_00`, `kitti-raw:ROOT?...`, `sim:seed=1&seconds=60`.
 
     Raises:
-        UsageError: it does not fit the grammar, or its query has an unknown key; says which there are.
-        SourceError: the recording is absent, incomplete or not in the layout its name promises.
+        UsageError: `source` does not fit the grammar, or its query has an unknown key; the message lists those known.
+        SourceError: the recording is absent, incomplete or not in the layout that its name promises.
         WindowError: a recorded window that is damaged.
 
     Example:
@@ -55,17 +55,17 @@ def open(source: str | PathLike[str]) -> Recording:
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What a recording holds, as far as it is known without loading its frames. `str()` makes lines for people of it.
+    """What a recording holds, as far as it is known without loading its frames. `str()` makes lines to print of it.
 
     Attributes:
         name: layout, drive, camera.
         pair: name of the camera-LiDAR pair.
         seconds: from the first camera frame to the last.
-        camera, lidar, motion: frames, rate (Hz, of the median interval) and longest gap (s) of the streams; `motion`
-            is None where there is no ego-motion, and sweeps are not compensated then.
+        camera, lidar, motion: number of frames, rate (Hz, of the median interval) and longest gap (s) of each stream.
+            `motion` is None where the recording has no ego-motion; its sweeps are then not compensated.
         camera_model: one of `pinhole, radtan, rational, kannala_brandt, mei, eucm, double_sphere`.
         intrinsics: its parameters by name, with `width` and `height`; pixels where they have a unit.
-        camera_frame, lidar_frame: names of the frames.
+        camera_frame, lidar_frame: names of the coordinate frames.
     """
 
     name: str
@@ -105,18 +105,18 @@ class Recording:
 
     @property
     def source(self) -> str:
-        """As it was given to `coec.open`."""
+        """The recording, as it was given to `coec.open`."""
         return self._source
 
     @property
     def name(self) -> str:
-        """For people: layout, drive, camera."""
+        """Layout, drive and camera, for people to read."""
         return self._opened.name
 
     @property
     def T_camera_lidar(self) -> NDArray[np.float64]:
         """(4, 4) the calibration that came with the recording, metres: maps LiDAR coordinates (x forward, y left, z up)
-        to camera coordinates (x right, y down, z forward). Corrections are counted from it."""
+        to camera coordinates (x right, y down, z forward). A `correction` is relative to it."""
         return self._opened.rig.T_camera_lidar_nominal.copy()
 
     @property
@@ -152,7 +152,7 @@ class Recording:
         )
 
     def truth(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """(4, 4) true T_camera_lidar at a time, where it is known beyond doubt (the drive was simulated); else None."""
+        """(4, 4) true T_camera_lidar at a time, if the drive was simulated; else None."""
         return self._opened.truth(stamp_ns) if isinstance(self._opened, KnowsTruth) else None
 
     def window(
@@ -162,17 +162,18 @@ class Recording:
         between_s: tuple[float, float] | None = None,
         progress: Progress | None = None,
     ) -> Window:
-        """One window: camera frames, evenly chosen, each with the sweep nearest to it.
+        """Cuts one window: evenly chosen camera frames, each with the sweep nearest to it in time.
 
         Args:
             frames: how many camera frames at most; None: 25, or all that a recorded window has.
-            between_s: only frames that were taken so many seconds after the first one, (begin, end), both included.
-            progress: hears of the stage `load`.
+            between_s: (begin, end), seconds after the first frame of the recording; only frames between them are used,
+                both ends included. None: the whole recording.
+            progress: is called for the stage `load`.
 
         Raises:
             UsageError: `frames` is below 1, or `between_s` is no interval.
-            SourceError: a file cannot be read; no camera frame found a sweep.
-            WindowError: a recorded window that is damaged.
+            SourceError: a file cannot be read, or no camera frame has a sweep near enough.
+            WindowError: a recorded window is damaged.
         """
         if frames is not None and frames < 1:
             raise UsageError(f"frames={frames}: a window has at least one")
@@ -187,13 +188,14 @@ class Recording:
         usual = WindowConfig().pairs
         if self.configuration is None:
             loaded = windows.chosen_from(self._opened, frames or usual, heard, (begin_s, end_s))
-        else:  # a recorded window is taken as it was recorded, not paired again
+        else:  # a recorded window keeps its pairs
             loaded = windows.load(self._source, frames, usual, heard, (begin_s, end_s))
         return Window(self._source, frames, loaded)
 
     def windows(self, *, seconds: float = 60.0, frames: int | None = None) -> Iterator[Window]:
-        """Windows one after the other, each of so many seconds; the last one takes what is left, from half to one and
-        a half of them. Each is loaded when it is asked for. A slice in which no camera frame has a sweep is left out.
+        """Cuts the recording into consecutive windows of `seconds` each. The last one takes the rest, which is half to
+        one and a half times as long. A window is loaded when the loop comes to it. A slice in which no camera frame has
+        a sweep is left out.
 
         Raises:
             UsageError: `seconds` is not above 0, or `frames` is below 1.
@@ -203,13 +205,13 @@ class Recording:
             raise UsageError(f"seconds={seconds:g}: a window takes more than none, and not for ever")
         count = max(1, round(self.seconds / seconds))
         for index in range(count):
-            # Both ends count: what lies on a border belongs to the window that begins there.
+            # `window` includes both ends; a frame on the border belongs to the window that begins there.
             end_s = inf if index == count - 1 else float(np.nextafter((index + 1) * seconds, 0.0))
             with suppress(NoPairsError):
                 yield self.window(frames=frames, between_s=(index * seconds, end_s))
 
     def calibrate(self, *, frames: int | None = None, **options: Unpack[Options]) -> Result:
-        """The result of the recording's window, which has at most so many camera frames (None: 25).
+        """Calibrates the recording's window of at most `frames` camera frames (None: 25).
 
         Args:
             frames: as `window`.

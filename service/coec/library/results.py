@@ -1,4 +1,4 @@
-"""What a calibration says, and what is done with it, for a program that imports coec."""
+"""The result of a calibration, and its export, for a program that imports coec."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from coec.schemas.base import to_json
 from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Verdict
 
 Pose = Literal["result", "start", "nominal"]
-"""At which of its poses a window is drawn."""
+"""The poses at which a window can be drawn."""
 
 
 class Result:
-    """What one window says of where the camera is. Arrays are copies: to change one changes nothing else."""
+    """Where the camera is, according to one window. Arrays are copies, so changing one does not change the result."""
 
     def __init__(self, calibrated: Calibrated) -> None:
         self._calibrated = calibrated
@@ -41,7 +41,7 @@ class Result:
 
     @property
     def document(self) -> CalibrationResult:
-        """Everything, as a pydantic model: what `coec calibrate --json` prints, but for how long it took."""
+        """The whole result as a pydantic model: what `coec calibrate --json` prints, except how long it took."""
         return self._document
 
     @property
@@ -62,49 +62,49 @@ class Result:
 
     @property
     def correction(self) -> NDArray[np.float64]:
-        """(6,) rx ry rz (degrees) and tx ty tz (metres) from the recording's own calibration, about and along the
-        camera axes: T_camera_lidar = exp(correction)·T_nominal."""
+        """(6,) rx ry rz (degrees) and tx ty tz (metres), about and along the camera axes, by which the result differs
+        from the recording's own calibration: T_camera_lidar = exp(correction)·T_nominal."""
         return np.array(self.document.correction)
 
     @property
     def sigma(self) -> NDArray[np.float64]:
-        """(6,) standard deviations of the same, degrees and metres; NaN where an axis was not estimated."""
+        """(6,) standard deviations of `correction`, degrees and metres; NaN where an axis was not estimated."""
         return np.array([np.nan if value is None else value for value in self.document.sigma])
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """(6, 6) of the error about and along the camera axes, radians and metres: the true transform is
+        """(6, 6) covariance of the error about and along the camera axes, radians and metres: the true transform is
         exp(error)·T_camera_lidar. NaN where an axis was not estimated."""
         return self._calibrated.estimate.uncertainty.covariance.copy()
 
     @property
     def accepted(self) -> bool:
-        """Whether the self-diagnosis stands by the result."""
+        """Whether the self-diagnosis accepts the result."""
         return self.document.verdict.decision == "accepted"
 
     @property
     def verdict(self) -> Verdict:
-        """The decision (`accepted` or `failed`), and the reasons."""
+        """The decision (`accepted` or `failed`) and its reasons."""
         return self.document.verdict
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Why it is not accepted: machine-readable codes, and a sentence each; empty where it is."""
+        """Why the result is not accepted: machine-readable codes with a sentence each. Empty if it is accepted."""
         return self.document.verdict.reasons
 
     @property
     def figures(self) -> dict[str, MetricReply]:
-        """The figures of the self-diagnosis by name, each with its limit and whether it keeps it."""
+        """The figures of the self-diagnosis by name, each with its limit and whether it is within it."""
         return dict(self.document.metrics)
 
     @property
     def configuration(self) -> CalibrationConfig:
-        """What decided the result. Give it to another `calibrate` to have the same again."""
+        """The settings that decided the result. Pass it to another `calibrate` to repeat them."""
         return self._calibrated.configuration
 
     @property
     def camera_fit(self) -> CameraFit | None:
-        """How well `camera_model` fits the recording's camera; None where none was asked for."""
+        """How well the chosen `camera_model` fits the recording's camera; None if none was chosen."""
         return self._calibrated.fit
 
     @property
@@ -113,7 +113,7 @@ class Result:
         return self._calibrated.offset
 
     def to_json(self) -> str:
-        """Canonical JSON of `document`: equal results give equal bytes. `coec export` reads it, and its schema is
+        """Canonical JSON of `document`: equal results give equal bytes. `coec export` reads it. Its schema is
         `schemas/v1/CalibrationResult.json`."""
         return to_json(self.document).decode()
 
@@ -127,26 +127,26 @@ class Result:
         T_parent_lidar: NDArray[np.float64] | None = None,
         force: bool = False,
     ) -> Path:
-        """Writes the result into a file of another program, at once or not at all. Of a file that holds other
-        transforms (URDF, Autoware's YAML and the like), this one alone is changed.
+        """Writes the result into a file of another program's format, completely or not at all. If the file exists and
+        holds other transforms (URDF, Autoware's YAML and the like), only this transform is changed.
 
         Args:
-            path: the file; its folder is made if need be.
+            path: the file; its folder is made if it does not exist.
             format: `tf`, `urdf`, `autoware`, `kalibr`, `kitti`, `kitti360`, `nuscenes`, `openlabel`, `colmap`,
-                `opencv` or `json`. Which direction each holds is written in the file.
-            parent: name of the frame; None: the LiDAR's.
-            child: likewise; None: the camera's.
+                `opencv` or `json`. The file states the direction of its transform.
+            parent: name of the parent frame; None: the LiDAR's.
+            child: name of the child frame; None: the camera's.
             T_parent_lidar: (4, 4) pose of the LiDAR in `parent`, metres; None: the LiDAR is the parent.
-            force: also write what is not accepted; the file says so.
+            force: also write a result that is not accepted; the file says that it is not.
 
         Returns:
-            The file.
+            The path of the file.
 
         Raises:
             NotAcceptedError: the verdict is negative, and `force` was not given.
             UsageError: no such format, or `T_parent_lidar` is no (4, 4) array of finite numbers.
-            OutputError: the file cannot be written, or what it holds cannot be changed.
-            SourceError: the file that is there cannot be read.
+            OutputError: the file cannot be written, or its present content cannot be changed.
+            SourceError: the existing file cannot be read.
         """
         pose = None if T_parent_lidar is None else np.array(T_parent_lidar, dtype=np.float64)
         if pose is not None and (pose.shape != (4, 4) or not np.isfinite(pose).all()):
@@ -159,15 +159,15 @@ class Result:
         return place
 
     def overlay(self, at: Pose = "result") -> NDArray[np.uint8]:
-        """The middle frame of the window with the points of its sweep, coloured by range.
+        """Draws the points of the sweep, coloured by range, over the middle camera frame of the window.
 
         Args:
-            at: the pose at which they are drawn: `result`, `start` (where the search began), or `nominal` (the
+            at: the pose at which the points are drawn: `result`, `start` (where the search began), or `nominal` (the
                 recording's own calibration).
 
         Returns:
-            (height, width, 3) uint8, RGB, as matplotlib's `imshow` and Pillow take it; somewhat higher than the image,
-            and a whole factor larger where that is small.
+            (height, width, 3) uint8, RGB, as matplotlib's `imshow` and Pillow take it. It is somewhat higher than the
+            image, and a small image is enlarged by a whole factor.
 
         Raises:
             DecodeError: the image cannot be decoded.

@@ -17,7 +17,7 @@ from coec.sources.windows import Loaded
 
 
 class Window:
-    """Pairs of a camera frame and a LiDAR sweep, of one slice of a drive: what one result is calibrated from. Made by
+    """Pairs of a camera frame and a LiDAR sweep from one slice of a drive: the input of one calibration. Made by
     `Recording.window` and `Recording.windows`."""
 
     def __init__(self, source: str, frames: int | None, loaded: Loaded) -> None:
@@ -30,12 +30,12 @@ class Window:
 
     @property
     def window_id(self) -> str:
-        """`<pair>-<stamp of the first camera frame, ns>`, or as it was recorded."""
+        """`<pair>-<stamp of the first camera frame, ns>`, or the recorded id."""
         return self._loaded.window.window_id
 
     @property
     def pairs(self) -> int:
-        """How many pairs it has."""
+        """Number of pairs."""
         return len(self._loaded.window.pairs)
 
     @property
@@ -45,31 +45,31 @@ class Window:
 
     @property
     def unpaired(self) -> dict[str, int]:
-        """Frames that found no partner, by cause."""
+        """Number of frames that found no partner, by cause."""
         return dict(self._loaded.unpaired)
 
     @property
     def source(self) -> str:
-        """Of the recording."""
+        """The recording, as it was given to `coec.open`."""
         return self._source
 
     @property
     def frames(self) -> int | None:
-        """How many camera frames were asked for at most; None: as many as usual."""
+        """The largest number of camera frames that was asked for; None: the usual number."""
         return self._frames
 
     @property
     def loaded(self) -> Loaded:
-        """The window as the package itself passes it on. No part of the stable interface."""
+        """The window as the package itself passes it on. Not part of the stable interface."""
         return self._loaded
 
     @property
     def T_camera_lidar_start(self) -> NDArray[np.float64]:
-        """(4, 4) where a search starts, metres."""
+        """(4, 4) pose at which a search starts, metres."""
         return self._loaded.window.T_camera_lidar_start.copy()
 
     def calibrate(self, **options: Unpack[Options]) -> Result:
-        """The result of the window. The same window, network and configuration give the same result, to the byte.
+        """Calibrates the window. The same window, network and configuration give the same result, to the byte.
 
         Args:
             options: as `coec.calibrate`.
